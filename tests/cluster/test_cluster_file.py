@@ -71,6 +71,7 @@ def test_the_example_is_read(folder: Path) -> None:
         ("address = 2\n", "", "heliostats.1.address: 'address' is missing"),
         ("tcp://10.0.0.2:4840", "tcp://10.0.0.2", "has no port"),
         ("tcp://10.0.0.2:4840", "mqtt://10.0.0.2", "has no prefix"),
+        ("unencrypted = true", "", "plant.url: 10.0.0.2 is not this machine, and the link is not"),
         ("tcp://10.0.0.2:4840", "http://10.0.0.2:80", "give tcp://host:port, mqtt://"),
         ("tcp://10.0.0.2:4840", "tcp://host:99999", "is not a URL"),
         ("[time]", "[time]\nerror_s = 0.6", "time.error_s: 0.6: input should be less than"),

@@ -8,6 +8,7 @@ import shutil
 import socket
 import subprocess
 import threading
+import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -29,7 +30,15 @@ from heliotrope.links.link import (
     received,
     running,
 )
-from heliotrope.links.tcp import TcpServer, client_tls, server_tls, tcp_link
+from heliotrope.links.tcp import (
+    _NEWCOMERS,
+    _NEWCOMERS_EACH,
+    TcpServer,
+    _Newcomers,
+    client_tls,
+    server_tls,
+    tcp_link,
+)
 
 SETTINGS = LinkSettings(period=0.5, deadline=1.5)
 #: For real sockets: quick beats, so that a test need not wait.
@@ -649,7 +658,7 @@ def test_too_many_newcomers_are_turned_away_and_a_cluster_still_gets_in() -> Non
         async with running(plant):
             await plant.listening()
             idle = []
-            for _ in range(140):  # 64 in their handshake, 64 waiting, the others cut off
+            for _ in range(140):  # 17 in their handshake, the others cut off
                 made = socket.create_connection(("127.0.0.1", plant.port))
                 made.setblocking(False)
                 idle.append(made)
@@ -662,6 +671,55 @@ def test_too_many_newcomers_are_turned_away_and_a_cluster_still_gets_in() -> Non
                 await connected(north, plant.links["north"])
 
     real(main)
+
+
+@pytest.mark.parametrize("encrypted", [False, True])
+def test_silent_strangers_do_not_delay_a_cluster(
+    encrypted: bool, certificate: tuple[Path, Path]
+) -> None:
+    """They hold their connections; the oldest give way, so that a cluster joins at once."""
+
+    async def main() -> None:
+        ours = server_tls(*certificate) if encrypted else None
+        theirs = client_tls(certificate[0]) if encrypted else None
+        plant = TcpServer("127.0.0.1", 0, {"north": KEY}, SystemClock(), tls=ours)
+        async with running(plant):
+            await plant.listening()
+            idle = [socket.create_connection(("127.0.0.1", plant.port)) for _ in range(90)]
+            await asyncio.sleep(0.1)
+            idle += [socket.create_connection(("127.0.0.1", plant.port)) for _ in range(50)]
+            await until(lambda: plant.refused >= 140 - _NEWCOMERS_EACH - 1)
+            assert "127.0.0.1 has too many connections" in plant.last_refusal
+            began = time.monotonic()
+            north = client(plant.port, tls=theirs)
+            async with running(north):
+                await connected(north, plant.links["north"])
+                # The strangers' handshakes end after 3 s; the cluster must not wait for that.
+                assert time.monotonic() - began < 0.5 * LinkSettings().open_limit
+            for made in idle:
+                made.close()
+
+    real(main)
+
+
+def test_strangers_of_many_addresses_push_out_their_busiest() -> None:
+    ended: list[str] = []
+
+    class Stub:
+        def __init__(self, address: str) -> None:
+            self.address = address
+
+        def lose(self, why: str) -> None:
+            ended.append(self.address)
+            assert self.address in why
+
+    newcomers = _Newcomers(1)
+    cluster = Stub("10.0.0.1")
+    newcomers.enter(cluster)  # type: ignore[arg-type]
+    for number in range(200):
+        newcomers.enter(Stub(f"10.0.1.{number % 10}"))  # type: ignore[arg-type]
+    assert len(ended) == 201 - 1 - _NEWCOMERS
+    assert "10.0.0.1" not in ended
 
 
 class Gate(threading.Thread):

@@ -62,6 +62,11 @@ def pair(
     )
 
 
+def test_a_link_without_a_key_is_refused() -> None:
+    with pytest.raises(InputError, match="cluster north: a key of 0 bytes; give at least 16"):
+        mqtt_link(Broker("127.0.0.1"), PREFIX, "north", b"", CLOCK, plant=True)
+
+
 def test_messages_pass_both_ways_and_clusters_do_not_hear_each_other(mosquitto: Mosquitto) -> None:
     async def main() -> None:
         north, south = pair(mosquitto.port), pair(mosquitto.port, cluster="south", key=OTHER_KEY)

@@ -12,7 +12,7 @@ from heliotrope.cluster.gpsd import PORT
 from heliotrope.cluster.serial_bus import BusSettings
 from heliotrope.errors import FormatError, InputError
 from heliotrope.files.documents import read_document, read_toml
-from heliotrope.links.addresses import Keys, Table, url_parts
+from heliotrope.links.addresses import Keys, Table, check_encryption, url_parts
 from heliotrope.sun import Site
 
 _CHRONY = "chronyd now keeps the computer's clock"
@@ -74,6 +74,7 @@ class PlantLinkTable(Table):
     username: str | None = Field(
         None, description="For the MQTT broker; its password is in the key file."
     )
+    unencrypted: bool = Field(False, description="Accept a plant elsewhere without TLS.")
 
 
 class TimeTable(Table):
@@ -253,6 +254,8 @@ def _install(path: Path, document: ClusterDocument, secrets: Keys) -> Installati
     )
     line = document.safety.emergency_line
     scheme, host, port, prefix = url_parts(path, document.plant.url, "plant.url")
+    encrypted = scheme == "mqtts" or (scheme == "tcp" and document.plant.authority is not None)
+    check_encryption(path, host, "plant.url", encrypted or document.plant.unencrypted)
     return Installation(
         config=config,
         bus_url=bus.url,

@@ -6,6 +6,7 @@ separate file that only its owner may read.
 
 import string
 from difflib import get_close_matches
+from ipaddress import ip_address
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -59,6 +60,36 @@ def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
         missing = "port: tcp://host:port" if port is None else "prefix: mqtt://host/prefix"
         raise FormatError(path, f"{url!r} has no {missing}", where)
     return parts.scheme, parts.hostname, port, prefix
+
+
+def check_encryption(path: Path, host: str, where: str, accepted: bool) -> None:
+    """Refuse a link to another machine that is not encrypted, unless that is accepted.
+
+    Parameters
+    ----------
+    path, where
+        File and place of the address, for the error message.
+    host
+        Host or address of the other end, or the address listened on.
+    accepted
+        Whether the link is encrypted, or the file says that it need not be.
+
+    Raises
+    ------
+    FormatError
+        Clear text beyond this machine.
+    """
+    try:
+        here = ip_address(host).is_loopback
+    except ValueError:
+        here = host == "localhost"
+    if not (here or accepted):
+        raise FormatError(
+            path,
+            f"{host} is not this machine, and the link is not encrypted; set up TLS, or write "
+            "unencrypted = true if nobody else can reach the network between them",
+            where,
+        )
 
 
 class Keys:

@@ -37,6 +37,7 @@ from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.link import LinkError, LinkLostError, LinkSettings, Statistics
+from heliotrope.links.tcp import check_key
 
 #: Consecutive messages that the broker may leave unconfirmed before the connection is given up.
 #: Below 20, the number from which paho would keep messages back and send them later.
@@ -294,8 +295,8 @@ def mqtt_link(
     cluster
         Name of the cluster, one level of a topic.
     key
-        Shared by both ends: messages under another key are refused, whatever the broker admits.
-        b"": none; damage is still detected.
+        Shared by both ends, at least 16 bytes: messages under another key are refused, whatever the
+        broker admits.
     clock, settings
         As in `CarriedLink`.
     plant
@@ -304,8 +305,9 @@ def mqtt_link(
     Raises
     ------
     InputError
-        Names that cannot form a topic.
+        Names that cannot form a topic, or a key that is too short.
     """
+    check_key(cluster, key)
     settings = settings or LinkSettings()
     statistics = Statistics()
     ends = _ends(prefix, cluster, plant=plant)

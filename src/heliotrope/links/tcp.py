@@ -21,7 +21,7 @@ import hmac
 import secrets
 import socket
 import ssl
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,15 +42,17 @@ _LENGTH = 4
 _WAITING = 64
 #: Kernel's send buffer, bytes: small, since data in it can no longer be taken back.
 _SEND_BUFFER = 65536
-#: Connections that may be in their handshake at the same time.
-_NEWCOMERS = 64
+#: Connections that may be in their handshake at the same time, beyond one for each cluster: in all,
+#: and from one address.
+_NEWCOMERS, _NEWCOMERS_EACH = 64, 16
 
 
 class _Pipe(asyncio.Protocol):
     """A connection as frames: bytes in, frames out."""
 
-    def __init__(self, largest: int, arrived: "asyncio.Queue[_Pipe] | None" = None) -> None:
+    def __init__(self, largest: int, arrived: "Callable[[_Pipe], None] | None" = None) -> None:
         self.largest = largest
+        self.address = ""
         self._arrived = arrived
         self._transport: asyncio.Transport | None = None
         self._buffer = bytearray()
@@ -70,12 +72,28 @@ class _Pipe(asyncio.Protocol):
         if link is not None and link.family in (socket.AF_INET, socket.AF_INET6):
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+            self.address = str((transport.get_extra_info("peername") or ("",))[0])
         self._writable.set()
         if self._arrived is not None:
-            try:
-                self._arrived.put_nowait(self)
-            except asyncio.QueueFull:
-                self.lose("too many connections are in their handshake at once")
+            # Read only once its task is there, which may begin with TLS.
+            transport.pause_reading()
+            self._arrived(self)
+
+    async def begin(self, tls: ssl.SSLContext | None, limit: float) -> None:
+        """Begin to read as a server, after the handshake of TLS if there is one."""
+        transport = self._transport
+        if transport is None:
+            raise LinkLostError(self._lost)
+        if tls is None:
+            transport.resume_reading()
+            return
+        made = await asyncio.get_running_loop().start_tls(
+            transport, self, tls, server_side=True, ssl_handshake_timeout=limit
+        )
+        if made is None or self._lost:
+            raise LinkLostError(self._lost or "the connection ended in the handshake of TLS")
+        made.set_write_buffer_limits(high=0)
+        self._transport = made
 
     def data_received(self, data: bytes) -> None:
         """Cut received bytes into frames."""
@@ -271,6 +289,37 @@ class _Client:
             raise
 
 
+class _Newcomers:
+    """Connections in their handshake: bounded in all and per address, the oldest gives way.
+
+    Parameters
+    ----------
+    clusters
+        Number of clusters, all of which may connect at once and from one address.
+    """
+
+    def __init__(self, clusters: int) -> None:
+        self._most, self._each = clusters + _NEWCOMERS, clusters + _NEWCOMERS_EACH
+        self._pipes: dict[_Pipe, None] = {}
+
+    def enter(self, pipe: _Pipe) -> None:
+        """Let a connection in; beyond the limits end the oldest of the busiest address."""
+        self._pipes[pipe] = None
+        counts = Counter(one.address for one in self._pipes)
+        busiest = pipe.address
+        if counts[busiest] <= self._each:
+            if len(self._pipes) <= self._most:
+                return
+            busiest = counts.most_common(1)[0][0]
+        oldest = next(one for one in self._pipes if one.address == busiest)
+        self.leave(oldest)
+        oldest.lose(f"{busiest} has too many connections in their handshake; the oldest ends")
+
+    def leave(self, pipe: _Pipe) -> None:
+        """Forget a connection whose handshake has ended."""
+        self._pipes.pop(pipe, None)
+
+
 class _Slot:
     """The place where a cluster's connection waits for its link; a new one ends the previous."""
 
@@ -393,8 +442,9 @@ class TcpServer:
         self.port = 0
         self.refused = 0
         self.last_refusal = ""
-        self._arrived: asyncio.Queue[_Pipe] = asyncio.Queue(_NEWCOMERS)
-        self._room = asyncio.Semaphore(_NEWCOMERS)
+        # As long as the newcomers are many: what is evicted is taken out at once.
+        self._arrived: asyncio.Queue[_Pipe] = asyncio.Queue()
+        self._newcomers = _Newcomers(len(keys))
         self._listening = asyncio.Event()
         self._closing = asyncio.Event()
 
@@ -418,7 +468,7 @@ class TcpServer:
         """
         try:
             server = await asyncio.get_running_loop().create_server(
-                lambda: _Pipe(_GREETING, self._arrived), self._host, self._wanted, ssl=self._tls
+                lambda: _Pipe(_GREETING, self._arrive), self._host, self._wanted
             )
         except OSError as error:
             raise LinkError(
@@ -441,16 +491,21 @@ class TcpServer:
             for slot in self._slots.values():
                 await slot.clear()
 
+    def _arrive(self, pipe: _Pipe) -> None:
+        self._newcomers.enter(pipe)
+        self._arrived.put_nowait(pipe)
+
     async def _welcome(self) -> None:
         async with asyncio.TaskGroup() as group:
             while True:
-                await self._room.acquire()
                 group.create_task(self._admit(await self._arrived.get()))
 
     async def _admit(self, pipe: _Pipe) -> None:
         admitted = False
         try:
-            async with asyncio.timeout(self._settings.open_limit):
+            limit = self._settings.open_limit
+            async with asyncio.timeout(limit):
+                await pipe.begin(self._tls, limit)
                 name, key = await _greet(pipe, self._keys, self._settings.largest + OVERHEAD)
             self._slots[name].offer(pipe, key)
             admitted = True
@@ -458,7 +513,7 @@ class TcpServer:
             self.refused += 1
             self.last_refusal = str(error) or "the handshake took too long"
         finally:
-            self._room.release()
+            self._newcomers.leave(pipe)
             if not admitted:
                 with contextlib.suppress(OSError):
                     await pipe.close()

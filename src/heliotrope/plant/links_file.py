@@ -17,7 +17,7 @@ from pydantic import Field
 
 from heliotrope.errors import FormatError
 from heliotrope.files.documents import read_document
-from heliotrope.links.addresses import Keys, Table, url_parts
+from heliotrope.links.addresses import Keys, Table, check_encryption, url_parts
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Link
 from heliotrope.links.mqtt import Broker, mqtt_link
@@ -36,6 +36,9 @@ class TcpTable(Table):
         description="PEM file of the authority that signs clusters' certificates; "
         "default: they need none.",
     )
+    unencrypted: bool = Field(
+        False, description="Accept connections from other machines without TLS."
+    )
 
 
 class MqttTable(Table):
@@ -50,6 +53,7 @@ class MqttTable(Table):
         description="PEM file of the authority that signs the broker's certificate; "
         "default: the system's.",
     )
+    unencrypted: bool = Field(False, description="Accept a broker elsewhere without TLS.")
 
 
 class LinksDocument(Table):
@@ -104,7 +108,7 @@ class LinksFile:
         Raises
         ------
         FormatError
-            A cluster without a link, or a link without a cluster.
+            A cluster without a link, a link without a cluster, or one without a key.
         """
         for name in homes:
             if name not in self.document.clusters:
@@ -121,6 +125,9 @@ class LinksFile:
                     f"the plant has no cluster {name}; it has {', '.join(homes)}",
                     "clusters",
                 )
+        for name, how in self.document.clusters.items():
+            if how == "mqtt" and name not in self.keys:
+                raise _keyless(self.path, name)
 
     def build(self, homes: Mapping[str, tuple[str, ...]], clock: Clock) -> "PlantLinks":
         """Return the plant's ends of the links, and everything that has to run beside them.
@@ -170,7 +177,7 @@ class LinksFile:
             if table.authority is not None:
                 tls = client_tls(self.path.parent / table.authority)
         broker = Broker(host, port, table.username, self.password or None, tls)
-        return mqtt_link(broker, prefix, name, self.keys.get(name, b""), clock, plant=True)
+        return mqtt_link(broker, prefix, name, self.keys[name], clock, plant=True)
 
 
 @dataclass
@@ -237,12 +244,7 @@ def _check(found: LinksFile) -> None:
         if not name.strip() or not how.strip():
             raise FormatError(path, "a cluster without a name or a way; give both", "clusters")
         if how == "tcp" and name not in found.keys:
-            raise FormatError(
-                path,
-                "a cluster that connects over TCP proves itself by its key; put one into the "
-                "key file, table [clusters]",
-                f"clusters.{name}",
-            )
+            raise _keyless(path, name)
         if how not in ("tcp", "mqtt") and not (path.parent / how).is_file():
             raise FormatError(
                 path,
@@ -251,11 +253,26 @@ def _check(found: LinksFile) -> None:
                 f"clusters.{name}",
             )
     if document.tcp is not None:
-        _listen(path, document.tcp.listen)
+        host, _ = _listen(path, document.tcp.listen)
+        encrypted = document.tcp.certificate is not None
+        check_encryption(path, host, "tcp.listen", encrypted or document.tcp.unencrypted)
         if (document.tcp.certificate is None) != (document.tcp.key is None):
             raise FormatError(path, "TLS needs both, certificate and key", "tcp")
-    if document.mqtt is not None and url_parts(path, document.mqtt.url, "mqtt.url")[0] == "tcp":
-        raise FormatError(path, "give mqtt://host/prefix or mqtts://host/prefix", "mqtt.url")
+    if document.mqtt is not None:
+        scheme, host, _, _ = url_parts(path, document.mqtt.url, "mqtt.url")
+        if scheme == "tcp":
+            raise FormatError(path, "give mqtt://host/prefix or mqtts://host/prefix", "mqtt.url")
+        encrypted = scheme == "mqtts"
+        check_encryption(path, host, "mqtt.url", encrypted or document.mqtt.unencrypted)
+
+
+def _keyless(path: Path, name: str) -> FormatError:
+    return FormatError(
+        path,
+        "a cluster and its plant prove themselves to each other by a key; put one into the key "
+        "file, table [clusters]",
+        f"clusters.{name}",
+    )
 
 
 def _listen(path: Path, text: str) -> tuple[str, int]:
