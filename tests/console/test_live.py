@@ -214,8 +214,8 @@ def test_ctl_lets_a_person_in_and_keeps_them_out(
 @pytest.mark.parametrize("cases", [1, pytest.param(10, marks=pytest.mark.slow)])
 def test_anything_at_all(console: LiveConsole, tokens: dict[str, str], cases: int) -> None:
     """What the description allows is answered as it says; nothing makes the server fail."""
-    schema = schemathesis.openapi.from_url(f"{console.address}api/v1/openapi.json")
     headers = {"Authorization": f"Bearer {tokens['viewer']}"}
+    schema = schemathesis.openapi.from_url(f"{console.address}api/v1/openapi.json", headers=headers)
     few = settings(
         max_examples=cases, deadline=None, database=None, suppress_health_check=list(HealthCheck)
     )

@@ -5,10 +5,12 @@
 
 import asyncio
 import contextlib
+import itertools
 import time
 from collections.abc import AsyncIterator, Callable
 
 from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse, Response
 from starlette.staticfiles import StaticFiles
 
@@ -17,12 +19,14 @@ from heliotrope.console import accounts, api, commands
 from heliotrope.console._attempts import Attempts
 from heliotrope.console._files import KEPT, PLAIN, STATIC, Files
 from heliotrope.console.auth import Console
+from heliotrope.console.edge import Edge
 from heliotrope.console.guard import Guard
 from heliotrope.console.live import Stream
+from heliotrope.console.routes import Routes
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError, UnknownNameError
 from heliotrope.plant.audit import AuditError
-from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.authority import RefusedError, Role
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.store.people import People
 from heliotrope.store.records import StoreError
@@ -32,6 +36,10 @@ ABOUT = (
     "(Authorization: Bearer). In a session, every change needs the header X-CSRF-Token with the "
     "word that the answer to the sign-in gave."
 )
+
+ROUTERS = (api.router, commands.router, accounts.router)
+#: Errors of a request that the answer lists, and their longest texts, characters.
+MOST_ERRORS, LONGEST_TEXT, LONGEST_WORD = 5, 200, 64
 
 
 def create(
@@ -73,8 +81,8 @@ def create(
         docs_url=None,
         redoc_url=None,
     )
-    app.state.console = console
-    for router in (api.router, commands.router, accounts.router):
+    app.state.console, app.state.edge = console, Edge()
+    for router in ROUTERS:
         app.include_router(router)
     for kind, status in (
         (HeliotropeError, 422),
@@ -84,9 +92,10 @@ def create(
         (StoreError, 503),
     ):
         app.add_exception_handler(kind, _problem(status))
+    app.add_exception_handler(RequestValidationError, _invalid)
     app.add_middleware(Files)
     # The middleware added last comes first.
-    app.add_middleware(Guard, console=lambda: console)
+    app.add_middleware(Guard, console=lambda: console, routes=_routes(chosen), edge=app.state.edge)
     _pages(app)
     if chosen.page:
         from heliotrope.console import page
@@ -101,6 +110,31 @@ def _problem(status: int) -> Callable[[Request, Exception], Response]:
         return JSONResponse({"detail": str(error)}, status)
 
     return answer
+
+
+def _invalid(request: Request, error: Exception) -> Response:
+    """Return what is wrong with a request, without its contents."""
+    del request
+    assert isinstance(error, RequestValidationError)
+    errors = [
+        {
+            "type": str(one["type"])[:LONGEST_WORD],
+            "loc": [part if isinstance(part, int) else part[:LONGEST_WORD] for part in one["loc"]],
+            "msg": str(one["msg"])[:LONGEST_TEXT],
+        }
+        for one in itertools.islice(error.errors(), MOST_ERRORS)
+    ]
+    return JSONResponse({"detail": errors}, 422)
+
+
+def _routes(settings: ConsoleSettings) -> Routes:
+    """Return the routes that the guard admits."""
+    files = [f"{place}/{file.name}" for place in (KEPT, PLAIN) for file in STATIC.iterdir()]
+    page = ["/"] * settings.page
+    own = {"/api/v1/openapi.json": Role.VIEWER}
+    if settings.page:
+        own["/favicon.ico"] = Role.VIEWER
+    return Routes(ROUTERS, [*files, *page, "/login", "/emergency"], own)
 
 
 def _pages(app: FastAPI) -> None:

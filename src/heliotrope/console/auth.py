@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, TypeVar, cast
 from urllib.parse import urlsplit
 
 from fastapi import Depends, HTTPException
@@ -37,7 +37,11 @@ TRUSTED = 5.0
 #: The same for EMERGENCY alone, s.
 LONG_TRUSTED = 3600.0
 MOST_KNOWN = 2000
+#: A longer word is no session's or token's secret, characters.
+LONGEST_SECRET = 200
 DAY = 86_400.0
+#: Key of the caller in the scope of a request: the guard looks each up once.
+FOUND = "heliotrope.caller"
 #: A holder of the authority counts as present for this long after renewing it, s.
 PRESENT = 8.0
 #: The shared answer that never changes.
@@ -164,14 +168,10 @@ async def find_caller(console: Console, connection: HTTPConnection) -> Caller | 
     EMERGENCY accepts a caller who was known recently: it must not wait for a store that is slow or
     gone.
     """
-    bearer = connection.headers.get("authorization", "")
-    kind, _, word = bearer.partition(" ")
-    if bearer and kind.lower() != "bearer":
+    found = secret_of(connection)
+    if found is None:
         return None
-    by, secret = ("token", word.strip()) if bearer else ("session", "")
-    secret = secret or connection.cookies.get(COOKIE, "")
-    if not secret or (bearer and not word.strip()):
-        return None
+    by, secret = found
     trusted = LONG_TRUSTED if _is_emergency(connection) else TRUSTED
     known, now = console.known.get((by, secret)), time.monotonic()
     if known is None or now - known[0] > trusted:
@@ -180,6 +180,20 @@ async def find_caller(console: Console, connection: HTTPConnection) -> Caller | 
             return None
     who = known[1]
     return who if who.expires is None or who.expires > console.now() else None
+
+
+def secret_of(connection: HTTPConnection) -> tuple[str, str] | None:
+    """Return kind and secret of the caller's token or session, whether valid or not; None for none.
+
+    A request with a token is never taken for one of a session.
+    """
+    bearer = connection.headers.get("authorization", "")
+    if bearer:
+        kind, _, word = bearer.partition(" ")
+        by, secret = "token", word.strip() if kind.lower() == "bearer" else ""
+    else:
+        by, secret = "session", connection.cookies.get(COOKIE, "")
+    return (by, secret) if 0 < len(secret) <= LONGEST_SECRET else None
 
 
 async def _look_up(console: Console, by: str, secret: str) -> tuple[float, Caller] | None:
@@ -228,7 +242,10 @@ async def caller(connection: HTTPConnection, console: Here) -> Caller:
     HTTPException
         401 if unknown; 403 if a page from elsewhere may have sent the request.
     """
-    found = await find_caller(console, connection)
+    if FOUND in connection.scope:
+        found = cast("Caller | None", connection.scope[FOUND])
+    else:
+        found = await find_caller(console, connection)
     if found is None:
         raise HTTPException(401, "sign in, or send a valid token", {"WWW-Authenticate": "Bearer"})
     changes = connection.scope.get("method", "GET") not in SAFE_METHODS
@@ -245,20 +262,32 @@ async def caller(connection: HTTPConnection, console: Here) -> Caller:
 Anyone = Annotated[Caller, Depends(caller)]
 
 
-def at_least(role: Role) -> Any:
-    """Return a dependency that admits only a role or higher."""
+@dataclass(frozen=True)
+class AtLeast:
+    """A dependency that admits only a role or higher; the guard asks it before it reads a body."""
 
-    async def allowed(who: Anyone) -> Caller:
-        if who.person.role < role:
+    role: Role
+
+    async def __call__(self, who: Anyone) -> Caller:
+        """Return the caller.
+
+        Raises
+        ------
+        HTTPException
+            403 if the role is too low.
+        """
+        return self.admitted(who)
+
+    def admitted(self, who: Caller) -> Caller:
+        """Return a caller whose role is high enough; see `__call__`."""
+        if who.person.role < self.role:
             name, mine = who.person.name, who.person.role.name.lower()
-            raise HTTPException(403, f"{name} is {mine}; this needs {role.name.lower()}")
+            raise HTTPException(403, f"{name} is {mine}; this needs {self.role.name.lower()}")
         return who
 
-    return Depends(allowed)
 
-
-Operator = Annotated[Caller, at_least(Role.OPERATOR)]
-Engineer = Annotated[Caller, at_least(Role.ENGINEER)]
+Operator = Annotated[Caller, Depends(AtLeast(Role.OPERATOR))]
+Engineer = Annotated[Caller, Depends(AtLeast(Role.ENGINEER))]
 
 
 def token_of(console: Console, person: Person) -> int:

@@ -1,14 +1,32 @@
-"""Checks before every request: known host names only, safe headers, sign-in for the page."""
+"""Checks before every request, and before any of its body is read.
 
+Known host names only, a known route, a caller with the role that it needs, a body of the size and
+shape that it accepts; then safe headers on every answer.
+"""
+
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
+from fastapi import HTTPException
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import HTTPConnection
-from starlette.responses import JSONResponse
+from starlette.responses import JSONResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from heliotrope.console.auth import Console, find_caller, host_known
+from heliotrope.console import bodies
+from heliotrope.console.auth import (
+    FOUND,
+    AtLeast,
+    Caller,
+    Console,
+    caller,
+    host_known,
+    same_origin,
+)
+from heliotrope.console.edge import Edge
+from heliotrope.console.routes import FORM, READ, TINY, Found, Routes
+from heliotrope.errors import HeliotropeError, InputError
 
 #: Nothing from other origins, nothing inline.
 STRICT = (
@@ -22,8 +40,10 @@ FRAME = (
     "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; connect-src 'self'; "
     "font-src 'self' data:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
-#: Largest accepted body, bytes: points for every heliostat of a large field.
-LARGEST = 16 << 20
+#: Where the page's framework lives: for people who are signed in, from this page only.
+FRAMEWORK, SOCKET = "/_nicegui/", "/_nicegui_ws/"
+#: The live stream answers strangers itself: the page reads its close code.
+LIVE = "/api/v1/live"
 
 
 class Guard:
@@ -35,10 +55,16 @@ class Guard:
         Application behind it.
     console
         Returns the console.
+    routes
+        Its routes.
+    edge
+        Counts the requests.
     """
 
-    def __init__(self, app: ASGIApp, console: Callable[[], Console]) -> None:
-        self._app, self._console = app, console
+    def __init__(
+        self, app: ASGIApp, console: Callable[[], Console], routes: Routes, edge: Edge
+    ) -> None:
+        self._app, self._console, self._routes, self._edge = app, console, routes, edge
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, if it is allowed."""
@@ -47,39 +73,72 @@ class Guard:
             return
         console = self._console()
         scope["heliotrope"] = console
-        headers = Headers(scope=scope)
-        refusal = await self._refusal(console, scope, headers)
 
         async def reply(message: Message) -> None:
             if message["type"] == "http.response.start":
                 self._dress(console, scope["path"], MutableHeaders(scope=message))
             await send(message)
 
-        if refusal is None:
-            await self._app(scope, receive, reply)
-        elif scope["type"] == "http":
-            status, text = refusal
-            await JSONResponse({"detail": text}, status)(scope, receive, reply)
-        else:
-            await receive()
-            await send({"type": "websocket.close", "code": 4403})
+        try:
+            await self._admit(console, scope, receive, reply)
+        except HTTPException as refusal:
+            await _refuse(refusal, scope, receive, reply)
+        except HeliotropeError as error:
+            # The store cannot be read, so that nobody is known.
+            await _refuse(HTTPException(503, str(error)), scope, receive, reply)
 
-    async def _refusal(
-        self, console: Console, scope: Scope, headers: Headers
-    ) -> tuple[int, str] | None:
-        """Return status and reason for a request that is not allowed."""
+    async def _admit(self, console: Console, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on.
+
+        Raises
+        ------
+        HTTPException
+            If it is not allowed.
+        """
+        connection, headers = HTTPConnection(scope), Headers(scope=scope)
         if not host_known(console, headers.get("host", "")):
-            return 421, "this machine is not known here by that name; see --name"
-        if "transfer-encoding" in headers:
-            return 411, "send the length of the body (Content-Length)"
-        length = headers.get("content-length", "0")
-        if not length.isdigit() or int(length) > LARGEST:
-            return 413, f"the body is longer than {LARGEST} bytes"
-        if scope["path"].startswith("/_nicegui_ws") and (
-            await find_caller(console, HTTPConnection(scope)) is None
-        ):
-            return 401, "sign in"
-        return None
+            raise HTTPException(421, "this machine is not known here by that name; see --name")
+        who = scope[FOUND] = await self._edge.find(console, connection)
+        if scope["type"] == "websocket":
+            _check_socket(console, connection, who)
+            await self._app(scope, receive, send)
+            return
+        found = self._route(scope, who)
+        if found.role is not None:
+            who = AtLeast(found.role).admitted(await caller(connection, console))
+        if who is not None and not _is_emergency(scope):
+            self._edge.count(who)
+        if scope["path"] == "/" and (who is None or who.by != "session"):
+            await RedirectResponse("/login", 303)(scope, receive, send)
+            return
+        length = _length(headers, found.largest)
+        with contextlib.ExitStack() as stack:
+            if length > FORM and who is not None:
+                stack.enter_context(self._edge.large(who))
+            if length:
+                body = await bodies.read_body(receive, length)
+                if body is None:
+                    return
+                await _check_body(scope, body)
+                receive = bodies.replayed(body, receive)
+            await self._app(scope, receive, send)
+
+    def _route(self, scope: Scope, who: Caller | None) -> Found:
+        """Return the route of a request; raises `HTTPException` if there is none."""
+        path = scope["path"]
+        if path.startswith((FRAMEWORK, SOCKET)) and who is not None and who.by == "session":
+            return _framework(self._console(), scope)
+        found = self._routes.find(scope)
+        if found.status == 200:
+            return found
+        if who is None:
+            # Strangers do not learn which addresses there are.
+            if path.startswith("/api/"):
+                raise HTTPException(401, "sign in, or send a valid token")
+            raise HTTPException(404, "nothing is at this address")
+        if found.status == 405:
+            raise HTTPException(405, "not this method", {"Allow": ", ".join(found.allow)})
+        raise HTTPException(404, "nothing is at this address")
 
     def _dress(self, console: Console, path: str, headers: Any) -> None:
         """Add the safe headers."""
@@ -94,3 +153,64 @@ class Guard:
             headers.setdefault("Cache-Control", "no-store")
         if console.settings.tls:
             headers["Strict-Transport-Security"] = "max-age=31536000"
+
+
+def _framework(console: Console, scope: Scope) -> Found:
+    """Return the route of the framework's files, and of its stream where it has no socket."""
+    if not same_origin(console, HTTPConnection(scope)):
+        raise HTTPException(403, "this page comes from another site")
+    if scope["method"] in READ:
+        return Found(200)
+    if scope["path"].startswith(SOCKET) and scope["method"] == "POST":
+        return Found(200, largest=FORM)
+    raise HTTPException(405, "not this method")
+
+
+def _check_socket(console: Console, connection: HTTPConnection, who: Caller | None) -> None:
+    """Raise `HTTPException` for a socket that may not be opened."""
+    path = connection.scope["path"]
+    if path == LIVE:
+        return
+    if not path.startswith(SOCKET):
+        raise HTTPException(404, "nothing is at this address")
+    if who is None or who.by != "session":
+        raise HTTPException(401, "sign in")
+    if "origin" not in connection.headers or not same_origin(console, connection):
+        raise HTTPException(403, "this page comes from another site")
+
+
+def _length(headers: Headers, most: int) -> int:
+    """Return the length of a body, bytes; raises `HTTPException` if it is not allowed."""
+    if "transfer-encoding" in headers:
+        raise HTTPException(411, "send the length of the body (Content-Length)")
+    length = headers.get("content-length", "0")
+    if not (length.isascii() and length.isdigit() and len(length) < 20) or int(length) > most:
+        raise HTTPException(413, f"the body is longer than {most} bytes")
+    return int(length)
+
+
+async def _check_body(scope: Scope, body: bytes) -> None:
+    """Raise `HTTPException` for JSON that is too deep or has too many values."""
+    if scope["path"].startswith("/api/"):
+        try:
+            await bodies.check(body)
+        except InputError as error:
+            raise HTTPException(422, str(error)) from None
+
+
+def _is_emergency(scope: Scope) -> bool:
+    return (scope["method"], scope["path"]) == ("POST", "/api/v1/emergency")
+
+
+async def _refuse(refusal: HTTPException, scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer a refused request; close the connection if much of a body is still to come."""
+    if scope["type"] == "websocket":
+        await receive()
+        await send({"type": "websocket.close", "code": 4403})
+        return
+    headers = dict(refusal.headers or {})
+    length = Headers(scope=scope).get("content-length", "0")
+    if not length.isdigit() or int(length[:20]) > TINY:
+        headers["Connection"] = "close"
+    answer = JSONResponse({"detail": refusal.detail}, refusal.status_code, headers)
+    await answer(scope, receive, send)

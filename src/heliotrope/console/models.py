@@ -14,7 +14,14 @@ from enum import Enum
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    create_model,
+    model_validator,
+)
 
 from heliotrope.optics import flux
 from heliotrope.plant import lockouts
@@ -80,17 +87,49 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
+def points_like(given: Any) -> Any:
+    """Return points whose shape is right; the first wrong one is named, not each of 200,000.
+
+    Raises
+    ------
+    ValueError
+        A name or a point of another shape.
+    """
+    for name, point in given.items() if isinstance(given, dict) else ():
+        numbers = isinstance(point, list) and len(point) == 3 and all(map(_bounded, point))
+        if not numbers or not 0 < len(name) <= 64:
+            raise ValueError(f"{name[:64]}: give east, north and up, m")
+    return given
+
+
+def _bounded(value: Any) -> bool:
+    return isinstance(value, int | float) and -1e5 <= value <= 1e5
+
+
 class Strict(BaseModel):
     """A request, without any further fields."""
 
     model_config = ConfigDict(extra="forbid")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _few(cls, given: Any) -> Any:
+        """Refuse many unknown fields in one error, not in one each."""
+        if isinstance(given, dict) and len(given) > len(cls.model_fields) + 5:
+            raise ValueError("too many fields")
+        return given
+
 
 Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f]+$")]
-Names = Annotated[list[Name], Field(max_length=200_000, description="Names; [] for all.")]
+#: The first wrong one is named: an error for each of 200,000 would take a second and 200 MB.
+Names = Annotated[
+    list[Name], Field(max_length=200_000, fail_fast=True, description="Names; [] for all.")
+]
 Words = Annotated[str, Field(max_length=500, pattern=r"^[^\x00-\x1f\x7f]*$")]
 Coordinate = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
 Point = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+#: Points by heliostat, ENU, m.
+Points = Annotated[dict[Name, Point], Field(max_length=200_000), BeforeValidator(points_like)]
 Place = Annotated[list[float], Field(min_length=3, max_length=3)]
 Number = Annotated[float, Field(ge=-2147483648, le=2147483647, allow_inf_nan=False)]
 
@@ -129,13 +168,13 @@ class AimOrder(SomeHeliostats):
     """Aim heliostats at a receiver or target by its name, or at points by heliostat, ENU, m."""
 
     where: Words = ""
-    points: Annotated[dict[Name, Point], Field(max_length=200_000)] = {}
+    points: Points = {}
 
 
 class StandbyOrder(Strict):
     """Standby points by heliostat, ENU, m."""
 
-    points: Annotated[dict[Name, Point], Field(min_length=1, max_length=200_000)]
+    points: Annotated[Points, Field(min_length=1)]
 
 
 class GivenReason(Strict):

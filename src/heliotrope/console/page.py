@@ -9,8 +9,8 @@ from html import escape
 from pathlib import Path
 
 from fastapi import FastAPI, Request
-from fastapi.responses import RedirectResponse, Response
-from nicegui import ui
+from fastapi.responses import JSONResponse, RedirectResponse, Response
+from nicegui import core, ui
 
 from heliotrope.console._files import KEPT
 from heliotrope.console.auth import Caller, find_caller
@@ -50,6 +50,7 @@ class View(ui.element, component="static/view.js"):
 
 def attach(app: FastAPI) -> None:
     """Add the page to an application; a process can have one."""
+    core.app.add_exception_handler(404, _nothing)
     ui.page("/", title="Heliotrope", response_timeout=10.0)(_page)
     ui.run_with(
         app,
@@ -62,6 +63,12 @@ def attach(app: FastAPI) -> None:
         binding_refresh_interval=None,
         reconnect_timeout=10.0,
     )
+
+
+async def _nothing(request: Request, error: Exception) -> Response:
+    """Answer for a missing file of the framework, which would build a whole page for it."""
+    del request, error
+    return JSONResponse({"detail": "nothing is at this address"}, 404)
 
 
 async def _page(request: Request) -> Response | None:

@@ -1,0 +1,80 @@
+"""Bodies of requests: largest size, and the shape of JSON checked before it is parsed."""
+
+import asyncio
+import re
+
+from starlette.types import Message, Receive
+
+from heliotrope.errors import InputError
+
+#: Deepest nesting of JSON; requests of the API need three levels.
+DEEPEST = 16
+#: Most values in a body: points of 200,000 heliostats, a name and three numbers each.
+MOST_VALUES = 1_000_000
+#: Most escaped characters in a body.
+_MOST_ESCAPES = 500_000
+#: A larger body is checked in a thread, bytes.
+_SMALL = 1 << 16
+_ESCAPED = re.compile(rb"\\.", re.DOTALL)
+_OTHER = bytes(sorted(set(range(256)) - set(b"[]{}")))
+
+
+async def read_body(receive: Receive, most: int) -> bytes | None:
+    """Return the whole body of a request; None if its sender has left or sends more than `most`.
+
+    The time limit is that of the connection, which is closed when it is over.
+    """
+    body = bytearray()
+    while True:
+        message = await receive()
+        if message["type"] != "http.request":
+            return None
+        body += message.get("body", b"")
+        if len(body) > most:
+            return None
+        if not message.get("more_body", False):
+            return bytes(body)
+
+
+def replayed(body: bytes, receive: Receive) -> Receive:
+    """Return a `receive` that gives a body which was read already."""
+    given = False
+
+    async def again() -> Message:
+        nonlocal given
+        if given:
+            return await receive()
+        given = True
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    return again
+
+
+async def check(body: bytes) -> None:
+    """Check the shape of a JSON body; see `check_json`."""
+    if len(body) > _SMALL:
+        await asyncio.to_thread(check_json, body)
+    else:
+        check_json(body)
+
+
+def check_json(body: bytes) -> None:
+    """Check depth and number of values of JSON, in a time proportional to its length.
+
+    Raises
+    ------
+    InputError
+        Too deep, or too many values.
+    """
+    if body.count(b"\\") > 2 * _MOST_ESCAPES or body.count(b'"') > 2 * MOST_VALUES:
+        raise InputError(f"the body has more than {MOST_VALUES} values")
+    if b"\\" in body:
+        body = _ESCAPED.sub(b"", body)
+    outside = b"".join(body.split(b'"')[::2])
+    if sum(map(outside.count, (b",", b"[", b"{"))) > MOST_VALUES:
+        raise InputError(f"the body has more than {MOST_VALUES} values")
+    brackets = outside.translate(None, _OTHER)
+    for _ in range(DEEPEST):
+        brackets = brackets.replace(b"[]", b"").replace(b"{}", b"")
+    if brackets:
+        raise InputError(f"the body is not JSON, or is nested more than {DEEPEST} deep")

@@ -1,0 +1,37 @@
+"""Token buckets: how often something may happen, by key."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+
+
+class Buckets:
+    """A token bucket for each key.
+
+    Parameters
+    ----------
+    rate
+        Tokens that a bucket gains, 1/s.
+    burst
+        Tokens in a full bucket.
+    monotonic
+        Returns the time, s.
+    largest
+        Number of keys that are kept; the longest unused are dropped first.
+    """
+
+    def __init__(
+        self, rate: float, burst: float, monotonic: Callable[[], float], largest: int = 10_000
+    ) -> None:
+        self._rate, self._burst, self._now, self._largest = rate, burst, monotonic, largest
+        self._kept: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def take(self, key: str) -> float:
+        """Take a token; return the time until there is one again, s; 0 if one was taken."""
+        now = self._now()
+        left, at = self._kept.pop(key, (self._burst, now))
+        left = min(self._burst, left + self._rate * (now - at))
+        wait = 0.0 if left >= 1.0 else (1.0 - left) / self._rate
+        self._kept[key] = (left - 1.0 if wait == 0.0 else left, now)
+        if len(self._kept) > self._largest:
+            self._kept.popitem(last=False)
+        return wait

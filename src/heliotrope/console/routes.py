@@ -1,0 +1,108 @@
+"""The routes of the console with the role and the size of body that each accepts.
+
+The guard looks a request up here before any of its body is read.
+"""
+
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from fastapi import APIRouter
+from fastapi.routing import APIRoute
+from starlette.routing import BaseRoute, Match
+from starlette.types import Scope
+
+from heliotrope.console.auth import AtLeast, caller
+from heliotrope.plant.authority import Role
+
+#: Largest body, bytes: of a stranger or where none is expected; of a form; of points or names for
+#: every heliostat of a large field.
+TINY, FORM, LARGEST = 4096, 1 << 14, 16 << 20
+READ = ("GET", "HEAD")
+
+
+@dataclass(frozen=True)
+class Found:
+    """The route of a request.
+
+    Attributes
+    ----------
+    status
+        200, or 404 or 405 if there is none.
+    role
+        Least role; None: open to all.
+    largest
+        Largest body, bytes.
+    allow
+        Methods that the path has.
+    """
+
+    status: int
+    role: Role | None = None
+    largest: int = TINY
+    allow: tuple[str, ...] = ()
+
+
+class Routes:
+    """Finds the route of a request.
+
+    Parameters
+    ----------
+    routers
+        Those of the API.
+    files
+        Paths open to all that can only be read.
+    own
+        Further paths that can only be read, with the least role.
+    """
+
+    def __init__(
+        self, routers: Sequence[APIRouter], files: Iterable[str], own: Mapping[str, Role]
+    ) -> None:
+        self._api = [(route, _of(route)) for router in routers for route in router.routes]
+        self._files, self._own = frozenset(files), dict(own)
+
+    def find(self, scope: Scope) -> Found:
+        """Return the route of a request."""
+        path, method = scope["path"], scope["method"]
+        if path in self._files or path in self._own:
+            found = Found(200, self._own.get(path))
+            return found if method in READ else Found(405, allow=READ)
+        allow: list[str] = []
+        for route, found in self._api:
+            match, _ = route.matches({**scope, "type": "http"})
+            if match is Match.FULL:
+                return found
+            if match is Match.PARTIAL:
+                allow += sorted(getattr(route, "methods", ()))
+        return Found(405, allow=tuple(allow)) if allow else Found(404)
+
+
+def _of(route: BaseRoute) -> Found:
+    if not isinstance(route, APIRoute):
+        return Found(404)
+    field = route.body_field
+    model = None if field is None else field.field_info.annotation
+    role = _role(route.dependant)
+    return Found(200, role, TINY if model is None or role is None else _largest(model))
+
+
+def _role(dependant: Any) -> Role | None:
+    """Return the least role that the dependencies of a route ask for."""
+    roles = [_role(one) for one in dependant.dependencies]
+    if isinstance(dependant.call, AtLeast):
+        roles.append(dependant.call.role)
+    elif dependant.call is caller:
+        roles.append(Role.VIEWER)
+    return max((role for role in roles if role is not None), default=None)
+
+
+def _largest(model: Any) -> int:
+    """Return the largest body: that of a field where a model holds names or points."""
+    kinds = [model, *typing.get_args(model)]
+    fields = [
+        field.annotation for kind in kinds for field in getattr(kind, "model_fields", {}).values()
+    ]
+    many = any(typing.get_origin(field) in (list, dict) for field in fields)
+    return LARGEST if many else FORM
