@@ -224,6 +224,40 @@ def test_systemd_takes_the_units(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in UNITS if name.endswith(".service")])
+def test_systemd_finds_the_units_little_exposed(name: str) -> None:
+    tool = shutil.which("systemd-analyze")
+    if tool is None:
+        if os.environ.get("CI"):
+            pytest.fail("systemd-analyze is not installed, and CI tests everything")
+        pytest.skip("no systemd-analyze here: the units are not judged")
+    given = [tool, "security", "--offline=true", "--threshold=30", str(DEPLOY / name)]
+    done = subprocess.run(given, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    found = re.search(r"exposure level for \S+: ([\d.]+)", done.stdout)
+    assert found
+    assert float(found[1]) <= 3.0
+
+
+@pytest.mark.parametrize("name", [name for name in UNITS if name.endswith(".service")])
+def test_the_units_are_bounded_and_can_do_their_work(name: str) -> None:
+    text = (DEPLOY / name).read_text(encoding="utf-8")
+    lines = text.splitlines()
+    for bound in ("MemoryMax=", "TasksMax=", "LimitNOFILE=", "SystemCallFilter=@system-service"):
+        assert any(line.startswith(bound) for line in lines), bound
+    assert "CapabilityBoundingSet=" in lines
+    # Compiled kernels need memory that is written, then executed.
+    assert "MemoryDenyWriteExecute=yes" not in lines
+    if "backup" in name:
+        return
+    assert {"DevicePolicy=closed", "DeviceAllow=char-ttyUSB rw"} <= set(lines)
+    assert "PrivateDevices=yes" not in lines
+    # `cluster.timekeeping` asks the kernel for the error of its clock.
+    assert "ProtectClock=yes" not in lines
+    calls = [line for line in lines if line.startswith("SystemCallFilter=")]
+    assert "adjtimex" in calls[-1]
+
+
+@pytest.mark.parametrize("name", [name for name in UNITS if name.endswith(".service")])
 def test_the_units_give_options_that_exist(name: str, capsys: Any, monkeypatch: Any) -> None:
     from heliotrope.cli import main
 
