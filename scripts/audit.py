@@ -1,6 +1,8 @@
 """Check the installed packages without a network: pinned versions, and allowed licences.
 
-python scripts/audit.py [--json]
+python scripts/audit.py [--json | --sbom]
+
+``--sbom`` prints a bill of materials in CycloneDX's format.
 
 It does not look up known vulnerabilities, which needs a service (see docs/how-to/deploy.md). The
 exit code is 1 if a package is not pinned at the installed version, or its licence is unknown or not
@@ -11,9 +13,11 @@ import argparse
 import json
 import re
 import sys
+import uuid
 from dataclasses import asdict, dataclass
-from importlib.metadata import Distribution, distributions
+from importlib.metadata import Distribution, distributions, version
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
 #: Tools of the environment itself, which no package of ours requires.
@@ -113,13 +117,58 @@ def audit() -> list[Package]:
     ]
 
 
+def bill(packages: list[Package], name: str, edition: str) -> dict[str, Any]:
+    """Return a bill of materials (CycloneDX 1.5, ECMA-424) of a program and its packages."""
+    installed = {normal(one.metadata["Name"]): one for one in distributions()}
+
+    def needs(package: str) -> list[str]:
+        """Return the references of what a package requires here."""
+        texts = installed[package].requires or [] if package in installed else []
+        names = {normal(re.split(r"[^\w.-]", text, maxsplit=1)[0]) for text in texts}
+        return sorted(reference(one) for one in packages if one.name in names)
+
+    def reference(one: Package) -> str:
+        return f"pkg:pypi/{one.name}@{one.version}"
+
+    root = f"pkg:pypi/{name}@{edition}"
+    content = [
+        {
+            "type": "library",
+            "bom-ref": reference(one),
+            "name": one.name,
+            "version": one.version,
+            "purl": reference(one),
+            "licenses": [{"license": {"name": one.licence or "unknown"}}],
+        }
+        for one in packages
+    ]
+    serial = uuid.uuid5(uuid.NAMESPACE_URL, "\n".join([root, *map(reference, packages)]))
+    program = {"type": "application", "bom-ref": root, "name": name, "version": edition}
+    return {
+        "bomFormat": "CycloneDX",
+        "specVersion": "1.5",
+        "serialNumber": f"urn:uuid:{serial}",
+        "version": 1,
+        "metadata": {"component": {**program, "purl": root}},
+        "components": content,
+        "dependencies": [
+            {"ref": root, "dependsOn": needs(name)},
+            *({"ref": reference(one), "dependsOn": needs(one.name)} for one in packages),
+        ],
+    }
+
+
 def main() -> None:
-    """Print the problems."""
+    """Print the problems, all packages or the bill of materials."""
     parser = argparse.ArgumentParser(description="Pinned versions and licences of the packages.")
     parser.add_argument("--json", action="store_true", help="all packages, as JSON")
+    parser.add_argument("--sbom", action="store_true", help="bill of materials, CycloneDX as JSON")
     given = parser.parse_args()
     packages = audit()
     wrong = [one for one in packages if one.problem]
+    if given.sbom:
+        print(json.dumps(bill(packages, "heliotrope", version("heliotrope")), indent=1))
+        return
     if given.json:
         print(json.dumps([asdict(one) for one in packages], indent=1))
     else:

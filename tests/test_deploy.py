@@ -2,6 +2,8 @@
 
 import ast
 import functools
+import hashlib
+import json
 import os
 import re
 import runpy
@@ -9,6 +11,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -331,6 +334,67 @@ def test_the_packages_are_pinned_and_have_a_licence() -> None:
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "known vulnerabilities were not looked up" in done.stdout
+
+
+def test_every_pinned_package_has_hashes() -> None:
+    given = [sys.executable, "scripts/lock.py", "--check"]
+    done = subprocess.run(given, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    text = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+    assert "://" not in text
+    assert "--require-hashes" in (ROOT / "scripts" / "setup.sh").read_text(encoding="utf-8")
+
+
+def test_the_check_of_hashes_can_fail() -> None:
+    lock = runpy.run_path(str(ROOT / "scripts" / "lock.py"))
+    text = f"a==1.0 \\\n    --hash=sha256:{'0' * 64}\nb==2.0\nc==3.0 \\\n    --hash=sha256:12\n"
+    assert lock["locked"](text) == {"a": "1.0"}
+    wrong = lock["differences"]({"a": "1.1", "b": "2.0"}, lock["locked"](text))
+    assert wrong == ["a: pinned 1.1, with hashes 1.0", "b: pinned 2.0, with hashes none"]
+
+
+def test_an_altered_package_is_not_installed(tmp_path: Path) -> None:
+    """pip compares a wheel with the lock before it installs anything."""
+    wheel = tmp_path / "thing-1.0-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        archive.writestr("thing.py", "")
+        about = "Metadata-Version: 2.1\nName: thing\nVersion: 1.0\n"
+        archive.writestr("thing-1.0.dist-info/METADATA", about)
+        archive.writestr("thing-1.0.dist-info/WHEEL", "Wheel-Version: 1.0\nTag: py3-none-any\n")
+        archive.writestr("thing-1.0.dist-info/RECORD", "")
+    good = hashlib.sha256(wheel.read_bytes()).hexdigest()
+    for sum_, accepted in ((good, True), (good[::-1], False)):
+        lock = tmp_path / "requirements.lock"
+        lock.write_text(f"thing==1.0 \\\n    --hash=sha256:{sum_}\n")
+        options = ["--isolated", "--no-index", "--no-cache-dir", "--find-links", str(tmp_path)]
+        options += ["--require-hashes", "--no-deps", "--target", str(tmp_path / sum_)]
+        done = subprocess.run(
+            [sys.executable, "-m", "pip", "install", *options, "--requirement", str(lock)],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert (done.returncode == 0) is accepted, done.stderr
+        assert (tmp_path / sum_ / "thing.py").exists() is accepted
+
+
+def test_the_bill_of_materials_names_every_package() -> None:
+    given = [sys.executable, "scripts/audit.py", "--sbom"]
+    done = subprocess.run(given, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    bill = json.loads(done.stdout)
+    assert (bill["bomFormat"], bill["specVersion"], bill["version"]) == ("CycloneDX", "1.5", 1)
+    assert re.fullmatch(r"urn:uuid:[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}", bill["serialNumber"])
+    audit = runpy.run_path(str(ROOT / "scripts" / "audit.py"))
+    assert {one["name"] for one in bill["components"]} == {one.name for one in audit["audit"]()}
+    known = {bill["metadata"]["component"]["bom-ref"], *(c["bom-ref"] for c in bill["components"])}
+    assert len(known) == 1 + len(bill["components"])
+    numpy = next(one for one in bill["components"] if one["name"] == "numpy")
+    assert numpy["purl"] == f"pkg:pypi/numpy@{numpy['version']}"
+    assert "BSD" in numpy["licenses"][0]["license"]["name"]
+    for one in bill["dependencies"]:
+        assert one["ref"] in known
+        assert known.issuperset(one["dependsOn"])
+    ours = next(one for one in bill["dependencies"] if "pkg:pypi/heliotrope@" in one["ref"])
+    assert numpy["purl"] in ours["dependsOn"]
 
 
 def test_the_audit_can_fail() -> None:
