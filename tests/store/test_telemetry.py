@@ -1,6 +1,7 @@
 """The telemetry archive: small, whole after a crash, and asked in SQL."""
 
 import errno
+import os
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -322,3 +323,19 @@ class TestQueries:
 def test_settings_that_cannot_be(wrong: dict[str, float], text: str) -> None:
     with pytest.raises(InputError, match=text):
         TelemetrySettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_only_its_user_may_read_the_archive(tmp_path: Path) -> None:
+    before = os.umask(0o022)
+    try:
+        folder = tmp_path / "plant" / "telemetry"
+        made = open_archive(folder, rows=2)
+        made.take(NOON, look())
+        made.take(NOON + 10.0, look(counts=9))
+        open_archive(folder).take(NOON + 20.0, look())
+    finally:
+        os.umask(before)
+    found = [tmp_path / "plant", *(tmp_path / "plant").rglob("*")]
+    assert {p.suffix for p in found} >= {".parquet", ".part"}
+    for place in found:
+        assert place.stat().st_mode & 0o777 == (0o700 if place.is_dir() else 0o600), place

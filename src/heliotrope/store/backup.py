@@ -24,7 +24,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from heliotrope import __version__
 from heliotrope.errors import FormatError
 from heliotrope.store import tables
-from heliotrope.store.database import FILE, HEAD, MODE, Database, cause
+from heliotrope.store.database import FILE, HEAD, MODE, Database, cause, make_private
 from heliotrope.store.records import StoreError
 
 MANIFEST = "manifest.json"
@@ -69,7 +69,8 @@ def backup(
         raise StoreError(f"backup {final}: it exists already; give a new folder")
     beside = final.with_name(f".{final.name}.{os.getpid()}.part")
     try:
-        beside.mkdir(parents=True)
+        make_private(beside.parent)
+        beside.mkdir(mode=0o700)
         if database.file is not None:
             _copy_file(database.file, beside / FILE)
         else:
@@ -309,7 +310,7 @@ def _parts(connection: Connection, table: Any) -> Iterator[list[dict[str, Any]]]
 
 def _copy_telemetry(source: Path, target: Path) -> None:
     """Copy an archive, of which parts may become Parquet files meanwhile."""
-    target.mkdir()
+    target.mkdir(mode=0o700)
     for _ in range(2):
         for path in sorted(source.glob("????-??-??/*.*")):
             copy = target / path.parent.name / path.name

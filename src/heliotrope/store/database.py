@@ -23,6 +23,8 @@ HEAD = "0002"
 FILE = "store.sqlite"
 #: Permissions of its files.
 MODE = 0o640
+#: Mode of the folders that the store makes, and of telemetry: for its user alone.
+_PRIVATE_FOLDER, PRIVATE = 0o700, 0o600
 #: Key of PostgreSQL's advisory lock; the second number stands for the schema.
 _LOCK = 0x48454C49
 #: Time limit for taking it, s.
@@ -303,3 +305,11 @@ def cause(error: Exception) -> str:
     inner = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
     lines = str(inner).strip().splitlines()
     return lines[0] if lines else type(inner).__name__
+
+
+def make_private(folder: Path) -> None:
+    """Make a folder and its missing parents, so that only this user may enter them."""
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    for place in reversed(missing):
+        place.mkdir(mode=_PRIVATE_FOLDER, exist_ok=True)
+    folder.mkdir(exist_ok=True)

@@ -20,7 +20,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.safety import Severity
 from heliotrope.store import _rows as rows
 from heliotrope.store import tables
-from heliotrope.store.database import Database
+from heliotrope.store.database import Database, make_private
 from heliotrope.store.people import People
 from heliotrope.store.records import (
     SEVERITIES,
@@ -438,7 +438,7 @@ def calibration_history(connection: Connection, heliostat: str) -> list[Heliosta
 
 def _make_folder(folder: Path) -> None:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_private(folder)
     except OSError as error:
         raise StoreError(
             f"store {folder}: {error.strerror}; give a folder that can be written"

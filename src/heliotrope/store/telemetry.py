@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +28,7 @@ import pyarrow.parquet as pq
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
+from heliotrope.store.database import PRIVATE, make_private
 from heliotrope.store.records import StoreError
 
 #: State of a heliostat whose values are stale.
@@ -150,7 +152,7 @@ class Telemetry:
         self._lost = False
         self._segment: _Segment | None = None
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            make_private(self.folder)
         except OSError as error:
             raise StoreError(f"telemetry {self.folder}: {error.strerror}") from None
         self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(_WAITING)
@@ -255,9 +257,9 @@ class _Segment:
     def __init__(self, folder: Path, day: date) -> None:
         self.day, self.rows = day, 0
         place = folder / day.isoformat()
-        place.mkdir(exist_ok=True)
+        make_private(place)
         number = 1 + max((int(p.stem) for p in place.iterdir() if p.stem.isdigit()), default=0)
-        self._file = (place / f"{number:04d}.part").open("xb")
+        self._file = _new_file(place / f"{number:04d}.part", os.O_EXCL)
         options = pa.ipc.IpcWriteOptions(compression="zstd")
         self._stream = pa.ipc.new_stream(self._file, SCHEMA, options=options)
 
@@ -329,7 +331,7 @@ def _write_parquet(table: pa.Table, final: Path) -> None:
     beside = final.with_suffix(".tmp")
     differences = dict.fromkeys(("time", "primary", "secondary"), "DELTA_BINARY_PACKED")
     try:
-        with beside.open("wb") as file:
+        with _new_file(beside, os.O_TRUNC) as file:
             pq.write_table(
                 table.take(order),
                 file,
@@ -347,6 +349,11 @@ def _write_parquet(table: pa.Table, final: Path) -> None:
         os.fsync(place)
     finally:
         os.close(place)
+
+
+def _new_file(path: Path, how: int) -> BinaryIO:
+    """Return a file that only this user may read, open for writing."""
+    return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | how, PRIVATE), "wb")
 
 
 def retain(folder: Path, days: int, today: date) -> list[str]:
