@@ -49,7 +49,7 @@ def write() -> None:
     """Fetch the hashes, and write the lock."""
     done = subprocess.run(  # noqa: S603  # fixed arguments
         [_uv(), "pip", "compile", str(PINS), "--generate-hashes", "--no-deps", "--universal",
-         "--no-header", "--no-annotate", "--no-emit-index-url", "--no-emit-find-links",
+         "--no-header", "--no-annotate",
          "--python-version", OLDEST, "--quiet"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
