@@ -1,11 +1,11 @@
 """The console under load: 10,000 heliostats, 50 viewers and 5 operators, and one page in a browser.
 
-The plant (twin, all clusters, console) is one process, as under ``heliotrope run``; the viewers are
-a second, Chromium others. All share the machine: with two cores that is the hardest part. First the
-page is alone with the plant: the time until it is ready, and the frames per second that it draws
-while the map is panned. Then all viewers connect, and EMERGENCY is clicked in the page: the time
-until the last local controller has heard DEFOCUS on its bus, and until the plant has the
-acknowledgement of each.
+The plant (twin, all clusters) is one process and the console another, as under ``heliotrope run``;
+the viewers are a third, Chromium others. All share the machine: with two cores that is the hardest
+part. First the page is alone with the plant: the time until it is ready, and the frames per second
+that it draws while the map is panned. Then all viewers connect, and EMERGENCY is clicked in the
+page: the time until the last local controller has heard DEFOCUS on its bus, and until the plant has
+the acknowledgement of each.
 """
 
 import asyncio
@@ -67,12 +67,11 @@ def serve(pipe: Connection, folder: str, heliostats: int) -> None:
 
 async def _serve(pipe: Connection, folder: Path, heliostats: int) -> None:
     from heliotrope.console import _secrets
-    from heliotrope.console.serve import ConsoleServer
     from heliotrope.console.settings import ConsoleSettings
     from heliotrope.field.layouts import malan_plant
     from heliotrope.links.clock import VirtualClock
-    from heliotrope.links.link import running
     from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
+    from heliotrope.plant.interface import ConsoleProcess, PlantInterface
     from heliotrope.plant.operations.automatic import AutomaticSettings
     from heliotrope.store.keeper import Keeper
     from heliotrope.twin.field.field_bus import FieldBus
@@ -95,20 +94,31 @@ async def _serve(pipe: Connection, folder: Path, heliostats: int) -> None:
     for bus in world.buses.values():
         if isinstance(bus, FieldBus):
             bus._took = heard.took
-    made: dict[int, float] = {}
-    server = ConsoleServer(live.operations, people, ConsoleSettings(port=0))
-    stream = server.app.state.console.stream
-    make = stream.make
+    made: dict[float, float] = {}
+    summary = live.operations.summary
 
-    def noted() -> None:
-        make()
-        made[stream.tick] = time.time()
+    def noted() -> Any:
+        found = summary()
+        made[found.at.timestamp()] = time.time()
+        return found
 
-    stream.make = noted
+    live.operations.summary = noted  # type: ignore[method-assign]
+    address: asyncio.Future[str] = loop.create_future()
+
+    def tell(where: str) -> None:
+        loop.call_soon_threadsafe(address.set_result, where)
+
+    interface = PlantInterface(live.operations, people, folder)
+    settings_of = ConsoleSettings(port=0).given
+    console = ConsoleProcess(interface, settings_of, live.logbook.take_alarm, tell)
     longest, acknowledged = _Longest(), _acknowledged(live.plant)
-    async with live.running(), running(server), asyncio.TaskGroup() as group:
+    async with (
+        live.running(),
+        interface.running(console.run),
+        asyncio.TaskGroup() as group,
+    ):
         watching = group.create_task(longest.run())
-        pipe.send((await server.address(), tokens, world.names))
+        pipe.send((await address, tokens, world.names))
         while (question := await asyncio.to_thread(pipe.recv)) != "end":
             if question == "begin":
                 heard.begin()
@@ -163,7 +173,7 @@ def look(pipe: Connection, address: str, tokens: list[str], viewers: int) -> Non
 
 
 async def _look(pipe: Connection, address: str, tokens: list[str], viewers: int) -> None:
-    came: list[list[tuple[int, float, int]]] = [[] for _ in tokens]
+    came: list[list[tuple[float, float, int]]] = [[] for _ in tokens]
     answers: list[float] = []
     async with asyncio.TaskGroup() as group:
         works = [
@@ -184,7 +194,7 @@ async def _look(pipe: Connection, address: str, tokens: list[str], viewers: int)
             work.cancel()
 
 
-async def _view(address: str, token: str, came: list[tuple[int, float, int]]) -> None:
+async def _view(address: str, token: str, came: list[tuple[float, float, int]]) -> None:
     """Follow the stream and only count: in a plant, a browser runs on a machine of its own."""
     import json
 
@@ -196,7 +206,7 @@ async def _view(address: str, token: str, came: list[tuple[int, float, int]]) ->
         async for data in socket:
             assert isinstance(data, bytes)
             at, length = time.time(), int.from_bytes(data[4:8], "little")
-            came.append((json.loads(data[8 : 8 + length])["tick"], at, len(data)))
+            came.append((json.loads(data[8 : 8 + length])["utc"], at, len(data)))
 
 
 async def _ask(
@@ -289,7 +299,7 @@ def _load(plant: Connection, people: Connection, page: Any, span: float) -> Row:
     over = time.time() - begun
     busy, held = _told(plant, "busy")
     made = _told(plant, "made")
-    delays = [at - made[tick] for mine in came for tick, at, _ in mine if tick in made]
+    delays = [at - made[utc] for mine in came for utc, at, _ in mine if utc in made]
     rates = [len(mine) / over for mine in came]
     sizes = [size for mine in came for _, _, size in mine]
     _told(plant, "begin")

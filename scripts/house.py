@@ -17,8 +17,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 NAME = "heliotrope"
-#: Started by name and not by an import: the command line, `python -m heliotrope.warm`, Alembic.
-STARTED = re.compile(rf"{NAME}(\.cli|\.warm|\.store\.migrations(\..*)?|\.lcu\.node)?$")
+#: Started by name and not by an import: the command line, `python -m heliotrope.warm`, the
+#: console's process, Alembic.
+STARTED = re.compile(
+    rf"{NAME}(\.cli|\.warm|\.console\.__main__|\.store\.migrations(\..*)?|\.lcu\.node)?$"
+)
 
 
 #: Colours, type and the head of an arrow.

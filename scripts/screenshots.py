@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from heliotrope.console import _secrets
-from heliotrope.console.serve import ConsoleServer
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.links.clock import VirtualClock
-from heliotrope.links.link import running
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
+from heliotrope.plant.interface import ConsoleProcess, PlantInterface
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.store.keeper import Keeper
 from heliotrope.twin.live import CYCLE, PacedLoop, World
@@ -31,7 +30,7 @@ WIDE, TABLET = {"width": 1600, "height": 900}, {"width": 1024, "height": 768}
 
 
 class Shown:
-    """A plant with its console in a thread of its own."""
+    """A plant in a thread of its own, with its console."""
 
     def __init__(self, folder: Path, heliostats: int, speed: float) -> None:
         self.password, self.address = _secrets.new_password(), ""
@@ -63,13 +62,17 @@ class Shown:
             AutomaticSettings(wanted=True), cycle=CYCLE, machines=MachineTables.HELD
         )
         live = PlantAssembly(design, ports, settings)
-        async with live.running():
-            server = ConsoleServer(live.operations, keeper.people, ConsoleSettings(port=0))
-            async with running(server):
-                self.address = await server.address()
-                self._ready.set()
-                while not self._over.is_set():
-                    await asyncio.sleep(0.2)
+        interface = PlantInterface(live.operations, keeper.people, folder)
+
+        def tell(address: str) -> None:
+            self.address = address
+            self._ready.set()
+
+        given = ConsoleSettings(port=0).given
+        console = ConsoleProcess(interface, given, live.logbook.take_alarm, tell)
+        async with live.running(), interface.running(console.run):
+            while not self._over.is_set():
+                await asyncio.sleep(0.2)
         keeper.close()
 
     def close(self) -> None:

@@ -89,10 +89,11 @@ def test_from_the_emergency_button_to_the_last_mirror(tmp_path: Path) -> None:
     recorder = Recorder(stays)
     console = LiveConsole(tmp_path, 2, page=False, speed=8.0, boards=True)
     try:
-        token = console.keeper.people.add_token("viewer", "test", "viewer", 0.0)[1]
+        token = console.keeper.people.add_token("viewer", "test", "viewer", time.time())[1]
         operations = console.live.operations
         console.until(lambda: operations.summary().states.get("TRACKING") == 2, 60.0)
         console.call(recorder.start)
+        console.console_call(recorder.start)
         with httpx.Client(
             base_url=console.address,
             headers={"Authorization": f"Bearer {token}"},

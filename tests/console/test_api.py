@@ -19,13 +19,12 @@ from heliotrope.console._attempts import Attempts
 from heliotrope.console._files import KEPT
 from heliotrope.console.client import Client, RemoteError
 from heliotrope.console.people import FIRST, first_start
-from heliotrope.console.serve import ConsoleServer
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import InputError
 from heliotrope.plant import audit
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import StoreError
-from support.live_console import PASSWORD, LiveConsole
+from support.live_console import PASSWORD, LiveConsole, serving
 
 Ask = Callable[..., httpx.Response]
 ORDER = ("", "viewer", "operator", "engineer")
@@ -323,7 +322,7 @@ def test_what_has_expired_leaves_the_store(console: LiveConsole) -> None:
             async with asyncio.timeout(1.0):
                 await console.server.app.state.console.forget_expired()
 
-    console.wait(begin())
+    console.console_wait(begin())
     console.until(lambda: old.key not in {one.key for one in people.tokens()}, 5.0)
     assert new.key in {one.key for one in people.tokens()}
     people.revoke_token(new.key)
@@ -337,12 +336,16 @@ def test_the_store_is_asked_beside_the_loop(
     monkeypatch.setattr("heliotrope.console.auth.TRUSTED", -1.0)
 
     def noted(secret: str, now: float) -> object:
-        threads.append(threading.current_thread().name)
+        threads.append(threading.current_thread())
         return look(secret, now)
 
     monkeypatch.setattr(people, "token", noted)
     assert ask("viewer", "GET", "sun").status_code == 200
-    assert [name.startswith("console store") for name in threads] == [True]
+    loops = {console.call(threading.current_thread), console.console_call(threading.current_thread)}
+    assert len(threads) == 1
+    assert not loops & set(threads)
+    # Nor in the thread of the sockets, where all requests of the console wait.
+    assert threads[0].name.startswith("plant people")
 
 
 def test_a_token_is_made_in_a_session_only(signed_in: httpx.Client, ask: Ask) -> None:
@@ -527,16 +530,8 @@ def test_tls_by_file(console: LiveConsole, tmp_path: Path) -> None:
     )
     settings = ConsoleSettings(port=0, page=False, certificate=certificate, key=key)
 
-    async def begin() -> tuple[ConsoleServer, asyncio.Task[None], str]:
-        server = ConsoleServer(console.live.operations, console.keeper.people, settings)
-        task = asyncio.get_running_loop().create_task(server.run())
-        return server, task, await server.address()
-
-    async def end() -> None:
-        await server.close()
-        await serving
-
-    server, serving, address = console.wait(begin())
+    second = serving(console.interface, settings)
+    _, address = console.console_wait(second.__aenter__())
     try:
         assert address.startswith("https://")
         known = ssl.create_default_context(cafile=certificate)
@@ -549,7 +544,7 @@ def test_tls_by_file(console: LiveConsole, tmp_path: Path) -> None:
         with pytest.raises(httpx.HTTPError):
             httpx.get(f"http{address[5:]}api/v1/health", trust_env=False)
     finally:
-        console.wait(end())
+        console.console_wait(second.__aexit__(None, None, None))
 
 
 def test_emergency_does_not_wait_for_the_store(
@@ -557,7 +552,7 @@ def test_emergency_does_not_wait_for_the_store(
 ) -> None:
     """Who was known lately may call it, also when the store cannot be read any more."""
 
-    def gone(*_: object) -> None:
+    def gone(**_: object) -> None:
         raise StoreError("store: cannot be read (gone)")
 
     assert ask("viewer", "GET", "summary").status_code == 200

@@ -21,6 +21,8 @@ Ask = Callable[..., httpx.Response]
 NESTED = b"[" * 900 + b"],[".join([b"[[1]]"] * 1000) + b"]" * 900
 FLOOD = b'{"name":' + b",".join([NESTED] * ((16 << 20) // len(NESTED) - 1)) + b"}"
 
+LOADS = json.loads
+
 
 def send_raw(console: LiveConsole, head: str, body: bytes, seconds: float = 20.0) -> bytes:
     """Send a request as it is; return the answer, b"" if the connection is closed without one."""
@@ -92,15 +94,17 @@ def test_a_large_body_is_refused_unparsed(
     path: str,
     status: int,
 ) -> None:
-    monkeypatch.setattr(json, "loads", _never)
+    monkeypatch.setattr(json, "loads", _not_the_body)
     head = f"{method} /api/v1/{path} HTTP/1.1\r\nAuthorization: Bearer {tokens[role]}"
     answer = send_raw(console, head, FLOOD)
     assert answer[:12] in (f"HTTP/1.1 {status}".encode(), b"")
     assert len(answer) < 2000
 
 
-def _never(*_: object, **__: object) -> Any:
-    raise AssertionError("the body was parsed")
+def _not_the_body(data: bytes, **options: Any) -> Any:
+    """Parse what the console hears from the plant, which is shorter than the body."""
+    assert len(data) < len(FLOOD) // 16, "the body was parsed"
+    return LOADS(data, **options)
 
 
 def test_errors_do_not_echo_the_input(ask: Ask) -> None:

@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 from heliotrope.cli._ctl import app
 from heliotrope.console import Client, LiveMessage, RemoteError, read_message
 from heliotrope.console._secrets import verify_password
-from heliotrope.console.models import plain
 from heliotrope.console.stream import MARK, ROW, changed, message
+from heliotrope.plant.interface import plain
 from support.live_console import PASSWORD, LiveConsole
 
 Ask = Callable[..., httpx.Response]

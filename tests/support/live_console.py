@@ -1,10 +1,14 @@
-"""A small plant of the twin at work with its console, in a thread of its own, at some speed."""
+"""A small plant of the twin at work, at some speed, and its console: a thread each.
+
+They speak through the plant's sockets, as the two processes of `heliotrope run` do; with ``child``
+the console is such a process itself.
+"""
 
 import asyncio
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,6 +16,7 @@ from typing import Any, TypeVar
 from nicegui import core
 
 from heliotrope.console import _secrets
+from heliotrope.console.remote import RemotePlant
 from heliotrope.console.serve import ConsoleServer
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.field.layouts import malan_plant
@@ -20,6 +25,8 @@ from heliotrope.links.clock import VirtualClock
 from heliotrope.links.link import running
 from heliotrope.plant.audit import JsonLines
 from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.interface import ConsoleProcess, PlantInterface
+from heliotrope.plant.interface.console_process import Patience
 from heliotrope.store.keeper import Keeper
 from heliotrope.twin.live.loop import PacedLoop
 from support.live import LiveOptions, LivePlant
@@ -31,6 +38,21 @@ GATE = Box("gate", (0.0, 60.0, 2.0), (6.0, 4.0, 4.0))
 T = TypeVar("T")
 
 
+@contextlib.asynccontextmanager
+async def serving(
+    interface: PlantInterface, settings: ConsoleSettings
+) -> AsyncIterator[tuple[ConsoleServer, str]]:
+    """Serve a console of a plant during a block; yield it with its address."""
+    plant = RemotePlant(interface.folder, interface.key)
+    server = ConsoleServer(plant, settings)
+    async with asyncio.TaskGroup() as group:
+        connecting = group.create_task(plant.run())
+        async with running(server):
+            await plant.up()
+            yield server, await server.address()
+        connecting.cancel()
+
+
 class LiveConsole:
     """Starts at once; `close` ends it and raises what went wrong.
 
@@ -38,8 +60,12 @@ class LiveConsole:
     ----------
     address
         Of the console.
-    live, server
-        The plant and its console; touch them with `call` only.
+    process
+        The console's process, with ``child``.
+    live, interface
+        The plant and its interface; touch them with `call` only.
+    server
+        The console; wait for it with `console_wait`.
     """
 
     def __init__(
@@ -51,13 +77,16 @@ class LiveConsole:
         speed: float = 1.0,
         rendered: bool = False,
         boards: bool = False,
+        child: Patience | None = None,
+        keep_outs: tuple[Box, ...] = (GATE,),
     ) -> None:
         self.folder, self.address = folder, ""
-        self._made = (heliostats, page, speed)
+        self._made, self._child = (heliostats, page, speed), child
+        self._keep_outs = keep_outs
         self._options = LiveOptions(rendered=rendered, boards=boards)
         self._ready, self._over = threading.Event(), threading.Event()
         self._problem: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name="console")
+        self._thread = threading.Thread(target=self._run, name="plant")
         self._thread.start()
         self._ready.wait(60.0)
         if not self.address:
@@ -80,7 +109,7 @@ class LiveConsole:
         now = time.time()
         for role in ROLES:
             self.keeper.people.add(role, _secrets.hash_password(PASSWORD), role, now)
-        design = replace(malan_plant(heliostats), keep_outs=(GATE,))
+        design = replace(malan_plant(heliostats), keep_outs=self._keep_outs)
         self.live = LivePlant(
             design,
             clock,
@@ -89,17 +118,39 @@ class LiveConsole:
             records=self.keeper,
             extra=lambda: {"speed": speed},
         )
-        async with self.live.running():
-            settings = ConsoleSettings(port=0, page=page)
-            # NiceGUI's application is one for the process, and the tests open several consoles.
-            core.app.middleware_stack = None
-            self.server = ConsoleServer(self.live.operations, self.keeper.people, settings)
-            async with running(self.server):
-                self.address = await self.server.address()
-                self._ready.set()
-                while not self._over.is_set():
-                    await asyncio.sleep(0.1)
+        self.interface = PlantInterface(self.live.operations, self.keeper.people, self.folder)
+        settings = ConsoleSettings(port=0, page=page)
+        if self._child is None:
+            async with self.live.running(), self.interface.running():
+                await asyncio.to_thread(self._serve, settings)
+        else:
+            self.process = ConsoleProcess(
+                self.interface,
+                settings.given,
+                self.live.assembly.logbook.take_alarm,
+                self._tell,
+                self._child,
+            )
+            async with self.live.running(), self.interface.running(self.process.run):
+                await asyncio.to_thread(self._over.wait)
         self.keeper.close()
+
+    def _tell(self, address: str) -> None:
+        self.address = address
+        self._ready.set()
+
+    def _serve(self, settings: ConsoleSettings) -> None:
+        """Run the console in this thread until the end."""
+        asyncio.run(self._console(settings))
+
+    async def _console(self, settings: ConsoleSettings) -> None:
+        self._console_loop = asyncio.get_running_loop()
+        # NiceGUI's application is one for the process, and the tests open several consoles.
+        core.app.middleware_stack = None
+        async with serving(self.interface, settings) as (self.server, self.address):
+            self._ready.set()
+            while not self._over.is_set():
+                await asyncio.sleep(0.1)
 
     def call(self, work: Callable[[], T]) -> T:
         """Do something in the plant's loop."""
@@ -112,6 +163,18 @@ class LiveConsole:
     def wait(self, work: Coroutine[Any, Any, T]) -> T:
         """Do something in the plant's loop that takes its time."""
         return asyncio.run_coroutine_threadsafe(work, self._loop).result(30.0)
+
+    def console_call(self, work: Callable[[], T]) -> T:
+        """Do something in the console's loop."""
+
+        async def inside() -> T:
+            return work()
+
+        return self.console_wait(inside())
+
+    def console_wait(self, work: Coroutine[Any, Any, T]) -> T:
+        """Do something in the console's loop that takes its time."""
+        return asyncio.run_coroutine_threadsafe(work, self._console_loop).result(30.0)
 
     def until(self, holds: Callable[[], Any], within: float = 30.0) -> Any:
         """Wait until something holds in the plant's loop; return it."""

@@ -6,7 +6,7 @@ from types import CodeType, FrameType
 
 
 class Recorder:
-    """Records the calls of some functions in the thread that starts it.
+    """Records the calls of some functions in the threads that start it.
 
     Parameters
     ----------

@@ -92,7 +92,7 @@ async def own_password(
     await _confirm(console, who, request, given.old)
     await _set_password(console, who.person.name, given.new)
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
-    console.operations.logbook.event("people", who.person.name, "has changed their password")
+    await console.plant.note("people", who.person.name, "has changed their password")
 
 
 @router.post("/accounts/{name}/password", response_model=models.GivenPassword, tags=["people"])
@@ -107,7 +107,7 @@ async def reset_password(
         raise HTTPException(404, f"there is no account {name}")
     password = _secrets.new_password()
     await _set_password(console, name, password)
-    console.operations.logbook.event("people", who.person.name, f"new password for {name}")
+    await console.plant.note("people", who.person.name, f"new password for {name}")
     return models.GivenPassword(name=name, password=password)
 
 
@@ -128,7 +128,7 @@ async def new_account(
     made = await console.ask(
         lambda: console.people.add(given.name, kept, given.role, console.now())
     )
-    console.operations.logbook.event(
+    await console.plant.note(
         "people", who.person.name, f"account {given.name} created, {given.role}"
     )
     return _account(made)
@@ -153,7 +153,7 @@ async def change_account(
         )
     )
     console.known.clear()
-    console.operations.logbook.event("people", who.person.name, f"account {name} changed")
+    await console.plant.note("people", who.person.name, f"account {name} changed")
     return _account(made)
 
 
@@ -178,7 +178,7 @@ async def new_token(
             who.person.name, given.label, given.role, console.now(), lifetime
         )
     )
-    console.operations.logbook.event(
+    await console.plant.note(
         "people", who.person.name, f"token {given.label} created, {given.role}"
     )
     return models.TokenState(**asdict(made), secret=secret)

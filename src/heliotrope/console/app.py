@@ -1,6 +1,6 @@
-"""The application: API, live stream and page over one plant at work.
+"""The application: API, live stream and page over one plant at work in its own process.
 
-`create` makes it; `console.serve` runs it in the plant's own event loop.
+`create` makes it; `console.serve` runs it.
 """
 
 import asyncio
@@ -22,13 +22,13 @@ from heliotrope.console.auth import Console
 from heliotrope.console.edge import Edge
 from heliotrope.console.guard import Guard
 from heliotrope.console.live import Stream
+from heliotrope.console.remote import RemotePeople, RemotePlant
 from heliotrope.console.routes import Routes
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError, UnknownNameError
+from heliotrope.local import AwayError
 from heliotrope.plant.audit import AuditError
 from heliotrope.plant.authority import RefusedError, Role
-from heliotrope.plant.operations.operations import Operations
-from heliotrope.store.people import People
 from heliotrope.store.records import StoreError
 
 ABOUT = (
@@ -42,31 +42,28 @@ ROUTERS = (api.router, commands.router, accounts.router)
 MOST_ERRORS, LONGEST_TEXT, LONGEST_WORD = 5, 200, 64
 
 
-def create(
-    operations: Operations, people: People, settings: ConsoleSettings | None = None
-) -> FastAPI:
+def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastAPI:
     """Return the application.
 
     Parameters
     ----------
-    operations
-        The plant at work.
-    people
-        Accounts, sessions and tokens.
+    plant
+        The plant at work, in its own process.
     settings
         Settings of the console. A process can have one page (NiceGUI is global), and any number of
         applications without one.
     """
     chosen = settings or ConsoleSettings()
-    stream = Stream(operations, chosen.period)
+    people, stream = RemotePeople(plant), Stream(plant, chosen.period)
     attempts = Attempts(chosen.failures, chosen.failures_s, time.monotonic)
-    console = Console(operations, people, chosen, stream, attempts)
+    console = Console(plant, people, chosen, stream, attempts)
 
     @contextlib.asynccontextmanager
     async def alive(app: FastAPI) -> AsyncIterator[None]:
         del app
+        people.begin()
         async with asyncio.TaskGroup() as group:
-            parts = (stream.run(), console.keep_authority(), console.forget_expired())
+            parts = (stream.run(), console.forget_expired())
             works = [group.create_task(part) for part in parts]
             yield
             for work in works:
@@ -90,6 +87,7 @@ def create(
         (RefusedError, 409),
         (AuditError, 503),
         (StoreError, 503),
+        (AwayError, 503),
     ):
         app.add_exception_handler(kind, _problem(status))
     app.add_exception_handler(RequestValidationError, _invalid)

@@ -22,13 +22,11 @@ from heliotrope.console import _secrets
 from heliotrope.console._attempts import Attempts
 from heliotrope.console.live import Stream
 from heliotrope.console.people import person_of
+from heliotrope.console.remote import RemotePeople, RemotePlant
 from heliotrope.console.settings import ConsoleSettings
-from heliotrope.console.tickets import Tickets
-from heliotrope.plant import refusals
+from heliotrope.errors import HeliotropeError
 from heliotrope.plant.authority import Person, Role
-from heliotrope.plant.operations.operations import Operations
-from heliotrope.store.people import Account, ApiToken, People, Session
-from heliotrope.store.records import StoreError
+from heliotrope.store.people import Account, ApiToken, Session
 
 T = TypeVar("T")
 COOKIE = "heliotrope_session"
@@ -42,8 +40,6 @@ LONGEST_SECRET = 200
 DAY = 86_400.0
 #: Key of the caller in the scope of a request: the guard looks each up once.
 FOUND = "heliotrope.caller"
-#: A holder of the authority counts as present for this long after renewing it, s.
-PRESENT = 8.0
 #: The shared answer that never changes.
 FIXED = "field"
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -53,16 +49,15 @@ SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 class Console:
     """State that the routes share."""
 
-    operations: Operations
-    people: People
+    plant: RemotePlant
+    people: RemotePeople
     settings: ConsoleSettings
     stream: Stream
     attempts: Attempts
-    tickets: Tickets = field(default_factory=Tickets)
     #: Concurrent password checks: each takes 50 ms of a core and 64 MiB.
     hashing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
 
-    #: Threads that wait for the store.
+    #: Threads that wait for the store, which the plant's process has.
     threads: ThreadPoolExecutor = field(
         default_factory=lambda: ThreadPoolExecutor(4, "console store")
     )
@@ -70,36 +65,20 @@ class Console:
     #: Recently authenticated callers, with the time, by kind and secret.
     known: dict[tuple[str, str], tuple[float, "Caller"]] = field(default_factory=dict)
 
-    #: When each holder of the authority was last present, monotonic time of the machine, s.
-    present: dict[str, float] = field(default_factory=dict)
-
     #: Answers that all viewers ask for, with the time: made at most twice a second.
     shared: dict[str, tuple[float, bytes, bytes | None]] = field(default_factory=dict)
-
-    async def keep_authority(self) -> None:
-        """Renew the authority for a holder whose page or program has been present recently.
-
-        The authority expires by the plant's time, which may run faster than that of people.
-        """
-        while True:
-            await asyncio.sleep(0.2 * self.operations.plant.authority.lifetime)
-            grant = self.operations.plant.authority.grant
-            if grant is None:
-                continue
-            if time.monotonic() - self.present.get(grant.holder.name, -math.inf) < PRESENT:
-                self.operations.keep_authority(grant.holder, grant.token)
 
     async def forget_expired(self) -> None:
         """Remove expired sessions and tokens from the store, at the start and once a day.
 
-        Sessions end by the machine's time; the loop's time may be faster.
+        Sessions end by the machine's time.
         """
         last = -math.inf
         while True:
             if self.now() - last >= DAY:
                 last = self.now()
-                with contextlib.suppress(StoreError):  # others report a full store
-                    self.people.forget_expired(last)
+                with contextlib.suppress(HeliotropeError):  # others report a full store
+                    await self.ask(lambda: self.people.forget_expired(self.now()))
             await asyncio.sleep(60.0)
 
     def forget(self) -> None:
@@ -112,8 +91,7 @@ class Console:
     async def ask(self, work: Callable[[], T]) -> T:
         """Return the result of work of the store, done in a thread: its disk may be slow.
 
-        The threads are the console's own: those that hang must not take the place of others, such
-        as the one that reads the sensors.
+        The threads have no other work: those that hang must not take the place of others.
         """
         return await asyncio.get_running_loop().run_in_executor(self.threads, work)
 
@@ -288,22 +266,6 @@ class AtLeast:
 
 Operator = Annotated[Caller, Depends(AtLeast(Role.OPERATOR))]
 Engineer = Annotated[Caller, Depends(AtLeast(Role.ENGINEER))]
-
-
-def token_of(console: Console, person: Person) -> int:
-    """Return a person's token of the command authority.
-
-    Raises
-    ------
-    RefusedError
-        If the person does not hold it.
-    """
-    grant = console.operations.plant.authority.grant
-    if grant is None:
-        raise refusals.NO_AUTHORITY.error(person=person.name)
-    if grant.holder != person:
-        raise refusals.OTHER_AUTHORITY.error(holder=grant.holder.name, person=person.name)
-    return grant.token
 
 
 async def log_in(console: Console, name: str, password: str, address: str) -> tuple[str, float]:

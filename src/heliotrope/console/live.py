@@ -13,21 +13,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.console.models import plain
+from heliotrope.console.remote import RemotePlant
 from heliotrope.console.stream import ROW, changed, message
 from heliotrope.errors import HeliotropeError
 from heliotrope.lcu import names as meanings
-from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.interface import frame_of
+from heliotrope.plant.operations.views import FieldFrame
 
 #: Flags that come and go with every step or sun vector, which would change every row.
 _RESTLESS = sum(1 << meanings.FLAGS.index(name) for name in ("MOVING", "SUN_FRESH"))
-#: Health of a cluster as the page colours it.
-WELL, TROUBLED, SILENT = 0, 1, 2
 
 
-def rows_of(operations: Operations) -> npt.NDArray[Any]:
+def rows_of(frame: FieldFrame) -> npt.NDArray[Any]:
     """Return the field as rows of `ROW`, (N,)."""
-    frame = operations.frame()
     rows = np.zeros(len(frame.state), ROW)
     rows["row"] = np.arange(len(rows))
     rows["error"], rows["measured"] = frame.error, frame.measured
@@ -44,28 +42,25 @@ class Stream:
 
     Parameters
     ----------
-    operations
+    plant
         The plant at work.
     period
         Time between messages, s.
     """
 
-    def __init__(self, operations: Operations, period: float = 1.0) -> None:
-        self._operations, self._period = operations, period
+    def __init__(self, plant: RemotePlant, period: float = 1.0) -> None:
+        self._plant, self._period = plant, period
         self._rows: npt.NDArray[Any] | None = None
         self._header: dict[str, Any] = {}
         self._whole = b""
         self.news = b""
         self.tick = 0
         self.viewers = 0
-        self._turned = asyncio.Event()
+        self._turned, self._making = asyncio.Event(), asyncio.Lock()
         self._problem: str = ""
 
     async def run(self) -> None:
-        """Make a message each period while anybody is watching.
-
-        The period is in the viewers' time: the loop of a simulation may run faster.
-        """
+        """Make a message each period while anybody is watching."""
         due = time.monotonic()
         while True:
             await asyncio.sleep(0.1 * self._period)
@@ -73,17 +68,22 @@ class Stream:
                 continue
             due = max(due + self._period, time.monotonic())
             if self.viewers:
-                self.make()
+                await self.make()
 
-    def make(self) -> None:
+    async def make(self) -> None:
         """Make the next message."""
-        try:
-            rows = rows_of(self._operations)
-            header = header_of(self._operations)
-        except HeliotropeError as error:
-            # An unreadable plant is not shown: the page judges by the age of the last message.
-            self._problem = str(error)
-            return
+        async with self._making:
+            try:
+                value, blob = await self._plant.fetch("live")
+            except HeliotropeError as error:
+                # A plant that cannot be read is not shown: the page judges by the age of the last
+                # message.
+                self._problem = str(error)
+                return
+            self._take(value, blob)
+
+    def _take(self, value: dict[str, Any], blob: bytes) -> None:
+        rows, header = rows_of(frame_of(value["frame"], blob)), value["overview"]
         self.tick += 1
         # A viewer that joins now may get this one as the whole; it is encoded only if one does.
         header["tick"], header["problem"] = self.tick, self._problem
@@ -93,10 +93,10 @@ class Stream:
         turned, self._turned = self._turned, asyncio.Event()
         turned.set()
 
-    def whole(self) -> bytes:
+    async def whole(self) -> bytes:
         """Return the last message with all rows."""
         if self._rows is None:
-            self.make()
+            await self.make()
         if not self._whole and self._rows is not None:
             self._whole = message({**self._header, "whole": True}, self._rows)
         return self._whole
@@ -108,61 +108,17 @@ class Stream:
         self.viewers += 1
         try:
             if self.viewers == 1:
-                self.make()
-            await send(self.whole())
-            seen = self.tick
+                await self.make()
+            data = await self.whole()
+            seen = self.tick if data else -1
+            if data:
+                await send(data)
             while True:
                 await self._turned.wait()
                 if not await allowed():
                     return
-                data = self.news if self.tick == seen + 1 else self.whole()
+                data = self.news if self.tick == seen + 1 else await self.whole()
                 seen = self.tick
                 await send(data)
         finally:
             self.viewers -= 1
-
-
-def header_of(operations: Operations) -> dict[str, Any]:
-    """Return the header of a message."""
-    summary, light = operations.summary(), operations.sun()
-    calibration = operations.calibration()
-    quality = calibration.quality[-1] if calibration.quality else None
-    cameras = {}
-    for target in operations.targets:
-        try:
-            cameras[target] = operations.camera(target).version
-        except HeliotropeError:
-            continue
-    found: dict[str, Any] = plain(summary)
-    found |= {
-        "utc": summary.at.timestamp(),
-        "sun": {"azimuth": light.azimuth, "elevation": light.elevation},
-        "surfaces": list(operations.aim_names),
-        "clusters": [_health(row) for row in operations.cluster_rows()],
-        "measuring": plain(list(calibration.running)),
-        "calibration": {
-            "on": calibration.on,
-            "reason": calibration.reason,
-            "done": calibration.done,
-            "waiting": calibration.waiting,
-            "failed": calibration.failed,
-            "quality": plain(quality),
-        },
-        "cameras": cameras,
-        "order": plain(operations.emergency_view()),
-        "events": _newest(operations),
-    }
-    return found
-
-
-def _newest(operations: Operations) -> float:
-    """Return the time of the last event, POSIX s; 0 before the first."""
-    events = operations.events(1)
-    return events[0].at if events else 0.0
-
-
-def _health(row: Any) -> int:
-    if not row.alive:
-        return SILENT
-    # NaN, not yet known, is not a problem.
-    return TROUBLED if row.live < row.heliostats or row.answered < 0.95 or row.acts else WELL

@@ -1,30 +1,24 @@
-"""Models of the HTTP API: made from the plant's views, and of requests.
+"""Models of the HTTP API: made from the plant's views, and of requests about people.
+
+Those of orders stand in `plant.interface.orders`: the plant checks them again.
 
 The views of `plant.operations` are frozen dataclasses of plain values and arrays. Their models have
 the same names and fields, so each has one description. Unknown numbers (NaN, infinite) are null.
 """
 
 import dataclasses
-import math
 import types
 import typing
 from collections.abc import Mapping
 from datetime import datetime
-from enum import Enum
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    create_model,
-    model_validator,
-)
+from pydantic import BaseModel, Field, create_model
 
 from heliotrope.optics import flux
 from heliotrope.plant import lockouts
+from heliotrope.plant.interface.orders import Name, Strict
 from heliotrope.plant.operations import views
 
 _MADE: dict[type, type[BaseModel]] = {}
@@ -66,74 +60,6 @@ def _type(hint: Any) -> Any:
     return Any
 
 
-def plain(value: Any) -> Any:
-    """Return the JSON values of views: lists, dictionaries, numbers, text; NaN as None."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Enum):
-        return value.name.lower()
-    if value is None or isinstance(value, str | bool | int):
-        return value
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(one) for one in value]
-    if isinstance(value, datetime):
-        return value.isoformat()
-    return str(value)
-
-
-def points_like(given: Any) -> Any:
-    """Return points whose shape is right; the first wrong one is named, not each of 200,000.
-
-    Raises
-    ------
-    ValueError
-        A name or a point of another shape.
-    """
-    for name, point in given.items() if isinstance(given, dict) else ():
-        numbers = isinstance(point, list) and len(point) == 3 and all(map(_bounded, point))
-        if not numbers or not 0 < len(name) <= 64:
-            raise ValueError(f"{name[:64]}: give east, north and up, m")
-    return given
-
-
-def _bounded(value: Any) -> bool:
-    return isinstance(value, int | float) and -1e5 <= value <= 1e5
-
-
-class Strict(BaseModel):
-    """A request, without any further fields."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _few(cls, given: Any) -> Any:
-        """Refuse many unknown fields in one error, not in one each."""
-        if isinstance(given, dict) and len(given) > len(cls.model_fields) + 5:
-            raise ValueError("too many fields")
-        return given
-
-
-Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f]+$")]
-#: The first wrong one is named: an error for each of 200,000 would take a second and 200 MB.
-Names = Annotated[
-    list[Name], Field(max_length=200_000, fail_fast=True, description="Names; [] for all.")
-]
-Words = Annotated[str, Field(max_length=500, pattern=r"^[^\x00-\x1f\x7f]*$")]
-Coordinate = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
-Point = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
-#: Points by heliostat, ENU, m.
-Points = Annotated[dict[Name, Point], Field(max_length=200_000), BeforeValidator(points_like)]
-Place = Annotated[list[float], Field(min_length=3, max_length=3)]
-Number = Annotated[float, Field(ge=-2147483648, le=2147483647, allow_inf_nan=False)]
-
-
 class LogIn(Strict):
     """Name and password."""
 
@@ -149,72 +75,6 @@ class CallerState(BaseModel):
     by: str = Field(description='"session" or "token"')
     expires: float | None = Field(description="POSIX s")
     csrf: str = Field("", description="Send it as X-CSRF-Token with every change")
-
-
-class SomeHeliostats(Strict):
-    """Some heliostats, or all."""
-
-    heliostats: Names = []
-
-
-class CommandOrder(SomeHeliostats):
-    """A command of the wire with its values, see the table of messages."""
-
-    command: Annotated[str, Field(pattern=r"^[A-Z_]{2,20}$")]
-    values: Annotated[list[Number], Field(max_length=8)] = []
-
-
-class AimOrder(SomeHeliostats):
-    """Aim heliostats at a receiver or target by its name, or at points by heliostat, ENU, m."""
-
-    where: Words = ""
-    points: Points = {}
-
-
-class StandbyOrder(Strict):
-    """Standby points by heliostat, ENU, m."""
-
-    points: Annotated[Points, Field(min_length=1)]
-
-
-class GivenReason(Strict):
-    """The reason."""
-
-    reason: Words
-
-
-class EmergencyCall(Strict):
-    """Order for the whole field, and the reason."""
-
-    act: Annotated[str, Field(pattern="^(DEFOCUS|STOW)$")] = "DEFOCUS"
-    reason: Words = ""
-
-
-class Acknowledged(Strict):
-    """The alarm."""
-
-    condition: Name
-    subject: Words = ""
-
-
-class HoldOrder(SomeHeliostats):
-    """Heliostats to take out of service, the reason, and the hours until they are expected back."""
-
-    heliostats: Annotated[list[Name], Field(min_length=1, max_length=200_000)]
-    reason: Words
-    hours: Annotated[float, Field(gt=0.0, le=8760.0)] | None = None
-
-
-class GivenBack(Strict):
-    """Heliostats to give back to service, each by its name."""
-
-    heliostats: Annotated[list[Name], Field(min_length=1, max_length=200_000)]
-
-
-class Switch(Strict):
-    """On or off."""
-
-    on: bool
 
 
 class Confirmed(Strict):
@@ -281,6 +141,9 @@ class AuthorityState(BaseModel):
     role: str
     mine: bool
     lifetime: float = Field(description="Life without renewal, s")
+
+
+Place = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
 class KeepOutOutline(BaseModel):

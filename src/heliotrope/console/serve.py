@@ -1,21 +1,19 @@
-"""Run the console in the plant's own event loop."""
+"""Run the console over a plant in its own process."""
 
 import asyncio
 import contextlib
-import gc
 from collections.abc import Iterator
 
 import uvicorn
 
 from heliotrope.console.app import create
+from heliotrope.console.remote import RemotePlant
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import InputError
-from heliotrope.plant.operations.operations import Operations
-from heliotrope.store.people import People
 
 
 class _Server(uvicorn.Server):
-    """A server that leaves signals to the owner of the process, which stows the field first."""
+    """A server that leaves signals to the owner of the process."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -27,15 +25,13 @@ class ConsoleServer:
 
     Parameters
     ----------
-    operations, people, settings
+    plant, settings
         As for `app.create`.
     """
 
-    def __init__(
-        self, operations: Operations, people: People, settings: ConsoleSettings | None = None
-    ) -> None:
+    def __init__(self, plant: RemotePlant, settings: ConsoleSettings | None = None) -> None:
         self.settings = settings or ConsoleSettings()
-        self.app = create(operations, people, self.settings)
+        self.app = create(plant, self.settings)
         chosen = self.settings
         config = uvicorn.Config(
             self.app,
@@ -66,9 +62,6 @@ class ConsoleServer:
             If the address is not available.
         """
         try:
-            # Freeze the existing objects: every ten seconds the collector would walk through those
-            # of 10,000 heliostats and hold the loop for up to a second.
-            gc.freeze()
             await self._server.serve()
         except SystemExit:
             # uvicorn's way of saying that it could not start.

@@ -1,8 +1,10 @@
 """Settings of the console."""
 
 import ipaddress
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from heliotrope.errors import InputError
 
@@ -67,6 +69,18 @@ class ConsoleSettings:
                 "can be read on the way; give --certificate and --key, or --plain behind a proxy "
                 "that has TLS"
             )
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> "ConsoleSettings":
+        """Return the settings of `given`."""
+        files = {name: Path(given[name]) for name in ("certificate", "key") if given[name]}
+        return cls(**{**given, "names": tuple(given["names"]), **files})
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The settings as JSON values, for the console's process."""
+        files = {name: str(getattr(self, name) or "") or None for name in ("certificate", "key")}
+        return {**asdict(self), "names": list(self.names), **files}
 
     @property
     def tls(self) -> bool:

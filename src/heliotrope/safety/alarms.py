@@ -128,6 +128,16 @@ IDENTITY = AlarmKind(
     "Stow both; then correct their addresses, or write the parameters of the mirror that is there.",
     over="{subject}: its own parameters answer again",
 )
+CONSOLE = AlarmKind(
+    "console",
+    _PLANT,
+    Severity.WARNING,
+    "The console's process has ended, or gives no sign of life.",
+    "the console {problem}",
+    "The plant goes on without it, and starts it again after a pause.",
+    "Use heliotrope ctl on the plant's computer meanwhile; if it returns, look at its messages.",
+    over="the console answers again",
+)
 RECORDS = AlarmKind(
     "records",
     _PLANT,

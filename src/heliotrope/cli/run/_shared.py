@@ -2,6 +2,8 @@
 
 import asyncio
 import contextlib
+import gc
+import importlib.util
 import shutil
 import signal
 import socket
@@ -11,7 +13,7 @@ import webbrowser
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,14 +23,14 @@ from heliotrope.geometry import as_float
 from heliotrope.lcu import states
 from heliotrope.plant.assembly import PlantAssembly
 from heliotrope.plant.disk import DiskBusyError, DiskThread
+from heliotrope.plant.interface import ConsoleProcess, PlantInterface
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry
 
-if TYPE_CHECKING:
-    from heliotrope.console.serve import ConsoleServer
-
 #: Factor on the time between lines while a console is served: people look at the console.
 _SELDOM = 6.0
+#: What the console needs beside the base installation.
+_OF_CONSOLE = ("argon2", "nicegui", "uvicorn", "websockets")
 #: Default time between lines, and period of the archive, s.
 EVERY, _ARCHIVED = 10.0, 5.0
 
@@ -87,8 +89,8 @@ class Shown:
         )
 
 
-def load_console(shown: Shown) -> None:
-    """Import the console before the plant begins: it takes longer than a lease lasts.
+def check_console(shown: Shown) -> None:
+    """Check that the console can be started, before the plant begins.
 
     Raises
     ------
@@ -106,10 +108,11 @@ def load_console(shown: Shown) -> None:
             f"console: {shown.host} port {shown.port} cannot be opened ({why}); another program "
             "may use it: choose another with --port"
         ) from None
-    try:
-        import heliotrope.console.serve  # noqa: F401 - only loaded
-    except ImportError as error:
-        raise _missing(error) from None
+    for module in _OF_CONSOLE:
+        if importlib.util.find_spec(module) is None:
+            raise _missing(ImportError(name=module))
+    # The plant makes the first account; loading this takes longer than a lease lasts.
+    import heliotrope.console.people  # noqa: F401 - only loaded
 
 
 def _missing(error: ImportError) -> InputError:
@@ -147,20 +150,20 @@ def ending_at_signals() -> asyncio.Event:
 
 
 @contextlib.contextmanager
-def store(shown: Shown) -> Iterator[Keeper]:
-    """Open the store: a database, a folder, or a folder that is deleted afterwards."""
-    kept = shown.data is not None or shown.database is not None
-    folder = shown.data if kept else Path(tempfile.mkdtemp(prefix="heliotrope-"))
+def store(shown: Shown) -> Iterator[tuple[Keeper, Path]]:
+    """Open the store: a database, or a folder; yield it, and the folder of the plant.
+
+    Without ``--data`` the folder of the plant is deleted afterwards.
+    """
+    folder = shown.data or Path(tempfile.mkdtemp(prefix="heliotrope-"))
     try:
-        place = shown.database or folder
-        assert place is not None
-        keeper = Keeper(place)
+        keeper = Keeper(shown.database or folder)
         try:
-            yield keeper
+            yield keeper, folder
         finally:
             keeper.close()
     finally:
-        if not kept and folder is not None:
+        if shown.data is None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -210,62 +213,53 @@ class Lines:
         self._thread.close(2.0)
 
 
-def console_of(
-    live: PlantAssembly, keeper: Keeper, shown: Shown
-) -> "tuple[ConsoleServer | None, str | None]":
-    """Return the console of a plant that does not run yet, and the password of a new first account.
-
-    None without a console. Making it takes longer than a lease lasts, and the account is written to
-    the store, so this comes before the plant begins.
-    """
-    if not shown.console:
-        return None, None
-    from heliotrope.console.people import first_start
-    from heliotrope.console.serve import ConsoleServer
-
-    server = ConsoleServer(live.operations, keeper.people, shown.settings())
-    return server, first_start(keeper.people, live.clock.utc().timestamp())
-
-
 @contextlib.asynccontextmanager
-async def console(
-    server: "ConsoleServer | None",
-    password: str | None,
+async def interface(
+    live: PlantAssembly,
+    keeper: Keeper,
     shown: Shown,
+    folder: Path,
+    password: str | None,
     lines: Lines,
-    speed: float = 1.0,
-) -> AsyncIterator[bool]:
-    """Serve the console during a block and print its address; yield whether there is one."""
-    if server is None:
-        yield False
+) -> AsyncIterator[None]:
+    """Serve the plant's local interface during a block, and the console in a process beside it."""
+    served = PlantInterface(live.operations, keeper.people, folder)
+    if not shown.console:
+        async with served.running():
+            yield
         return
     from heliotrope.console.people import FIRST
 
-    async with asyncio.TaskGroup() as group:
-        serving = group.create_task(server.run())
-        address = await server.address(60.0 * speed)
+    def tell(address: str) -> None:
         lines.print(f"console: {address}")
         if password is not None:
             lines.print(f"first account: {FIRST}, password {password} (shown only now)")
         if shown.browser and sys.stdout.isatty():
-            await asyncio.to_thread(webbrowser.open, address)
-        yield True
-        await server.close()
-        await serving
+            webbrowser.open(address)
+
+    console = ConsoleProcess(served, shown.settings().given, live.logbook.take_alarm, tell)
+    async with served.running(console.run):
+        yield
+
+
+def first_account(live: PlantAssembly, keeper: Keeper, shown: Shown) -> str | None:
+    """Return the password of a new first account, None if there is none.
+
+    It is written to the store, which may be slow, so this comes before the plant begins.
+    """
+    if not shown.console:
+        return None
+    from heliotrope.console.people import first_start
+
+    return first_start(keeper.people, live.clock.utc().timestamp())
 
 
 async def watch(
-    live: PlantAssembly,
-    shown: Shown,
-    ending: asyncio.Event,
-    lines: Lines,
-    *,
-    seen: bool,
-    speed: float = 1.0,
+    live: PlantAssembly, shown: Shown, ending: asyncio.Event, lines: Lines, *, speed: float = 1.0
 ) -> None:
-    """Print a line at intervals until the end; ``seen``: a console is served."""
+    """Print a line at intervals until the end."""
     loop = asyncio.get_running_loop()
-    pause = speed * shown.every * (_SELDOM if seen and shown.every == EVERY else 1.0)
+    pause = speed * shown.every * (_SELDOM if shown.console and shown.every == EVERY else 1.0)
     until = None if shown.minutes is None else loop.time() + 60.0 * shown.minutes
     while not ending.is_set() and (until is None or loop.time() < until):
         left = pause if until is None else min(pause, until - loop.time())
@@ -326,32 +320,43 @@ def _silent(live: PlantAssembly) -> str:
 
 
 def begin(design: Plant, shown: Shown) -> asyncio.Event:
-    """Print what begins and load the console; return the event that ends it.
+    """Print what begins and check the console; return the event that ends it.
 
     Raises
     ------
     InputError
-        See `load_console`.
+        See `check_console`.
     """
     ending = ending_at_signals()
     print(f"{design.name}: {len(design):,} heliostats", flush=True)
-    load_console(shown)
+    check_console(shown)
     return ending
 
 
 async def at_work(
-    live: PlantAssembly, keeper: Keeper, shown: Shown, ending: asyncio.Event, speed: float = 1.0
+    live: PlantAssembly,
+    keeper: Keeper,
+    shown: Shown,
+    folder: Path,
+    ending: asyncio.Event,
+    speed: float = 1.0,
 ) -> None:
-    """Run a plant with console and archive until the end, then stow its field."""
-    server, password = console_of(live, keeper, shown)
+    """Run a plant with interface, console and archive until the end, then stow its field.
+
+    The sockets of the interface stand in ``folder``.
+    """
+    password = first_account(live, keeper, shown)
+    # Freeze the existing objects: every ten seconds the collector would walk through those of
+    # 10,000 heliostats and hold the loop for up to a second.
+    gc.freeze()
     with contextlib.closing(Lines()) as lines:
         # The archive opens its folder before the plant begins, and is closed after its end.
         async with (
             archive(live, shown),
             live.running(),
-            console(server, password, shown, lines, speed) as seen,
+            interface(live, keeper, shown, folder, password, lines),
         ):
-            await watch(live, shown, ending, lines, seen=seen, speed=speed)
+            await watch(live, shown, ending, lines, speed=speed)
             if not await stow(live, ending, lines):
                 lines.print(live.left())
             await live.end()

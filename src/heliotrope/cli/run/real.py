@@ -1,4 +1,4 @@
-"""A real plant with its store and its console, in one event loop."""
+"""A real plant with its store, its local interface and its console."""
 
 import asyncio
 import contextlib
@@ -136,10 +136,10 @@ async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outsid
         machines=MachineTables.WRITTEN if choice.configure else MachineTables.UNKNOWN,
     )
     ending = begin(design, shown)
-    with store(shown) as keeper:
+    with store(shown) as (keeper, folder):
         clock = SystemClock()
         ports = outside.ports(design, choice, shown, clock, keeper)
         live = PlantAssembly(design, ports, settings)
         if live.plant.unwatched:
             print(f"no readings for: {', '.join(live.plant.unwatched)}", flush=True)
-        await at_work(live, keeper, shown, ending)
+        await at_work(live, keeper, shown, folder, ending)

@@ -1,4 +1,4 @@
-"""A simulated plant with its store and its console, in one event loop."""
+"""A simulated plant with its store, its local interface and its console."""
 
 import asyncio
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
         machines=MachineTables.HELD,
     )
     ending = begin(design, shown)
-    with store(shown) as keeper:
+    with store(shown) as (keeper, folder):
         ports = World(design, clock, options).ports(
             audit=KeptAudit(keeper, SystemClock(), clock.utc()),
             # A record takes long in a time that runs faster, so there the loop waits for it.
@@ -52,4 +52,5 @@ async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
             assigned=KeptPoints(keeper),
             facts=lambda: {"lag": loop.lag, "speed": loop.speed},
         )
-        await at_work(PlantAssembly(design, ports, settings), keeper, shown, ending, choice.speed)
+        live = PlantAssembly(design, ports, settings)
+        await at_work(live, keeper, shown, folder, ending, choice.speed)

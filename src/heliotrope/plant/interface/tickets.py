@@ -1,8 +1,8 @@
-"""The last commands given through the console."""
+"""The last commands given through the interface."""
 
 from collections import OrderedDict
+from typing import Any
 
-from heliotrope.console.models import TicketState
 from heliotrope.errors import UnknownNameError
 from heliotrope.plant.tickets import Ticket
 
@@ -16,14 +16,14 @@ class Tickets:
     def __init__(self) -> None:
         self._kept: OrderedDict[str, Ticket] = OrderedDict()
 
-    def put(self, ticket: Ticket) -> TicketState:
+    def put(self, ticket: Ticket) -> dict[str, Any]:
         """Keep a ticket; return its progress."""
         self._kept[ticket.identity] = ticket
         while len(self._kept) > KEPT:
             self._kept.popitem(last=False)
         return state_of(ticket)
 
-    def get(self, identity: str) -> TicketState:
+    def get(self, identity: str) -> dict[str, Any]:
         """Return the progress of a command.
 
         Raises
@@ -36,20 +36,20 @@ class Tickets:
             raise UnknownNameError("command", identity, list(self._kept)[-5:])
         return state_of(ticket)
 
-    def last(self, limit: int = 50) -> list[TicketState]:
+    def last(self, limit: int = 50) -> list[dict[str, Any]]:
         """Return the last tickets, newest first."""
         return [state_of(ticket) for ticket in list(self._kept.values())[: -limit - 1 : -1]]
 
 
-def state_of(ticket: Ticket) -> TicketState:
+def state_of(ticket: Ticket) -> dict[str, Any]:
     """Return the progress of a command."""
-    return TicketState(
-        identity=ticket.identity,
-        command=ticket.name,
-        heliostats=len(ticket.heliostats),
-        counted=ticket.counted(),
-        finished=ticket.finished,
-        good=ticket.good,
-        text=ticket.text,
-        refusals=dict(list(ticket.refusals.items())[:100]),
-    )
+    return {
+        "identity": ticket.identity,
+        "command": ticket.name,
+        "heliostats": len(ticket.heliostats),
+        "counted": ticket.counted(),
+        "finished": ticket.finished,
+        "good": ticket.good,
+        "text": ticket.text,
+        "refusals": dict(list(ticket.refusals.items())[:100]),
+    }

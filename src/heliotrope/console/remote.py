@@ -1,0 +1,186 @@
+"""The plant as a console sees it: calls over the local interface to the plant's process.
+
+Errors come back as the classes that the plant raised. EMERGENCY, DEFOCUS and STOW have a standing
+connection of their own.
+"""
+
+import asyncio
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heliotrope.local import EMERGENCY, INTERNAL, ORDINARY, CallError, LocalConnection
+from heliotrope.plant.authority import Person
+from heliotrope.plant.interface import CALLS, remade
+from heliotrope.store.people import Account, ApiToken, Session
+
+#: Time between two signs of life, s.
+BEAT = 1.0
+#: Limit of an answer about people, s: the store may have to write.
+_STORE = 20.0
+
+
+class RemotePlant:
+    """The plant in its own process.
+
+    Parameters
+    ----------
+    folder
+        Folder of the sockets.
+    key
+        Proves that this is the plant's console.
+    """
+
+    def __init__(self, folder: Path, key: str) -> None:
+        self._ordinary = LocalConnection(folder / ORDINARY, {"key": key})
+        self._urgent = LocalConnection(folder / EMERGENCY, {"key": key}, 10.0)
+
+    async def run(self) -> None:
+        """Keep both connections up until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._ordinary.run())
+            group.create_task(self._urgent.run())
+
+    async def up(self) -> None:
+        """Wait until both connections stand."""
+        while not (self._ordinary.up and self._urgent.up):
+            await asyncio.sleep(0.05)
+
+    async def ask(self, call: str, who: Person | None = None, /, **arguments: Any) -> Any:
+        """Make a call on somebody's behalf; return its value.
+
+        Raises
+        ------
+        HeliotropeError
+            The plant's error; `AwayError` if the plant does not answer.
+        RuntimeError
+            If the call has failed in the plant by a mistake of the program.
+        """
+        return (await self.fetch(call, who, **arguments))[0]
+
+    async def fetch(
+        self, call: str, who: Person | None = None, blob: bytes = b"", /, **arguments: Any
+    ) -> tuple[Any, bytes]:
+        """Make a call; return value and blob of its answer. See `ask`."""
+        known = CALLS.get(call)
+        line = self._urgent if known is not None and known.urgent else self._ordinary
+        behalf = None if who is None else {"name": who.name, "role": who.role.title}
+        try:
+            return await line.ask(call, arguments, blob, on_behalf=behalf)
+        except CallError as error:
+            if error.kind == INTERNAL:
+                raise RuntimeError(f"{call}: {error}") from None
+            raise remade(error) from None
+
+    async def point(
+        self, call: str, who: Person, points: Mapping[str, Sequence[float]], /, **arguments: Any
+    ) -> Any:
+        """Make a call with points by heliostat, ENU, m; see `ask`."""
+        blob = np.array(list(points.values()), "<f8").tobytes()
+        return (await self.fetch(call, who, blob, points=list(points), **arguments))[0]
+
+    async def note(self, kind: str, who: str, text: str) -> None:
+        """Note an event in the plant's logbook."""
+        await self.ask("note", None, kind=kind, who=who, text=text)
+
+
+class RemotePeople:
+    """Accounts, sessions and tokens in the plant's store, as `store.people.People` has them.
+
+    Its methods wait for the plant's process, so they are called in threads.
+
+    Parameters
+    ----------
+    plant
+        The plant.
+    """
+
+    def __init__(self, plant: RemotePlant) -> None:
+        self._plant = plant
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    def begin(self) -> None:
+        """Take the running loop as the one that makes the calls."""
+        self._loop = asyncio.get_running_loop()
+
+    def _ask(self, call: str, **arguments: Any) -> Any:
+        assert self._loop is not None
+        asked = self._plant.ask(f"people.{call}", **arguments)
+        return asyncio.run_coroutine_threadsafe(asked, self._loop).result(_STORE)
+
+    def account(self, name: str) -> Account | None:
+        """Return an account, None if the name is unknown."""
+        found = self._ask("account", name=name)
+        return None if found is None else Account(**found)
+
+    def accounts(self) -> tuple[Account, ...]:
+        """Return all accounts by name."""
+        return tuple(Account(**one) for one in self._ask("accounts"))
+
+    def add(self, name: str, password_hash: str, role: str, now: float) -> Account:
+        """Make an account; see `People.add`."""
+        return Account(
+            **self._ask("add", name=name, password_hash=password_hash, role=role, now=now)
+        )
+
+    def change(
+        self,
+        name: str,
+        now: float,
+        *,
+        password_hash: str | None = None,
+        role: str | None = None,
+        disabled: bool | None = None,
+    ) -> Account:
+        """Change an account; see `People.change`."""
+        return Account(
+            **self._ask(
+                "change",
+                name=name,
+                now=now,
+                password_hash=password_hash,
+                role=role,
+                disabled=disabled,
+            )
+        )
+
+    def open_session(self, name: str, now: float, lifetime: float, note: str = "") -> str:
+        """Return the secret of a new session; see `People.open_session`."""
+        return str(self._ask("open_session", name=name, now=now, lifetime=lifetime, note=note))
+
+    def session(self, secret: str, now: float) -> Session | None:
+        """Return the session of a secret; see `People.session`."""
+        found = self._ask("session", secret=secret, now=now)
+        return None if found is None else Session(**found)
+
+    def close_session(self, secret: str) -> None:
+        """End a session, if it exists."""
+        self._ask("close_session", secret=secret)
+
+    def add_token(
+        self, name: str, label: str, role: str, now: float, lifetime: float | None = None
+    ) -> tuple[ApiToken, str]:
+        """Make a token of an account; see `People.add_token`."""
+        made, secret = self._ask(
+            "add_token", name=name, label=label, role=role, now=now, lifetime=lifetime
+        )
+        return ApiToken(**made), str(secret)
+
+    def token(self, secret: str, now: float) -> ApiToken | None:
+        """Return the token of a secret; see `People.token`."""
+        found = self._ask("token", secret=secret, now=now)
+        return None if found is None else ApiToken(**found)
+
+    def tokens(self, name: str = "") -> tuple[ApiToken, ...]:
+        """Return the tokens of an account, or all, the oldest first."""
+        return tuple(ApiToken(**one) for one in self._ask("tokens", name=name))
+
+    def revoke_token(self, key: str) -> None:
+        """Remove a token by its key, if it exists."""
+        self._ask("revoke_token", key=key)
+
+    def forget_expired(self, now: float) -> None:
+        """Remove expired sessions and tokens."""
+        self._ask("forget_expired", now=now)

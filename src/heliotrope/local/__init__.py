@@ -1,0 +1,29 @@
+"""The local interface of a running plant: frames over Unix sockets, bounded on every side.
+
+`LocalServer` listens in the plant's process; `LocalConnection` (asyncio) and `ask_once` (blocking)
+call it. The package knows nothing of a plant: `plant.interface` says which calls there are and who
+may make them. It needs the standard library only, so a command in an emergency starts at once.
+
+Begin with `frames`.
+"""
+
+from heliotrope.local.client import AwayError, CallError, LocalConnection, ask_once
+from heliotrope.local.frames import INTERNAL, Frame, FrameError, pack
+from heliotrope.local.server import LocalLimits, LocalServer
+from heliotrope.local.sockets import EMERGENCY, ORDINARY, socket_folder
+
+__all__ = [
+    "EMERGENCY",
+    "INTERNAL",
+    "ORDINARY",
+    "AwayError",
+    "CallError",
+    "Frame",
+    "FrameError",
+    "LocalConnection",
+    "LocalLimits",
+    "LocalServer",
+    "ask_once",
+    "pack",
+    "socket_folder",
+]

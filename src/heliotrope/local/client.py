@@ -1,0 +1,185 @@
+"""The calling side of the local interface."""
+
+import asyncio
+import contextlib
+import socket
+from pathlib import Path
+from typing import Any
+
+from heliotrope.errors import HeliotropeError
+from heliotrope.local.frames import (
+    ANSWER_BLOB,
+    ANSWER_HEAD,
+    PREFIX,
+    Frame,
+    FrameError,
+    head_of,
+    lengths,
+    pack,
+    read_frame,
+)
+from heliotrope.local.sockets import connect
+
+
+class AwayError(HeliotropeError):
+    """The plant's process cannot be reached, or does not answer."""
+
+
+class CallError(HeliotropeError):
+    """A call that the plant's process has refused; ``kind`` is the kind of the error."""
+
+    def __init__(self, kind: str, text: str) -> None:
+        super().__init__(text)
+        self.kind = kind
+
+
+def value_of(answer: Frame) -> Any:
+    """Return the value of an answer.
+
+    Raises
+    ------
+    CallError
+        If it is an error.
+    """
+    if "error" in answer.head:
+        raise CallError(str(answer.head["error"]), str(answer.head.get("text", "")))
+    return answer.head.get("value")
+
+
+class LocalConnection:
+    """A standing connection that is opened again whenever it has ended.
+
+    Parameters
+    ----------
+    path
+        Socket of the plant.
+    hello
+        First frame: ``{"key": ...}`` or ``{"token": ...}``.
+    timeout
+        Limit for connecting and for each answer, s.
+    """
+
+    def __init__(self, path: Path, hello: dict[str, Any], timeout: float = 30.0) -> None:
+        self._path, self._hello, self._timeout = path, hello, timeout
+        self._writer: asyncio.StreamWriter | None = None
+        self._waiting: dict[int, asyncio.Future[Frame]] = {}
+        self._number = 0
+        self._turn = asyncio.Lock()
+
+    async def run(self, pause: float = 0.25) -> None:
+        """Keep the connection up until cancelled."""
+        while True:
+            with contextlib.suppress(HeliotropeError, EOFError, OSError, TimeoutError):
+                await self._live()
+            await asyncio.sleep(pause)
+
+    async def _live(self) -> None:
+        """Connect, and take answers until the connection ends."""
+        raw = await asyncio.to_thread(connect, self._path, 2.0)
+        raw.setblocking(False)
+        reader, writer = await asyncio.open_unix_connection(sock=raw)
+        try:
+            async with asyncio.timeout(self._timeout):
+                writer.write(pack(self._hello))
+                value_of(await read_frame(reader))
+            self._writer = writer
+            while True:
+                frame = await read_frame(reader)
+                waiting = self._waiting.pop(frame.head.get("id", 0), None)
+                if waiting is not None and not waiting.done():
+                    waiting.set_result(frame)
+        finally:
+            self._writer = None
+            writer.transport.abort()
+            for waiting in self._waiting.values():
+                if not waiting.done():
+                    waiting.set_exception(self._away("the connection has ended"))
+            self._waiting.clear()
+
+    def _away(self, why: str) -> AwayError:
+        return AwayError(f"the plant's process does not answer ({why}); see whether it runs")
+
+    @property
+    def up(self) -> bool:
+        """Whether the connection stands."""
+        return self._writer is not None
+
+    async def ask(
+        self, call: str, arguments: dict[str, Any], blob: bytes = b"", *, on_behalf: Any = None
+    ) -> tuple[Any, bytes]:
+        """Make a call; return value and blob of the answer.
+
+        Raises
+        ------
+        CallError
+            If the plant refuses it.
+        AwayError
+            If the plant cannot be reached, or does not answer in time.
+        """
+        writer = self._writer
+        if writer is None:
+            raise self._away("no connection")
+        self._number += 1
+        number = self._number
+        head = {"id": number, "call": call, "arguments": arguments, "for": on_behalf}
+        future = asyncio.get_running_loop().create_future()
+        self._waiting[number] = future
+        try:
+            async with asyncio.timeout(self._timeout):
+                async with self._turn:
+                    writer.write(pack(head, blob))
+                    await writer.drain()
+                answer = await future
+        except TimeoutError:
+            raise self._away(f"no answer within {self._timeout:g} s") from None
+        except OSError:
+            raise self._away("the connection has ended") from None
+        finally:
+            self._waiting.pop(number, None)
+            if future.done() and not future.cancelled():
+                future.exception()  # it may have failed after the limit
+        return value_of(answer), answer.blob
+
+
+def ask_once(
+    path: Path,
+    hello: dict[str, Any],
+    call: str,
+    arguments: dict[str, Any],
+    blob: bytes = b"",
+    timeout: float = 30.0,
+) -> Any:
+    """Connect, make one call, and return the value of its answer; without an event loop.
+
+    Raises
+    ------
+    CallError
+        If the plant refuses it.
+    AwayError
+        If the plant cannot be reached.
+    """
+    try:
+        with connect(path, timeout) as raw:
+            raw.sendall(pack(hello))
+            value_of(_receive(raw))
+            raw.sendall(pack({"id": 1, "call": call, "arguments": arguments}, blob))
+            return value_of(_receive(raw))
+    except (OSError, EOFError, FrameError) as error:
+        why = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        raise AwayError(f"the plant at {path} does not answer ({why}); is it running?") from None
+
+
+def _receive(raw: socket.socket) -> Frame:
+    head, blob = lengths(_exactly(raw, PREFIX), ANSWER_HEAD, ANSWER_BLOB)
+    text = _exactly(raw, head)
+    return Frame(head_of(text), _exactly(raw, blob))
+
+
+def _exactly(raw: socket.socket, count: int) -> bytes:
+    found = bytearray()
+    while len(found) < count:
+        part = raw.recv(min(count - len(found), 1 << 20))
+        if not part:
+            raise EOFError("the connection has ended")
+        found += part
+    return bytes(found)

@@ -1,0 +1,103 @@
+"""Frames of the local interface.
+
+A frame is the mark ``HLP1``, the lengths of head and blob (uint32 each, little-endian), the head (a
+JSON object) and the blob (bytes). A request has ``id``, ``call``, ``arguments`` and, if a console
+makes it, ``for``: the person on whose behalf. An answer has the ``id`` with a ``value``, or with
+``error`` (its kind) and ``text``. The first frame of a connection says who is calling: ``key`` or
+``token``.
+"""
+
+import asyncio
+import json
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+from heliotrope.errors import HeliotropeError
+
+MARK = b"HLP1"
+_PREFIX = struct.Struct("<4sII")
+PREFIX = _PREFIX.size
+#: Largest head and blob of a request, bytes. Python reads JSON without letting other threads run:
+#: a head of this size takes less than 0.1 s.
+REQUEST_HEAD, REQUEST_BLOB = 1 << 20, 8 << 20
+#: Largest head before the caller is known, bytes.
+HELLO_HEAD = 4096
+#: Kind of an error that is a mistake of the program.
+INTERNAL = "internal"
+#: Largest head and blob of an answer, bytes.
+ANSWER_HEAD, ANSWER_BLOB = 64 << 20, 64 << 20
+
+
+class FrameError(HeliotropeError):
+    """Bytes that are not a frame, or a frame that is too large."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame."""
+
+    head: dict[str, Any]
+    blob: bytes = b""
+
+
+def pack(head: dict[str, Any], blob: bytes = b"") -> bytes:
+    """Return the bytes of a frame."""
+    text = json.dumps(head, separators=(",", ":"), allow_nan=False).encode()
+    return _PREFIX.pack(MARK, len(text), len(blob)) + text + blob
+
+
+def lengths(prefix: bytes, most_head: int, most_blob: int) -> tuple[int, int]:
+    """Return the lengths of head and blob.
+
+    Raises
+    ------
+    FrameError
+        Another mark, or a length above its limit.
+    """
+    mark, head, blob = _PREFIX.unpack(prefix)
+    if mark != MARK:
+        raise FrameError(f"local interface: bytes that do not begin with {MARK.decode()}")
+    if head > most_head or blob > most_blob:
+        raise FrameError(
+            f"local interface: a frame of {head} + {blob} bytes; at most {most_head} + {most_blob}"
+        )
+    return head, blob
+
+
+def head_of(data: bytes) -> dict[str, Any]:
+    """Return the head of a frame.
+
+    Raises
+    ------
+    FrameError
+        If it is not a JSON object.
+    """
+    try:
+        found = json.loads(data, parse_constant=_no_number)
+    except (ValueError, RecursionError):
+        raise FrameError(f"local interface: a head of {len(data)} bytes that is not JSON") from None
+    if not isinstance(found, dict):
+        raise FrameError("local interface: a head that is not a JSON object")
+    return found
+
+
+def _no_number(text: str) -> float:
+    raise ValueError(text)
+
+
+async def read_frame(
+    reader: asyncio.StreamReader, most_head: int = ANSWER_HEAD, most_blob: int = ANSWER_BLOB
+) -> Frame:
+    """Read one frame.
+
+    Raises
+    ------
+    FrameError
+        See `lengths` and `head_of`.
+    EOFError
+        If the connection ends.
+    """
+    head, blob = lengths(await reader.readexactly(PREFIX), most_head, most_blob)
+    text = await reader.readexactly(head)
+    return Frame(head_of(text), await reader.readexactly(blob))

@@ -1,0 +1,241 @@
+"""The listening side of the local interface: every number is bounded, and a newcomer gets in.
+
+Connections are taken at a limited rate. One that does not say who it is in time is cut off; where
+all places are taken, the oldest connection gives way. A connection has a limited number of requests
+under way: while they are, nothing more is read from it. A request counts until its answer is
+written, and a client that does not read its answers is cut off.
+"""
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+from heliotrope.errors import HeliotropeError
+from heliotrope.local.frames import (
+    HELLO_HEAD,
+    INTERNAL,
+    REQUEST_BLOB,
+    REQUEST_HEAD,
+    Frame,
+    FrameError,
+    pack,
+    read_frame,
+)
+from heliotrope.local.sockets import is_ours, listen
+
+_LOG = logging.getLogger(__name__)
+#: Bytes of answers that wait in a connection before its requests do.
+_BUFFER = 1 << 16
+
+
+class Caller(Protocol):
+    """Who is at the other end."""
+
+    @property
+    def reserved(self) -> bool:
+        """Whether there is a place for this caller whatever others do."""
+        ...
+
+
+C = TypeVar("C", bound=Caller)
+#: Kind and text of an error.
+Problem = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class LocalLimits:
+    """Limits of one listener.
+
+    Attributes
+    ----------
+    strangers, callers, reserved
+        Connections that have not said who they are, those that have, and those of consoles: one
+        that begins may meet one that ends.
+    under_way
+        Requests under way in one connection.
+    hello_s, answer_s
+        Time to say who is calling, and to take an answer, s.
+    pace_s
+        Time between two new connections, s.
+    """
+
+    strangers: int = 8
+    callers: int = 16
+    reserved: int = 2
+    under_way: int = 32
+    hello_s: float = 2.0
+    answer_s: float = 5.0
+    pace_s: float = 0.005
+
+
+class _Peer:
+    """One connection."""
+
+    def __init__(self, writer: asyncio.StreamWriter) -> None:
+        self._writer, self._turn = writer, asyncio.Lock()
+        writer.transport.set_write_buffer_limits(_BUFFER)
+
+    def cut(self) -> None:
+        self._writer.transport.abort()
+
+    async def write(self, data: bytes, limit: float) -> None:
+        """Write a frame; a peer that does not take it within ``limit`` s is cut off."""
+        try:
+            async with asyncio.timeout(limit), self._turn:
+                self._writer.write(data)
+                await self._writer.drain()
+        except (TimeoutError, OSError):
+            self.cut()
+
+
+class LocalServer(Generic[C]):
+    """One listener.
+
+    Parameters
+    ----------
+    path
+        Socket, in a folder made by `sockets.make_folder`.
+    caller
+        Returns who sends the first frame of a connection; None refuses it.
+    answer
+        Returns value and blob of the answer to a request.
+    kinds
+        Returns kind and text of an error for the client.
+    limits
+        See `LocalLimits`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        caller: Callable[[dict[str, Any]], Awaitable[C | None]],
+        answer: Callable[[C, Frame], Awaitable[tuple[Any, bytes]]],
+        kinds: Callable[[HeliotropeError], Problem],
+        limits: LocalLimits | None = None,
+    ) -> None:
+        self._path, self._caller, self._answer, self._kinds = path, caller, answer, kinds
+        self._limits = limits or LocalLimits()
+        self._listener: socket.socket | None = None
+        #: Taken, and not served yet.
+        self._taken = set[socket.socket]()
+        self._strangers: list[_Peer] = []
+        self._callers: list[_Peer] = []
+        self._reserved: list[_Peer] = []
+
+    def open(self) -> None:
+        """Listen.
+
+        Raises
+        ------
+        InputError
+            If it cannot listen there.
+        """
+        self._listener = listen(self._path)
+
+    async def run(self) -> None:
+        """Take connections until cancelled."""
+        assert self._listener is not None
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.TaskGroup() as group:
+                while True:
+                    await asyncio.sleep(self._limits.pace_s)
+                    with contextlib.suppress(OSError):  # too many open files: it waits
+                        peer, _ = await loop.sock_accept(self._listener)
+                        if is_ours(peer):
+                            self._taken.add(peer)
+                            group.create_task(self._serve(peer))
+                        else:
+                            peer.close()
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Stop listening; again, nothing."""
+        if self._listener is not None:
+            self._listener.close()
+            self._path.unlink(missing_ok=True)
+            self._listener = None
+        while self._taken:
+            self._taken.pop().close()
+
+    async def _serve(self, connection: socket.socket) -> None:
+        self._taken.discard(connection)
+        reader, writer = await asyncio.open_unix_connection(sock=connection, limit=_BUFFER)
+        peer = _Peer(writer)
+        _place(self._strangers, peer, self._limits.strangers)
+        try:
+            caller = await self._known(reader, peer)
+            if caller is not None:
+                await self._talk(reader, peer, caller)
+        except (HeliotropeError, EOFError, OSError, TimeoutError):
+            return  # the connection has ended, or has to
+        except Exception:  # noqa: BLE001 - it is logged
+            # One connection must not end the others.
+            _LOG.exception("local interface")
+        finally:
+            for pool in (self._strangers, self._callers, self._reserved):
+                if peer in pool:
+                    pool.remove(peer)
+            peer.cut()
+
+    async def _known(self, reader: asyncio.StreamReader, peer: _Peer) -> C | None:
+        """Return the caller, None if the connection is refused."""
+        async with asyncio.timeout(self._limits.hello_s):
+            hello = await read_frame(reader, HELLO_HEAD, 0)
+            caller = await self._caller(hello.head)
+        if caller is None:
+            refusal = {"id": 0, "error": "refused", "text": "the key or token is not valid"}
+            await peer.write(pack(refusal), self._limits.answer_s)
+            return None
+        if peer in self._strangers:
+            self._strangers.remove(peer)
+        if caller.reserved:
+            _place(self._reserved, peer, self._limits.reserved)
+        else:
+            _place(self._callers, peer, self._limits.callers)
+        await peer.write(pack({"id": 0, "value": None}), self._limits.answer_s)
+        return caller
+
+    async def _talk(self, reader: asyncio.StreamReader, peer: _Peer, caller: C) -> None:
+        room = asyncio.Semaphore(self._limits.under_way)
+        works = set[asyncio.Task[None]]()
+        async with asyncio.TaskGroup() as group:
+            try:
+                while True:
+                    await room.acquire()
+                    frame = await read_frame(reader, REQUEST_HEAD, REQUEST_BLOB)
+                    work = group.create_task(self._one(frame, peer, caller, room))
+                    works.add(work)
+                    work.add_done_callback(works.discard)
+            except (FrameError, EOFError, OSError):
+                for work in works:
+                    work.cancel()
+
+    async def _one(self, frame: Frame, peer: _Peer, caller: C, room: asyncio.Semaphore) -> None:
+        """Answer one request."""
+        number, blob = frame.head.get("id"), b""
+        try:
+            value, blob = await self._answer(caller, frame)
+            data = pack({"id": number, "value": value}, blob)
+        except HeliotropeError as error:
+            kind, text = self._kinds(error)
+            data = pack({"id": number, "error": kind, "text": text})
+        except Exception:  # noqa: BLE001 - it is logged
+            # The plant goes on whatever a call does.
+            _LOG.exception("local interface: %s", str(frame.head.get("call"))[:64])
+            data = pack({"id": number, "error": INTERNAL, "text": "the call has failed"})
+        await peer.write(data, self._limits.answer_s)
+        room.release()
+
+
+def _place(pool: list[_Peer], peer: _Peer, most: int) -> None:
+    """Add a connection; the oldest gives way."""
+    while len(pool) >= most:
+        pool.pop(0).cut()
+    pool.append(peer)

@@ -1,0 +1,118 @@
+"""Unix sockets in a folder that only the plant's own user can enter."""
+
+import contextlib
+import os
+import socket
+import stat
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from heliotrope.errors import InputError
+
+#: The sockets of a plant: for all calls, and for EMERGENCY, DEFOCUS and STOW alone.
+ORDINARY, EMERGENCY = "plant.sock", "emergency.sock"
+_FOLDER = "interface"
+#: Connections that wait to be taken.
+_BACKLOG = 16
+#: Pause before another attempt to connect, s.
+_AGAIN = 0.01
+#: A socket's address has room for this many bytes.
+_LONGEST = 100
+_CREDENTIALS = struct.Struct("3i")
+
+
+def socket_folder(data: Path) -> Path:
+    """Return the folder of the sockets in a plant's data folder."""
+    return data / _FOLDER
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for sockets that only this user can enter.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made, or belongs to another user.
+    """
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        known = folder.lstat()
+        if not stat.S_ISDIR(known.st_mode) or known.st_uid != os.getuid():
+            raise InputError(f"{folder}: it is not a folder of this user; remove it")
+        folder.chmod(0o700)
+    except OSError as error:
+        raise InputError(f"{folder}: {error.strerror}; give --data a folder of this user") from None
+
+
+@contextlib.contextmanager
+def _short(path: Path) -> Iterator[str]:
+    """Return an address for a socket whose path may be too long for one."""
+    if len(os.fsencode(path)) <= _LONGEST:
+        yield str(path)
+        return
+    folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield f"/proc/self/fd/{folder}/{path.name}"
+    finally:
+        os.close(folder)
+
+
+def listen(path: Path) -> socket.socket:
+    """Return a listening socket that only this user can connect to; a stale one is replaced.
+
+    Raises
+    ------
+    InputError
+        If there can be none.
+    """
+    made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        path.unlink(missing_ok=True)
+        with _short(path) as address:
+            made.bind(address)
+        path.chmod(0o600)
+        made.listen(_BACKLOG)
+        made.setblocking(False)
+    except OSError as error:
+        made.close()
+        raise InputError(f"{path}: it cannot listen there: {error.strerror}") from None
+    return made
+
+
+def connect(path: Path, timeout: float) -> socket.socket:
+    """Return a connected socket, blocking for ``timeout`` s at most.
+
+    Raises
+    ------
+    OSError
+        If nobody listens there.
+    """
+    made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    made.settimeout(timeout)
+    try:
+        until = time.monotonic() + timeout
+        with _short(path) as address:
+            while True:
+                try:
+                    made.connect(address)
+                    break
+                except BlockingIOError:  # others wait to be taken: try again
+                    if time.monotonic() > until:
+                        raise
+                    time.sleep(_AGAIN)
+    except BaseException:
+        made.close()
+        raise
+    return made
+
+
+def is_ours(peer: socket.socket) -> bool:
+    """Whether the process at the other end belongs to this user or to root."""
+    try:
+        data = peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    except OSError:
+        return False
+    _, user, _ = _CREDENTIALS.unpack(data)
+    return user in (os.getuid(), 0)

@@ -1,0 +1,164 @@
+"""What the calls share in the plant's process: operations, tickets, and who is present.
+
+The command authority is renewed for a holder whose page or program has been present recently. It
+expires by the plant's time, which may run faster than that of people.
+"""
+
+import asyncio
+import math
+import time
+from typing import Any
+
+from heliotrope.field.volumes import outline
+from heliotrope.lcu import names as meanings
+from heliotrope.lcu import states
+from heliotrope.plant import refusals
+from heliotrope.plant.authority import Person
+from heliotrope.plant.interface.tickets import Tickets, state_of
+from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.orders import RECORDING
+from heliotrope.plant.tickets import Ticket
+
+#: A holder of the authority counts as present for this long after renewing it, s.
+PRESENT = 8.0
+
+
+class Desk:
+    """The plant at work, as the calls see it; used in the plant's loop only.
+
+    Parameters
+    ----------
+    operations
+        The plant at work.
+
+    Attributes
+    ----------
+    tickets
+        The last commands.
+    """
+
+    def __init__(self, operations: Operations) -> None:
+        self.operations, self.tickets = operations, Tickets()
+        #: When each holder of the authority was last present, monotonic time of the machine, s.
+        self._present: dict[str, float] = {}
+
+    async def keep_authority(self) -> None:
+        """Renew the authority for a holder who is present, until cancelled."""
+        authority = self.operations.plant.authority
+        while True:
+            await asyncio.sleep(0.2 * authority.lifetime)
+            grant = authority.grant
+            if grant is None:
+                continue
+            if time.monotonic() - self._present.get(grant.holder.name, -math.inf) < PRESENT:
+                self.operations.keep_authority(grant.holder, grant.token)
+
+    # -- the authority ---------------------------------------------------------------------
+
+    def authority_of(self, person: Person) -> dict[str, Any]:
+        """Return the holder of the command authority."""
+        authority = self.operations.plant.authority
+        grant = authority.grant
+        holder = None if grant is None else grant.holder
+        return {
+            "holder": "" if holder is None else holder.name,
+            "role": "" if holder is None else holder.role.title,
+            "mine": holder == person,
+            "lifetime": authority.lifetime,
+        }
+
+    def token_of(self, person: Person) -> int:
+        """Return a person's token of the command authority.
+
+        Raises
+        ------
+        RefusedError
+            If the person does not hold it.
+        """
+        grant = self.operations.plant.authority.grant
+        if grant is None:
+            raise refusals.NO_AUTHORITY.error(person=person.name)
+        if grant.holder != person:
+            raise refusals.OTHER_AUTHORITY.error(holder=grant.holder.name, person=person.name)
+        return grant.token
+
+    def take(self, person: Person) -> bool:
+        """Take the command authority, or renew it; return whether its token is new."""
+        grant = self.operations.plant.authority.grant
+        if grant is not None and grant.holder == person:
+            self.operations.keep_authority(person, grant.token)
+            return False
+        self.operations.take_authority(person)
+        return True
+
+    def seize(self, person: Person, reason: str) -> bool:
+        """Break another person's command authority and take it; return that its token is new."""
+        self.operations.seize_authority(person, reason)
+        return True
+
+    async def told(self, person: Person, new: bool) -> dict[str, Any]:
+        """Return the holder once a new token is known.
+
+        Clusters get it with a lease, their nodes a second later; until then the field would refuse
+        commands.
+        """
+        if new:
+            await asyncio.sleep(1.5 * self.operations.plant.settings.period + 1.0)
+        return self._is_present(person)
+
+    def keep(self, person: Person) -> dict[str, Any]:
+        """Renew the command authority."""
+        self.operations.keep_authority(person, self.token_of(person))
+        return self._is_present(person)
+
+    def release(self, person: Person) -> dict[str, Any]:
+        """Release the command authority; automatic control goes on."""
+        self._present.pop(person.name, None)
+        self.operations.release_authority(person, self.token_of(person))
+        return self.authority_of(person)
+
+    def _is_present(self, person: Person) -> dict[str, Any]:
+        self._present[person.name] = time.monotonic()
+        return self.authority_of(person)
+
+    # -- commands --------------------------------------------------------------------------
+
+    async def recorded(self, _: Person, ticket: Ticket) -> dict[str, Any]:
+        """Keep a ticket; return its progress once it is recorded, or once that has failed.
+
+        The next command of the same client then finds the points that this one has assigned.
+        """
+        self.tickets.put(ticket)
+        await ticket.written(RECORDING + 1.0)
+        return state_of(ticket)
+
+    # -- views -----------------------------------------------------------------------------
+
+    def field(self) -> dict[str, Any]:
+        """Return everything about the field that does not change."""
+        here = self.operations
+        design, plant = here.design, here.plant.field
+        middle = [0.0, 0.0, 0.0]
+        if design.receivers:
+            middle = [
+                float(sum(r.center[k] for r in design.receivers) / len(design.receivers))
+                for k in range(3)
+            ]
+        sizes = sorted(here.sizes.max(axis=1).tolist())
+        volumes = here.plant.beams.volumes
+        keep_outs = [{"name": v.name, "outline": outline(v).round(2).tolist()} for v in volumes]
+        return {
+            "plant": design.name,
+            "names": here.names,
+            "positions": here.positions.round(3),
+            "clusters": here.clusters,
+            "cluster": plant.cluster,
+            "size": sizes[len(sizes) // 2],
+            "tower": middle,
+            "receivers": here.receivers,
+            "targets": here.targets,
+            "keep_outs": keep_outs,
+            "surfaces": here.aim_names,
+            "states": states.STATES,
+            "faults": meanings.FAULTS,
+        }

@@ -1,0 +1,33 @@
+"""Errors on their way over the local interface: a kind and a text, and the same class again."""
+
+from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
+from heliotrope.local import CallError
+from heliotrope.plant.audit import AuditError
+from heliotrope.plant.refusals import RefusedError
+from heliotrope.store.records import StoreError
+
+#: By kind; a class comes before those that it derives from.
+_CLASSES: dict[str, type[HeliotropeError]] = {
+    "unknown": UnknownNameError,
+    "input": InputError,
+    "refused": RefusedError,
+    "audit": AuditError,
+    "store": StoreError,
+}
+
+
+def kind_of(error: HeliotropeError) -> tuple[str, str]:
+    """Return kind and text of an error."""
+    for kind, made in _CLASSES.items():
+        if isinstance(error, made):
+            return kind, str(error)
+    return "other", str(error)
+
+
+def remade(error: CallError) -> HeliotropeError:
+    """Return the error that the plant's process raised."""
+    kind = _CLASSES.get(error.kind, HeliotropeError)
+    # The text is complete: the constructor of an unknown name would make another.
+    made = kind.__new__(kind)
+    made.args = (str(error),)
+    return made

@@ -1,0 +1,188 @@
+"""Arguments of the calls, checked where they arrive: by the console, and again by the plant.
+
+Lists of points travel as names in the arguments and coordinates in the blob; see `points_of`.
+"""
+
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
+
+#: Largest coordinate of a point, m.
+_FAR = 1e5
+
+
+def points_like(given: Any) -> Any:
+    """Return points whose shape is right; the first wrong one is named, not each of 200,000.
+
+    Raises
+    ------
+    ValueError
+        A name or a point of another shape.
+    """
+    for name, point in given.items() if isinstance(given, dict) else ():
+        numbers = isinstance(point, list) and len(point) == 3 and all(map(_bounded, point))
+        if not numbers or not 0 < len(name) <= 64:
+            raise ValueError(f"{name[:64]}: give east, north and up, m")
+    return given
+
+
+def _bounded(value: Any) -> bool:
+    return isinstance(value, int | float) and -_FAR <= value <= _FAR
+
+
+class Strict(BaseModel):
+    """A request, without any further fields."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _few(cls, given: Any) -> Any:
+        """Refuse many unknown fields in one error, not in one each."""
+        if isinstance(given, dict) and len(given) > len(cls.model_fields) + 5:
+            raise ValueError("too many fields")
+        return given
+
+
+Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f]+$")]
+#: The first wrong one is named: an error for each of 200,000 would take a second and 200 MB.
+Names = Annotated[
+    list[Name], Field(max_length=200_000, fail_fast=True, description="Names; [] for all.")
+]
+Words = Annotated[str, Field(max_length=500, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Coordinate = Annotated[float, Field(ge=-_FAR, le=_FAR, allow_inf_nan=False)]
+Point = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+#: Points by heliostat, ENU, m.
+Points = Annotated[dict[Name, Point], Field(max_length=200_000), BeforeValidator(points_like)]
+Number = Annotated[float, Field(ge=-2147483648, le=2147483647, allow_inf_nan=False)]
+
+
+class Nothing(Strict):
+    """No arguments."""
+
+
+class Named(Strict):
+    """The name of one thing."""
+
+    name: Name
+
+
+class Some(Strict):
+    """The last ones, at most this many; of one cluster if it is named."""
+
+    limit: Annotated[int, Field(ge=1, le=2000)] = 200
+    cluster: Annotated[str, Field(max_length=64)] = ""
+
+
+class Picture(Strict):
+    """A target, and the version of its photograph that is known already."""
+
+    name: Name
+    known: int = -1
+
+
+class Note(Strict):
+    """An event: its kind, the person it is about, and one line."""
+
+    kind: Annotated[str, Field(pattern=r"^[a-z]{1,20}$")]
+    who: Annotated[str, Field(max_length=100)]
+    text: Words
+
+
+class Beat(Strict):
+    """A sign of life: the address at which a console listens."""
+
+    address: Annotated[str, Field(max_length=200)]
+
+
+class SomeHeliostats(Strict):
+    """Some heliostats, or all."""
+
+    heliostats: Names = []
+
+
+class CommandOrder(SomeHeliostats):
+    """A command of the wire with its values, see the table of messages."""
+
+    command: Annotated[str, Field(pattern=r"^[A-Z_]{2,20}$")]
+    values: Annotated[list[Number], Field(max_length=8)] = []
+
+
+class AimOrder(SomeHeliostats):
+    """Aim heliostats at a receiver or target by its name, or at points by heliostat, ENU, m."""
+
+    where: Words = ""
+    points: Points = {}
+
+
+class StandbyOrder(Strict):
+    """Standby points by heliostat, ENU, m."""
+
+    points: Annotated[Points, Field(min_length=1)]
+
+
+class PointsOrder(SomeHeliostats):
+    """`AimOrder` or `StandbyOrder` on its way: names of the points in the blob."""
+
+    where: Words = ""
+    points: Names = []
+
+
+class GivenReason(Strict):
+    """The reason."""
+
+    reason: Words
+
+
+class EmergencyCall(Strict):
+    """Order for the whole field, and the reason."""
+
+    act: Annotated[str, Field(pattern="^(DEFOCUS|STOW)$")] = "DEFOCUS"
+    reason: Words = ""
+
+
+class Acknowledged(Strict):
+    """The alarm."""
+
+    condition: Name
+    subject: Words = ""
+
+
+class HoldOrder(SomeHeliostats):
+    """Heliostats to take out of service, the reason, and the hours until they are expected back."""
+
+    heliostats: Annotated[list[Name], Field(min_length=1, max_length=200_000)]
+    reason: Words
+    hours: Annotated[float, Field(gt=0.0, le=8760.0)] | None = None
+
+
+class GivenBack(Strict):
+    """Heliostats to give back to service, each by its name."""
+
+    heliostats: Annotated[list[Name], Field(min_length=1, max_length=200_000)]
+
+
+class Switch(Strict):
+    """On or off."""
+
+    on: bool
+
+
+def points_of(order: PointsOrder, blob: bytes) -> dict[str, FloatArray]:
+    """Return the points by heliostat, ENU, m.
+
+    Raises
+    ------
+    InputError
+        If there is not one point for each name, or one is not on the site.
+    """
+    if len(blob) != 24 * len(order.points):
+        raise InputError(f"points: {len(blob)} bytes for {len(order.points)} heliostats")
+    found = np.frombuffer(blob, "<f8").reshape(-1, 3)
+    if not (np.isfinite(found).all() and (np.abs(found) <= _FAR).all()):
+        raise InputError(f"points: a coordinate is not a number within {_FAR:g} m")
+    return dict(zip(order.points, found, strict=True))

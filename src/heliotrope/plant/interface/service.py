@@ -1,0 +1,345 @@
+"""The plant's local interface at work: two sockets, each with a thread of its own.
+
+The plant's loop does nothing but the calls, one at a time for each socket, and those of the
+ordinary socket for a limited share of its time. Taking connections, checking keys and tokens,
+reading, writing and making views plain are done in the threads, whose time is the machine's.
+"""
+
+import asyncio
+import contextlib
+import functools
+import hashlib
+import hmac
+import logging
+import math
+import secrets
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
+from heliotrope.local import EMERGENCY, ORDINARY, Frame, LocalLimits, LocalServer, socket_folder
+from heliotrope.local.sockets import make_folder
+from heliotrope.plant import refusals
+from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.interface.calls import CALLS, Call, WithBlob
+from heliotrope.plant.interface.desk import Desk
+from heliotrope.plant.interface.encoding import plain
+from heliotrope.plant.interface.errors import kind_of
+from heliotrope.plant.interface.orders import Beat
+from heliotrope.plant.operations.operations import Operations
+from heliotrope.store.people import People
+
+T = TypeVar("T")
+_LOG = logging.getLogger(__name__)
+#: Share of the plant's loop that the calls of the two sockets may take.
+_SHARE = {ORDINARY: 0.25, EMERGENCY: 0.5}
+#: Longest pause after a call, s.
+_PAUSE = 1.0
+#: Time for the store to find a token, and how long one that it found is good if it cannot, s.
+_STORE, _TRUSTED = 1.0, 3600.0
+#: Refused callers are noted at most this often, s.
+_NOTED = 10.0
+_MOST_KNOWN = 100
+#: Time for the threads to end, s.
+_END = 5.0
+
+
+@dataclass(frozen=True)
+class LocalCaller:
+    """Who is at the other end; a console (None) names the person with each request."""
+
+    person: Person | None
+
+    @property
+    def reserved(self) -> bool:
+        """A console has a place of its own."""
+        return self.person is None
+
+
+class PlantInterface:
+    """The interface of one plant.
+
+    Parameters
+    ----------
+    operations
+        The plant at work.
+    people
+        Accounts, sessions and tokens.
+    data
+        Folder of the plant, in which the folder of the sockets stands.
+
+    Attributes
+    ----------
+    folder
+        Folder of the sockets.
+    key
+        Proves a console; made at each start.
+    heard
+        When a console last gave a sign of life, monotonic time of the machine, s.
+    address
+        Address at which it listens; "" before.
+    """
+
+    def __init__(self, operations: Operations, people: People, data: Path) -> None:
+        self._desk, self._people = Desk(operations), people
+        self.folder, self.key = socket_folder(data), secrets.token_hex(32)
+        self.heard, self.address = -math.inf, ""
+        self._known: dict[str, tuple[float, Person]] = {}
+        self._noted = -math.inf
+        #: Threads that wait for the store; those that hang take no place from others.
+        self._threads = ThreadPoolExecutor(4, "plant people")
+        self._plant: asyncio.AbstractEventLoop | None = None
+
+    @contextlib.asynccontextmanager
+    async def running(
+        self, *beside: Callable[[], Coroutine[Any, Any, None]]
+    ) -> AsyncIterator["PlantInterface"]:
+        """Serve during a block, in the plant's loop; ``beside`` runs in the ordinary thread.
+
+        Raises
+        ------
+        InputError
+            If the sockets cannot be made.
+        """
+        self._plant = asyncio.get_running_loop()
+        make_folder(self.folder)
+        threads = [
+            _LoopThread(self._listener(EMERGENCY)),
+            _LoopThread(self._listener(ORDINARY), beside),
+        ]
+        try:
+            for thread in threads:
+                thread.start()
+            async with asyncio.TaskGroup() as group:
+                keeping = group.create_task(self._desk.keep_authority())
+                yield self
+                keeping.cancel()
+        finally:
+            for thread in threads:
+                await asyncio.to_thread(thread.close)
+            self._threads.shutdown(wait=False, cancel_futures=True)
+
+    def in_plant(self, work: Callable[[], T]) -> "Future[T]":
+        """Do work in the plant's loop, from any thread."""
+        assert self._plant is not None
+        done: Future[T] = Future()
+
+        def run() -> None:
+            if done.set_running_or_notify_cancel():
+                try:
+                    done.set_result(work())
+                except BaseException as error:  # noqa: BLE001 - it goes to the caller
+                    done.set_exception(error)
+
+        self._plant.call_soon_threadsafe(run)
+        return done
+
+    async def _wait_in_plant(self, work: Coroutine[Any, Any, T]) -> T:
+        """Do work in the plant's loop that waits there; awaited in another loop."""
+        assert self._plant is not None
+        return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, self._plant))
+
+    # -- who is calling --------------------------------------------------------------------
+
+    async def _caller(self, hello: dict[str, Any]) -> LocalCaller | None:
+        """Return the caller of a first frame, None if key or token is not valid."""
+        key, token = hello.get("key"), hello.get("token")
+        if isinstance(key, str) and hmac.compare_digest(key.encode(), self.key.encode()):
+            return LocalCaller(None)
+        person = await self._person(token) if isinstance(token, str) else None
+        if person is not None:
+            return LocalCaller(person)
+        if time.monotonic() - self._noted >= _NOTED:
+            self._noted = time.monotonic()
+            event, text = self._desk.operations.logbook.event, "a local caller was refused"
+            self.in_plant(lambda: event("security", "", f"{text}: key or token not valid"))
+        return None
+
+    async def _person(self, token: str) -> Person | None:
+        """Return the person of a token; one known lately also if the store cannot say."""
+        name = hashlib.sha256(token.encode()).hexdigest()
+        try:
+            async with asyncio.timeout(_STORE):
+                found = await asyncio.to_thread(self._people.token, token, time.time())
+        except (TimeoutError, HeliotropeError):
+            at, person = self._known.get(name, (-math.inf, None))
+            return person if time.monotonic() - at < _TRUSTED else None
+        self._known.pop(name, None)
+        if found is None:
+            return None
+        person = Person(found.name, Role[found.role.upper()])
+        if len(self._known) >= _MOST_KNOWN:
+            self._known.clear()
+        self._known[name] = time.monotonic(), person
+        return person
+
+    # -- the calls -------------------------------------------------------------------------
+
+    def _listener(self, name: str) -> LocalServer[LocalCaller]:
+        calls = {key: call for key, call in CALLS.items() if call.urgent == (name == EMERGENCY)}
+        turns = _Turns(self, _SHARE[name])
+
+        async def answer(caller: LocalCaller, frame: Frame) -> tuple[Any, bytes]:
+            return await self._answer(calls, turns, caller, frame)
+
+        return LocalServer(self.folder / name, self._caller, answer, kind_of, LocalLimits())
+
+    async def _answer(
+        self, calls: dict[str, Call], turns: "_Turns", caller: LocalCaller, frame: Frame
+    ) -> tuple[Any, bytes]:
+        """Return value and blob of the answer to a request."""
+        name, given = frame.head.get("call"), frame.head.get("arguments")
+        if not isinstance(name, str) or not isinstance(given, dict):
+            raise InputError("local interface: a request needs a call and its arguments")
+        if caller.person is None and name == "heartbeat":
+            self.heard, self.address = time.monotonic(), _checked(Beat, given).address
+            return None, b""
+        people = _people_calls(self._people)
+        if caller.person is None and name in people:
+            work = functools.partial(people[name], **given)
+            loop = asyncio.get_running_loop()
+            return plain(await loop.run_in_executor(self._threads, work)), b""
+        call = calls.get(name)
+        if call is None or (call.console and caller.person is not None):
+            raise UnknownNameError("call", name[:64], sorted(calls))
+        arguments = _checked(call.arguments, given)
+        person = caller.person or _on_behalf(frame.head.get("for"))
+        if person.role < call.role:
+            raise refusals.ROLE_TOO_LOW.error(
+                what=name, person=person.name, role=person.role.title, needed=call.role.title
+            )
+        value = await turns.do(call, self._desk, person, arguments, frame.blob)
+        if call.then is not None:
+            value = await self._wait_in_plant(call.then(self._desk, person, value))
+        if isinstance(value, WithBlob):
+            return plain(value.value), value.blob
+        return plain(value), b""
+
+
+class _Turns:
+    """One call at a time in the plant's loop, for a share of its time."""
+
+    def __init__(self, interface: PlantInterface, share: float) -> None:
+        self._interface, self._rest = interface, 1.0 / share - 1.0
+        self._turn, self._free_at = asyncio.Lock(), -math.inf
+
+    async def do(self, call: Call, desk: Desk, person: Person, given: Any, blob: bytes) -> Any:
+        """Do a call; return its value."""
+        async with self._turn:
+            await asyncio.sleep(max(0.0, self._free_at - time.monotonic()))
+            took = 0.0
+
+            def timed() -> Any:
+                nonlocal took
+                begin = time.perf_counter()
+                try:
+                    return call.work(desk, person, given, blob)
+                finally:
+                    took = time.perf_counter() - begin
+
+            try:
+                return await asyncio.wrap_future(self._interface.in_plant(timed))
+            finally:
+                self._free_at = time.monotonic() + min(self._rest * took, _PAUSE)
+
+
+class _LoopThread:
+    """A thread with an ordinary loop that serves one socket; a failure opens it again."""
+
+    def __init__(
+        self,
+        server: LocalServer[LocalCaller],
+        beside: Sequence[Callable[[], Coroutine[Any, Any, None]]] = (),
+    ) -> None:
+        self._server, self._beside = server, beside
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._over = threading.Event()
+        self._main: asyncio.Task[None] | None = None
+        self._thread = threading.Thread(target=self._run, name="plant interface", daemon=True)
+
+    def start(self) -> None:
+        """Listen, and begin to serve."""
+        self._server.open()
+        self._thread.start()
+
+    def close(self) -> None:
+        """End."""
+        self._over.set()
+        if self._loop is not None and self._main is not None and not self._loop.is_closed():
+            with contextlib.suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._main.cancel)
+        if self._thread.ident is not None:
+            self._thread.join(_END)
+        self._server.close()
+
+    def _run(self) -> None:
+        while not self._over.is_set():
+            try:
+                asyncio.run(self._serve())
+            except asyncio.CancelledError:
+                continue
+            except Exception:  # noqa: BLE001 - it is logged
+                _LOG.exception("local interface")
+                self._over.wait(1.0)
+                with contextlib.suppress(HeliotropeError):
+                    self._server.open()
+
+    async def _serve(self) -> None:
+        self._loop, self._main = asyncio.get_running_loop(), asyncio.current_task()
+        if self._over.is_set():
+            return
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._server.run())
+            for work in self._beside:
+                group.create_task(work())
+
+
+def _people_calls(people: People) -> dict[str, Callable[..., Any]]:
+    """Return the calls that only a console may make, done in threads and not in the loop."""
+    return {
+        "people.account": people.account,
+        "people.accounts": people.accounts,
+        "people.add": people.add,
+        "people.change": people.change,
+        "people.open_session": people.open_session,
+        "people.session": people.session,
+        "people.close_session": people.close_session,
+        "people.add_token": people.add_token,
+        "people.token": people.token,
+        "people.tokens": people.tokens,
+        "people.revoke_token": people.revoke_token,
+        "people.forget_expired": people.forget_expired,
+    }
+
+
+def _checked(model: Any, given: dict[str, Any]) -> Any:
+    """Return checked arguments.
+
+    Raises
+    ------
+    InputError
+        If they do not fit.
+    """
+    try:
+        return model.model_validate(given)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise InputError(f"{place}: {first['msg']}") from None
+
+
+def _on_behalf(given: Any) -> Person:
+    """Return the person whom a console speaks for; nobody in particular may look only."""
+    if given is None:
+        return Person("console", Role.VIEWER)
+    try:
+        return Person(str(given["name"]), Role[str(given["role"]).upper()])
+    except (KeyError, TypeError):
+        raise InputError("local interface: for needs a name and a role") from None

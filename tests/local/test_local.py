@@ -1,0 +1,288 @@
+"""The local interface by itself: frames, and a listener under clients of every kind."""
+
+import asyncio
+import os
+import socket
+import struct
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from heliotrope.errors import HeliotropeError, InputError
+from heliotrope.local import (
+    AwayError,
+    CallError,
+    Frame,
+    FrameError,
+    LocalConnection,
+    LocalLimits,
+    LocalServer,
+    ask_once,
+    pack,
+)
+from heliotrope.local.frames import HELLO_HEAD, MARK, head_of, lengths
+from heliotrope.local.sockets import connect, is_ours, listen, make_folder
+
+HELLO = {"token": "good"}
+SHORT = LocalLimits(strangers=4, callers=4, under_way=4, hello_s=0.5, answer_s=0.5, pace_s=0.001)
+
+
+@dataclass
+class _Caller:
+    reserved: bool
+
+
+class _Echo:
+    """Answers with its arguments; ``wait`` holds an answer back, ``large`` makes it long."""
+
+    def __init__(self) -> None:
+        self.most = self.now = 0
+
+    async def caller(self, hello: dict[str, Any]) -> _Caller | None:
+        if hello.get("key") == "console":
+            return _Caller(reserved=True)
+        return _Caller(reserved=False) if hello.get("token") == "good" else None
+
+    async def answer(self, _: _Caller, frame: Frame) -> tuple[Any, bytes]:
+        given = frame.head["arguments"]
+        self.now += 1
+        self.most = max(self.most, self.now)
+        try:
+            await asyncio.sleep(given.get("wait", 0.0))
+        finally:
+            self.now -= 1
+        if frame.head["call"] == "refuse":
+            raise InputError("no")
+        if frame.head["call"] == "break":
+            raise ZeroDivisionError
+        return given, frame.blob * given.get("large", 1)
+
+
+@asynccontextmanager
+async def _serving(folder: Path, limits: LocalLimits = SHORT) -> AsyncIterator[tuple[Path, _Echo]]:
+    make_folder(folder)
+    echo = _Echo()
+    server = LocalServer(
+        folder / "plant.sock", echo.caller, echo.answer, lambda e: ("input", str(e)), limits
+    )
+    server.open()
+    async with asyncio.TaskGroup() as group:
+        serving = group.create_task(server.run())
+        yield folder / "plant.sock", echo
+        serving.cancel()
+
+
+def _run(folder: Path, work: Callable[[Path, _Echo], Awaitable[None]]) -> None:
+    async def main() -> None:
+        async with asyncio.timeout(30.0), _serving(folder / "interface") as (path, echo):
+            await work(path, echo)
+
+    asyncio.run(main())
+
+
+async def _ask(path: Path, call: str = "echo", blob: bytes = b"", **arguments: Any) -> Any:
+    return await asyncio.to_thread(ask_once, path, HELLO, call, arguments, blob, 5.0)
+
+
+def _ended(raw: socket.socket, within: float = 5.0) -> bool:
+    """Whether the server cuts a connection off."""
+    raw.settimeout(within)
+    try:
+        while raw.recv(1 << 16):
+            pass
+    except TimeoutError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+# -- frames ------------------------------------------------------------------------------------
+
+
+def test_a_frame_there_and_back() -> None:
+    data = pack({"id": 1, "call": "a"}, b"xyz")
+    head, blob = lengths(data[:12], 100, 100)
+    assert head_of(data[12 : 12 + head]) == {"id": 1, "call": "a"}
+    assert data[12 + head :] == b"xyz"
+    assert blob == 3
+
+
+@pytest.mark.parametrize(
+    ("prefix", "text"),
+    [
+        (b"GET / HTTP/1", "do not begin with HLP1"),
+        (MARK + struct.pack("<II", 101, 0), "a frame of 101"),
+        (MARK + struct.pack("<II", 0, 101), "a frame of 0 \\+ 101"),
+    ],
+)
+def test_what_is_no_frame(prefix: bytes, text: str) -> None:
+    with pytest.raises(FrameError, match=text):
+        lengths(prefix, 100, 100)
+
+
+@pytest.mark.parametrize("data", [b"", b"[1]", b"{", b'{"a": NaN}', b"[" * 100_000, b"\xff{}"])
+def test_what_is_no_head(data: bytes) -> None:
+    with pytest.raises(FrameError, match="local interface"):
+        head_of(data)
+
+
+# -- the listener ------------------------------------------------------------------------------
+
+
+def test_answers_and_errors(tmp_path: Path) -> None:
+    async def work(path: Path, _: _Echo) -> None:
+        assert await _ask(path, a=[1, "two"]) == {"a": [1, "two"]}
+        for call, kind in (("refuse", "input"), ("break", "internal")):
+            with pytest.raises(CallError) as caught:
+                await _ask(path, call)
+            assert caught.value.kind == kind
+        with pytest.raises(CallError, match="not valid"):
+            await asyncio.to_thread(ask_once, path, {"token": "bad"}, "echo", {})
+
+    _run(tmp_path, work)
+
+
+def test_only_this_user_may_enter(tmp_path: Path) -> None:
+    async def work(path: Path, _: _Echo) -> None:
+        assert path.stat().st_mode & 0o777 == 0o600
+        assert path.parent.stat().st_mode & 0o777 == 0o700
+        with connect(path, 1.0) as raw:
+            assert is_ours(raw)
+        assert await _ask(path) == {}
+
+    _run(tmp_path, work)
+    assert not (tmp_path / "interface" / "plant.sock").exists()
+
+
+def test_a_folder_of_another_kind_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file"):
+        make_folder(tmp_path / "file")
+    (tmp_path / "link").symlink_to(tmp_path)
+    with pytest.raises(InputError, match="not a folder of this user"):
+        make_folder(tmp_path / "link")
+
+
+def test_a_folder_with_a_long_name_has_sockets_too(tmp_path: Path) -> None:
+    async def work(path: Path, _: _Echo) -> None:
+        assert len(os.fsencode(path)) > 200
+        assert await _ask(path, a=1) == {"a": 1}
+
+    _run(tmp_path / ("x" * 100) / ("y" * 100), work)
+
+
+def test_a_stale_socket_is_replaced(tmp_path: Path) -> None:
+    listen(tmp_path / "a.sock").close()
+    listen(tmp_path / "a.sock").close()
+    with pytest.raises(AwayError, match="is it running"):
+        ask_once(tmp_path / "a.sock", HELLO, "echo", {})
+
+
+def test_strangers_are_cut_off_and_never_keep_a_caller_out(tmp_path: Path) -> None:
+    """Many connections that say nothing, say nonsense, or a first frame that is too large."""
+
+    async def work(path: Path, _: _Echo) -> None:
+        raws = [await asyncio.to_thread(connect, path, 2.0) for _ in range(40)]
+        raws[-1].sendall(b"GET / HTTP/1.1\r\n\r\n")
+        raws[-2].sendall(MARK + struct.pack("<II", HELLO_HEAD + 1, 0))
+        raws[-3].sendall(MARK + struct.pack("<II", 10, 1))
+        begin = time.monotonic()
+        assert await _ask(path, a=1) == {"a": 1}
+        assert time.monotonic() - begin < 2.0
+        assert all([await asyncio.to_thread(_ended, raw) for raw in raws])
+        for raw in raws:
+            raw.close()
+
+    _run(tmp_path, work)
+
+
+def test_a_frame_that_is_too_large_ends_its_connection_only(tmp_path: Path) -> None:
+    async def work(path: Path, _: _Echo) -> None:
+        with connect(path, 2.0) as raw:
+            raw.sendall(pack(HELLO) + MARK + struct.pack("<II", 1 << 31, 0))
+            assert await asyncio.to_thread(_ended, raw)
+        assert await _ask(path, a=1) == {"a": 1}
+
+    _run(tmp_path, work)
+
+
+def test_requests_under_way_are_bounded(tmp_path: Path) -> None:
+    """More requests than a connection may have wait in the client's own buffers."""
+
+    async def work(path: Path, echo: _Echo) -> None:
+        line = LocalConnection(path, HELLO)
+        async with asyncio.TaskGroup() as group:
+            running = group.create_task(line.run())
+            while not line.up:
+                await asyncio.sleep(0.01)
+            asked = [group.create_task(line.ask("echo", {"wait": 0.05})) for _ in range(40)]
+            await asyncio.gather(*asked)
+            running.cancel()
+        assert echo.most == SHORT.under_way
+
+    _run(tmp_path, work)
+
+
+def test_a_client_that_never_reads_is_cut_off(tmp_path: Path) -> None:
+    async def work(path: Path, echo: _Echo) -> None:
+        with connect(path, 2.0) as raw:
+            raw.sendall(pack(HELLO))
+            request = pack({"id": 1, "call": "echo", "arguments": {"large": 1000}}, b"x" * 4096)
+            begin = time.monotonic()
+            with pytest.raises(OSError):  # noqa: PT011, PT012 - broken pipe, or reset
+                while time.monotonic() - begin < 10.0:
+                    await asyncio.to_thread(raw.sendall, request)
+        assert echo.most <= SHORT.under_way
+        assert await _ask(path, a=1) == {"a": 1}
+
+    _run(tmp_path, work)
+
+
+def test_the_oldest_caller_gives_way_and_a_console_never(tmp_path: Path) -> None:
+    async def work(path: Path, _: _Echo) -> None:
+        with connect(path, 2.0) as console:
+            console.sendall(pack({"key": "console"}))
+            raws = []
+            for _ in range(10):
+                raws.append(await asyncio.to_thread(connect, path, 2.0))
+                raws[-1].sendall(pack(HELLO))
+                await asyncio.sleep(0.05)
+            assert all([await asyncio.to_thread(_ended, raw) for raw in raws[:6]])
+            assert not await asyncio.to_thread(_ended, raws[-1], 0.2)
+            assert not await asyncio.to_thread(_ended, console, 0.2)
+            for raw in raws:
+                raw.close()
+
+    _run(tmp_path, work)
+
+
+def test_a_connection_comes_back(tmp_path: Path) -> None:
+    async def main() -> None:
+        path = tmp_path / "interface" / "plant.sock"
+        line = LocalConnection(path, HELLO, timeout=5.0)
+        async with asyncio.TaskGroup() as group:
+            running = group.create_task(line.run(0.05))
+            with pytest.raises(AwayError, match="no connection"):
+                await line.ask("echo", {})
+            for _ in range(2):
+                async with _serving(path.parent):
+                    while not line.up:
+                        await asyncio.sleep(0.01)
+                    assert await line.ask("echo", {"a": 1}, b"b") == ({"a": 1}, b"b")
+                    lost = group.create_task(_lost(line))
+                    await asyncio.sleep(0.1)
+                assert "ended" in str(await lost)
+            running.cancel()
+
+    async def _lost(line: LocalConnection) -> HeliotropeError:
+        with pytest.raises(AwayError) as caught:
+            await line.ask("echo", {"wait": 20.0})
+        return caught.value
+
+    asyncio.run(main())

@@ -1,0 +1,327 @@
+"""The plant beside a console that is killed, hangs or lies, and under clients that mean it ill."""
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from heliotrope.errors import HeliotropeError, UnknownNameError
+from heliotrope.lcu import states
+from heliotrope.local import EMERGENCY, ORDINARY, CallError, LocalConnection, ask_once
+from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.interface import CALLS, frame_of, frame_parts, kind_of, plain, remade
+from heliotrope.plant.interface.console_process import Patience
+from heliotrope.twin.field.field_bus import FieldBus
+from support.live_console import ROLES, LiveConsole
+
+#: EMERGENCY to the last local controller, s: the limit of the design.
+HEARD = 1.0
+#: At the receiver or at the standby point, or on the way between them.
+UP = (states.APPROACHING, states.IDLE, states.TRACKING)
+#: A client that opens connections, says nonsense, and never stops.
+FLOOD = """
+import socket, sys, time
+end = time.monotonic() + float(sys.argv[2])
+held = []
+while time.monotonic() < end:
+    try:
+        raw = socket.socket(socket.AF_UNIX)
+        raw.settimeout(0.5)
+        raw.connect(sys.argv[1])
+        raw.sendall(sys.argv[3].encode() * 100)
+        held = [*held[-50:], raw]
+    except OSError:
+        time.sleep(0.001)
+"""
+
+
+class Watch:
+    """What the plant must not show whatever its clients do; made and read in its loop."""
+
+    def __init__(self, plant: LiveConsole) -> None:
+        self._plant = plant
+        self.up = self.least_lease = np.inf
+        self._task = asyncio.get_running_loop().create_task(self._look())
+
+    async def _look(self) -> None:
+        here = self._plant.live.operations
+        while True:
+            rows = here.cluster_rows()
+            self.least_lease = min(self.least_lease, *(row.lease_left for row in rows))
+            up = here.plant.field.among(UP, here.plant.now())
+            self.up = min(self.up, int(up.sum()))
+            await asyncio.sleep(0.1)
+
+    def end(self) -> None:
+        """Stop looking."""
+        self._task.cancel()
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
+    """Thirty-two heliostats out of stow, and a console in a process of its own."""
+    patience = Patience(silent=3.0, pause=0.2, longest=0.4)
+    made = LiveConsole(
+        tmp_path_factory.mktemp("plant"), 32, page=False, speed=8.0, child=patience, keep_outs=()
+    )
+    try:
+        assert made.address
+        _raised(made)
+        yield made
+    finally:
+        made.close()
+
+
+@pytest.fixture(scope="module")
+def tokens(plant: LiveConsole) -> dict[str, str]:
+    """An API token of each role."""
+    people, now = plant.keeper.people, time.time()
+    return {role: people.add_token(role, "tests", role, now)[1] for role in ROLES}
+
+
+def _raised(plant: LiveConsole) -> None:
+    """Wait until all heliostats are up."""
+    here, who = plant.live.operations, Person("engineer", Role.ENGINEER)
+    plant.call(lambda: here.switch_calibration(who, on=False))
+    plant.call(lambda: here.resume(who))
+    plant.call(lambda: here.give_back(who))
+    plant.until(lambda: here.plant.field.among(UP, here.plant.now()).all(), 120.0)
+
+
+@pytest.fixture
+def undisturbed(plant: LiveConsole) -> Iterator[Callable[[], None]]:
+    """Every heliostat stays up, and no lease comes late."""
+    _raised(plant)
+    watch = plant.call(lambda: Watch(plant))
+
+    def check() -> None:
+        assert watch.up == 32
+        assert watch.least_lease > 0.0
+
+    yield check
+    plant.call(watch.end)
+    check()
+
+
+def _answers(plant: LiveConsole, within: float = 60.0) -> None:
+    """Wait until the console answers."""
+    end = time.monotonic() + within
+    while True:
+        try:
+            assert httpx.get(f"{plant.address}api/v1/health", trust_env=False).is_success
+            return
+        except httpx.HTTPError:
+            assert time.monotonic() < end
+            time.sleep(0.1)
+
+
+def _console_alarm(plant: LiveConsole, *, active: bool) -> str:
+    """Wait for the alarm about the console, or for its end; return its text."""
+
+    def found() -> list[str]:
+        rows = plant.live.operations.alarms()
+        return [r.text for r in rows if r.condition == "console" and r.active == active]
+
+    return str(plant.until(found, 60.0)[0])
+
+
+@pytest.mark.parametrize(
+    ("how", "text"), [(signal.SIGKILL, "signal 9"), (signal.SIGSTOP, "no sign of life")]
+)
+def test_a_console_that_dies_or_hangs_is_started_again_and_the_plant_goes_on(
+    plant: LiveConsole, undisturbed: Callable[[], None], how: signal.Signals, text: str
+) -> None:
+    _answers(plant)
+    before, starts = plant.process.pid, plant.process.starts
+    os.kill(before, how)
+    assert text in _console_alarm(plant, active=True)
+    _answers(plant)
+    _console_alarm(plant, active=False)
+    assert plant.process.starts > starts
+    assert plant.process.pid not in (0, before)
+    undisturbed()
+
+
+def _flood(path: Path, seconds: float, word: str = "HLP1") -> "subprocess.Popen[bytes]":
+    return subprocess.Popen([sys.executable, "-c", FLOOD, str(path), str(seconds), word])
+
+
+@pytest.mark.parametrize("name", [ORDINARY, EMERGENCY])
+def test_a_local_client_that_floods_a_socket_disturbs_nothing(
+    plant: LiveConsole, undisturbed: Callable[[], None], tokens: dict[str, str], name: str
+) -> None:
+    floods = [_flood(plant.interface.folder / name, 6.0) for _ in range(2)]
+    try:
+        time.sleep(1.0)
+        _answers(plant)
+        hello = {"token": tokens["viewer"]}
+        found = ask_once(plant.interface.folder / ORDINARY, hello, "summary", {})
+        assert found["heliostats"] == 32
+    finally:
+        for one in floods:
+            one.wait(20.0)
+    undisturbed()
+
+
+def test_a_console_that_floods_waits_for_itself(
+    plant: LiveConsole, undisturbed: Callable[[], None]
+) -> None:
+    """A thousand requests at once: the plant takes them in turn, for a share of its time."""
+
+    async def main() -> None:
+        folder, key = plant.interface.folder, plant.interface.key
+        line = LocalConnection(folder / ORDINARY, {"key": key}, 60.0)
+        async with asyncio.TaskGroup() as group:
+            running = group.create_task(line.run())
+            while not line.up:
+                await asyncio.sleep(0.01)
+            asked = [group.create_task(line.ask("field", {})) for _ in range(1000)]
+            await asyncio.gather(*asked)
+            running.cancel()
+
+    asyncio.run(main())
+    undisturbed()
+
+
+def test_a_wrong_key_is_refused_and_noted(plant: LiveConsole) -> None:
+    for name in (ORDINARY, EMERGENCY):
+        for hello in ({"key": "0" * 64}, {"key": ""}, {"token": "x"}, {}, {"key": None}):
+            with pytest.raises(CallError, match="not valid"):
+                ask_once(plant.interface.folder / name, hello, "summary", {})
+    plant.until(lambda: [e for e in plant.live.operations.events() if e.kind == "security"])
+
+
+@pytest.mark.parametrize(
+    ("role", "call", "given", "text"),
+    [
+        ("engineer", "people.account", {"name": "engineer"}, "no call"),
+        ("engineer", "live", {}, "no call"),
+        ("engineer", "note", {"kind": "people", "who": "", "text": ""}, "no call"),
+        ("engineer", "heartbeat", {"address": ""}, "no call"),
+        ("engineer", "order_emergency", {}, "no call"),
+        ("engineer", "__class__", {}, "no call"),
+        ("viewer", "resume", {}, "needs operator"),
+        ("viewer", "heliostat", {"name": "nobody"}, "nobody"),
+        ("viewer", "heliostat", {"name": ["P0001A"]}, "name: "),
+        ("viewer", "summary", {"more": 1}, "more: "),
+        ("operator", "command", {"command": "TRACK"}, "take it first"),
+    ],
+)
+def test_calls_that_are_refused(
+    plant: LiveConsole,
+    tokens: dict[str, str],
+    role: str,
+    call: str,
+    given: dict[str, Any],
+    text: str,
+) -> None:
+    with pytest.raises(CallError, match=text):
+        ask_once(plant.interface.folder / ORDINARY, {"token": tokens[role]}, call, given)
+
+
+def test_what_a_token_may_see_and_order(plant: LiveConsole, tokens: dict[str, str]) -> None:
+    folder, operator = plant.interface.folder, {"token": tokens["operator"]}
+    for call in ("summary", "field", "alarms", "calibration", "authority", "emergency", "commands"):
+        assert ask_once(folder / ORDINARY, operator, call, {}) is not None
+    viewer = {"token": tokens["viewer"]}
+    with pytest.raises(CallError, match="needs operator"):
+        ask_once(folder / EMERGENCY, viewer, "stow", {"heliostats": [plant.live.names[0]]})
+    name = plant.live.names[0]
+    ticket = ask_once(folder / EMERGENCY, operator, "defocus", {"heliostats": [name]})
+    assert (ticket["command"], ticket["heliostats"]) == ("DEFOCUS", 1)
+    with pytest.raises(CallError, match="no call"):
+        ask_once(folder / EMERGENCY, operator, "summary", {})
+
+
+class Heard:
+    """The time at which the last local controller has heard DEFOCUS."""
+
+    def __init__(self, count: int) -> None:
+        self._who, self.at = np.zeros(count, dtype=np.bool_), 0.0
+
+    def took(self, name: str, rows: range) -> None:
+        """Note which heliostats took a command."""
+        if name == "DEFOCUS" and not self.at:
+            self._who[rows.start : rows.stop] = True
+            if self._who.all():
+                self.at = time.monotonic()
+
+
+def test_an_emergency_passes_a_stopped_console_and_a_full_socket(
+    plant: LiveConsole, tokens: dict[str, str]
+) -> None:
+    _raised(plant)
+    _answers(plant)
+    heard = Heard(32)
+    for bus in plant.live.world.buses.values():
+        assert isinstance(bus, FieldBus)
+        bus._took = heard.took
+    folder, hello = plant.interface.folder, {"token": tokens["viewer"]}
+    os.kill(plant.process.pid, signal.SIGSTOP)
+    flood = _flood(folder / ORDINARY, 4.0)
+    try:
+        time.sleep(1.0)
+        begin = time.monotonic()
+        view = ask_once(folder / EMERGENCY, hello, "order_emergency", {"reason": "smoke"})
+        assert (view["on"], view["act"], view["who"]) == (True, "DEFOCUS", "viewer")
+        plant.until(lambda: heard.at, 10.0)
+        assert heard.at - begin < HEARD
+    finally:
+        flood.wait(20.0)
+        plant.calm()
+
+
+def test_an_emergency_does_not_wait_for_the_store(
+    plant: LiveConsole, tokens: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A token that was good lately is good while the store hangs; an unknown one is not."""
+    path, hello = plant.interface.folder / EMERGENCY, {"token": tokens["viewer"]}
+    given = {"reason": "smoke"}
+    hang = monkeypatch.setattr
+    ask_once(path, hello, "order_emergency", given)
+    plant.calm()
+    hang(plant.keeper.people, "token", lambda *_: time.sleep(3.0))
+    try:
+        assert ask_once(path, hello, "order_emergency", given)["on"]
+        with pytest.raises((CallError, HeliotropeError)):
+            ask_once(path, {"token": "never seen"}, "order_emergency", given)
+    finally:
+        monkeypatch.undo()
+        plant.calm()
+
+
+# -- values on their way -------------------------------------------------------------------------
+
+
+def test_a_frame_of_the_field_there_and_back(plant: LiveConsole) -> None:
+    frame = plant.call(plant.live.operations.frame)
+    head, blob = frame_parts(frame)
+    again = frame_of(plain(head), blob)
+    assert again.number == frame.number
+    for name in ("state", "age", "counts", "calibrated_at", "held", "truth_error"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(frame, name))
+
+
+@pytest.mark.parametrize(
+    "error", [RefusedError("r"), UnknownNameError("thing", "x", ["y"]), HeliotropeError("h")]
+)
+def test_an_error_comes_back_as_the_same_class(error: HeliotropeError) -> None:
+    kind, text = kind_of(error)
+    again = remade(CallError(kind, text))
+    assert type(again) is type(error)
+    assert str(again) == str(error)
+
+
+def test_every_urgent_call_takes_beams_away() -> None:
+    assert {name for name, call in CALLS.items() if call.urgent} == {
+        "order_emergency", "stow", "defocus"
+    }  # fmt: skip
