@@ -2,22 +2,82 @@
 
 import asyncio
 import contextlib
-from collections.abc import Iterator
+import socket
+from collections.abc import Callable, Iterator
 
 import uvicorn
 
+from heliotrope.console._logs import limit
 from heliotrope.console.app import create
+from heliotrope.console.connections import (
+    RESERVE,
+    Doors,
+    Limits,
+    Listener,
+    listening,
+    raise_descriptors,
+)
 from heliotrope.console.remote import RemotePlant
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import InputError
 
 
 class _Server(uvicorn.Server):
-    """A server that leaves signals to the owner of the process."""
+    """A server whose connections are counted and timed.
+
+    It leaves signals to the owner of the process.
+
+    Parameters
+    ----------
+    config
+        Its configuration.
+    doors
+        The application, whose listeners it serves.
+    listen
+        Opens them.
+    """
+
+    def __init__(
+        self, config: uvicorn.Config, doors: Doors, listen: Callable[[], list[Listener]]
+    ) -> None:
+        super().__init__(config)
+        self._doors, self._listen = doors, listen
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start the application and listen."""
+        del sockets
+        await self.lifespan.startup()
+        if self.lifespan.should_exit:
+            raise RuntimeError("console: the application has not started, see the log")
+        try:
+            self._doors.listeners = self._listen()
+        except InputError:
+            await self.lifespan.shutdown()
+            raise
+        self.servers = list(self._doors.listeners)  # type: ignore[arg-type]  # what `shutdown` uses
+
+    async def main_loop(self) -> None:
+        """Serve until it should end."""
+        config, state = self.config, self.lifespan.state
+
+        def protocol() -> asyncio.Protocol:
+            made: asyncio.Protocol = config.http_protocol_class(  # type: ignore[call-arg]
+                config=config, server_state=self.server_state, app_state=state
+            )
+            return made
+
+        async with asyncio.TaskGroup() as group:
+            works = [
+                group.create_task(one.run(protocol, config.ssl)) for one in self._doors.listeners
+            ]
+            self.started = True
+            await super().main_loop()
+            for work in works:
+                work.cancel()
 
 
 class ConsoleServer:
@@ -33,15 +93,17 @@ class ConsoleServer:
         self.settings = settings or ConsoleSettings()
         self.app = create(plant, self.settings)
         chosen = self.settings
+        self._doors = Doors(self.app)
         config = uvicorn.Config(
-            self.app,
-            host=chosen.host,
-            port=chosen.port,
+            self._doors,
             log_config=None,
             access_log=False,
             server_header=False,
             proxy_headers=False,
             lifespan="on",
+            # It bounds the length of headers; the listener keeps the deadlines.
+            http="h11",
+            timeout_keep_alive=3600,
             ws="websockets-sansio",
             ws_per_message_deflate=False,
             ws_max_size=1 << 16,
@@ -51,7 +113,21 @@ class ConsoleServer:
         )
         # This reads modules and certificates from the disk, which no loop may wait for.
         config.load()
-        self._server = _Server(config)
+        limit()
+        self._server = _Server(config, self._doors, self._listen)
+
+    def _listen(self) -> list[Listener]:
+        left = raise_descriptors() - RESERVE
+        shared = ("127.0.0.1", "::1")
+        chosen = self.settings
+        try:
+            line = listening(chosen.host, chosen.port)
+        except OSError:
+            raise InputError(
+                f"console: {chosen.host} port {chosen.port} is not available; another program "
+                "may use it, choose another with --port"
+            ) from None
+        return [Listener(line, self.app, Limits().within(left), shared)]
 
     async def run(self) -> None:
         """Serve until closed.
@@ -61,14 +137,7 @@ class ConsoleServer:
         InputError
             If the address is not available.
         """
-        try:
-            await self._server.serve()
-        except SystemExit:
-            # uvicorn's way of saying that it could not start.
-            raise InputError(
-                f"console: {self.settings.host} port {self.settings.port} is not "
-                "available; another program may use it, choose another with --port"
-            ) from None
+        await self._server.serve()
 
     async def close(self) -> None:
         """Stop serving; viewers are disconnected."""

@@ -1,0 +1,50 @@
+"""Limits on repeated lines of the log: whatever strangers send must not fill it."""
+
+import logging
+import time
+from collections.abc import Callable
+
+#: Loggers whose lines strangers can cause.
+NOISY = (
+    "asyncio", "engineio.server", "heliotrope.console", "nicegui", "socketio.server",
+    "uvicorn.error", "websockets.server",
+)  # fmt: skip
+#: Lines of one kind within a span, s, and kinds that are kept.
+MOST, SPAN, KINDS = 5, 60.0, 500
+
+
+class Repeated(logging.Filter):
+    """Passes a few lines of each kind within a span, then one with the count of the others.
+
+    Parameters
+    ----------
+    monotonic
+        Returns the time, s.
+    """
+
+    def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._now = monotonic
+        self._seen: dict[tuple[str, int, str], tuple[float, int]] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether a line is written."""
+        kind = (record.name, record.lineno, str(record.msg)[:60].partition("\n")[0])
+        now = self._now()
+        begun, count = self._seen.get(kind, (now, 0))
+        if now - begun >= SPAN:
+            if count > MOST:
+                record.msg = f"{record.msg} ({count - MOST} more like this were left out)"
+            begun, count = now, 0
+        if len(self._seen) >= KINDS and kind not in self._seen:
+            del self._seen[next(iter(self._seen))]
+        self._seen[kind] = (begun, count + 1)
+        return count < MOST
+
+
+def limit() -> None:
+    """Limit the repeated lines of the noisy loggers, once for the process."""
+    for name in NOISY:
+        logger = logging.getLogger(name)
+        if not any(isinstance(one, Repeated) for one in logger.filters):
+            logger.addFilter(Repeated())

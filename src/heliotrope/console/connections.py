@@ -1,0 +1,405 @@
+"""The connections of the console: counted, timed, and closed in favour of known callers.
+
+`Listener` accepts the connections of one address; `Doors` is the application in front of all of
+them, which notes how far each connection's request is. A connection that has never completed a
+request of a known caller is a stranger's. Strangers have few places and short deadlines, and lose
+the longest-held place to the next connection, so they shut nobody out.
+"""
+
+import asyncio
+import contextlib
+import errno
+import logging
+import resource
+import socket
+import ssl
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from heliotrope.console.auth import FOUND
+
+logger = logging.getLogger("heliotrope.console")
+#: Descriptors asked of the system, and those kept for files, the plant and the store.
+WANTED, RESERVE = 16_384, 128
+#: Connections accepted in one turn of the loop, and those that may wait in the system.
+_BURST, _BACKLOG = 32, 2048
+#: Time between two looks at the deadlines, and pause after a failure to accept, s.
+_LOOK, _PAUSE = 0.25, 0.25
+#: Least time between two looks for places that have become free, s.
+_SOON = 0.02
+#: Least rate of a known caller's body, bytes/s.
+_SLOWEST = 200_000.0
+_FULL = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
+Key = tuple[Any, int]
+Protocols = Callable[[], asyncio.Protocol]
+
+
+class Stage(IntEnum):
+    """How far a connection is."""
+
+    HANDSHAKE = 0
+    HEADER = 1
+    IDLE = 2
+    BODY = 3
+    ANSWER = 4
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of a listener.
+
+    Attributes
+    ----------
+    most
+        Connections.
+    strangers, address
+        Those of strangers, and of strangers from one address.
+    handshake, header, body, idle, answer
+        Time that a stranger's connection may spend in each stage, s. A known caller's body has the
+        time that its length needs.
+    idle_known, answer_known
+        The same for a connection of a known caller, s.
+    """
+
+    most: int = 1000
+    strangers: int = 200
+    address: int = 100
+    handshake: float = 5.0
+    header: float = 5.0
+    body: float = 5.0
+    idle: float = 5.0
+    answer: float = 15.0
+    idle_known: float = 75.0
+    answer_known: float = 120.0
+
+    def within(self, most: int) -> "Limits":
+        """Return the same limits with at most this many connections."""
+        if most >= self.most:
+            return self
+        share = max(8, most) / self.most
+        few = {
+            name: max(4, int(share * getattr(self, name)))
+            for name in ("most", "strangers", "address")
+        }
+        return replace(self, **few)
+
+
+class Connection:
+    """One connection.
+
+    Attributes
+    ----------
+    address
+        Of the other side.
+    stage, since
+        Stage, and when it began, s.
+    known
+        When a request of a known caller was last completed, s; None for a stranger.
+    transport
+        None during the handshake.
+    """
+
+    def __init__(self, address: str, line: socket.socket, now: float) -> None:
+        self.address, self.line = address, line
+        self.opening: asyncio.Task[None] | None = None
+        self.transport: asyncio.Transport | None = None
+        self.stage, self.since = Stage.HANDSHAKE, now
+        self.known: float | None = None
+        self.scope: Scope | None = None
+        self.length = 0
+
+    @property
+    def gone(self) -> bool:
+        """Whether its socket is closed."""
+        return self.line.fileno() < 0
+
+    @property
+    def present(self) -> bool:
+        """Whether a request of a known caller is at work."""
+        return self.scope is not None and self.scope.get(FOUND) is not None
+
+    def enter(self, stage: Stage, now: float) -> None:
+        """Begin a stage."""
+        self.stage, self.since = stage, now
+
+    def abort(self) -> None:
+        """Close at once."""
+        if self.transport is not None:
+            self.transport.abort()
+        elif self.opening is not None:
+            self.opening.cancel()
+
+    def late(self, limits: Limits, now: float) -> bool:
+        """Whether its stage has taken too long."""
+        socket_open = self.scope is not None and self.scope["type"] == "websocket"
+        if socket_open and self.present:
+            return False  # the server's pings watch it
+        if self.known is None and not self.present:
+            most = getattr(limits, self.stage.name.lower())
+        elif self.stage is Stage.BODY:
+            most = limits.body + self.length / _SLOWEST
+        else:
+            most = limits.answer_known if self.stage is Stage.ANSWER else limits.idle_known
+        return bool(now - self.since > most)
+
+
+class Listener:
+    """Accepts connections at one address.
+
+    Parameters
+    ----------
+    line
+        Listening socket.
+    app
+        The application for its requests.
+    limits
+        Limits of its connections.
+    shared
+        Addresses behind which there are many callers: this machine, proxies. They have the places
+        of all strangers.
+    monotonic
+        Returns the time, s.
+    """
+
+    def __init__(
+        self,
+        line: socket.socket,
+        app: ASGIApp,
+        limits: Limits,
+        shared: Iterable[str] = (),
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        line.setblocking(False)
+        self.app, self.limits, self.sockets = app, limits, (line,)
+        self.port = int(line.getsockname()[1])
+        self._shared, self._now = frozenset(shared), monotonic
+        self._known: dict[Key, Connection] = {}
+        self._strangers: dict[Key, Connection] = {}
+        self._sorted = -1.0
+
+    def __len__(self) -> int:
+        return len(self._known) + len(self._strangers)
+
+    async def run(
+        self, protocol: Callable[[], asyncio.Protocol], tls: ssl.SSLContext | None
+    ) -> None:
+        """Accept connections until cancelled."""
+        loop, (line,) = asyncio.get_running_loop(), self.sockets
+        async with asyncio.TaskGroup() as group:
+
+            def accept() -> None:
+                if not self._accept(loop, group, protocol, tls):
+                    # Accepting again at once would fail again, thousands of times a second.
+                    loop.remove_reader(line)
+                    loop.call_later(_PAUSE, resume)
+
+            def resume() -> None:
+                if line.fileno() >= 0:
+                    loop.add_reader(line, accept)
+
+            resume()
+            try:
+                while True:
+                    await asyncio.sleep(_LOOK)
+                    self.look()
+            finally:
+                loop.remove_reader(line)
+
+    def close(self) -> None:
+        """Accept no more connections."""
+        self.sockets[0].close()
+
+    async def wait_closed(self) -> None:
+        """Do nothing: the server waits for its connections by itself."""
+
+    def _accept(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        group: asyncio.TaskGroup,
+        protocol: Protocols,
+        tls: ssl.SSLContext | None,
+    ) -> bool:
+        """Accept what waits; return whether the system had the means."""
+        for _ in range(_BURST):
+            try:
+                line, peer = self.sockets[0].accept()
+            except (BlockingIOError, InterruptedError, ConnectionAbortedError):
+                return True
+            except OSError as error:
+                if error.errno in _FULL:
+                    logger.warning("console: no connection can be accepted (%s)", error.strerror)
+                    self.look()
+                    self._evict(self._strangers or self._known)
+                return False
+            line.setblocking(False)
+            key = ((str(peer[0]), int(peer[1])), self.port)
+            self._make_room(key[0][0])
+            found = self._strangers[key] = Connection(key[0][0], line, self._now())
+            found.opening = group.create_task(self._open(loop, found, protocol, tls))
+            # A task that is cancelled before its first turn cannot close the socket itself.
+            found.opening.add_done_callback(partial(_close_unopened, found))
+        return True
+
+    async def _open(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        found: Connection,
+        protocol: Protocols,
+        tls: ssl.SSLContext | None,
+    ) -> None:
+        """Shake hands with a new connection."""
+        limit = 10.0 * self.limits.handshake if tls is not None else None  # `look` is earlier
+        try:
+            made, _ = await loop.connect_accepted_socket(
+                protocol, found.line, ssl=tls, ssl_handshake_timeout=limit
+            )
+        except OSError:
+            return
+        found.transport = made
+        found.enter(Stage.HEADER, self._now())
+
+    def _make_room(self, address: str) -> None:
+        """Close the connection whose place a new one gets, if the limits are reached."""
+        fewest = min(self.limits.address, self.limits.strangers)
+        if len(self._strangers) >= fewest or len(self) >= self.limits.most:
+            self._sort()
+        if len(self._strangers) >= self.limits.address and address not in self._shared:
+            here = {key: one for key, one in self._strangers.items() if one.address == address}
+            if len(here) >= self.limits.address:
+                self._evict(here)
+        if len(self._strangers) >= self.limits.strangers:
+            self._evict(self._strangers)
+        elif len(self) >= self.limits.most:
+            self._evict(self._strangers or self._known)
+
+    def _evict(self, among: dict[Key, Connection]) -> None:
+        """Close the connection that has longest not completed a request of a known caller."""
+        if not among:
+            return
+        key = min(among, key=lambda key: _rank(among[key]))
+        one = among[key]
+        self._strangers.pop(key, None)
+        self._known.pop(key, None)
+        one.abort()
+
+    def look(self) -> None:
+        """Close connections that are late, and forget those that are gone."""
+        self._sorted = -1.0
+        self._sort()
+        now = self._now()
+        for kept in (self._known, self._strangers):
+            for key in [key for key, one in kept.items() if one.late(self.limits, now)]:
+                kept.pop(key).abort()
+
+    def _sort(self) -> None:
+        """Forget connections that are gone; those that a known caller uses are not strangers'."""
+        now = self._now()
+        if now - self._sorted < _SOON:
+            return
+        self._sorted = now
+        for kept in (self._known, self._strangers):
+            for key in [key for key, one in kept.items() if one.gone]:
+                del kept[key]
+        for key in [key for key, one in self._strangers.items() if one.present]:
+            self._known[key] = self._strangers.pop(key)
+
+    @contextlib.contextmanager
+    def request(self, scope: Scope) -> Iterator[Callable[[], None]]:
+        """Note a request of a connection during a block; yield what to call after its body."""
+        key = (tuple(scope["client"] or ()), self.port)
+        found = self._known.get(key) or self._strangers.get(key)
+        if found is None:
+            yield lambda: None
+            return
+        length = Headers(scope=scope).get("content-length", "0")
+        found.length = int(length) if length.isdigit() and len(length) < 12 else 0
+        found.enter(Stage.BODY if found.length else Stage.ANSWER, self._now())
+        found.scope = scope
+        try:
+            yield lambda: found.enter(Stage.ANSWER, self._now())
+        finally:
+            now = self._now()
+            if found.present:
+                found.known = now
+                if self._strangers.pop(key, None) is not None:
+                    self._known[key] = found
+            found.scope = None
+            found.enter(Stage.IDLE, now)
+
+
+def _close_unopened(found: Connection, task: "asyncio.Task[None]") -> None:
+    del task
+    if found.transport is None:
+        found.line.close()
+
+
+def _rank(one: Connection) -> tuple[bool, float, int, float]:
+    """Return the order in which connections are closed: first those that wait for a request."""
+    return (one.present, one.known or 0.0, max(one.stage, Stage.IDLE), one.since)
+
+
+class Doors:
+    """The application in front of all listeners.
+
+    Parameters
+    ----------
+    app
+        The application of the first listener.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+        self.listeners: list[Listener] = []
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on to the application of the listener that it came to."""
+        if scope["type"] == "lifespan":
+            await self.app(scope, receive, send)
+            return
+        port = (scope.get("server") or ("", 0))[1]
+        listener = next((one for one in self.listeners if one.port == port), None)
+        if listener is None:
+            await self.app(scope, receive, send)
+            return
+        with listener.request(scope) as whole:
+
+            async def take() -> Message:
+                message = await receive()
+                if not message.get("more_body", False):
+                    whole()
+                return message
+
+            await listener.app(scope, take if scope["type"] == "http" else receive, send)
+
+
+def listening(host: str, port: int) -> socket.socket:
+    """Return a listening socket."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    return socket.create_server((host, port), family=family, backlog=_BACKLOG)
+
+
+def raise_descriptors() -> int:
+    """Raise the number of descriptors that this process may open; return how many are left."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = WANTED if hard == resource.RLIM_INFINITY else min(WANTED, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with contextlib.suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+            soft = wanted
+    most = WANTED if soft == resource.RLIM_INFINITY else soft
+    return most - _open_now()
+
+
+def _open_now() -> int:
+    try:
+        return sum(1 for _ in Path("/proc/self/fd").iterdir())
+    except OSError:
+        return 64
