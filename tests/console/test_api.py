@@ -250,7 +250,7 @@ def test_a_new_password_is_told_once_and_ends_sessions(
         again = client.post("session", json=made)
         assert again.status_code == 200
     events = ask("viewer", "GET", "events").text
-    assert "new password for desk-2" in events
+    assert "made a new password: desk-2" in events
     assert made["password"] not in events + ask("engineer", "GET", "accounts").text
     assert person("engineer", "POST", "accounts/engineer/password").status_code == 409
     assert person("engineer", "POST", "accounts/nobody/password").status_code == 404

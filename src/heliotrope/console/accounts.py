@@ -16,10 +16,12 @@ from heliotrope.console.auth import (
     Here,
     checked,
     log_in,
+    refused,
     same_origin,
 )
 from heliotrope.console.people import ROLES
 from heliotrope.plant.authority import Role
+from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.people import Account
 
 router = APIRouter(prefix="/api/v1", responses=REFUSALS)
@@ -52,8 +54,9 @@ async def sign_in(
 ) -> models.CallerState:
     """Sign in: the answer sets the session's cookie."""
     if not same_origin(console, request):
+        await console.note(SecurityEvent.ORIGIN_REFUSED, request)
         raise HTTPException(403, "this page comes from another site; sign in at the console itself")
-    secret, expires = await log_in(console, given.name, given.password, _address(request))
+    secret, expires = await log_in(console, given.name, given.password, request)
     response.set_cookie(
         COOKIE,
         secret,
@@ -71,12 +74,13 @@ async def sign_in(
 
 
 @router.delete("/session", status_code=204, tags=["people"])
-async def sign_out(console: Here, who: Anyone, response: Response) -> None:
+async def sign_out(console: Here, who: Anyone, request: Request, response: Response) -> None:
     """Sign out."""
     if who.by == "session":
         await console.ask(lambda: console.people.close_session(who.secret))
         console.known.clear()
         response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
+        await console.note(SecurityEvent.SIGNED_OUT, request, who.person.name)
 
 
 @router.put(
@@ -92,7 +96,7 @@ async def own_password(
     await _confirm(console, who, request, given.old)
     await _set_password(console, who.person.name, given.new)
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
-    await console.plant.note("people", who.person.name, "has changed their password")
+    await console.note(SecurityEvent.PASSWORD_CHANGED, request, who.person.name)
 
 
 @router.post("/accounts/{name}/password", response_model=models.GivenPassword, tags=["people"])
@@ -107,7 +111,7 @@ async def reset_password(
         raise HTTPException(404, f"there is no account {name}")
     password = _secrets.new_password()
     await _set_password(console, name, password)
-    await console.plant.note("people", who.person.name, f"new password for {name}")
+    await console.note(SecurityEvent.PASSWORD_RESET, request, who.person.name, name)
     return models.GivenPassword(name=name, password=password)
 
 
@@ -128,9 +132,8 @@ async def new_account(
     made = await console.ask(
         lambda: console.people.add(given.name, kept, given.role, console.now())
     )
-    await console.plant.note(
-        "people", who.person.name, f"account {given.name} created, {given.role}"
-    )
+    what = f"{given.name}, {given.role}"
+    await console.note(SecurityEvent.ACCOUNT_MADE, request, who.person.name, what)
     return _account(made)
 
 
@@ -153,7 +156,8 @@ async def change_account(
         )
     )
     console.known.clear()
-    await console.plant.note("people", who.person.name, f"account {name} changed")
+    detail = _changes(name, given)
+    await console.note(SecurityEvent.ACCOUNT_CHANGED, request, who.person.name, detail)
     return _account(made)
 
 
@@ -171,6 +175,7 @@ async def new_token(
     """Create a token for a program; its secret is shown in this answer only."""
     await _confirm(console, who, request, given.own_password)
     if ROLES[given.role] > who.person.role:
+        await refused(console, request, who)
         raise HTTPException(403, f"token: role {given.role} is higher than your own")
     lifetime = 86_400.0 * given.days
     made, secret = await console.ask(
@@ -178,9 +183,8 @@ async def new_token(
             who.person.name, given.label, given.role, console.now(), lifetime
         )
     )
-    await console.plant.note(
-        "people", who.person.name, f"token {given.label} created, {given.role}"
-    )
+    what = f"{given.label}, {given.role}, {given.days:g} days"
+    await console.note(SecurityEvent.TOKEN_MADE, request, who.person.name, what)
     return models.TokenState(**asdict(made), secret=secret)
 
 
@@ -191,10 +195,13 @@ async def revoke(
     """Revoke a token: your own, or any as an engineer."""
     await _confirm(console, who, request, given.own_password)
     found = await console.ask(lambda: console.people.tokens(_whose(who)))
-    if key not in {one.key for one in found}:
+    token = next((one for one in found if one.key == key), None)
+    if token is None:
         raise HTTPException(404, f"there is no token {key}")
     await console.ask(lambda: console.people.revoke_token(key))
     console.known.clear()
+    what = f"{token.label} of {token.name}"
+    await console.note(SecurityEvent.TOKEN_REVOKED, request, who.person.name, what)
 
 
 async def _confirm(console: Console, who: Caller, request: Request, password: str) -> None:
@@ -208,7 +215,8 @@ async def _confirm(console: Console, who: Caller, request: Request, password: st
     if who.by != "session":
         raise HTTPException(403, "a token cannot change accounts or tokens; sign in to do so")
     try:
-        await checked(console, who.person.name, password, _address(request))
+        wrong = SecurityEvent.CONFIRMATION_FAILED
+        await checked(console, who.person.name, password, request, wrong)
     except HTTPException as error:
         if error.status_code == 401:
             raise HTTPException(403, "your current password is wrong") from None
@@ -226,8 +234,16 @@ async def _set_password(console: Console, name: str, password: str) -> None:
     console.known.clear()
 
 
-def _address(request: Request) -> str:
-    return request.client.host if request.client else ""
+def _changes(name: str, given: models.AccountChange) -> str:
+    """Return in one line how an account was changed."""
+    found = [name]
+    if given.role is not None:
+        found.append(f"role {given.role}")
+    if given.disabled is not None:
+        found.append("disabled" if given.disabled else "enabled")
+    if given.password is not None:
+        found.append("new password")
+    return ", ".join(found)
 
 
 def _whose(who: Caller) -> str:

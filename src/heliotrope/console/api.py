@@ -21,6 +21,7 @@ from heliotrope.console.auth import (
     find_caller,
     same_origin,
 )
+from heliotrope.plant.operations.security import SecurityEvent
 
 #: Answers that any route behind the sign-in may give.
 REFUSALS: dict[int | str, dict[str, Any]] = {
@@ -203,6 +204,8 @@ async def live(socket: WebSocket) -> None:
     console: Console = console_of(socket)
     found = await find_caller(console, socket)
     if found is None or not same_origin(console, socket):
+        if found is not None:
+            await console.note(SecurityEvent.ORIGIN_REFUSED, socket, found.person.name)
         await socket.accept()
         await socket.close(4401, "sign in, or send a valid token")
         return

@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -26,6 +27,7 @@ from heliotrope.console.remote import RemotePeople, RemotePlant
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError
 from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.operations.security import SPAN, SecurityEvent, plain
 from heliotrope.store.people import Account, ApiToken, Session
 
 T = TypeVar("T")
@@ -37,9 +39,10 @@ LONG_TRUSTED = 3600.0
 MOST_KNOWN = 2000
 #: A longer word is no session's or token's secret, characters.
 LONGEST_SECRET = 200
-DAY = 86_400.0
 #: Key of the caller in the scope of a request: the guard looks each up once.
 FOUND = "heliotrope.caller"
+#: Security events of one kind that are sent to the plant within a minute.
+MOST_NOTED = 100
 #: The shared answer that never changes.
 FIXED = "field"
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -65,21 +68,36 @@ class Console:
     #: Recently authenticated callers, with the time, by kind and secret.
     known: dict[tuple[str, str], tuple[float, "Caller"]] = field(default_factory=dict)
 
+    #: When the last security events of each kind were sent to the plant, s.
+    noted: dict[SecurityEvent, deque[float]] = field(default_factory=dict)
+
     #: Answers that all viewers ask for, with the time: made at most twice a second.
     shared: dict[str, tuple[float, bytes, bytes | None]] = field(default_factory=dict)
 
     async def forget_expired(self) -> None:
-        """Remove expired sessions and tokens from the store, at the start and once a day.
+        """Remove expired sessions and tokens from the store, and record that they have ended.
 
         Sessions end by the machine's time.
         """
-        last = -math.inf
         while True:
-            if self.now() - last >= DAY:
-                last = self.now()
-                with contextlib.suppress(HeliotropeError):  # others report a full store
-                    await self.ask(lambda: self.people.forget_expired(self.now()))
+            with contextlib.suppress(HeliotropeError):  # others report a full store
+                for one in await self.ask(lambda: self.people.forget_expired(self.now())):
+                    ended = SecurityEvent.TOKEN_ENDED if one.token else SecurityEvent.SESSION_ENDED
+                    await self.plant.note(ended, one.name, "", one.label)
             await asyncio.sleep(60.0)
+
+    async def note(
+        self, kind: SecurityEvent, connection: HTTPConnection, who: str = "", detail: str = ""
+    ) -> None:
+        """Record a security event that a request has caused.
+
+        The plant counts floods; strangers who cause one must not cost it a call each.
+        """
+        times = self.noted.setdefault(kind, deque(maxlen=MOST_NOTED))
+        now = time.monotonic()
+        if len(times) < MOST_NOTED or now - times[0] >= SPAN:
+            times.append(now)
+            await self.plant.note(kind, who, address_of(connection), plain(detail))
 
     def forget(self) -> None:
         """Drop the shared answers that a change may have made stale."""
@@ -135,6 +153,11 @@ async def here(connection: HTTPConnection) -> Console:
 def console_of(connection: HTTPConnection) -> Console:
     """Return the console of an application."""
     return cast("Console", connection.app.state.console)
+
+
+def address_of(connection: HTTPConnection) -> str:
+    """Return the address that a request comes from."""
+    return connection.client.host if connection.client else ""
 
 
 Here = Annotated[Console, Depends(here)]
@@ -225,6 +248,8 @@ async def caller(connection: HTTPConnection, console: Here) -> Caller:
     else:
         found = await find_caller(console, connection)
     if found is None:
+        if "authorization" in connection.headers:
+            await console.note(SecurityEvent.TOKEN_REFUSED, connection)
         raise HTTPException(401, "sign in, or send a valid token", {"WWW-Authenticate": "Bearer"})
     changes = connection.scope.get("method", "GET") not in SAFE_METHODS
     if changes:
@@ -233,11 +258,20 @@ async def caller(connection: HTTPConnection, console: Here) -> Caller:
     if found.by == "session" and changes:
         word = connection.headers.get("x-csrf-token", "")
         if not same_origin(console, connection) or not _secrets.same(word, found.csrf):
+            await console.note(SecurityEvent.ORIGIN_REFUSED, connection, found.person.name)
             raise HTTPException(403, "the header X-CSRF-Token is missing or not this session's")
     return found
 
 
 Anyone = Annotated[Caller, Depends(caller)]
+
+
+async def refused(console: Console, connection: HTTPConnection, who: Caller) -> None:
+    """Record that a caller's role is too low for a request."""
+    path = f"{connection.scope.get('method', '')} {connection.scope['path']}"
+    await console.note(
+        SecurityEvent.ORDER_REFUSED, connection, who.person.name, f"{path} by {who.by}"
+    )
 
 
 @dataclass(frozen=True)
@@ -268,7 +302,9 @@ Operator = Annotated[Caller, Depends(AtLeast(Role.OPERATOR))]
 Engineer = Annotated[Caller, Depends(AtLeast(Role.ENGINEER))]
 
 
-async def log_in(console: Console, name: str, password: str, address: str) -> tuple[str, float]:
+async def log_in(
+    console: Console, name: str, password: str, connection: HTTPConnection
+) -> tuple[str, float]:
     """Check a password; return the secret of a new session and its end, POSIX s.
 
     Raises
@@ -276,25 +312,35 @@ async def log_in(console: Console, name: str, password: str, address: str) -> tu
     HTTPException
         401 if name or password is wrong; 429 after too many failures.
     """
-    account = await checked(console, name, password, address)
+    account = await checked(console, name, password, connection, SecurityEvent.SIGN_IN_FAILED)
     now, lifetime = console.now(), console.settings.session_s
     secret = await console.ask(
-        lambda: console.people.open_session(account.name, now, lifetime, address)
+        lambda: console.people.open_session(account.name, now, lifetime, address_of(connection))
     )
+    await console.note(SecurityEvent.SIGNED_IN, connection, name)
     return secret, now + lifetime
 
 
-async def checked(console: Console, name: str, password: str, address: str) -> Account:
-    """Return the account for a name and password.
+async def _known(console: Console, name: str) -> str:
+    """Return a name if it is an account's: what else people type there may be a password."""
+    known = await console.ask(lambda: console.people.account(name))
+    return name if known is not None else ""
+
+
+async def checked(
+    console: Console, name: str, password: str, connection: HTTPConnection, failure: SecurityEvent
+) -> Account:
+    """Return the account for a name and password; a wrong one is recorded as ``failure``.
 
     Raises
     ------
     HTTPException
         401 if name or password is wrong; 429 after too many failures.
     """
-    keys = (f"name {name}", f"address {address}")
+    keys = (f"name {name}", f"address {address_of(connection)}")
     if (wait := console.attempts.wait(*keys)) > 0.0:
         seconds = math.ceil(wait)
+        await console.note(SecurityEvent.LOCKED_OUT, connection, await _known(console, name))
         raise HTTPException(
             429,
             f"too many failed sign-ins; try again in {seconds} s",
@@ -306,6 +352,7 @@ async def checked(console: Console, name: str, password: str, address: str) -> A
     async with console.hashing:
         good = await asyncio.to_thread(_secrets.verify_password, kept, password)
     if not good or account is None:
+        await console.note(failure, connection, name if account is not None else "")
         raise HTTPException(401, "name or password is wrong")
     console.attempts.good(*keys)
     return account

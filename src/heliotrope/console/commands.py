@@ -5,12 +5,12 @@ command authority; an accepted command has its record in the audit before it is 
 open to everybody who is signed in; everything else needs an operator.
 """
 
-from fastapi import APIRouter, HTTPException
+from fastapi import APIRouter, HTTPException, Request
 from fastapi.responses import JSONResponse
 
 from heliotrope.console import models
 from heliotrope.console.api import REFUSALS, Named, answer
-from heliotrope.console.auth import Anyone, Here, Operator
+from heliotrope.console.auth import Anyone, Here, Operator, refused
 from heliotrope.errors import InputError
 from heliotrope.plant.authority import OPERATOR_COMMANDS, Role
 from heliotrope.plant.interface import orders
@@ -86,13 +86,16 @@ async def defocus(console: Here, who: Operator, order: orders.SomeHeliostats) ->
 
 
 @router.post("/commands", response_model=models.TicketState, tags=["commands"])
-async def command(console: Here, who: Operator, order: orders.CommandOrder) -> models.TicketState:
+async def command(
+    console: Here, who: Operator, request: Request, order: orders.CommandOrder
+) -> models.TicketState:
     """Give a command of the wire: APPROACH, TRACK, IDLE, LOCK, SEARCH, JOG, ZERO, ..."""
     name = order.command
     if name in ("STOW", "DEFOCUS"):
         found = await console.plant.ask(name.lower(), who.person, heliostats=order.heliostats)
         return models.TicketState(**found)
     if name not in OPERATOR_COMMANDS and who.person.role < Role.ENGINEER:
+        await refused(console, request, who)
         raise HTTPException(403, f"{name}: {who.person.name} is operator; this needs engineer")
     return models.TicketState(
         **await console.plant.ask("command", who.person, **order.model_dump())

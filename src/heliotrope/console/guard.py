@@ -22,11 +22,13 @@ from heliotrope.console.auth import (
     Console,
     caller,
     host_known,
+    refused,
     same_origin,
 )
 from heliotrope.console.edge import Edge
 from heliotrope.console.routes import FORM, READ, TINY, Found, Routes
 from heliotrope.errors import HeliotropeError, InputError
+from heliotrope.plant.operations.security import SecurityEvent
 
 #: Nothing from other origins, nothing inline.
 STRICT = (
@@ -97,15 +99,20 @@ class Guard:
         """
         connection, headers = HTTPConnection(scope), Headers(scope=scope)
         if not host_known(console, headers.get("host", "")):
+            host = headers.get("host", "")
+            await console.note(SecurityEvent.HOST_REFUSED, connection, detail=host)
             raise HTTPException(421, "this machine is not known here by that name; see --name")
         who = scope[FOUND] = await self._edge.find(console, connection)
         if scope["type"] == "websocket":
-            _check_socket(console, connection, who)
+            await _check_socket(console, connection, who)
             await self._app(scope, receive, send)
             return
-        found = self._route(scope, who)
+        found = await self._route(scope, who)
         if found.role is not None:
-            who = AtLeast(found.role).admitted(await caller(connection, console))
+            who = await caller(connection, console)
+            if who.person.role < found.role:
+                await refused(console, connection, who)
+            AtLeast(found.role).admitted(who)
         if who is not None and not _is_emergency(scope):
             self._edge.count(who)
         if scope["path"] == "/" and (who is None or who.by != "session"):
@@ -123,11 +130,11 @@ class Guard:
                 receive = bodies.replayed(body, receive)
             await self._app(scope, receive, send)
 
-    def _route(self, scope: Scope, who: Caller | None) -> Found:
+    async def _route(self, scope: Scope, who: Caller | None) -> Found:
         """Return the route of a request; raises `HTTPException` if there is none."""
         path = scope["path"]
         if path.startswith((FRAMEWORK, SOCKET)) and who is not None and who.by == "session":
-            return _framework(self._console(), scope)
+            return await _framework(self._console(), scope, who)
         found = self._routes.find(scope)
         if found.status == 200:
             return found
@@ -155,9 +162,11 @@ class Guard:
             headers["Strict-Transport-Security"] = "max-age=31536000"
 
 
-def _framework(console: Console, scope: Scope) -> Found:
+async def _framework(console: Console, scope: Scope, who: Caller) -> Found:
     """Return the route of the framework's files, and of its stream where it has no socket."""
-    if not same_origin(console, HTTPConnection(scope)):
+    connection = HTTPConnection(scope)
+    if not same_origin(console, connection):
+        await console.note(SecurityEvent.ORIGIN_REFUSED, connection, who.person.name)
         raise HTTPException(403, "this page comes from another site")
     if scope["method"] in READ:
         return Found(200)
@@ -166,7 +175,7 @@ def _framework(console: Console, scope: Scope) -> Found:
     raise HTTPException(405, "not this method")
 
 
-def _check_socket(console: Console, connection: HTTPConnection, who: Caller | None) -> None:
+async def _check_socket(console: Console, connection: HTTPConnection, who: Caller | None) -> None:
     """Raise `HTTPException` for a socket that may not be opened."""
     path = connection.scope["path"]
     if path == LIVE:
@@ -176,6 +185,7 @@ def _check_socket(console: Console, connection: HTTPConnection, who: Caller | No
     if who is None or who.by != "session":
         raise HTTPException(401, "sign in")
     if "origin" not in connection.headers or not same_origin(console, connection):
+        await console.note(SecurityEvent.ORIGIN_REFUSED, connection, who.person.name)
         raise HTTPException(403, "this page comes from another site")
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from heliotrope.local import EMERGENCY, INTERNAL, ORDINARY, CallError, LocalConnection
 from heliotrope.plant.authority import Person
 from heliotrope.plant.interface import CALLS, remade
-from heliotrope.store.people import Account, ApiToken, Session
+from heliotrope.plant.operations.security import SecurityEvent
+from heliotrope.store.people import Account, ApiToken, Expired, Session
 
 #: Time between two signs of life, s.
 BEAT = 1.0
@@ -81,9 +82,9 @@ class RemotePlant:
         blob = np.array(list(points.values()), "<f8").tobytes()
         return (await self.fetch(call, who, blob, points=list(points), **arguments))[0]
 
-    async def note(self, kind: str, who: str, text: str) -> None:
-        """Note an event in the plant's logbook."""
-        await self.ask("note", None, kind=kind, who=who, text=text)
+    async def note(self, kind: SecurityEvent, who: str, address: str, detail: str) -> None:
+        """Record a security event in the plant; see `SecurityLog.note`."""
+        await self.ask("note", None, kind=kind.name, who=who, address=address, detail=detail)
 
 
 class RemotePeople:
@@ -181,6 +182,6 @@ class RemotePeople:
         """Remove a token by its key, if it exists."""
         self._ask("revoke_token", key=key)
 
-    def forget_expired(self, now: float) -> None:
-        """Remove expired sessions and tokens."""
-        self._ask("forget_expired", now=now)
+    def forget_expired(self, now: float) -> tuple[Expired, ...]:
+        """Remove expired sessions and tokens; see `People.forget_expired`."""
+        return tuple(Expired(**one) for one in self._ask("forget_expired", now=now))

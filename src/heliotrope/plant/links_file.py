@@ -206,8 +206,9 @@ class PlantLinks:
 
     def facts(self) -> dict[str, str]:
         """Return why the last connection was refused, by name; empty if none was."""
-        refusal = self.server.last_refusal if self.server is not None else ""
-        return {"refused link": refusal} if refusal else {}
+        if self.server is None or not self.server.refused:
+            return {}
+        return {"refused link": f"{self.server.last_refusal} ({self.server.refused} so far)"}
 
 
 def read_links(path: str | Path) -> LinksFile:

@@ -148,6 +148,26 @@ RECORDS = AlarmKind(
     "Check the disk or the database.",
     over="records are stored again",
 )
+LOCKOUT = AlarmKind(
+    "sign_in_lockout",
+    _PLANT,
+    Severity.WARNING,
+    "Sign-ins for one name or from one address have failed too often.",
+    "sign-ins as {who} from {address} are refused after too many failures",
+    "Who is signed in goes on; the refusal ends by itself within minutes.",
+    "Ask that person; if nobody tried, find who uses that address, and read the security events.",
+    over="no sign-in was refused for ten minutes",
+)
+ORDERS_REFUSED = AlarmKind(
+    "orders_refused",
+    _PLANT,
+    Severity.WARNING,
+    "Five orders within five minutes were refused because the caller's role is too low.",
+    "orders are refused again and again: {who} from {address} has too low a role",
+    "Nothing was sent; EMERGENCY stays open to everybody who is signed in.",
+    "Ask that person; revoke the token or disable the account if it is not them.",
+    over="no order was refused for ten minutes",
+)
 RECORD_REFUSED = AlarmKind(
     "record_refused",
     _PLANT,

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 
-from sqlalchemy import ColumnElement, Connection, Table, select
+from sqlalchemy import ColumnElement, Connection, Table, literal, select
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.store import _rows as rows
@@ -90,6 +90,15 @@ class ApiToken:
     created: float
     expires: float | None
     last_used: float | None
+
+
+@dataclass(frozen=True)
+class Expired:
+    """A session, or a token with its label, of a person that has expired."""
+
+    token: bool
+    name: str
+    label: str
 
 
 _DAY = 86_400.0
@@ -369,14 +378,29 @@ class People:
         """Remove a token by its key, if it exists."""
         self._writer.do(lambda c: _delete(c, _TOKEN, _TOKEN.c.key == key))
 
-    def forget_expired(self, now: float) -> None:
-        """Remove expired sessions and tokens; written in the background."""
+    def forget_expired(self, now: float) -> tuple[Expired, ...]:
+        """Remove expired sessions and tokens; return them.
+
+        Raises
+        ------
+        StoreError
+            If they could not be removed.
+        """
+        found, keys = [], []
+        with self._database.reading() as connection:
+            for table, label in ((_SESSION, None), (_TOKEN, _TOKEN.c.label)):
+                query = select(table.c.key, table.c.name, literal("") if label is None else label)
+                for key, name, text in connection.execute(query.where(table.c.expires <= now)):
+                    found.append(Expired(table is _TOKEN, name, text))
+                    keys.append((table, key))
 
         def work(connection: Connection) -> None:
-            for table in (_SESSION, _TOKEN):
-                connection.execute(table.delete().where(table.c.expires <= now))
+            for table, key in keys:
+                _delete(connection, table, table.c.key == key)
 
-        self._writer.put(work)
+        if keys:
+            self._writer.do(work)
+        return tuple(found)
 
     def _secret(self) -> str:
         return self._entropy(_SECRET).hex()

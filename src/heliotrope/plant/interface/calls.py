@@ -11,6 +11,7 @@ from heliotrope.plant.interface import orders
 from heliotrope.plant.interface.desk import Desk
 from heliotrope.plant.interface.encoding import frame_parts
 from heliotrope.plant.interface.overview import overview
+from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.operations.zero import zero
 from heliotrope.plant.tickets import Ticket
 
@@ -201,7 +202,9 @@ _CONSOLES = {
     "note": Call(
         Role.VIEWER,
         orders.Note,
-        lambda d, _, a, __: d.operations.logbook.event(a.kind, a.who, a.text),
+        lambda d, _, a, __: d.operations.security.note(
+            SecurityEvent[a.kind], a.who, a.address, a.detail
+        ),
         console=True,
     ),
 }

@@ -10,6 +10,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
+from heliotrope.plant.operations.security import SecurityEvent
 
 #: Largest coordinate of a point, m.
 _FAR = 1e5
@@ -86,11 +87,12 @@ class Picture(Strict):
 
 
 class Note(Strict):
-    """An event: its kind, the person it is about, and one line."""
+    """A security event: its name, the person, the address of the caller, and details."""
 
-    kind: Annotated[str, Field(pattern=r"^[a-z]{1,20}$")]
-    who: Annotated[str, Field(max_length=100)]
-    text: Words
+    kind: Annotated[str, Field(pattern=f"^({'|'.join(SecurityEvent.__members__)})$")]
+    who: Words
+    address: Words
+    detail: Words
 
 
 class Beat(Strict):

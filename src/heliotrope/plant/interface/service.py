@@ -34,6 +34,7 @@ from heliotrope.plant.interface.encoding import plain
 from heliotrope.plant.interface.errors import kind_of
 from heliotrope.plant.interface.orders import Beat
 from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.people import People
 
 T = TypeVar("T")
@@ -158,8 +159,8 @@ class PlantInterface:
             return LocalCaller(person)
         if time.monotonic() - self._noted >= _NOTED:
             self._noted = time.monotonic()
-            event, text = self._desk.operations.logbook.event, "a local caller was refused"
-            self.in_plant(lambda: event("security", "", f"{text}: key or token not valid"))
+            note, kind = self._desk.operations.security.note, SecurityEvent.TOKEN_REFUSED
+            self.in_plant(lambda: note(kind, detail="by a caller on this machine"))
         return None
 
     async def _person(self, token: str) -> Person | None:

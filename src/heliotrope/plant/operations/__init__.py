@@ -9,6 +9,7 @@ from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSet
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.operations import Operations, Photographer
+from heliotrope.plant.operations.security import SecurityEvent, SecurityLog, SecurityNote
 from heliotrope.plant.operations.zero import zero
 
 __all__ = [
@@ -18,5 +19,8 @@ __all__ = [
     "Operations",
     "Photographer",
     "Scheduling",
+    "SecurityEvent",
+    "SecurityLog",
+    "SecurityNote",
     "zero",
 ]

@@ -14,7 +14,7 @@ from heliotrope.links.messages import ClusterStatus, ProtocolError, decode
 from heliotrope.links.tapped import TappedLink
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import AlarmRow, ClusterRow, EventRow, PacketRow
-from heliotrope.safety import Alarm, alarms
+from heliotrope.safety import Alarm, Severity, alarms
 from heliotrope.store.records import Event, Records, StoreError
 
 #: Messages that come each second: only the last of each cluster is kept.
@@ -120,12 +120,12 @@ class Logbook:
                     active=alarm.active,
                 )
 
-    def event(self, kind: str, who: str, text: str) -> None:
+    def event(self, kind: str, who: str, text: str, severity: Severity = Severity.INFO) -> None:
         """Take an event; see `EventRow`."""
         self._events.append(EventRow(self._now(), kind, who, text))
         if self._records is not None and kind != "alarm":
             line = f"{who}: {text}" if who else text
-            self._keep(self._records.record_event, Event(self._now(), kind, line))
+            self._keep(self._records.record_event, Event(self._now(), kind, line, severity))
 
     def _keep(self, keep: Any, *values: Any, **named: Any) -> None:
         """Keep a record; one that cannot be kept raises an alarm and stops nothing."""

@@ -31,6 +31,7 @@ from heliotrope.plant.lockouts import Lockout
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.security import SecurityLog
 from heliotrope.plant.operations.viewing import Viewer
 from heliotrope.plant.operations.views import (
     AlarmRow,
@@ -57,6 +58,10 @@ _AWAY = frozenset({"STOW", "DEFOCUS", "LOCK", "JOG", "GOTO", "SEARCH", "DIAGNOSE
 _BACK = frozenset({"APPROACH", "TRACK", "REFOCUS"})
 #: Time between predictions of the flux, s.
 _FLUX_EVERY = 5.0
+#: Time between looks after the security events, s.
+_LOOKED = 5.0
+#: Row of the summary with the reason why the last link was refused.
+REFUSED_LINK = "refused link"
 
 
 class Photographer(Protocol):
@@ -100,7 +105,7 @@ class Operations:
 
     Attributes
     ----------
-    plant, logbook, automatic
+    plant, logbook, automatic, security
         See their classes.
     """
 
@@ -128,6 +133,7 @@ class Operations:
             truth=truth,
             settings=settings or AutomaticSettings(),
         )
+        self.security = SecurityLog(logbook, plant.clock)
         self._viewer = Viewer(plant, self.automatic)
         self._flux: dict[str, _Cached] = {}
         self._closing = asyncio.Event()
@@ -139,10 +145,19 @@ class Operations:
         self.logbook.event("plant", "", f"{self.design.name}: operations begin")
         async with asyncio.TaskGroup() as group:
             work = group.create_task(self.automatic.run())
+            looking = group.create_task(self._look())
             await self._closing.wait()
             self.automatic.stop()
             work.cancel()
+            looking.cancel()
         self.logbook.event("plant", "", f"{self.design.name}: operations end")
+
+    async def _look(self) -> None:
+        """Look after the security events."""
+        while True:
+            facts = {} if self._extra is None else self._extra()
+            self.security.look(str(facts.get(REFUSED_LINK, "")))
+            await asyncio.sleep(_LOOKED)
 
     async def close(self) -> None:
         """End automatic control; beams stay where they are, so stow the field first."""

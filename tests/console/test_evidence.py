@@ -1,0 +1,127 @@
+"""Security events: each leaves a record in the store, and patterns of them raise alarms."""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+
+from heliotrope.store.records import Event
+from support.live_console import PASSWORD, LiveConsole
+
+Ask = Callable[..., httpx.Response]
+
+
+def recorded(console: LiveConsole, text: str, since: float = 0.0) -> Event:
+    """Return the newest security event with a text, once the store has it."""
+
+    def find() -> Event | None:
+        found = console.keeper.events(500)
+        return next(
+            (e for e in found if e.source == "security" and text in e.text and e.at >= since), None
+        )
+
+    found = console.until(find, 10.0)
+    assert isinstance(found, Event)
+    return found
+
+
+def test_sessions_leave_a_trace(console: LiveConsole) -> None:
+    with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
+        wrong = {"name": "viewer", "password": "not the password"}
+        assert client.post("session", json=wrong).status_code == 401
+        answer = client.post("session", json={"name": "viewer", "password": PASSWORD})
+        client.headers["X-CSRF-Token"] = answer.json()["csrf"]
+        assert client.delete("session").status_code == 204
+    for text in ("failed to sign in", "signed in", "signed out"):
+        found = recorded(console, f"viewer: {text} (from 127.0.0.1)")
+        assert "not the password" not in found.text
+    assert recorded(console, "failed to sign in").severity == "warning"
+
+
+def test_a_name_that_is_no_account_is_not_recorded(console: LiveConsole) -> None:
+    """People type their password there."""
+    with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
+        client.post("session", json={"name": "my dear password", "password": "viewer?????"})
+    recorded(console, "failed to sign in")
+    assert not any("my dear password" in event.text for event in console.keeper.events(500))
+
+
+def test_expiry_leaves_a_trace(console: LiveConsole) -> None:
+    people, now = console.keeper.people, time.time()
+    people.open_session("operator", now - 100.0, 50.0)
+    people.add_token("operator", "old report", "operator", now - 100.0, 50.0)
+
+    async def begin() -> None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(1.0):
+                await console.server.app.state.console.forget_expired()
+
+    console.console_wait(begin())
+    recorded(console, "operator: session expired")
+    recorded(console, "operator: token expired: old report")
+
+
+CHANGES: tuple[tuple[str, str, dict[str, Any], str], ...] = (
+    (
+        "POST",
+        "accounts",
+        {"name": "desk-8", "role": "viewer", "password": "a long password"},
+        "made an account: desk-8, viewer",
+    ),
+    ("PATCH", "accounts/desk-8", {"role": "operator"}, "changed an account: desk-8, role operator"),
+    ("PATCH", "accounts/desk-8", {"disabled": True}, "changed an account: desk-8, disabled"),
+    ("POST", "accounts/desk-8/password", {}, "made a new password: desk-8"),
+    ("POST", "tokens", {"label": "one", "role": "viewer"}, "made a token: one, viewer, 30 days"),
+)
+
+
+def test_changes_of_accounts_leave_a_trace(console: LiveConsole, person: Ask) -> None:
+    for method, path, body, text in CHANGES:
+        assert person("engineer", method, path, body).is_success, path
+        recorded(console, f"engineer: {text} (from 127.0.0.1)")
+    (token,) = [t for t in console.keeper.people.tokens("engineer") if t.label == "one"]
+    assert person("engineer", "DELETE", f"tokens/{token.key}").status_code == 204
+    recorded(console, "engineer: revoked a token: one of engineer")
+    wrong = {"own_password": "not it"}
+    assert person("engineer", "POST", "accounts/desk-8/password", wrong).status_code == 403
+    recorded(console, "engineer: gave a wrong password for a change of accounts")
+
+
+def test_strangers_leave_a_trace(console: LiveConsole, signed_in: httpx.Client) -> None:
+    url = f"{console.address}api/v1/summary"
+    httpx.get(url, headers={"Host": "rebound.example"}, trust_env=False)
+    recorded(console, "unknown host name refused: rebound.example")
+    httpx.get(url, headers={"Authorization": "Bearer 0123"}, trust_env=False)
+    recorded(console, "a token was refused (from 127.0.0.1)")
+    signed_in.put("authority", headers={"Origin": "https://elsewhere.example"})
+    recorded(console, "operator: request from another site refused")
+
+
+def test_refused_orders_raise_an_alarm(console: LiveConsole, ask: Ask) -> None:
+    for _ in range(5):
+        assert ask("viewer", "POST", "stow", {"heliostats": []}).status_code == 403
+    recorded(console, "viewer: order refused: the role is too low: POST /api/v1/stow by token")
+    alarms = {row.condition: row for row in console.call(console.live.operations.alarms)}
+    assert alarms["orders_refused"].active
+    assert "viewer from 127.0.0.1 has too low a role" in alarms["orders_refused"].text
+
+
+def test_a_lockout_raises_an_alarm(console: LiveConsole) -> None:
+    wrong = {"name": "viewer", "password": "not the password"}
+    with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
+        answers = [client.post("session", json=wrong).status_code for _ in range(12)]
+    assert 429 in answers
+    recorded(console, "viewer: sign-ins refused after too many failures")
+    alarms = {row.condition: row for row in console.call(console.live.operations.alarms)}
+    assert alarms["sign_in_lockout"].active
+    attempts = console.server.app.state.console.attempts
+    console.call(lambda: attempts.good("address 127.0.0.1", "name viewer"))
+
+
+def test_a_refused_link_leaves_a_trace(console: LiveConsole) -> None:
+    text = "cluster C9: wrong key (1 so far)"
+    console.call(lambda: console.live.operations.security.look(text))
+    recorded(console, f"link refused: {text}")

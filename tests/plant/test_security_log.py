@@ -1,0 +1,98 @@
+"""The log of security events: bounded, and with alarms that end."""
+
+import asyncio
+from collections.abc import Callable
+
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.operations import Logbook, SecurityEvent, SecurityLog, SecurityNote
+from heliotrope.plant.operations.security import MOST, ORDERS, QUIET, SPAN
+
+
+def within(work: Callable[[Logbook, SecurityLog], object]) -> Logbook:
+    """Return the logbook after some work in virtual time."""
+
+    async def run(clock: VirtualClock) -> Logbook:
+        book = Logbook(clock)
+        waiting = work(book, SecurityLog(book, clock))
+        if asyncio.iscoroutine(waiting):
+            await waiting
+        return book
+
+    return run_virtual(run)
+
+
+def texts(book: Logbook) -> list[str]:
+    return [row.text for row in book.events(1000) if row.kind == "security"]
+
+
+def test_a_flood_is_counted() -> None:
+    async def flood(book: Logbook, log: SecurityLog) -> None:
+        for _ in range(10_000):
+            log.note(SecurityEvent.SIGN_IN_FAILED, "", "10.0.0.9")
+        log.note(SecurityEvent.SIGNED_IN, "anna", "10.0.0.3")
+        assert len(texts(book)) == MOST + 1
+        await asyncio.sleep(SPAN + 1.0)
+
+    book = within(flood)
+    assert texts(book)[0] == f"failed to sign in: at least {10_000 - MOST} more in a minute"
+    assert "signed in (from 10.0.0.3)" in texts(book)
+
+
+def test_alarms_end_when_it_is_quiet() -> None:
+    async def work(book: Logbook, log: SecurityLog) -> None:
+        for _ in range(ORDERS):
+            log.note(SecurityEvent.ORDER_REFUSED, "ben", "10.0.0.3", "POST /stow")
+        log.note(SecurityEvent.LOCKED_OUT, "", "10.0.0.9")
+        assert {row.condition for row in book.alarms() if row.active} == {
+            "orders_refused",
+            "sign_in_lockout",
+        }
+        await asyncio.sleep(QUIET - 1.0)
+        log.look()
+        assert all(row.active for row in book.alarms())
+        await asyncio.sleep(2.0)
+        log.look()
+        assert not any(row.active for row in book.alarms())
+
+    within(work)
+
+
+def test_a_few_refused_orders_raise_none() -> None:
+    def work(_: Logbook, log: SecurityLog) -> None:
+        for _ in range(ORDERS - 1):
+            log.note(SecurityEvent.ORDER_REFUSED, "ben", "10.0.0.3")
+
+    assert within(work).alarms() == ()
+
+
+def test_a_refused_link_is_noted_once() -> None:
+    def work(_: Logbook, log: SecurityLog) -> None:
+        for text in ("", "wrong key (1 so far)", "wrong key (1 so far)", "wrong key (2 so far)"):
+            log.look(text)
+
+    assert texts(within(work)) == [
+        "link refused: wrong key (2 so far)",
+        "link refused: wrong key (1 so far)",
+    ]
+
+
+def test_what_strangers_type_is_one_short_line() -> None:
+    def work(_: Logbook, log: SecurityLog) -> None:
+        log.note(SecurityEvent.HOST_REFUSED, detail="a\r\nb" + "x" * 1000)
+
+    (text,) = texts(within(work))
+    assert text.startswith("request for an unknown host name refused: a??bxxx")
+    assert len(text) < 200
+
+
+def test_notes_are_sent_on() -> None:
+    sent: list[SecurityNote] = []
+
+    def work(_: Logbook, log: SecurityLog) -> None:
+        log.forward = sent.append
+        log.note(SecurityEvent.SIGNED_IN, "anna", "10.0.0.3")
+
+    within(work)
+    assert [(note.kind, note.who, note.address) for note in sent] == [
+        (SecurityEvent.SIGNED_IN, "anna", "10.0.0.3")
+    ]
