@@ -1,4 +1,4 @@
-"""``heliotrope ctl``: look at and command a running plant, through its console."""
+"""``heliotrope ctl``: look at and command a running plant, by its console or without."""
 
 import os
 import time
@@ -11,11 +11,10 @@ from heliotrope.cli._common import parse_point, print_json, print_table
 from heliotrope.errors import InputError
 
 if TYPE_CHECKING:
+    from heliotrope.cli._at_plant import AtPlant
     from heliotrope.console.client import Client
 
-app = typer.Typer(
-    help="Look at and command a running plant, through its console.", no_args_is_help=True
-)
+app = typer.Typer(help="Look at and command a running plant.", no_args_is_help=True)
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Whom = Annotated[list[str] | None, typer.Argument(help="Heliostats.", show_default=False)]
@@ -33,26 +32,46 @@ def _where(
         Path | None,
         typer.Option(help="File with the API token; else HELIOTROPE_TOKEN.", show_default=False),
     ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            envvar="HELIOTROPE_PLANT",
+            help="Data folder of a plant on this machine: speak to the plant itself, without its "
+            "console, as the plant's user or root.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
-    """Look at and command a running plant, through its console."""
-    context.obj = (url, token_file)
+    """Look at and command a running plant."""
+    context.obj = (url, token_file, data)
 
 
-def _client(context: typer.Context, *, token: bool = True) -> "Client":
+def _sign_in_client(context: typer.Context) -> "Client":
+    """Return a client without a token; only the console takes passwords."""
     from heliotrope.console.client import Client
 
-    url, file = context.obj
-    secret = os.environ.get("HELIOTROPE_TOKEN", "") if token else ""
-    if token and file is not None:
+    return Client("", context.obj[0])
+
+
+def _client(context: typer.Context) -> "Client | AtPlant":
+    url, file, data = context.obj
+    secret = os.environ.get("HELIOTROPE_TOKEN", "")
+    if file is not None:
         try:
             secret = file.read_text(encoding="utf-8").strip()
         except OSError as error:
             raise InputError(f"token file {file}: {error.strerror}") from None
-    if token and not secret:
+    if not secret:
         raise InputError(
             "ctl: no token; make one with `heliotrope ctl token LABEL`, then set HELIOTROPE_TOKEN "
             "or give --token-file"
         )
+    if data is not None:
+        from heliotrope.cli._at_plant import AtPlant
+
+        return AtPlant(secret, data)
+    from heliotrope.console.client import Client
+
     return Client(secret, url)
 
 
@@ -71,7 +90,7 @@ def token(
     ] = "",
 ) -> None:
     """Make an API token; it is printed once."""
-    with _client(context, token=False) as client:
+    with _sign_in_client(context) as client:
         client.sign_in(name, password)
         made = client.ask(
             "POST",
@@ -97,7 +116,7 @@ def account(
     if disable and reset:
         raise InputError("ctl: give --disable or --reset, not both")
     own = typer.prompt("Your password", hide_input=True)
-    with _client(context, token=False) as client:
+    with _sign_in_client(context) as client:
         client.sign_in(by, own)
         again = {"own_password": own}
         if reset:
@@ -317,7 +336,7 @@ def _give(
                 client.ask("DELETE", "authority")
 
 
-def _follow(client: "Client", ticket: dict[str, Any], wait: float) -> None:
+def _follow(client: "Client | AtPlant", ticket: dict[str, Any], wait: float) -> None:
     """Wait for the end of a command and print it; exit code 1 if it failed."""
     until = time.monotonic() + wait
     while not ticket["finished"] and time.monotonic() < until:

@@ -1,0 +1,103 @@
+"""`heliotrope ctl` at the plant itself: the API's requests as calls of the local interface.
+
+It needs no console, and EMERGENCY, DEFOCUS and STOW take the plant's own socket for them. Nothing
+heavy is imported: an emergency starts at once.
+"""
+
+from array import array
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+from urllib.parse import unquote
+
+from heliotrope.errors import InputError
+from heliotrope.local import EMERGENCY, ORDINARY, ask_once, socket_folder
+
+_VIEWS = (
+    "alarms", "authority", "calibration", "clusters", "emergency", "events", "field", "holds",
+    "packets", "schedule", "summary", "sun",
+)  # fmt: skip
+#: Calls of the socket for emergencies.
+_URGENT = ("order_emergency", "stow", "defocus")
+#: Calls by the method and the path of their request.
+_CALLS = {
+    **{("GET", view): view for view in _VIEWS},
+    ("POST", "emergency"): "order_emergency",
+    ("DELETE", "emergency"): "withdraw_emergency",
+    ("POST", "stow"): "stow",
+    ("POST", "defocus"): "defocus",
+    ("POST", "commands"): "command",
+    ("POST", "aim"): "aim",
+    ("POST", "authority"): "take_authority",
+    ("PUT", "authority"): "keep_authority",
+    ("DELETE", "authority"): "release_authority",
+    ("POST", "alarms/acknowledge"): "acknowledge",
+    ("PUT", "calibration"): "switch_calibration",
+    ("POST", "holds"): "hold",
+    ("POST", "holds/release"): "unhold",
+    ("POST", "automatic/resume"): "resume",
+}
+#: Calls about one thing, by the beginning of the path.
+_NAMED = {"heliostats": "heliostat", "commands": "one_command"}
+
+
+class AtPlant:
+    """Has the methods of `console.Client` that `heliotrope ctl` needs.
+
+    Parameters
+    ----------
+    token
+        API token.
+    data
+        Data folder of the plant.
+    """
+
+    def __init__(self, token: str, data: Path) -> None:
+        self._hello, self._folder = {"token": token}, socket_folder(data)
+
+    def __enter__(self) -> "AtPlant":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Do nothing: each call has a connection of its own."""
+
+    def ask(self, method: str, path: str, body: dict[str, Any] | None = None) -> Any:
+        """Make the call of a request; return its value.
+
+        Raises
+        ------
+        HeliotropeError
+            If the plant refuses it, or cannot be reached.
+        """
+        given, blob = dict(body or {}), b""
+        kind, _, name = path.partition("/")
+        call = _CALLS.get((method, path))
+        if call is None and method == "GET" and name and kind in _NAMED:
+            call, given = _NAMED[kind], {"name": unquote(name)}
+        if call is None:
+            raise InputError(f"ctl: {path} is only known to the console; leave out --data")
+        if call == "command" and given["command"] in ("STOW", "DEFOCUS"):
+            call, given = given["command"].lower(), {"heliostats": given["heliostats"]}
+        if call == "aim":
+            points = given.pop("points", {})
+            given["points"] = list(points)
+            blob = array("d", [x for point in points.values() for x in point]).tobytes()
+        socket = EMERGENCY if call in _URGENT else ORDINARY
+        return ask_once(self._folder / socket, self._hello, call, given, blob)
+
+    def get(self, path: str) -> Any:
+        """Return the view of a path."""
+        return self.ask("GET", path)
+
+    def command(
+        self, name: str, heliostats: Sequence[str] = (), values: Sequence[float] = ()
+    ) -> Any:
+        """Give a command; return its progress."""
+        order = {"command": name, "heliostats": list(heliostats), "values": list(values)}
+        return self.ask("POST", "commands", order)
