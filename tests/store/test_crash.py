@@ -19,7 +19,7 @@ import pytest
 from sqlalchemy import select, text
 
 from heliotrope.plant.audit import STOPPED
-from heliotrope.store import audit, tables
+from heliotrope.store import audit, chain, tables
 from heliotrope.store.database import Database
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Event, StoreError
@@ -131,6 +131,7 @@ class Promises:
             with keeper.database.reading() as connection:
                 records = {r.identity: r for r in audit.entries(connection, 10**6)}
                 points = audit.points(connection).get("AIM", {})
+                chain.verify(connection)
             assert self.begun <= set(records)
             assert all(records[i].result in ("done", STOPPED) for i in self.finished)
             if self.points is not None:
@@ -193,6 +194,7 @@ def kill_plants(loads: Loads, place: Path, kills: int) -> dict[str, int]:
             with keeper.database.reading() as connection:
                 records = {r.identity for r in audit.entries(connection, 10**6)}
                 kept = audit.points(connection).get("STANDBY", {})
+                chain.verify(connection)
             assert accepted <= records
             assert events <= {e.text for e in keeper.events(10**6)}
             latest = keeper.latest_calibrations()

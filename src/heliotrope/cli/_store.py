@@ -116,6 +116,38 @@ def migrate(place: Place) -> None:
 
 
 @app.command()
+def head(place: Place) -> None:
+    """Print the heads of the chains of events and audit: note them on another machine."""
+    from heliotrope.store import chain
+    from heliotrope.store.database import Database
+
+    with Database(place) as database:
+        database.require()
+        with database.reading() as connection:
+            print(" ".join(map(str, chain.heads(connection))))
+
+
+@app.command()
+def verify(
+    place: Place,
+    head: Annotated[
+        list[str] | None,
+        typer.Option(help="What `store head` printed before; may be given several times."),
+    ] = None,
+) -> None:
+    """Check that no event and no record of the audit was altered or removed."""
+    from heliotrope.store import chain
+    from heliotrope.store.database import Database
+
+    known = [chain.Head.read(word) for text in head or () for word in text.split()]
+    with Database(place) as database:
+        database.require()
+        with database.reading() as connection:
+            found = chain.verify(connection, known)
+    print(f"{place}: every record fits; {' '.join(map(str, found))}")
+
+
+@app.command()
 def query(
     place: Annotated[Path, typer.Argument(help="Data folder of a plant, or its telemetry.")],
     sql: Annotated[str, typer.Argument(help="One SELECT from telemetry.")],

@@ -29,10 +29,11 @@ _MISSES = ("before_right", "before_above", "after_right", "after_above")
 Record = TypeVar("Record")
 
 
-def insert(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
-    """Insert rows; a row whose key exists already is left as it is."""
-    if rows:
-        connection.execute(_insert(connection.dialect.name, table), list(rows))
+def insert(connection: Connection, table: Table, rows: Sequence[Row]) -> int:
+    """Insert rows, except those whose key exists already; return the number of inserted rows."""
+    if not rows:
+        return 0
+    return connection.execute(_insert(connection.dialect.name, table), list(rows)).rowcount
 
 
 @cache

@@ -6,7 +6,7 @@ from sqlalchemy import Connection, delete, func, select, update
 
 from heliotrope.errors import InputError
 from heliotrope.store import _rows as rows
-from heliotrope.store import tables
+from heliotrope.store import chain, tables
 from heliotrope.store.records import AuditEntry
 
 _AUDIT = tables.audit
@@ -32,6 +32,7 @@ def begin(connection: Connection, entry: AuditEntry) -> None:
     number = (connection.scalar(select(func.max(_AUDIT.c.number))) or 0) + 1
     row = rows.row_of(_AUDIT, entry, number=number, result="", finished="")
     rows.insert(connection, _AUDIT, [row])
+    chain.add_accepted(connection, entry, number)
 
 
 def finish(connection: Connection, identity: str, result: str, at: str) -> None:
@@ -45,6 +46,7 @@ def finish(connection: Connection, identity: str, result: str, at: str) -> None:
     open_ = (_AUDIT.c.identity == identity) & (_AUDIT.c.result == "")
     values = {"result": result, "finished": at}
     if connection.execute(update(_AUDIT).where(open_).values(values)).rowcount:
+        chain.add_result(connection, identity, result, at)
         return
     known = _find(connection, identity)
     if known is None or known.result != result:
@@ -53,8 +55,11 @@ def finish(connection: Connection, identity: str, result: str, at: str) -> None:
 
 def finish_open(connection: Connection, result: str, at: str) -> int:
     """Give one result to all records without one; return their number."""
-    open_ = update(_AUDIT).where(_AUDIT.c.result == "")
-    return connection.execute(open_.values(result=result, finished=at)).rowcount
+    query = select(_AUDIT.c.identity).where(_AUDIT.c.result == "").order_by(_AUDIT.c.number)
+    left = connection.scalars(query).all()
+    for identity in left:
+        finish(connection, identity, result, at)
+    return len(left)
 
 
 def entries(connection: Connection, limit: int = 100, before: int = 0) -> list[AuditEntry]:

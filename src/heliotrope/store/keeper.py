@@ -19,7 +19,7 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.safety import Severity
 from heliotrope.store import _rows as rows
-from heliotrope.store import tables
+from heliotrope.store import chain, tables
 from heliotrope.store.database import Database, make_private
 from heliotrope.store.people import People
 from heliotrope.store.records import (
@@ -300,9 +300,12 @@ class Keeper:
             If there is no such severity.
         """
         _check_severity(event.severity)
-        number = self._take_numbers(tables.event)
-        row = rows.row_of(tables.event, event, number=number)
-        self.writer.put(lambda c: rows.insert(c, tables.event, [row]))
+        with self._mine:
+            # In the order of the numbers, in which they are linked.
+            number = self._numbers[tables.event.name] + 1
+            row = rows.row_of(tables.event, event, number=number)
+            self.writer.put(lambda c: chain.add_event(c, row))
+            self._numbers[tables.event.name] = number
 
     def record_alarm(
         self,
@@ -367,12 +370,12 @@ class Keeper:
         return self._records(AlarmEntry, query)
 
     def forget_events(self, before: float) -> None:
-        """Remove events before a time, and alarms that were over and acknowledged by then."""
+        """Remove the oldest events up to a time, and alarms over and acknowledged by then."""
         a = tables.alarm.c
         over = and_(a.cleared < before, a.acknowledged < before)
 
         def work(connection: Connection) -> None:
-            connection.execute(delete(tables.event).where(tables.event.c.at < before))
+            chain.forget_events(connection, before)
             connection.execute(delete(tables.alarm).where(over))
 
         self.writer.put(work)

@@ -305,7 +305,7 @@ class People:
     ) -> tuple[ApiToken, str]:
         """Make a token of an account; return it with its secret, which is shown only now.
 
-        It expires ``lifetime`` s from now; None: after the `LONGEST` time of its role.
+        It expires ``lifetime`` s from now, and after the `LONGEST` time of its role at the latest.
 
         Raises
         ------
@@ -324,7 +324,7 @@ class People:
                 f"{longest / _DAY:g}"
             )
         secret = self._secret()
-        expires = now + (longest if lifetime is None else lifetime)
+        expires = None if lifetime is None else now + lifetime
         made = ApiToken(_key(secret), name, label, role, now, expires, None)
 
         def work(connection: Connection) -> None:

@@ -364,6 +364,12 @@ audit = Table(
     _text("finished"),
 )
 
+#: A link for each event, and two for each record of the audit: accepted, and result; see `chain`.
+event_link = Table("event_link", metadata, _number(), _text("digest"))
+audit_link = Table(
+    "audit_link", metadata, _number(), _text("identity"), _text("part"), _text("digest")
+)
+
 assigned_point = Table(
     "assigned_point",
     metadata,

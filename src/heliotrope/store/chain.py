@@ -1,0 +1,238 @@
+"""Hash chains over events and audit: a record that was altered or removed no longer fits.
+
+Each link has the SHA-256 of the content of a record and of the digest before it. An event has one
+link; a record of the audit has two, when it is accepted and when it has its result. The one writer
+makes them in the transaction of the record, so they cost no further sync, and a killed plant leaves
+chains that fit.
+
+Whoever can write the database can make all digests anew, or remove the newest records. So the
+heads (`heads`) go to another machine, and `verify` compares them.
+"""
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, RowMapping, func, select
+
+from heliotrope.errors import InputError
+from heliotrope.safety import Severity
+from heliotrope.store import _rows as rows
+from heliotrope.store import tables
+from heliotrope.store.records import AuditEntry, StoreError
+
+#: Digest before the first record.
+GENESIS = "0" * 64
+EVENT, AUDIT = "event", "audit"
+ACCEPTED, RESULT = "accepted", "result"
+#: Row of the table ``about`` with the digest before the oldest event that is kept.
+ANCHOR = "event_anchor"
+_EVENT, _AUDIT = tables.event, tables.audit
+_LINKS = {EVENT: tables.event_link, AUDIT: tables.audit_link}
+
+
+@dataclass(frozen=True)
+class Head:
+    """Number and digest of the last link of a chain, `EVENT` or `AUDIT`."""
+
+    chain: str
+    number: int
+    digest: str
+
+    def __str__(self) -> str:
+        return f"{self.chain}:{self.number}:{self.digest}"
+
+    @classmethod
+    def read(cls, text: str) -> "Head":
+        """Return a head from its text.
+
+        Raises
+        ------
+        InputError
+            If it is none.
+        """
+        chain, _, rest = text.partition(":")
+        number, _, digest = rest.partition(":")
+        if chain not in (EVENT, AUDIT) or not number.isdigit() or len(digest) != len(GENESIS):
+            raise InputError(f"head {text!r}: give one as `heliotrope store head` prints it")
+        return cls(chain, int(number), digest)
+
+
+def digest_of(before: str, content: Sequence[Any]) -> str:
+    """Return the digest of a record, from the digest before it and its content."""
+    text = json.dumps(content, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
+    return hashlib.sha256(f"{before}\n{text}".encode(errors="surrogatepass")).hexdigest()
+
+
+def _event(row: Mapping[str, Any] | RowMapping) -> list[Any]:
+    values = {str(k): float(x) if math.isfinite(x) else None for k, x in row["values"].items()}
+    rank = Severity(row["severity"]).rank
+    return [row["number"], float(row["at"]), row["source"], rank, row["heliostat"], row["text"],
+            values]  # fmt: skip
+
+
+def _accepted(entry: AuditEntry, number: int) -> list[Any]:
+    return [entry.identity, number, entry.who, entry.role, entry.what, entry.at,
+            [float(x) for x in entry.values], list(entry.heliostats), entry.note]  # fmt: skip
+
+
+# -- adding ------------------------------------------------------------------------------
+
+
+def add_event(connection: Connection, row: dict[str, Any]) -> None:
+    """Insert an event and its link; inserting it twice is the same as once."""
+    if not rows.insert(connection, _EVENT, [row]):
+        return
+    digest = digest_of(_last(connection, EVENT)[1], _event(row))
+    link = {"number": row["number"], "digest": digest}
+    connection.execute(_LINKS[EVENT].insert().values(link))
+    # A connection does not outlive a failure, and what it remembers goes with it.
+    connection.info[EVENT] = row["number"], digest
+
+
+def add_accepted(connection: Connection, entry: AuditEntry, number: int) -> None:
+    """Add the link of a record of the audit that was accepted."""
+    _add_link(connection, entry.identity, ACCEPTED, _accepted(entry, number))
+
+
+def add_result(connection: Connection, identity: str, result: str, finished: str) -> None:
+    """Add the link of a record's result."""
+    _add_link(connection, identity, RESULT, [identity, result, finished])
+
+
+def _add_link(connection: Connection, identity: str, part: str, content: list[Any]) -> None:
+    number, before = _last(connection, AUDIT)
+    digest = digest_of(before, content)
+    row = {"number": number + 1, "identity": identity, "part": part, "digest": digest}
+    connection.execute(_LINKS[AUDIT].insert().values(row))
+    connection.info[AUDIT] = number + 1, digest
+
+
+def _last(connection: Connection, chain: str) -> tuple[int, str]:
+    """Return number and digest of the last link, as the writing connection remembers it."""
+    if chain not in connection.info:
+        connection.info[chain] = _read_last(connection, chain)
+    number, digest = connection.info[chain]
+    return int(number), str(digest)
+
+
+def _read_last(connection: Connection, chain: str) -> tuple[int, str]:
+    table = _LINKS[chain].c
+    query = select(table.number, table.digest).order_by(table.number.desc()).limit(1)
+    row = connection.execute(query).first()
+    return (row[0], row[1]) if row is not None else (0, _anchor(connection, chain))
+
+
+def _anchor(connection: Connection, chain: str) -> str:
+    if chain == AUDIT:
+        return GENESIS
+    query = select(tables.about.c.value).where(tables.about.c.name == ANCHOR)
+    return connection.scalar(query) or GENESIS
+
+
+def forget_events(connection: Connection, before: float) -> None:
+    """Remove the oldest events, up to the first that is not before a time."""
+    e = _EVENT.c
+    kept = connection.scalar(select(func.min(e.number)).where(e.at >= before))
+    last = connection.scalar(select(func.max(e.number)))
+    end = kept if kept is not None else (last or 0) + 1
+    links = _LINKS[EVENT]
+    gone = select(links.c.digest).where(links.c.number < end)
+    digest = connection.scalar(gone.order_by(links.c.number.desc()).limit(1))
+    if digest is not None:
+        rows.replace(connection, tables.about, [{"name": ANCHOR, "value": digest}])
+        # A chain without links begins where the last one ended.
+        connection.info.pop(EVENT, None)
+    connection.execute(links.delete().where(links.c.number < end))
+    connection.execute(_EVENT.delete().where(e.number < end))
+
+
+# -- checking ----------------------------------------------------------------------------
+
+
+def heads(connection: Connection) -> tuple[Head, Head]:
+    """Return the heads of both chains."""
+    event, record = (_read_last(connection, chain) for chain in (EVENT, AUDIT))
+    return Head(EVENT, *event), Head(AUDIT, *record)
+
+
+def verify(connection: Connection, known: Iterable[Head] = ()) -> tuple[Head, Head]:
+    """Check both chains, and that heads that were noted before are in them; return the heads.
+
+    Raises
+    ------
+    StoreError
+        If a record does not fit; the text names the first.
+    """
+    _verify_events(connection)
+    _verify_audit(connection)
+    for head in known:
+        _verify_head(connection, head)
+    return heads(connection)
+
+
+def _verify_events(connection: Connection) -> None:
+    before, links = _anchor(connection, EVENT), _LINKS[EVENT].c
+    found = connection.execute(select(links.number, links.digest))
+    kept = {int(number): str(digest) for number, digest in found}
+    query = select(_EVENT).order_by(_EVENT.c.number)
+    for row in connection.execute(query).mappings():
+        digest = digest_of(before, _event(row))
+        if digest != kept.pop(row["number"], ""):
+            raise StoreError(
+                f"event {row['number']} ({row['text'][:80]!r}) does not fit: it was altered, or "
+                "events before it were removed"
+            )
+        before = digest
+    if kept:
+        raise StoreError(f"event {min(kept)} was removed")
+
+
+def _verify_audit(connection: Connection) -> None:
+    numbers = select(_AUDIT.c.identity, _AUDIT.c.number)
+    number_of = {name: int(number) for name, number in connection.execute(numbers)}
+    entries = {
+        entry.identity: entry for entry in rows.records(connection, AuditEntry, select(_AUDIT))
+    }
+    before, linked = GENESIS, set()
+    for row in connection.execute(
+        select(_LINKS[AUDIT]).order_by(_LINKS[AUDIT].c.number)
+    ).mappings():
+        entry = entries.get(row["identity"])
+        if entry is None:
+            raise StoreError(f"audit record {row['identity']} was removed")
+        content = (
+            _accepted(entry, number_of[entry.identity])
+            if row["part"] == ACCEPTED
+            else [entry.identity, entry.result, entry.finished]
+        )
+        digest = digest_of(before, content)
+        if digest != row["digest"]:
+            raise StoreError(
+                f"audit record {entry.identity} ({entry.what} by {entry.who}, {row['part']}) does "
+                "not fit: it was altered, or links before it were"
+            )
+        linked.add((entry.identity, row["part"]))
+        before = digest
+    for name, entry in entries.items():
+        parts = (ACCEPTED, RESULT) if entry.result else (ACCEPTED,)
+        if any((name, part) not in linked for part in parts):
+            raise StoreError(f"audit record {name} ({entry.what} by {entry.who}) is not linked")
+
+
+def _verify_head(connection: Connection, head: Head) -> None:
+    if head.number == 0:
+        return
+    table = _LINKS[head.chain]
+    first = connection.scalar(select(func.min(table.c.number))) or 0
+    digest = connection.scalar(select(table.c.digest).where(table.c.number == head.number))
+    if digest is None and head.chain == EVENT and head.number < first:
+        raise StoreError(f"head {head}: events up to {first - 1} are no longer kept; give a newer")
+    if digest != head.digest:
+        what = "is not there" if digest is None else "has another digest"
+        raise StoreError(
+            f"head {head}: link {head.number} {what}; records were removed or made anew since"
+        )

@@ -1,0 +1,145 @@
+"""The hash chains: whatever is altered, removed or added is named."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from sqlalchemy import text
+from tests.store import old_store
+from typer.testing import CliRunner
+
+from heliotrope.cli import app
+from heliotrope.errors import InputError
+from heliotrope.safety import Severity
+from heliotrope.store import audit, chain
+from heliotrope.store.keeper import Keeper
+from heliotrope.store.records import AuditEntry, Event, StoreError
+
+ENTRY = AuditEntry("a0", "anna", "engineer", "TRACK", "t0", (1.5,), ("H1", "H2"), "why")
+
+
+def fill(keeper: Keeper) -> None:
+    """Record five events, one with figures, and three records of the audit, the last open."""
+    for i in range(5):
+        values = {"wind": 3.0, "unknown": float("nan")} if i == 2 else {}
+        keeper.record_event(Event(100.0 + i, "test", f"event {i}", Severity.WARNING, "H1", values))
+    for i in range(3):
+        keeper.do(lambda c, i=i: audit.begin(c, replace(ENTRY, identity=f"a{i}", at=f"t{i}")))
+    keeper.do(lambda c: audit.finish(c, "a0", "done", "t5"))
+    keeper.do(lambda c: audit.finish(c, "a1", "done", "t6"))
+
+
+def verified(keeper: Keeper, *heads: chain.Head) -> tuple[chain.Head, chain.Head]:
+    """Check a keeper's chains."""
+    with keeper.database.reading() as connection:
+        return chain.verify(connection, heads)
+
+
+def test_what_nobody_touched_fits(
+    keeper: Keeper, place: str | Path, opened: Callable[..., Keeper]
+) -> None:
+    fill(keeper)
+    events, records = verified(keeper)
+    assert (events.number, records.number) == (5, 5)
+    keeper.close()
+    again = opened(place)
+    again.record_event(Event(200.0, "test", "after a restart"))
+    again.do(lambda c: audit.finish_open(c, "stopped", "t9"))
+    assert [head.number for head in verified(again, events, records)] == [6, 6]
+
+
+@pytest.mark.parametrize(
+    ("sql", "named"),
+    [
+        ("UPDATE event SET text = 'nothing' WHERE number = 3", "event 3 .* does not fit"),
+        ("UPDATE event SET at = 1.0 WHERE number = 2", "event 2 .* does not fit"),
+        ("DELETE FROM event WHERE number = 2", "event 3 .* does not fit"),
+        ("DELETE FROM event WHERE number = 5", "event 5 was removed"),
+        ("UPDATE audit SET who = 'ben' WHERE identity = 'a1'", "a1 .TRACK by ben, accepted. does"),
+        ("UPDATE audit SET result = 'good' WHERE identity = 'a1'", "a1 .TRACK by anna, result. do"),
+        ("DELETE FROM audit WHERE identity = 'a2'", "audit record a2 was removed"),
+        ("UPDATE audit SET result = 'good' WHERE identity = 'a2'", "a2 .* is not linked"),
+        ("DELETE FROM audit_link WHERE number = 2", "a2 .* does not fit"),
+    ],
+)
+def test_the_first_record_that_does_not_fit_is_named(keeper: Keeper, sql: str, named: str) -> None:
+    fill(keeper)
+    verified(keeper)
+    keeper.do(lambda c: c.execute(text(sql)))
+    with pytest.raises(StoreError, match=named):
+        verified(keeper)
+
+
+def test_a_chain_that_was_made_anew_has_another_head(tmp_path: Path) -> None:
+    """Whoever has the service's rights can do that; a head noted elsewhere shows it."""
+    keeper = Keeper(tmp_path, inline=True)
+    fill(keeper)
+    noted = verified(keeper)
+    for name in ("event", "event_link"):
+        keeper.do(lambda c, name=name: c.execute(text(f"DELETE FROM {name} WHERE number = 5")))
+    verified(keeper)
+    with pytest.raises(StoreError, match="link 5 is not there; records were removed"):
+        verified(keeper, *noted)
+    keeper.close()
+    again = Keeper(tmp_path, inline=True)
+    again.record_event(Event(1.0, "test", "in its place"))
+    with pytest.raises(StoreError, match="link 5 has another digest"):
+        verified(again, *noted)
+    again.close()
+
+
+def test_old_events_leave_and_the_rest_fits(keeper: Keeper) -> None:
+    fill(keeper)
+    early = verified(keeper)
+    keeper.forget_events(103.0)
+    keeper.record_event(Event(200.0, "test", "later"))
+    keeper.writer.confirmed().result(10.0)
+    assert len(keeper.events()) == 3
+    later = verified(keeper, *early)
+    keeper.forget_events(1000.0)
+    keeper.record_event(Event(2000.0, "test", "after all had left"))
+    keeper.writer.confirmed().result(10.0)
+    verified(keeper)
+    with pytest.raises(StoreError, match="events up to 6 are no longer kept"):
+        verified(keeper, *later)
+
+
+def test_an_old_store_is_linked_when_it_is_migrated(tmp_path: Path) -> None:
+    keeper = Keeper(tmp_path, inline=True)
+    old_store.fill(keeper)
+    fill(keeper)
+    wanted = verified(keeper)
+    for sql in (
+        "DROP TABLE event_link",
+        "DROP TABLE audit_link",
+        "UPDATE alembic_version SET version_num = '0002'",
+    ):
+        keeper.do(lambda c, sql=sql: c.execute(text(sql)))
+    keeper.close()
+    migrated = CliRunner().invoke(app, ["store", "migrate", str(tmp_path)])
+    assert migrated.exit_code == 0, migrated.output
+    again = Keeper(tmp_path, inline=True)
+    found = verified(again)
+    assert found[0] == wanted[0]
+    again.record_event(Event(1.0, "test", "after the migration"))
+    verified(again, *found)
+    again.close()
+
+
+def test_from_the_command_line(tmp_path: Path) -> None:
+    keeper = Keeper(tmp_path, inline=True)
+    fill(keeper)
+    run = CliRunner()
+    head = run.invoke(app, ["store", "head", str(tmp_path)]).stdout.strip()
+    assert head.startswith("event:5:")
+    good = run.invoke(app, ["store", "verify", str(tmp_path), "--head", head])
+    assert good.exit_code == 0, good.output
+    assert "every record fits" in good.stdout
+    keeper.do(lambda c: c.execute(text("UPDATE event SET text = 'x' WHERE number = 1")))
+    bad = run.invoke(app, ["store", "verify", str(tmp_path)])
+    assert isinstance(bad.exception, StoreError)
+    assert "event 1 " in str(bad.exception)
+    wrong = run.invoke(app, ["store", "verify", str(tmp_path), "--head", "nonsense"])
+    assert isinstance(wrong.exception, InputError)
+    keeper.close()
