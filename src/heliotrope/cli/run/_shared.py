@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import gc
 import importlib.util
+import os
 import shutil
 import signal
 import socket
@@ -31,6 +32,8 @@ from heliotrope.store.telemetry import Look, Telemetry
 _SELDOM = 6.0
 #: What the console needs beside the base installation.
 _OF_CONSOLE = ("argon2", "nicegui", "uvicorn", "websockets")
+#: File with the password of the first account, where no terminal can show it.
+FIRST_FILE = "first-password"
 #: Default time between lines, and period of the archive, s.
 EVERY, _ARCHIVED = 10.0, 5.0
 
@@ -213,6 +216,21 @@ class Lines:
         self._thread.close(2.0)
 
 
+def first_password(password: str, folder: Path) -> str:
+    """Return the words that lead a person to the first password.
+
+    The password itself goes to a terminal only. What is printed elsewhere ends in a log or journal,
+    so there the password goes into a file that only its owner may read.
+    """
+    if sys.stdout.isatty():
+        return f"password {password} (shown only now)"
+    path = folder / FIRST_FILE
+    path.unlink(missing_ok=True)
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+        file.write(f"{password}\n")
+    return f"password in {path} (change it, and delete the file)"
+
+
 @contextlib.asynccontextmanager
 async def interface(
     live: PlantAssembly,
@@ -233,7 +251,7 @@ async def interface(
     def tell(address: str) -> None:
         lines.print(f"console: {address}")
         if password is not None:
-            lines.print(f"first account: {FIRST}, password {password} (shown only now)")
+            lines.print(f"first account: {FIRST}, {password}")
         if shown.browser and sys.stdout.isatty():
             webbrowser.open(address)
 
@@ -242,8 +260,8 @@ async def interface(
         yield
 
 
-def first_account(live: PlantAssembly, keeper: Keeper, shown: Shown) -> str | None:
-    """Return the password of a new first account, None if there is none.
+def first_account(live: PlantAssembly, keeper: Keeper, shown: Shown, folder: Path) -> str | None:
+    """Return what to print of the password of a new first account, None if there is none.
 
     It is written to the store, which may be slow, so this comes before the plant begins.
     """
@@ -251,7 +269,8 @@ def first_account(live: PlantAssembly, keeper: Keeper, shown: Shown) -> str | No
         return None
     from heliotrope.console.people import first_start
 
-    return first_start(keeper.people, live.clock.utc().timestamp())
+    password = first_start(keeper.people, live.clock.utc().timestamp())
+    return None if password is None else first_password(password, folder)
 
 
 async def watch(
@@ -345,7 +364,7 @@ async def at_work(
 
     The sockets of the interface stand in ``folder``.
     """
-    password = first_account(live, keeper, shown)
+    password = first_account(live, keeper, shown, folder)
     # Freeze the existing objects: every ten seconds the collector would walk through those of
     # 10,000 heliostats and hold the loop for up to a second.
     gc.freeze()
