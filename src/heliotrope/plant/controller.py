@@ -325,9 +325,9 @@ class PlantController:
         """Return the monotonic time, s."""
         return self.clock.monotonic()
 
-    def sun_vector(self) -> FloatArray:
-        """Return the unit vector to the sun now, ENU, (3,)."""
-        return fast_vector(self.clock.utc().timestamp(), self.design.site)
+    def sun_vector(self, ahead: float = 0.0) -> FloatArray:
+        """Return the unit vector to the sun now, or some seconds ahead, ENU, (3,)."""
+        return fast_vector(self.clock.utc().timestamp() + ahead, self.design.site)
 
     @property
     def emergency(self) -> EmergencyOrder | None:

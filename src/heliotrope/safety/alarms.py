@@ -172,7 +172,7 @@ BEAM_BLOCKED = AlarmKind(
     "beam_blocked",
     _PLANT,
     Severity.WARNING,
-    "The beam of a heliostat would enter a keep-out volume at its aim or on the way there.",
+    "The beam of a heliostat would enter a keep-out volume at its aim or on its way there.",
     "{subject}: {reason}",
     "Automatic control leaves it where it is and tries again every five minutes.",
     "Give it another aim point, or correct the volume in the plant file.",
