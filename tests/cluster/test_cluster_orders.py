@@ -514,6 +514,31 @@ def test_no_more_orders_are_taken_than_the_bus_can_carry() -> None:
     run(main)
 
 
+def test_a_sun_that_jumped_is_an_alarm_for_a_minute() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        assert not field.plant.alarms("sun_jumped")
+        sun = field.boards[0].node.controller.sun
+        for told in (1, 2):
+            sun.leaps += 1
+            await field.until(lambda n=told: len(field.plant.alarms("sun_jumped")) == 2 * n - 1)
+            alarm = field.plant.alarms("sun_jumped")[-1]
+            assert alarm.subject == "A1"
+            assert alarm.active
+            await asyncio.sleep(50.0)
+            assert field.plant.alarms("sun_jumped")[-1] == alarm
+            await asyncio.sleep(15.0)
+            assert not field.plant.alarms("sun_jumped")[-1].active
+            # The local controller shows it on, until it is restarted.
+            sun.leaps += 1
+            await asyncio.sleep(5.0)
+            assert len(field.plant.alarms("sun_jumped")) == 2 * told
+            sun.leaps = 0
+            await asyncio.sleep(2.0)
+
+    run(main)
+
+
 def test_a_state_of_other_firmware_is_named_and_not_believed() -> None:
     async def main(field: Field) -> None:
         await field.until(field.sun_is_fresh)

@@ -239,6 +239,16 @@ NODE_UNINTELLIGIBLE = AlarmKind(
     "Install the same firmware version on heliostat and cluster.",
     over="{subject}: its state is known again",
 )
+SUN_JUMPED = AlarmKind(
+    "sun_jumped",
+    _CLUSTER,
+    Severity.WARNING,
+    "A local controller was sent a sun that cannot follow from the one before.",
+    "{subject}: its cluster sent a sun that cannot follow from the one before",
+    "It refused that sun, or took it after a lapse; if it was tracking, it has turned away.",
+    "Check the clock, the time source and the site of the cluster.",
+    over="{subject}: a minute ago; another jump shows only after its local controller is restarted",
+)
 PLANT_UNINTELLIGIBLE = AlarmKind(
     "plant_unintelligible",
     _CLUSTER,
