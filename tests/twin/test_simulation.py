@@ -107,9 +107,11 @@ def test_each_run_of_any_draws_its_worlds_again() -> None:
     "worlds", [("calm",), ("calm", "swarm"), *(("calm", name) for name in MIX[3:])]
 )
 def test_no_invariant_is_broken_while_mirrors_track(worlds: tuple[str, ...]) -> None:
-    outcome = run(RunPlan(1, 120.0, 3, 60.0, worlds=worlds))
+    # With seed 1 a jump of the clock takes the sun away before any mirror tracks.
+    outcome = run(RunPlan(2, 120.0, 3, 60.0, worlds=worlds))
     assert outcome.good, f"{outcome.text}; {outcome.command}"
-    assert outcome.checks[12] > 50
+    assert outcome.states[states.TRACKING] > 0
+    assert outcome.checks[12] > 200
 
 
 def test_a_failing_seed_is_replayed_by_its_command(monkeypatch: pytest.MonkeyPatch) -> None:
