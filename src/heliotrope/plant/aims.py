@@ -1,6 +1,6 @@
 """Aim points for heliostats, and the proof that a beam may go to its point."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -239,7 +239,12 @@ class BeamCheck:
         return found
 
     def on_the_way(
-        self, rows: npt.NDArray[np.intp], counts: FloatArray, aims: FloatArray, sun: FloatArray
+        self,
+        rows: npt.NDArray[np.intp],
+        counts: FloatArray,
+        aims: FloatArray,
+        sun: FloatArray,
+        motion: Callable[[npt.NDArray[np.intp], FloatArray, FloatArray], FloatArray],
     ) -> dict[str, str]:
         """Return the heliostats whose beams would enter a volume on the way to their aims, and why.
 
@@ -251,6 +256,8 @@ class BeamCheck:
             Step counts of their axes, (K, 2).
         aims, sun
             As in `problems`.
+        motion
+            Returns the angles that the axes pass between counts; see `Ways.motion`.
         """
         found: dict[str, str] = {}
         solved = self.poses(rows, aims, sun)
@@ -261,8 +268,7 @@ class BeamCheck:
             )
         good = status == TrackingStatus.OK
         if good.any():
-            begin = Drive(self.drives.table[rows]).angles(counts)
-            path = np.stack([begin, solved.chosen(solved.angles)], axis=-2)[good]
+            path = motion(rows[good], counts[good], solved.chosen(solved.counts)[good])
             found |= self.moving(rows[good], path, sun)
         return found
 

@@ -222,7 +222,7 @@ class BeamWatch:
         if not unknown.all():
             known = rows[~unknown]
             counts, light = self._field.counts(known), self._sun(0.0)
-            found |= self._check.on_the_way(known, counts, aims[~unknown], light)
+            found |= self._check.on_the_way(known, counts, aims[~unknown], light, self._ways.motion)
             if name == "SEARCH":
                 found |= self._check.around(known, aims[~unknown], values[1], light)
         return found
