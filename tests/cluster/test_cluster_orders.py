@@ -13,6 +13,7 @@ from heliotrope.cluster._goals import Goals
 from heliotrope.cluster._reports import Reports
 from heliotrope.cluster.memory import Kept
 from heliotrope.lcu import messages, states, wire
+from heliotrope.lcu.controller import SWITCH
 from heliotrope.lcu.journal import CODES_OF
 from heliotrope.links.messages import Answer, Ask, Command, Parameters, Progress, Stage
 from heliotrope.twin.boards.bus import TwinBus
@@ -633,6 +634,20 @@ def test_nothing_is_done_where_the_step_counts_are_unknown(name: str) -> None:
         assert await final(field, "stop", limit=310.0) is Stage.FAILED
         assert field.plant.stages("stop", "A1")[-2] is Stage.ACKNOWLEDGED
         text = f"{name}: its step counts are unknown, so nothing shows where its beam is"
+        assert text in field.plant.text("stop")
+
+    run(main, "IDLE")
+
+
+@pytest.mark.parametrize("name", ["DEFOCUS", "STOW"])
+def test_nothing_is_done_where_the_drives_are_switched_off(name: str) -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        board = field.boards[0]
+        board.node.on_fault(SWITCH, board._tick(field.clock.monotonic()), True)
+        await field.emergency("stop", name)
+        assert await final(field, "stop", limit=310.0) is Stage.FAILED
+        text = f"{name}: its drives are switched off at the mirror, away from stow"
         assert text in field.plant.text("stop")
 
     run(main, "IDLE")

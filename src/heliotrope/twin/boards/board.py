@@ -14,7 +14,7 @@ import numpy as np
 
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
-from heliotrope.lcu.controller import Controller
+from heliotrope.lcu.controller import SWITCH, Controller
 from heliotrope.lcu.journal import Journal
 from heliotrope.lcu.node import Node
 from heliotrope.twin.boards.clocks import TickCounter
@@ -89,6 +89,8 @@ class Board:
         True time of the last event, in s.
     tilt
         Reading of the accelerometer, or None.
+    switched_off
+        Whether the drives are switched off at the mirror.
     """
 
     def __init__(
@@ -113,6 +115,7 @@ class Board:
         self.slip = [0, 0]
         self.now = 0.0
         self.tilt: tuple[float, float] | None = None
+        self.switched_off = False
         self._out = bytearray()
         self._looked = -math.inf
         self._restless = False
@@ -147,6 +150,7 @@ class Board:
                 key=self.outfit.key,
                 sensor=lambda: self.tilt,
             )
+            self._switch()
         except PowerCutError:
             self._die()
             return
@@ -161,6 +165,21 @@ class Board:
             with contextlib.suppress(PowerCutError):
                 self.node.on_supply_failing(self.ticks.at(now))
         self._die()
+
+    def switch(self, now: float, *, off: bool) -> None:
+        """Switch the drives off, or on again, with the switch at the mirror."""
+        self._to(now)
+        self.switched_off = off
+        try:
+            self._switch()
+        except PowerCutError:
+            self._die()
+
+    def _switch(self) -> None:
+        if self.node is not None and self.switched_off:
+            self.node.on_fault(SWITCH, self.ticks.at(self.now), True)
+        elif self.node is not None:
+            self.node.fault_gone(SWITCH)
 
     def _die(self) -> None:
         for axis in self.axes:
