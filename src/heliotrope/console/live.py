@@ -21,6 +21,8 @@ from heliotrope.plant.operations.operations import Operations
 
 #: Flags that come and go with every step or sun vector, which would change every row.
 _RESTLESS = sum(1 << meanings.FLAGS.index(name) for name in ("MOVING", "SUN_FRESH"))
+#: Flag of a heliostat whose drives are switched off at the mirror; out of service, it is 2 in a row.
+_SWITCHED_OFF = 1 << meanings.FLAGS.index("LOCAL_SWITCH")
 #: Health of a cluster as the page colours it.
 WELL, TROUBLED, SILENT = 0, 1, 2
 
@@ -35,7 +37,7 @@ def rows_of(operations: Operations) -> npt.NDArray[Any]:
     rows["sightings"] = np.minimum(frame.sightings, 65_535)
     rows["flags"] = frame.flags & (0xFFFF ^ _RESTLESS)
     rows["state"], rows["fault"] = frame.state, frame.fault
-    rows["on"], rows["held"] = frame.on, frame.held
+    rows["on"], rows["held"] = frame.on, np.where(frame.flags & _SWITCHED_OFF, 2, 1) * frame.held
     return rows
 
 
