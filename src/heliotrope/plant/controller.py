@@ -724,8 +724,8 @@ class PlantController:
 
         Raises
         ------
-        BeamError
-            If none may.
+        RefusedError
+            If none may; the reason of the whole plant or of a cluster comes before their own.
         """
         wrong = {} if name == "LOCK" else self._identities.barred(names)
         if name in MOTIONS:
@@ -733,6 +733,7 @@ class PlantController:
         if name in JOINING:
             wrong |= self._sentinel.barred(names)
         if wrong and len(wrong) == len(names):
+            self._refuse_now(name, names)
             raise BeamError(name, wrong)
         return tuple(n for n in names if n not in wrong), wrong
 
