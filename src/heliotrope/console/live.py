@@ -21,7 +21,7 @@ from heliotrope.plant.operations.operations import Operations
 
 #: Flags that come and go with every step or sun vector, which would change every row.
 _RESTLESS = sum(1 << meanings.FLAGS.index(name) for name in ("MOVING", "SUN_FRESH"))
-#: Flag of a heliostat whose drives are switched off at the mirror; out of service, it is 2 in a row.
+#: Flag of drives that are switched off at the mirror: it confirms *out of service*.
 _SWITCHED_OFF = 1 << meanings.FLAGS.index("LOCAL_SWITCH")
 #: Health of a cluster as the page colours it.
 WELL, TROUBLED, SILENT = 0, 1, 2
