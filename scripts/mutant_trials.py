@@ -42,7 +42,7 @@ RUNS: tuple[tuple[str, int, tuple[str, ...], float], ...] = (
 )
 SECONDS, HELIOSTATS = 180.0, 3
 #: Tests of one mutant together, at most, s; those left over are not run.
-MOST_TESTS = 60.0
+MOST_TESTS = 120.0
 #: Time of the processor after which a test or a run hangs: this and so much more than it takes
 #: unchanged; of a run; wall time for those that wait for ever, on a machine that does more. s.
 SPARE, FACTOR, RUN_LIMIT, WALL = 5.0, 1.5, 30.0, 300.0
@@ -397,12 +397,22 @@ class Bench:
         return {n for n, item in self._items.items() if word in texts.get(item.path, "")}
 
     def _shortest(self, mutant: Mutant, tests: set[str]) -> tuple[list[str], float]:
-        """Return tests, the shortest first, and the time that they take."""
+        """Return tests, the shortest first, and the time that they take.
+
+        Of a test with parameters one comes first, and the others after all tests had their turn:
+        they mostly find the same.
+        """
         seconds = self._seconds
         own = f"tests/{Path(mutant.file).parts[0]}/"
         order = sorted(
             tests - self._flaky, key=lambda n: seconds.get(n, 1.0) * (1 + (own not in n))
         )
+        turns = Counter[str]()
+        turn = {}
+        for name in order:
+            turn[name] = min(2, turns[name.split("[")[0]])
+            turns[name.split("[")[0]] += 1
+        order.sort(key=lambda name: turn[name])
         chosen: list[str] = []
         total = 0.0
         for name in order:
