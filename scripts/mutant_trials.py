@@ -32,15 +32,16 @@ import mutant_operators as operators
 import pytest
 from mutant_operators import ROOT, SOURCE, Mutant
 
-#: Runs of the simulation: name, seed, worlds, mean time between two faults (s).
-RUNS: tuple[tuple[str, int, tuple[str, ...], float], ...] = (
-    ("held 41", 41, ("held",), 12.0),
-    ("calm 11", 11, ("calm",), 60.0),
-    ("calm held 42", 42, ("calm", "held"), 30.0),
-    ("swarm 21", 21, ("swarm",), 12.0),
-    ("site 61", 61, ("site",), 12.0),
+#: Runs of the simulation: name, seed, worlds, mean time between two faults, length, s.
+RUNS: tuple[tuple[str, int, tuple[str, ...], float, float], ...] = (
+    ("tour 2", 2, ("tour",), 12.0, 240.0),
+    ("held 41", 41, ("held",), 12.0, 180.0),
+    ("calm 11", 11, ("calm",), 60.0, 180.0),
+    ("calm held 42", 42, ("calm", "held"), 30.0, 180.0),
+    ("swarm 21", 21, ("swarm",), 12.0, 180.0),
+    ("site 61", 61, ("site",), 12.0, 180.0),
 )
-SECONDS, HELIOSTATS = 180.0, 3
+HELIOSTATS = 3
 #: Tests of one mutant together, at most, s; those left over are not run.
 MOST_TESTS = 120.0
 #: Time of the processor after which a test or a run hangs: this and so much more than it takes
@@ -66,8 +67,8 @@ def simulate(name: str) -> bool:
     from heliotrope.twin.world.simulation import RunPlan, run
 
     limit(RUN_LIMIT)
-    seed, worlds, pause = next(each[1:] for each in RUNS if each[0] == name)
-    return not run(RunPlan(seed, SECONDS, HELIOSTATS, pause, worlds=worlds)).good
+    seed, worlds, pause, seconds = next(each[1:] for each in RUNS if each[0] == name)
+    return not run(RunPlan(seed, seconds, HELIOSTATS, pause, worlds=worlds)).good
 
 
 # -- what reaches a line -----------------------------------------------------------------------

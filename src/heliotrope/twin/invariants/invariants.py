@@ -22,7 +22,7 @@ number    check
 9         As 1, and the plant's lease too, while a clock or counter has jumped.
 10        Azimuth moves first from stow and last to stow; no beam crosses the receiver on the way.
 11        Every command on the bus was accepted and reported once; no value is reported younger
-          or other than it is.
+          or other than it is. Where nothing fails (`world.tour`) it is done in time.
 12        A beam in a state that lights anything is where it was sent; otherwise an alarm names
           it within 10 s and it is off within 30 s.
 13        In no state does a beam stay on the receiver unsent, or in a keep-out volume, for 30 s.
