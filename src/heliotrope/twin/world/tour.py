@@ -87,6 +87,7 @@ class Tour:
         """
         await asyncio.sleep(5.0)  # until all have been heard
         self._operator.seize(self._plant, ENGINEER)
+        await asyncio.sleep(REST)  # until the clusters have the new token
         async with asyncio.TaskGroup() as group:
             for name in self._boards:
                 group.create_task(self._lead(name))
