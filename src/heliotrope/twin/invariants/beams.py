@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
+from heliotrope.lcu.node import Node
 from heliotrope.links.messages import Command, Progress, Stage
 from heliotrope.plant.controller import PlantController
 from heliotrope.safety import Act, Alarm
@@ -59,8 +60,8 @@ class _Mirror:
     ----------
     aims, standbys
         Identities of orders and points: the last point that was reported as done, and all later.
-    state, settled_at
-        State last seen; when it must be where it was sent, s.
+    state, node, settled_at
+        State and program last seen; when it must be where it was sent, s.
     elsewhere, approached
         Whether its last motion led to step counts, not to its standby point; whether it has come to
         its standby point by the way from stow since it last had power or was at stow.
@@ -80,6 +81,7 @@ class _Mirror:
     aims: deque[tuple[str, Point]] = field(default_factory=lambda: deque(maxlen=40))
     standbys: deque[tuple[str, Point]] = field(default_factory=lambda: deque(maxlen=40))
     state: int = -1
+    node: Node | None = None
     settled_at: float = float("-inf")
     elsewhere: bool = False
     approached: bool = False
@@ -234,6 +236,8 @@ class BeamObserver:
         for mirror in self._mirrors.values():
             if mirror.cluster not in carried or named & {mirror.name, mirror.cluster}:
                 mirror.named_at = now
+            if mirror.node is not mirror.board.node:  # it was without power, however shortly
+                mirror.node, mirror.approached = mirror.board.node, False
             self._enters(mirror, mirror.board.state, now)
             on += mirror.state in _ON
             if mirror.state < 0:

@@ -29,7 +29,9 @@ WORLDS = {
 #: Name that lets each run draw its worlds: see `mixed`.
 ANY = "any"
 #: Worlds that hold, of which `mixed` chooses.
-MIX = ("calm", "swarm", "held", "frozen", "disk")
+MIX = (
+    "calm", "swarm", "held", "frozen", "disk", "place", "sensors", "parameters", "calibrations",
+)  # fmt: skip
 
 
 def checked(worlds: Sequence[str]) -> None:
