@@ -374,7 +374,11 @@ class Bench:
             found, at_import = reaching(mutant, self._reach)
         where = "outside" if at_import or not self._patches(plain, new) else "inside"
         if kind == "unit":
-            names, spare = self._shortest(mutant, found & set(self._items))
+            # What the import makes of it, a table or a constant, others use: all tests of the
+            # package may find it.
+            wide = at_import and self._reach is not None
+            own = self._own(mutant) if wide else set()
+            names, spare = self._shortest(mutant, (found | own) & set(self._items))
         else:
             names = sorted(found & set(self._kills), key=self._chance, reverse=True)
             spare = 10.0 * len(names)
@@ -387,15 +391,17 @@ class Bench:
     def _chance(self, run: str) -> float:
         return (self._kills[run] + 1.0) / (self._tries[run] + 2.0)
 
+    def _own(self, mutant: Mutant) -> set[str]:
+        """Return the tests of a mutant's package."""
+        start = f"tests/{Path(mutant.file).parts[0]}/"
+        return {name for name in self._items if name.startswith(start)}
+
     def _near(self, mutant: Mutant) -> set[str]:
-        path = Path(mutant.file)
-        texts: dict[Path, str] = {}
-        start = ROOT / "tests" / path.parts[0]
-        for item in self._items.values():
-            if item.path.is_relative_to(start) and item.path not in texts:
-                texts[item.path] = item.path.read_text(encoding="utf-8")
-        word = path.stem.strip("_")
-        return {n for n, item in self._items.items() if word in texts.get(item.path, "")}
+        """Return the tests of a mutant's package whose file names its module."""
+        word = Path(mutant.file).stem.strip("_")
+        files = {name.split("::")[0] for name in self._own(mutant)}
+        near = {file for file in files if word in (ROOT / file).read_text(encoding="utf-8")}
+        return {name for name in self._own(mutant) if name.split("::")[0] in near}
 
     def _shortest(self, mutant: Mutant, tests: set[str]) -> tuple[list[str], float]:
         """Return tests, the shortest first, and the time that they take.

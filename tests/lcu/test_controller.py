@@ -286,6 +286,20 @@ def test_defocus_turns_the_beam_away_and_refocus_brings_it_back() -> None:
     assert bench.miss(AIM) < 0.01
 
 
+@pytest.mark.parametrize("near", [0, 1])
+def test_between_stops_too_near_for_a_defocus_it_goes_to_the_farther_one(near: int) -> None:
+    """0.1 rad fit neither way between stops 0.03 and 0.06 rad off."""
+    bench = tracking()
+    motion = bench.node.controller.motion
+    drive = motion.config.drives[0]
+    assert drive is not None
+    here = drive.angle(motion.place(0))
+    stops = [here - 0.03, here + 0.06] if near == 0 else [here - 0.06, here + 0.03]
+    motion._stops[0][:] = stops
+    motion.defocus()
+    assert drive.angle(motion.goal(0)) == pytest.approx(stops[1 - near], abs=1e-4)
+
+
 def test_a_defocused_mirror_goes_with_the_sun() -> None:
     bench = tracking()
     bench.order("DEFOCUS")

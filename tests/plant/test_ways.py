@@ -24,7 +24,7 @@ from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.mechanism.tracking import track
 from heliotrope.optics import MirrorOptics, beams, find_entries
-from heliotrope.plant.aims import BeamCheck
+from heliotrope.plant.aims import BeamCheck, _disc
 from heliotrope.plant.assigned import rest_on
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.controller import PlantController
@@ -186,6 +186,17 @@ def test_a_search_is_wide_enough_as_seen_by_single_beams(radius: float) -> None:
             hits += 1
             assert check.around(rows, aim, radius, sun)
     assert hits > 0
+
+
+@pytest.mark.parametrize("way", [(0.0, 0.0, 40.0), (30.0, -20.0, 40.0), (10.0, 0.0, 0.0)])
+def test_a_search_is_a_disc_across_the_beam(way: tuple[float, float, float]) -> None:
+    """Straight up too, where no direction is to the right."""
+    eye = np.array([5.0, 6.0, 2.0])
+    offsets = _disc(eye, eye + way, 0.1, 1.0) - (eye + way)
+    np.testing.assert_allclose(offsets @ np.array(way), 0.0, atol=1e-9)
+    far = np.linalg.norm(offsets, axis=1)
+    assert far.max() == pytest.approx(np.linalg.norm(way) * np.tan(0.1))
+    np.testing.assert_allclose(offsets[far > 0.99 * far.max()].mean(axis=0), 0.0, atol=1e-9)
 
 
 def test_by_night_and_without_volumes_nothing_is_in_the_way() -> None:
