@@ -128,6 +128,17 @@ IDENTITY = AlarmKind(
     "Stow both; then correct their addresses, or write the parameters of the mirror that is there.",
     over="{subject}: its own parameters answer again",
 )
+COUNTS_DOUBTFUL = AlarmKind(
+    "counts_doubtful",
+    _PLANT,
+    Severity.WARNING,
+    "A local controller lost its power in motion, so its step counts may be wrong.",
+    "{subject}: its step counts may be wrong since a power cut in motion",
+    "It does not join the receiver; targets, standby, DEFOCUS and STOW go on as before.",
+    "Look where its mirror stands. If that is right, acknowledge; if not, an engineer locks it and "
+    "gives its step counts (ZERO). A calibration visit confirms it too.",
+    over="{subject}: its step counts are confirmed, or have been given again",
+)
 RECORDS = AlarmKind(
     "records",
     _PLANT,

@@ -243,7 +243,7 @@ class BeamObserver:
             if mirror.state < 0:
                 mirror.astray_since = mirror.lit_since = mirror.inside_since = None
                 continue
-            self._placed(mirror, sun, now)
+            self._placed(mirror, sun, now, named=mirror.name in named)
             self._dark(mirror, sun, now)
         self._loss(on, now)
         if plant is not None:
@@ -275,8 +275,13 @@ class BeamObserver:
             good = mirror.resumed_at >= self._lost_at
             self._check(14, good, now, mirror.name, saw)
 
-    def _placed(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
-        """Check that a beam that was sent to a point is there."""
+    def _placed(self, mirror: _Mirror, sun: FloatArray, now: float, *, named: bool) -> None:
+        """Check that a beam that was sent to a point is there, or named and off.
+
+        A mirror at standby is off if its beam is neither on the receiver nor in a volume: no order
+        can bring one whose step counts are wrong to a better place, so its alarm (``named``) is all
+        that is asked for, as long as it stands.
+        """
         sent = _LIT.get(mirror.state)
         if sent is None or (mirror.left and not mirror.uncalled):
             mirror.astray_since = None
@@ -297,7 +302,13 @@ class BeamObserver:
         unnamed = 0.0 if since is None else now - max(since, mirror.named_at)
         saw = f"{beside}, and no alarm names it"
         self._check(12, unnamed <= NAMED_WITHIN, now, mirror.name, saw)
-        self._check(12, passed <= OFF_WITHIN, now, mirror.name, beside)
+        off = named and mirror.state == states.IDLE and not self._lights(mirror, sun)
+        self._check(12, off or passed <= OFF_WITHIN, now, mirror.name, beside)
+
+    def _lights(self, mirror: _Mirror, sun: FloatArray) -> bool:
+        """Whether a beam is on the receiver or inside a volume."""
+        inside = any(mirror.board.miss(sun, at) <= radius for at, radius in self._keep_outs)
+        return inside or mirror.board.miss(sun, RECEIVER) <= OFF
 
     def _dark(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
         """Check that a beam that nobody sent to the receiver, or into a volume, leaves."""
