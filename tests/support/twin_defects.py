@@ -257,6 +257,21 @@ def _lease_too_long(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(lease.SunLease, "look", lambda self, now, elapsed: True)
 
 
+def _ready_after_stow(patch: pytest.MonkeyPatch) -> None:
+    """That standby was reached by the safe way is not forgotten at stow."""
+
+    def remembering(does: Callable[[Any], None]) -> Callable[[Any], None]:
+        def sticky(self: Any) -> None:
+            ready = self.ready
+            does(self)
+            self.ready = self.ready or ready
+
+        return sticky
+
+    for name in ("stow", "stow_directly", "approach"):
+        patch.setattr(motion.Motion, name, remembering(getattr(motion.Motion, name)))
+
+
 def _straight_to_standby(patch: pytest.MonkeyPatch) -> None:
     """No way along the ground: from stow straight to the standby point."""
 
@@ -334,6 +349,7 @@ DEFECTS = (
     Defect((13,), "a mirror stays where it was after a boot", _stays_after_boot,
            faults=tuple(Fault("power_cut", 150.0, 2.0, i, 0.5) for i in range(3)), seconds=220.0,
            worlds=("calm",)),
+    Defect((10,), "TRACK accepted straight from stow", _ready_after_stow, pause=12.0, first=2),
     Defect((10,), "approach straight to the standby point", _straight_to_standby,
            ("line_drop",), 60.0, first=1),
     Defect((9,), "SUN sent although the table says dark", _sun_in_the_dark, ("time_jump",), 10.0),
