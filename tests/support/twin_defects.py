@@ -257,6 +257,10 @@ def _lease_too_long(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(lease.SunLease, "look", lambda self, now, elapsed: True)
 
 
+def _search_without_sun(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(states, "NEED_SUN", (states.APPROACHING, states.TRACKING))
+
+
 def _ready_after_stow(patch: pytest.MonkeyPatch) -> None:
     """That standby was reached by the safe way is not forgotten at stow."""
 
@@ -348,6 +352,10 @@ DEFECTS = (
            worlds=("calm",)),
     Defect((13,), "a mirror stays where it was after a boot", _stays_after_boot,
            faults=tuple(Fault("power_cut", 150.0, 2.0, i, 0.5) for i in range(3)), seconds=220.0,
+           worlds=("calm",)),
+    Defect((1,), "SEARCHING goes on without a sun", _search_without_sun,
+           faults=tuple(Fault("cluster_crash", at, 12.0, i, 0.5)
+                        for at in (70.0, 100.0, 130.0, 160.0, 190.0, 220.0) for i in range(3)),
            worlds=("calm",)),
     Defect((10,), "TRACK accepted straight from stow", _ready_after_stow, pause=12.0, first=2),
     Defect((10,), "approach straight to the standby point", _straight_to_standby,
