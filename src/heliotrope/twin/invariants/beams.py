@@ -15,7 +15,7 @@ from heliotrope.lcu import states
 from heliotrope.lcu.node import Node
 from heliotrope.links.messages import Command, Progress, Stage
 from heliotrope.plant.controller import PlantController
-from heliotrope.safety import Act, Alarm
+from heliotrope.safety import Act, Alarm, alarms
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import RECEIVER, STANDBY, STOW, Ball
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Violation
@@ -243,7 +243,7 @@ class BeamObserver:
             if mirror.state < 0:
                 mirror.astray_since = mirror.lit_since = mirror.inside_since = None
                 continue
-            self._placed(mirror, sun, now, named=mirror.name in named)
+            self._placed(mirror, sun, now)
             self._dark(mirror, sun, now)
         self._loss(on, now)
         if plant is not None:
@@ -275,12 +275,12 @@ class BeamObserver:
             good = mirror.resumed_at >= self._lost_at
             self._check(14, good, now, mirror.name, saw)
 
-    def _placed(self, mirror: _Mirror, sun: FloatArray, now: float, *, named: bool) -> None:
+    def _placed(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
         """Check that a beam that was sent to a point is there, or named and off.
 
         A mirror at standby is off if its beam is neither on the receiver nor in a volume: no order
-        can bring one whose step counts are wrong to a better place, so its alarm (``named``) is all
-        that is asked for, as long as it stands.
+        can bring one whose step counts are wrong to a better place, so its alarm is all that is
+        asked for, as long as it stands. Other alarms about standby have a better remedy.
         """
         sent = _LIT.get(mirror.state)
         if sent is None or (mirror.left and not mirror.uncalled):
@@ -302,7 +302,8 @@ class BeamObserver:
         unnamed = 0.0 if since is None else now - max(since, mirror.named_at)
         saw = f"{beside}, and no alarm names it"
         self._check(12, unnamed <= NAMED_WITHIN, now, mirror.name, saw)
-        off = named and mirror.state == states.IDLE and not self._lights(mirror, sun)
+        doubtful = self._alarms.get((alarms.COUNTS_DOUBTFUL.name, mirror.name), (0.0, False))[1]
+        off = doubtful and mirror.state == states.IDLE and not self._lights(mirror, sun)
         self._check(12, off or passed <= OFF_WITHIN, now, mirror.name, beside)
 
     def _lights(self, mirror: _Mirror, sun: FloatArray) -> bool:
