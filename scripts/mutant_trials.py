@@ -32,17 +32,18 @@ import mutant_operators as operators
 import pytest
 from mutant_operators import ROOT, SOURCE, Mutant
 
-#: Runs of the simulation: name, seed, worlds, mean time between two faults (s).
-RUNS: tuple[tuple[str, int, tuple[str, ...], float], ...] = (
-    ("held 41", 41, ("held",), 12.0),
-    ("calm 11", 11, ("calm",), 60.0),
-    ("calm held 42", 42, ("calm", "held"), 30.0),
-    ("swarm 21", 21, ("swarm",), 12.0),
-    ("site 61", 61, ("site",), 12.0),
+#: Runs of the simulation: name, seed, worlds, mean time between two faults, length, s.
+RUNS: tuple[tuple[str, int, tuple[str, ...], float, float], ...] = (
+    ("tour 2", 2, ("tour",), 12.0, 240.0),
+    ("held 41", 41, ("held",), 12.0, 180.0),
+    ("calm 11", 11, ("calm",), 60.0, 180.0),
+    ("calm held 42", 42, ("calm", "held"), 30.0, 180.0),
+    ("swarm 21", 21, ("swarm",), 12.0, 180.0),
+    ("site 61", 61, ("site",), 12.0, 180.0),
 )
-SECONDS, HELIOSTATS = 180.0, 3
+HELIOSTATS = 3
 #: Tests of one mutant together, at most, s; those left over are not run.
-MOST_TESTS = 60.0
+MOST_TESTS = 120.0
 #: Time of the processor after which a test or a run hangs: this and so much more than it takes
 #: unchanged; of a run; wall time for those that wait for ever, on a machine that does more. s.
 SPARE, FACTOR, RUN_LIMIT, WALL = 5.0, 1.5, 30.0, 300.0
@@ -66,8 +67,8 @@ def simulate(name: str) -> bool:
     from heliotrope.twin.world.simulation import RunPlan, run
 
     limit(RUN_LIMIT)
-    seed, worlds, pause = next(each[1:] for each in RUNS if each[0] == name)
-    return not run(RunPlan(seed, SECONDS, HELIOSTATS, pause, worlds=worlds)).good
+    seed, worlds, pause, seconds = next(each[1:] for each in RUNS if each[0] == name)
+    return not run(RunPlan(seed, seconds, HELIOSTATS, pause, worlds=worlds)).good
 
 
 # -- what reaches a line -----------------------------------------------------------------------
@@ -373,7 +374,11 @@ class Bench:
             found, at_import = reaching(mutant, self._reach)
         where = "outside" if at_import or not self._patches(plain, new) else "inside"
         if kind == "unit":
-            names, spare = self._shortest(mutant, found & set(self._items))
+            # What the import makes of it, a table or a constant, others use: all tests of the
+            # package may find it.
+            wide = at_import and self._reach is not None
+            own = self._own(mutant) if wide else set()
+            names, spare = self._shortest(mutant, (found | own) & set(self._items))
         else:
             names = sorted(found & set(self._kills), key=self._chance, reverse=True)
             spare = 10.0 * len(names)
@@ -386,23 +391,35 @@ class Bench:
     def _chance(self, run: str) -> float:
         return (self._kills[run] + 1.0) / (self._tries[run] + 2.0)
 
+    def _own(self, mutant: Mutant) -> set[str]:
+        """Return the tests of a mutant's package."""
+        start = f"tests/{Path(mutant.file).parts[0]}/"
+        return {name for name in self._items if name.startswith(start)}
+
     def _near(self, mutant: Mutant) -> set[str]:
-        path = Path(mutant.file)
-        texts: dict[Path, str] = {}
-        start = ROOT / "tests" / path.parts[0]
-        for item in self._items.values():
-            if item.path.is_relative_to(start) and item.path not in texts:
-                texts[item.path] = item.path.read_text(encoding="utf-8")
-        word = path.stem.strip("_")
-        return {n for n, item in self._items.items() if word in texts.get(item.path, "")}
+        """Return the tests of a mutant's package whose file names its module."""
+        word = Path(mutant.file).stem.strip("_")
+        files = {name.split("::")[0] for name in self._own(mutant)}
+        near = {file for file in files if word in (ROOT / file).read_text(encoding="utf-8")}
+        return {name for name in self._own(mutant) if name.split("::")[0] in near}
 
     def _shortest(self, mutant: Mutant, tests: set[str]) -> tuple[list[str], float]:
-        """Return tests, the shortest first, and the time that they take."""
+        """Return tests, the shortest first, and the time that they take.
+
+        Of a test with parameters one comes first, and the others after all tests had their turn:
+        they mostly find the same.
+        """
         seconds = self._seconds
         own = f"tests/{Path(mutant.file).parts[0]}/"
         order = sorted(
             tests - self._flaky, key=lambda n: seconds.get(n, 1.0) * (1 + (own not in n))
         )
+        turns = Counter[str]()
+        turn = {}
+        for name in order:
+            turn[name] = min(2, turns[name.split("[")[0]])
+            turns[name.split("[")[0]] += 1
+        order.sort(key=lambda name: turn[name])
         chosen: list[str] = []
         total = 0.0
         for name in order:

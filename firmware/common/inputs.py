@@ -9,7 +9,8 @@ DIVIDER = 11
 class Inputs:
     """Inputs read the same way on all boards.
 
-    ``good``, ``limits`` and ``address`` are pins of the board, ``dog`` its watchdog.
+    ``good``, ``limits`` and ``address`` are pins of the board, ``local`` too or None, ``dog`` its
+    watchdog.
     """
 
     def sha256(self, data):
@@ -30,3 +31,7 @@ class Inputs:
     def limit_hit(self):
         # Switches open when they are hit, so that a broken wire stops the axis too.
         return any([pin() for pin in self.limits])
+
+    def switched_off(self):
+        # The contact is closed while the drives have power, so that a broken wire locks too.
+        return self.local is not None and self.local() == 1

@@ -17,7 +17,7 @@ class Loop:
 
     ``board`` has ``storage``, ``timer`` (with ``pump``), ``port``, ``serial``, ``firmware``,
     ``sha256``, ``key``, ``switches()`` (0: none), ``supply_mv()``, ``temperature_degc()``,
-    ``supply_good()``, ``limit_hit()``, ``tilt()`` and ``feed()``.
+    ``supply_good()``, ``limit_hit()``, ``switched_off()``, ``tilt()`` and ``feed()``.
     """
 
     def __init__(self, board):
@@ -40,7 +40,7 @@ class Loop:
             # No address set over the wire yet: use the switches.
             config.address = board.switches()
         self.ticked = self.measured = now
-        self.failing = self.limited = False
+        self.failing = self.limited = self.off = False
         self.hot = self.weak = False
 
     def turn(self):
@@ -61,7 +61,7 @@ class Loop:
             self.measure(now)
 
     def guard(self, now):
-        """Handle urgent inputs: the supply's fall, and the limit switches."""
+        """Handle urgent inputs: the supply's fall, limit switches, the switch at the mirror."""
         good = self.board.supply_good()
         if not good and not self.failing:
             self.failing = True
@@ -75,6 +75,12 @@ class Loop:
         elif self.limited and not hit:
             self.node.fault_gone(controller.LIMIT_SWITCH)
         self.limited = hit
+        off = self.board.switched_off()
+        if off and not self.off:
+            self.node.on_fault(controller.SWITCH, now, True)
+        elif self.off and not off:
+            self.node.fault_gone(controller.SWITCH)
+        self.off = off
 
     def measure(self, now):
         """Measure supply and temperature, for STATUS; beyond their limits latch a fault."""

@@ -25,6 +25,8 @@ class Board(Inputs):
         self.good = Pin(pins["supply_good"], Pin.IN, Pin.PULL_UP)
         self.limits = [Pin(number, Pin.IN, Pin.PULL_UP) for number in pins["limits"]]
         self.address = [Pin(number, Pin.IN, Pin.PULL_UP) for number in pins["switches"]]
+        local = settings.LOCAL_SWITCH
+        self.local = None if local is None else Pin(local, Pin.IN, Pin.PULL_UP)
         self.supply, self.warmth = ADC(pins["supply"]), ADC(ADC.CORE_TEMP)
         self.dog = machine.WDT(timeout=2000)
 

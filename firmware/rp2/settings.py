@@ -4,6 +4,8 @@ FIRMWARE = 1
 BAUD = 115200
 #: 32 bytes known to the plant and this board only; if empty, nothing can be stored over the wire.
 KEY = b""
+#: Pin of the contact that opens when the drives are switched off at the mirror; None: no contact.
+LOCAL_SWITCH = None
 PINS = {
     "bus": (0, 1), "flash": (18, 19, 16, 17),
     "drive": 2, "steps": (6, 7, 8, 9),

@@ -25,6 +25,8 @@ class Board(Inputs):
         self.good = Pin(pins["supply_good"], Pin.IN, Pin.PULL_UP)
         self.limits = [Pin(name, Pin.IN, Pin.PULL_UP) for name in pins["limits"]]
         self.address = [Pin(name, Pin.IN, Pin.PULL_UP) for name in pins["switches"]]
+        local = settings.LOCAL_SWITCH
+        self.local = None if local is None else Pin(local, Pin.IN, Pin.PULL_UP)
         self.supply = pyb.ADC(Pin(pins["supply"]))
         self.chip = pyb.ADCAll(12, 0x70000)
         self.dog = machine.WDT(timeout=2000)

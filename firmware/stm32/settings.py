@@ -4,6 +4,8 @@ FIRMWARE = 1
 BAUD = 115200
 #: 32 bytes known to the plant and this board only; if empty, nothing can be stored over the wire.
 KEY = b""
+#: Pin of the contact that opens when the drives are switched off at the mirror; None: no contact.
+LOCAL_SWITCH = None
 PINS = {
     # The chip fixes these pins of UART 2 and SPI 2; only the flash's select can change.
     "bus": ("A2", "A3"), "flash": ("B13", "B15", "B14", "B12"),

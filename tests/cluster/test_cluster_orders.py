@@ -13,6 +13,7 @@ from heliotrope.cluster._goals import Goals
 from heliotrope.cluster._reports import Reports
 from heliotrope.cluster.memory import Kept
 from heliotrope.lcu import messages, states, wire
+from heliotrope.lcu.controller import SWITCH
 from heliotrope.lcu.journal import CODES_OF
 from heliotrope.links.messages import Answer, Ask, Command, Parameters, Progress, Stage
 from heliotrope.twin.boards.bus import TwinBus
@@ -514,6 +515,31 @@ def test_no_more_orders_are_taken_than_the_bus_can_carry() -> None:
     run(main)
 
 
+def test_a_sun_that_jumped_is_an_alarm_for_a_minute() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        assert not field.plant.alarms("sun_jumped")
+        sun = field.boards[0].node.controller.sun
+        for told in (1, 2):
+            sun.leaps += 1
+            await field.until(lambda n=told: len(field.plant.alarms("sun_jumped")) == 2 * n - 1)
+            alarm = field.plant.alarms("sun_jumped")[-1]
+            assert alarm.subject == "A1"
+            assert alarm.active
+            await asyncio.sleep(50.0)
+            assert field.plant.alarms("sun_jumped")[-1] == alarm
+            await asyncio.sleep(15.0)
+            assert not field.plant.alarms("sun_jumped")[-1].active
+            # The local controller shows it on, until it is restarted.
+            sun.leaps += 1
+            await asyncio.sleep(5.0)
+            assert len(field.plant.alarms("sun_jumped")) == 2 * told
+            sun.leaps = 0
+            await asyncio.sleep(2.0)
+
+    run(main)
+
+
 def test_a_state_of_other_firmware_is_named_and_not_believed() -> None:
     async def main(field: Field) -> None:
         await field.until(field.sun_is_fresh)
@@ -608,6 +634,20 @@ def test_nothing_is_done_where_the_step_counts_are_unknown(name: str) -> None:
         assert await final(field, "stop", limit=310.0) is Stage.FAILED
         assert field.plant.stages("stop", "A1")[-2] is Stage.ACKNOWLEDGED
         text = f"{name}: its step counts are unknown, so nothing shows where its beam is"
+        assert text in field.plant.text("stop")
+
+    run(main, "IDLE")
+
+
+@pytest.mark.parametrize("name", ["DEFOCUS", "STOW"])
+def test_nothing_is_done_where_the_drives_are_switched_off(name: str) -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        board = field.boards[0]
+        board.node.on_fault(SWITCH, board._tick(field.clock.monotonic()), True)
+        await field.emergency("stop", name)
+        assert await final(field, "stop", limit=310.0) is Stage.FAILED
+        text = f"{name}: its drives are switched off at the mirror, away from stow"
         assert text in field.plant.text("stop")
 
     run(main, "IDLE")

@@ -1,6 +1,7 @@
 """The operator page in a browser: what people's safety rests on."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -210,6 +211,15 @@ def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
     page.click(".hx-tabs >> text=Heliostat")
     page.wait_for_selector(".hx-heliostat dd:has-text('washing (operator, since')")
     page.wait_for_selector(".hx-heliostat dd:has-text('expected back'):has-text('in stow')")
+    # The switch at the mirror confirms it.
+    operations = field.live.operations
+    with pytest.MonkeyPatch.context() as patch:
+        shown = replace(
+            operations.heliostat(name), state="LOCKED", flags=("AT_STOW", "LOCAL_SWITCH")
+        )
+        patch.setattr(operations, "heliostat", lambda _: shown)
+        page.wait_for_selector(".hx-heliostat dd:has-text('in stow; confirmed at the mirror')")
+        page.wait_for_selector(".hx-heliostat dd:has-text('drives off: nothing moves it')")
     # The whole field is given to automatic control: it stays where it is.
     page.select_option(".hx-to select", "field")
     page.click(".hx-orders >> text=Automatic")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from heliotrope.console.live import rows_of
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.example import board_prototype
 from heliotrope.field.layouts import lay_out
@@ -131,3 +132,27 @@ def test_old_events_are_let_go_once_a_day(tmp_path: Path) -> None:
 def test_events_are_kept_for_some_time() -> None:
     with pytest.raises(InputError, match="events are kept for 0"):
         AutomaticSettings(events=0.0)
+
+
+def test_out_of_service_is_confirmed_by_the_switch_at_the_mirror() -> None:
+    async def work(live: LivePlant) -> None:
+        plant, name, operations = live.plant, live.names[0], live.operations
+        row = plant.field.place(name)
+        board = live.field.boards[0]
+        operations.hold(OPERATOR, [name], "washing")
+        await asyncio.sleep(3.0)
+        assert rows_of(operations)["held"][row] == 1
+        board.switch(plant.now(), off=True)
+        await asyncio.sleep(3.0)
+        assert rows_of(operations)["held"][row] == 2
+        seen = operations.heliostat(name)
+        assert {"LOCAL_SWITCH", "AT_STOW"} <= set(seen.flags)
+        assert (seen.state, seen.fault) == ("LOCKED", "none")
+        # At stow, standing there is to obey.
+        assert await plant.defocus("Vera", [name]).end(20.0)
+        board.switch(plant.now(), off=False)
+        await asyncio.sleep(3.0)
+        assert rows_of(operations)["held"][row] == 1
+        assert operations.heliostat(name).state == "LOCKED"
+
+    _live(work)

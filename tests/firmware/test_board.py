@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from heliotrope.lcu import controller, messages, states, wire
+from heliotrope.lcu import controller, messages, names, states, wire
 from heliotrope.lcu.journal import Journal
 from support.board_chips import DRIVE, Partition, World, board_path
 from support.lcu_machines import (
@@ -25,12 +25,14 @@ BOARDS = ("rp2", "esp32", "stm32")
 class Plant:
     """A board that runs its main loop, and who talks to it."""
 
-    def __init__(self, board: str, *, configured: bool = True) -> None:
+    def __init__(self, board: str, *, configured: bool = True, local: object = None) -> None:
         self.world = World()
         items = items_of_heliostat(heliostat()) if configured else {}
         with board_path(board, self.world) as load:
             self.settings: Any = load("settings")
             self.settings.KEY = KEY
+            self.settings.LOCAL_SWITCH = local
+            self.world.pins[local] = 0
             self.pins = self.settings.PINS
             self.world.pins[self.pins["supply_good"]] = 1
             for pin in self.pins["switches"]:
@@ -181,6 +183,32 @@ def test_a_limit_switch_stops_the_axes(plant: Plant, number: int) -> None:
     plant.world.pins[plant.pins["limits"][number]] = 0
     plant.run(0.1)
     assert plant.order("CLEAR_FAULT") == messages.DONE
+
+
+@pytest.mark.parametrize(("board", "pin"), [("rp2", 12), ("esp32", 15), ("stm32", "C4")])
+def test_the_switch_at_the_mirror_locks_it(board: str, pin: object) -> None:
+    Partition.device = None
+    plant = Plant(board, local=pin)
+    plant.run(1.5)
+    plant.order("IDLE")
+    plant.order("GOTO", STOW[0] - 9000, STOW[1])
+    plant.run(1.0)
+    plant.world.pins[pin] = 1
+    plant.run(0.2)
+    held = pulses(plant)
+    plant.run(1)
+    assert pulses(plant) == held
+    assert plant.state == "LOCKED"
+    assert plant.own.motion.place(0) - STOW[0] == held[0]
+    ((_, told),) = plant.ask("QUERY_STATUS")
+    assert told[1] >> names.FLAGS.index("LOCAL_SWITCH") & 1
+    assert plant.order("UNLOCK") == messages.REFUSED_SWITCH
+    assert plant.order("STOW") == messages.REFUSED_SWITCH
+    plant.world.pins[pin] = 0
+    plant.run(1)
+    assert pulses(plant) == held
+    assert plant.order("STOW") == messages.DONE
+    Partition.device = None
 
 
 @pytest.mark.parametrize("board", BOARDS)

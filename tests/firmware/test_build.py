@@ -134,6 +134,8 @@ class Board:
         return True
     def limit_hit(self):
         return False
+    def switched_off(self):
+        return False
     def supply_mv(self):
         return 24000
     def temperature_degc(self):

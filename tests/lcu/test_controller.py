@@ -18,6 +18,7 @@ from heliotrope.lcu.messages import (
     REFUSED_AUTHORITY,
     REFUSED_KEY,
     REFUSED_STATE,
+    REFUSED_SWITCH,
 )
 from heliotrope.lcu.motion import HOLD, MOVE
 from support.lcu_machines import (
@@ -283,6 +284,20 @@ def test_defocus_turns_the_beam_away_and_refocus_brings_it_back() -> None:
     bench.run(20)
     assert bench.state == "TRACKING"
     assert bench.miss(AIM) < 0.01
+
+
+@pytest.mark.parametrize("near", [0, 1])
+def test_between_stops_too_near_for_a_defocus_it_goes_to_the_farther_one(near: int) -> None:
+    """0.1 rad fit neither way between stops 0.03 and 0.06 rad off."""
+    bench = tracking()
+    motion = bench.node.controller.motion
+    drive = motion.config.drives[0]
+    assert drive is not None
+    here = drive.angle(motion.place(0))
+    stops = [here - 0.03, here + 0.06] if near == 0 else [here - 0.06, here + 0.03]
+    motion._stops[0][:] = stops
+    motion.defocus()
+    assert drive.angle(motion.goal(0)) == pytest.approx(stops[1 - near], abs=1e-4)
 
 
 def test_a_defocused_mirror_goes_with_the_sun() -> None:
@@ -598,6 +613,83 @@ def test_a_mirror_that_is_locked_at_stow_stands_still_without_a_cluster() -> Non
     bench.run(400)
     assert steps == []
     assert bench.state == "LOCKED"
+
+
+def test_drives_that_are_switched_off_at_the_mirror_make_no_step() -> None:
+    bench = tracking()
+    bench.node.on_fault(controller.SWITCH, bench.now, True)
+    bench.check()
+    held = list(bench.made)
+    assert bench.state == "LOCKED"
+    assert "LOCAL_SWITCH" in flags(bench)
+    assert bench.controller.fault == controller.NO_FAULT
+    orders = ("TRACK", "REFOCUS", "APPROACH", "IDLE", "UNLOCK", "CLEAR_FAULT", "DIAGNOSE")
+    for name in (*orders, "DEFOCUS", "STOW"):
+        assert bench.order(name) == REFUSED_SWITCH
+    assert bench.order("GOTO", STOW[0], STOW[1]) == REFUSED_SWITCH
+    assert bench.order("AIM", *AIM) == DONE
+    assert bench.order("LOCK") == DONE
+    bench.run(30)
+    bench.sends_sun = bench.sends_time = False
+    bench.run(400)
+    assert bench.made == held
+    assert bench.state == "LOCKED"
+    # Whoever switches them on again has the time of a silence to step back.
+    bench.node.fault_gone(controller.SWITCH)
+    bench.run(5)
+    assert bench.made == held
+    assert "LOCAL_SWITCH" not in flags(bench)
+    bench.run(10)
+    assert bench.miss(AIM) > OFF, "without a cluster it leaves"
+    bench.run(300)
+    assert tuple(bench.made) == STOW
+    assert bench.state == "LOCKED"
+    bench.sends_sun = bench.sends_time = True
+    bench.run(2)
+    assert bench.order("UNLOCK") == DONE
+    assert bench.state == "STOWED"
+
+
+def test_drives_that_are_switched_off_at_stow_obey_by_standing_there() -> None:
+    bench = Bench()
+    bench.run(1.5)
+    bench.node.on_fault(controller.SWITCH, bench.now, True)
+    for name in ("DEFOCUS", "STOW"):
+        assert bench.order(name) == DONE
+    assert bench.order("APPROACH") == REFUSED_SWITCH
+    bench.run(60)
+    assert tuple(bench.made) == STOW
+    assert {"AT_STOW", "LOCAL_SWITCH"} <= flags(bench)
+    assert "FAULT_PRESENT" not in flags(bench)
+
+
+def test_drives_that_are_switched_off_in_motion_keep_the_counts() -> None:
+    bench = standing_by()
+    assert bench.order("GOTO", STOW[0], STOW[1]) == DONE
+    bench.run(1.0)
+    bench.motors.undone = (3, -2)
+    bench.node.on_fault(controller.SWITCH, bench.now, True)
+    bench.check()  # the counts are those of the motors
+    held = list(bench.made)
+    bench.run(20)
+    assert bench.made == held
+
+
+def test_a_board_that_starts_with_its_drives_switched_off_stands_still() -> None:
+    for known in (True, False):
+        bench = tracking()
+        bench.start(bench.flash)
+        if not known:
+            bench.controller.motion.declare(*bench.made, False)
+        bench.node.on_fault(controller.SWITCH, bench.now, True)
+        held = list(bench.made)
+        bench.run(30)
+        assert bench.made == held
+        assert bench.state == "LOCKED"
+        bench.node.fault_gone(controller.SWITCH)
+        assert bench.order("DEFOCUS") == DONE
+        bench.run(10)
+        assert bench.made != held, "it turns away as soon as it can"
 
 
 def test_while_the_cause_of_a_fault_is_present_silence_moves_nothing_at_once() -> None:

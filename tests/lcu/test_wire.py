@@ -97,7 +97,7 @@ def test_only_what_makes_the_field_safe_is_taken_from_anyone() -> None:
 
 
 def test_results_have_texts() -> None:
-    assert len(messages.RESULTS) == messages.NOT_STORED + 1
+    assert len(messages.RESULTS) == messages.REFUSED_SWITCH + 1
 
 
 def test_the_suns_rate_fits_its_field() -> None:

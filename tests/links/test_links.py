@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from heliotrope.errors import InputError
+from heliotrope.errors import FormatError, InputError
+from heliotrope.links.addresses import Keys
 from heliotrope.links.clock import SystemClock, VirtualClock, run_virtual, sleep_until
 from heliotrope.links.envelope import OVERHEAD, Conversation
 from heliotrope.links.in_process import Faults, memory_pair
@@ -988,3 +989,17 @@ def test_tls_with_wrong_files_is_refused(certificate: tuple[Path, Path], tmp_pat
     with pytest.raises(InputError, match="give both"):
         client_tls(pem, certificate=pem)
     assert server_tls(pem, key, pem).verify_mode.name == "CERT_REQUIRED"
+
+
+@pytest.mark.parametrize("size", [15, 16, 17, 31, 32, 64, 65])
+@pytest.mark.parametrize("odd", [False, True])
+def test_a_key_in_a_file_is_whole_bytes(size: int, odd: bool, tmp_path: Path) -> None:
+    path = tmp_path / "keys.toml"
+    text = bytes(range(size)).hex() + "a" * odd
+    path.write_text(f'plant = "{text}"\n', encoding="utf-8")
+    path.chmod(0o600)
+    if 16 <= size <= 64 and not odd:
+        assert Keys(path, "clusters").plant == bytes(range(size))
+    else:
+        with pytest.raises(FormatError, match=f"a key of {len(text)} characters; give 16 to 64"):
+            Keys(path, "clusters")

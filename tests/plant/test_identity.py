@@ -189,8 +189,9 @@ def test_nothing_moves_before_the_boards_of_a_connection_are_known(tmp_path: Pat
         cluster.mute = True
         async with running(bench):
             token = await bench.commanded(ENGINEER)
-            with pytest.raises(RefusedError, match=r"APPROACH P5A.*has not been heard since its"):
+            with pytest.raises(RefusedError, match="APPROACH: not accepted now: cluster_silent"):
                 plant.command(ENGINEER, token, "APPROACH", PAIR)
+            assert plant._identities.barred(PAIR).keys() == set(PAIR)
             cluster.mute = False
             for _ in range(15):
                 plant.authority.keep(ENGINEER, token)

@@ -12,7 +12,7 @@ from heliotrope.field.volumes import Sphere
 from heliotrope.geometry import reflect
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.links.messages import Parameters
+from heliotrope.links.messages import Ask, Parameters
 from heliotrope.mechanism.board_items import Wanted, items_of, tables_with
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant.audit import read
@@ -120,6 +120,21 @@ def test_nothing_moves_beside_what_is_wanted(tmp_path: Path) -> None:
             plant.command(ENGINEER, token, "TRACK", (NAME,))
 
     play(tmp_path, scene, wanted=wanted)
+
+
+def test_one_that_does_not_answer_is_asked_again_now_and_then(tmp_path: Path) -> None:
+    wanted = Wanted({NAME: items(NAME)})
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path, wanted=wanted)
+        cluster = bench.cluster_of(NAME)
+        cluster.deaf.add(NAME)
+        async with running(bench):
+            await bench.wait(95.0)
+        asked = [ask for ask in cluster.of(Ask) if (ask.what, ask.heliostat) == ("stored", NAME)]
+        assert 3 <= len(asked) <= 5  # each 30 s, not at each look
+
+    run_virtual(main)
 
 
 def test_a_locked_mirror_takes_only_parameters_with_a_clear_way_to_standby(tmp_path: Path) -> None:

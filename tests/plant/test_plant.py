@@ -178,6 +178,9 @@ def test_defocus_and_stow_are_taken_from_anybody(tmp_path: Path) -> None:
         assert bench.count(states.DEFOCUSED) == 2
         assert await bench.plant.stow("a passer-by").end(2.0)
         assert bench.count(states.STOWED) == 18
+        # What is suggested instead is a command.
+        with pytest.raises(UnknownNameError, match=r"'AIM'; did you mean LOCK_AIM\?$"):
+            bench.plant.command(OPERATOR, 0, "AIM", ("P1A",))
         with pytest.raises(UnknownNameError, match="no heliostat 'P9'"):
             bench.plant.stow("a passer-by", ("P9",))
 

@@ -388,6 +388,34 @@ def test_done_is_judged_by_state_and_by_axes() -> None:
 
 
 @pytest.mark.parametrize("act", [Act.DEFOCUS, Act.STOW])
+def test_drives_that_are_switched_off_away_from_stow_are_never_done(
+    act: Act, tmp_path: Path
+) -> None:
+    async def scene(bench: Bench) -> None:
+        cluster = bench.cluster_of("P3B")
+        row, flags = cluster.names.index("P3B"), cluster.rows["flags"]
+        # The cluster reports all it is asked for as done.
+        flags[row] = off = 1 << meanings.FLAGS.index("LOCAL_SWITCH")
+        cluster.set(states.LOCKED, "P3B")
+        await bench.wait(2.0)
+        order = bench.plant.raise_emergency("a visitor", act)
+        for _ in range(20):
+            cluster.set(states.LOCKED, "P3B")
+            await bench.wait(0.5)
+        report = order.report(bench.plant.now())
+        assert report.not_done == ("P3B",)
+        assert not report.complete
+        assert "P3B: its drives are switched off at the mirror, so it is not proven" in report.text
+        flags[row] = off | 1 << meanings.FLAGS.index("AT_STOW")
+        await bench.wait(2.0)
+        report = order.report(bench.plant.now())
+        assert report.not_done == ()
+        assert "switched off" not in report.text
+
+    play(tmp_path, scene)
+
+
+@pytest.mark.parametrize("act", [Act.DEFOCUS, Act.STOW])
 @pytest.mark.parametrize("seen", [True, False])
 def test_unknown_step_counts_are_never_done(act: Act, seen: bool, tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:

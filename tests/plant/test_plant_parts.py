@@ -325,6 +325,10 @@ def test_rows_are_put_by_their_names_and_strangers_left_out() -> None:
     assert field.of("A", 10.0).state == "TRACKING"
     assert field.of("B", 10.0).state == "IDLE"
     assert not field.of("C", 10.0).live
+    # A row of exactly the limit is live, one by one as in the whole field.
+    last = 10.0 + field.limit
+    for now in (last, np.nextafter(last, np.inf)):
+        assert field.live(now)[0] == field.of("A", now).live == (now == last)
     assert field.take("K", status(2), 11.0) == ["cluster K: 2 rows for 3 names"]
     with pytest.raises(ProtocolError, match="are not rows of"):
         field.take("K", ClusterStatus("K", 1, 0.0, "gps", 0.0, 3.0, 0.1, block=b"x"), 11.0)

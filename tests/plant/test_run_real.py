@@ -430,7 +430,10 @@ def read(folder: Path, homes: dict[str, tuple[str, ...]] | None = None) -> Links
 
 
 def test_each_cluster_gets_its_way(folder: Path) -> None:
-    made = read_links(folder / "links.toml").build(clusters_of(design()), SystemClock())
+    found = read_links(folder / "links.toml")
+    assert "links.toml" in repr(found)
+    assert not re.search(r"keys=\{|password='", repr(found)), "a log that shows it shows a secret"
+    made = found.build(clusters_of(design()), SystemClock())
     assert set(made.links) == {"K1", "K2", "K4"}
     assert made.server is not None
     assert set(made.server.links) == {"K1", "K4"}

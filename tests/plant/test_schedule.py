@@ -10,11 +10,14 @@ from benchmarks.days import Days, Standing
 from hypothesis import given
 from hypothesis import strategies as st
 
+from heliotrope.calibration.plan.planning import SightingLimits
 from heliotrope.errors import InputError, TimeError, UnknownNameError
 from heliotrope.field.layouts import malan_plant
+from heliotrope.field.target import Target
 from heliotrope.geometry import MRAD, direction
 from heliotrope.lcu import states
 from heliotrope.plant.schedule import scheduler as schedule
+from heliotrope.plant.schedule.choice import Sight
 from heliotrope.plant.schedule.scheduler import (
     Assignment,
     Finished,
@@ -44,6 +47,21 @@ def ask(one: Scheduler, now: datetime = MORNING, **more: object) -> Assignment |
 
 
 # --- one decision ---------------------------------------------------------------------
+
+
+def test_who_sees_the_sun_or_the_target_too_obliquely_is_not_considered() -> None:
+    """A target that faces north, one heliostat before it and one far to the side."""
+    corners = np.array([[2.0, 0, 4], [-2.0, 0, 4], [-2.0, 0, 0], [2.0, 0, 0]])
+    target = Target("T", corners, np.array([0.0, 0.0, 2.0]))
+    assert target.normal[1] > 0.99
+    feet = np.array([[0.0, 100.0, 2.0], [100.0, 5.0, 2.0]])
+    sight = Sight(target, feet, np.full((2, 2), 2.0), ())
+    limits = SightingLimits()
+    high = direction(np.radians(180.0), np.radians(60.0))
+    assert sight.able(high, limits).tolist() == [True, False]
+    # Low in the north, behind the mirror.
+    behind = direction(0.0, np.radians(2.0))
+    assert sight.able(behind, limits).tolist() == [False, False]
 
 
 def test_a_decision_names_who_where_and_why() -> None:

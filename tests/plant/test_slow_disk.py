@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from heliotrope.lcu import states
-from heliotrope.links.clock import SystemClock, VirtualClock, run_virtual, sleep_until
+from heliotrope.links.clock import VirtualClock, run_virtual, sleep_until
 from heliotrope.links.messages import Command, Emergency, Lease, Stage
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.assigned import AssignedFile
@@ -21,6 +21,7 @@ from heliotrope.plant.audit import read
 from heliotrope.plant.disk import DiskBusyError, DiskThread, Then, Work
 from heliotrope.plant.lockouts import Lockout
 from heliotrope.safety import Act
+from support.midsummer import DayClock
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 AIM = {"P1A": (0.1, 0.2, 16.5)}
@@ -286,7 +287,7 @@ def test_a_slow_or_full_file_holds_up_no_lease_and_no_emergency(
     audited: list[Path] = []
 
     async def main() -> None:
-        clock = SystemClock()
+        clock = DayClock()
         bench = Bench(clock, tmp_path, disk=disk)  # type: ignore[arg-type]
         audited.append(bench.audit.path)
         for cluster in bench.clusters.values():

@@ -1,26 +1,42 @@
 """Commands that move axes by counts are proven too: no beam enters a keep-out volume."""
 
+import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from heliotrope.field.example import prototype
-from heliotrope.field.volumes import Sphere
+from heliotrope.field.layouts import malan_plant
+from heliotrope.field.plant import Plant
+from heliotrope.field.volumes import Box, Sphere
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import names, states
-from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.lcu.stepper import BOTH, PRIMARY_FIRST, Axis, Stepper
+from heliotrope.links.clock import VirtualClock, gps_seconds, run_virtual
 from heliotrope.links.messages import Emergency
+from heliotrope.mechanism.board_items import items_of
+from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.mechanism.tracking import track
-from heliotrope.plant.aims import BeamCheck
+from heliotrope.optics import MirrorOptics, beams, find_entries
+from heliotrope.plant.aims import BeamCheck, _disc
 from heliotrope.plant.assigned import rest_on
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.leaving import turned_away, way_out
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.ways import Ways
 from heliotrope.safety import Act
+from heliotrope.sun import broadcast_values, vector
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.outfit import Outfit, own_items
+from heliotrope.twin.field.field import Field
+from support.live import LiveOptions, LivePlant
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 #: South of the tower; P5A stands due south of it and shines to the tower.
@@ -170,6 +186,17 @@ def test_a_search_is_wide_enough_as_seen_by_single_beams(radius: float) -> None:
             hits += 1
             assert check.around(rows, aim, radius, sun)
     assert hits > 0
+
+
+@pytest.mark.parametrize("way", [(0.0, 0.0, 40.0), (30.0, -20.0, 40.0), (10.0, 0.0, 0.0)])
+def test_a_search_is_a_disc_across_the_beam(way: tuple[float, float, float]) -> None:
+    """Straight up too, where no direction is to the right."""
+    eye = np.array([5.0, 6.0, 2.0])
+    offsets = _disc(eye, eye + way, 0.1, 1.0) - (eye + way)
+    np.testing.assert_allclose(offsets @ np.array(way), 0.0, atol=1e-9)
+    far = np.linalg.norm(offsets, axis=1)
+    assert far.max() == pytest.approx(np.linalg.norm(way) * np.tan(0.1))
+    np.testing.assert_allclose(offsets[far > 0.99 * far.max()].mean(axis=0), 0.0, atol=1e-9)
 
 
 def test_by_night_and_without_volumes_nothing_is_in_the_way() -> None:
@@ -377,3 +404,192 @@ def test_without_volumes_nobody_is_looked_at(tmp_path: Path) -> None:
             assert "keep_out_predicted" in bench.plant.unwatched
 
     run_virtual(main)
+
+
+# -- the way from stow ---------------------------------------------------------------------------
+
+#: North of the tower, where beams pass on their ways along the ground to its foot and up.
+GATE = Box("gate", (0.0, 60.0, 2.0), (6.0, 4.0, 4.0))
+NOON = datetime(2026, 6, 21, 10, tzinfo=UTC)
+
+
+def gated(count: int) -> Plant:
+    """A field south of its tower, with a gate across the ways of some beams."""
+    return replace(malan_plant(count), keep_outs=(GATE,))
+
+
+def inside(
+    check: BeamCheck, normal: FloatArray, vertex: FloatArray, sun: FloatArray, error: float
+) -> npt.NDArray[np.bool_]:
+    """Which true beams, (N,), are in a volume; ``error`` widens them, rad."""
+    sizes = check.mirrors.width, check.mirrors.height
+    mirrors = MirrorOptics.of(*sizes, error=error)
+    way = 2.0 * (normal @ sun)[:, None] * normal - sun
+    found = find_entries(beams(vertex, vertex + way, mirrors, reach=3000.0), check.volumes)
+    return np.asarray(found.entered.any(axis=-1) & (normal @ sun > 0.0))
+
+
+def test_who_would_cross_a_volume_on_the_way_from_stow_is_known_beforehand() -> None:
+    """The oracle: the true beams of simulated heliostats that go, every 50 ms."""
+    design = gated(96)
+    mechanism, machine = design.groups["azel"].calibrated, design.machine(design.names[0])
+    assert machine.standby is not None
+    check = BeamCheck(design, design.names)
+
+    def sun(ahead: float) -> FloatArray:
+        return vector(NOON.timestamp() + ahead, design.site)
+
+    rows = np.arange(96)
+    stow, standby = (np.tile(np.array(x, dtype=float), (96, 1)) for x in _rest(machine))
+    ways = Ways(check, dict.fromkeys(design.names, machine))
+    found = ways.approach(rows, stow, standby, sun)
+    assert all("gate" in text and "from stow to standby" in text for text in found.values())
+    refused = np.array([name in found for name in design.names])
+
+    field = Field(mechanism, machine)
+    crossed, near = np.zeros((2, 96), dtype=np.bool_)
+    for tick in range(1200):
+        if tick % 20 == 0:
+            at = NOON.timestamp() + tick // 20
+            values = broadcast_values(int(gps_seconds(NOON)) + tick // 20, at, design.site)
+            assert values is not None
+            field.take_sun(values)
+            if tick == 0:
+                field.order("APPROACH")
+        field.advance(50)
+        light = sun(0.05 * tick)
+        crossed |= inside(check, *field.stand(), light, 0.0)
+        near |= inside(check, *field.stand(), light, 0.02)
+        if not (field.state == states.APPROACHING).any():
+            break
+    assert (field.state == states.IDLE).all()
+    assert 10 < crossed.sum() < 86
+    assert not (crossed & ~refused).any()
+    assert not (refused & ~near).any()
+
+
+def _rest(machine: Machine) -> tuple[tuple[int, int], tuple[float, float, float]]:
+    assert machine.standby is not None
+    return machine.stow, machine.standby
+
+
+def test_a_way_is_the_one_that_the_motors_go() -> None:
+    """No count of the local controller's stepper is further than the backlash from the path."""
+    rng = np.random.default_rng(5)
+    design = gated(6)
+    name, row = design.names[0], np.array([0])
+    limits = (AxisLimits(-200_000, 200_000, 8000, 16_000, 40), AxisLimits(0, 99_000, 3000, 9000, 0))
+    machine = replace(design.machine(name), axes=limits, stow=(0, 90_000))
+    check = BeamCheck(design, design.names)
+    ways = Ways(check, {name: machine})
+    drives = Drive(check.drives.table[0])
+    worst = 0.0
+    for case in range(40):
+        spread = 10.0 ** rng.uniform(2.0, 4.7)
+        begin = np.array([0, 50_000]) + rng.integers(-40_000, 40_000, 2)
+        end = np.clip(begin + spread * rng.uniform(-1.0, 1.0, 2), (-200_000, 0), (200_000, 99_000))
+        end = end.round()
+        axes = [Axis(x.low, x.high, x.rate, x.acceleration, x.backlash, 50) for x in limits]
+        for axis, count in zip(axes, begin, strict=True):
+            axis.count = axis.goal = axis.leg = int(count)
+        stepper = Stepper(axes, 50, 100)
+        turns = case % 2 == 0
+        stepper.go(int(end[0]), int(end[1]), PRIMARY_FIRST if turns else BOTH)
+        path = (ways.turns if turns else ways.motion)(row, begin[None] * 1.0, end[None])[0]
+        ticks = 0
+        while ticks == 0 or not stepper.still():
+            stepper.advance(50, [], 0)
+            ticks += 1
+            at = drives.angles(np.array([axis.count for axis in axes], dtype=float))
+            worst = max(worst, _apart(at, path))
+        took = float(ways.lasts(row, begin[None] * 1.0, end[None], turns=turns)[0])
+        assert abs(took - 0.05 * ticks) < 0.3 + 0.02 * took
+    assert worst < 1.5e-3
+
+
+def _apart(point: FloatArray, path: FloatArray) -> float:
+    """The distance of a point (2,) from a line through points (W, 2)."""
+    begin, leg = path[:-1], np.diff(path, axis=0)
+    size = np.maximum((leg**2).sum(axis=-1), 1e-30)
+    share = np.clip(((point - begin) * leg).sum(axis=-1) / size, 0.0, 1.0)
+    return float(np.linalg.norm(point - begin - share[:, None] * leg, axis=-1).min())
+
+
+def test_the_points_of_a_way_are_those_of_a_board() -> None:
+    design = gated(6)
+    check = BeamCheck(design, design.names)
+    rows = np.array([1, 4])
+    machine = design.machine(design.names[0])
+    given = ((3.0, -20.0, 0.0), (3.0, -4.0, 0.5))
+    machines = dict.fromkeys(design.names, machine)
+    machines[design.names[4]] = replace(machine, way=given)
+    ways = Ways(check, machines)
+    for standby in ((21.0, 0.0, 81.7), (-30.0, 0.0, 60.0)):
+        points, length = ways.points(rows, np.tile(standby, (2, 1)))
+        for row, found, count in zip(rows, points, length, strict=True):
+            name, mechanism = design.names[row], design.groups["azel"].mechanism[row]
+            items = items_of(mechanism, replace(machines[name], standby=standby))
+            board = Board(Outfit(name, 1, 1, b"key", mechanism, {}, {**items, **own_items(1)}))
+            board.power_on(0.0)
+            assert board.controller is not None
+            assert np.allclose(found[:count], board.controller.motion.way(), atol=1e-4)
+
+
+def test_an_approach_is_refused_by_name_and_the_others_go(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        token = await bench.commanded()
+        with pytest.raises(RefusedError, match="APPROACH P5A: its standby point is not known"):
+            plant.command(OPERATOR, token, "APPROACH", ("P5A",))
+        rest_on(plant.standbys, (4.0, 0.0, 14.0))
+        free, texts = [], {}
+        for name in plant.field.names:
+            try:
+                plant.command(OPERATOR, token, "APPROACH", (name,))
+                free.append(name)
+            except RefusedError as error:
+                texts[name] = str(error)
+        assert free
+        assert texts
+        assert all("walkway" in t and "on its way from stow" in t for t in texts.values())
+        ticket = plant.command(OPERATOR, token, "APPROACH")
+        assert ticket.blocked.keys() == texts.keys()
+        # What is in the way is gone.
+        plant.beams.volumes = ()
+        for name in texts:
+            plant.command(OPERATOR, token, "APPROACH", (name,))
+
+    play(tmp_path, scene)
+
+
+def test_automatic_control_raises_those_with_a_free_way_and_names_the_others() -> None:
+    design = gated(48)
+    work = AutomaticSettings(wanted=True, calibrate=False)
+    options = LiveOptions(rendered=False, threads=0, work=work, installed=lambda real: real)
+    lit: set[str] = set()
+
+    async def main(clock: VirtualClock) -> None:
+        async with LivePlant(design, clock, options).running() as live:
+            plant = live.plant
+            for _ in range(900):
+                await asyncio.sleep(0.1)
+                beams_in = inside(plant.beams, *live.field.stand(), live.world.sun(), 0.0)
+                lit.update(live.names[i] for i in np.flatnonzero(beams_in))
+            told = [a for a in live.operations.alarms() if a.condition == "beam_blocked"]
+            blocked = {a.subject for a in told}
+            now = plant.now()
+            state = {name: plant.field.of(name, now).state for name in live.names}
+            assert {name for name in live.names if state[name] == "STOWED"} == blocked
+            assert 5 < len(blocked) < 43
+            assert all("gate" in a.text and a.count == 1 for a in told)
+            assert {state[name] for name in live.names if name not in blocked} <= {
+                "IDLE",
+                "TRACKING",
+            }
+            assert not [a for a in plant.alarms if a.condition == "keep_out_predicted"]
+            asked = [t for t in plant.orders if t.name == "APPROACH"]
+            assert not asked
+            await live.end()
+
+    run_virtual(main, start=NOON)
+    assert not lit

@@ -316,6 +316,7 @@ def test_a_wrong_name_is_told() -> None:
     assert [a.text for a in actions] == [
         "reading 'wind_maen' is in no row of the safety table, so nothing watches it"
     ]
+    assert not actions[0].waits  # there is nothing to acknowledge
 
 
 def test_only_the_cluster_that_is_silent_is_defocused() -> None:

@@ -14,6 +14,7 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency.order import EmergencyOrder
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.orders import PlantOrders
+from heliotrope.plant.parameters import ParameterSync
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import JoinLimiter
 from heliotrope.twin.invariants.plant_observer import PlantObserver
@@ -110,6 +111,12 @@ def identity_unchecked(patch: pytest.MonkeyPatch) -> None:
     """Whatever board answers at an address counts as the heliostat's."""
     patch.setattr(Identities, "look", lambda self, cluster: {})
     patch.setattr(Identities, "barred", lambda self, heliostats: {})
+
+
+def differing_moves(patch: pytest.MonkeyPatch) -> None:
+    """Boards that store other parameters than the wanted ones are moved, and are not corrected."""
+    patch.setattr(ParameterSync, "differing", lambda self, heliostats: {})
+    patch.setattr(ParameterSync, "_push", lambda self, *given: None)
 
 
 #: Invariants that may find it, name, defect, faults to draw from, pause between them, and the seed

@@ -2,18 +2,19 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
 
-from heliotrope.cluster import _nodes, _reports, _watch
+from heliotrope.cluster import _goals, _nodes, _reports, _watch
 from heliotrope.lcu import (
     controller,
     journal,
     lease,
     messages,
     motion,
+    node,
     states,
     stepper,
     ticks,
@@ -22,6 +23,7 @@ from heliotrope.lcu import (
 from heliotrope.links.messages import Stage
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant import aims
+from heliotrope.safety import evaluation
 from heliotrope.twin.boards import outfit
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.simulation import RunPlan
@@ -255,6 +257,67 @@ def _lease_too_long(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(lease.SunLease, "look", lambda self, now, elapsed: True)
 
 
+def _search_without_sun(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(states, "NEED_SUN", (states.APPROACHING, states.TRACKING))
+
+
+def _ready_after_stow(patch: pytest.MonkeyPatch) -> None:
+    """That standby was reached by the safe way is not forgotten at stow."""
+
+    def remembering(does: Callable[[Any], None]) -> Callable[[Any], None]:
+        def sticky(self: Any) -> None:
+            ready = self.ready
+            does(self)
+            self.ready = self.ready or ready
+
+        return sticky
+
+    for name in ("stow", "stow_directly", "approach"):
+        patch.setattr(motion.Motion, name, remembering(getattr(motion.Motion, name)))
+
+
+def _straight_to_standby(patch: pytest.MonkeyPatch) -> None:
+    """No way along the ground: from stow straight to the standby point."""
+
+    def straight(self: Any) -> list[tuple[float, float, float]]:
+        return [self.config.standby] if self.config.standby is not None else []
+
+    patch.setattr(motion.Motion, "way", straight)
+
+
+def _sun_in_the_dark(patch: pytest.MonkeyPatch) -> None:
+    """SUN goes out although the cluster's safety table says dark."""
+    patch.setattr(_watch.Verdict, "dark", property(lambda self: False))
+
+
+def _off_when_acknowledged(patch: pytest.MonkeyPatch) -> None:
+    """The cluster reports DEFOCUS and STOW as done when a local controller acknowledges them."""
+    for name in ("DEFOCUS", "STOW"):
+        patch.delitem(_goals.GOALS, name)
+
+
+def _brown_out_as_queued(patch: pytest.MonkeyPatch) -> None:
+    """The last record counts the steps that were queued and are not made any more."""
+    failing = node.Node.on_supply_failing
+
+    def careless(self: Any, now_ms: int) -> bool:
+        self.timer.stop()  # what it takes back is forgotten
+        return bool(failing(self, now_ms))
+
+    patch.setattr(node.Node, "on_supply_failing", careless)
+
+
+def _silence_unseen(patch: pytest.MonkeyPatch) -> None:
+    """The last reading of a sensor counts for ever."""
+    advance = evaluation._advance
+
+    def patient(row: Any, track: Any, reading: Any, now: float) -> Any:
+        fed = reading is not None and not row.ages
+        return advance(row, track, replace(reading, at=now) if fed else reading, now)
+
+    patch.setattr(evaluation, "_advance", patient)
+
+
 DEFECTS = (
     Defect((1, 4, 5), "lease renewed by any frame", _lease_by_any_frame,
            ("cluster_crash", "replay", "stranger_safe", "forgery"), 1.5),
@@ -296,6 +359,22 @@ DEFECTS = (
     Defect((13,), "a mirror stays where it was after a boot", _stays_after_boot,
            faults=tuple(Fault("power_cut", 150.0, 2.0, i, 0.5) for i in range(3)), seconds=220.0,
            worlds=("calm",)),
+    Defect((1,), "SEARCHING goes on without a sun", _search_without_sun,
+           faults=tuple(Fault("cluster_crash", at, 12.0, i, 0.5)
+                        for at in (70.0, 100.0, 130.0, 160.0, 190.0, 220.0) for i in range(3)),
+           worlds=("calm",)),
+    Defect((10,), "TRACK accepted straight from stow", _ready_after_stow, pause=12.0, first=2),
+    Defect((15,), "a cluster calls DEFOCUS done on its acknowledgement", _off_when_acknowledged,
+           ("line_drop",), 60.0),
+    Defect((10,), "approach straight to the standby point", _straight_to_standby,
+           ("line_drop",), 60.0, first=1),
+    Defect((9,), "SUN sent although the table says dark", _sun_in_the_dark, ("time_jump",), 10.0),
+    Defect((7,), "a brown-out record ignores steps undone", _brown_out_as_queued,
+           ("brown_out",), 5.0),
+    Defect((2,), "the last reading of a sensor counts for ever", _silence_unseen,
+           ("sensor_silent",), 20.0, worlds=("calm", "sensors")),
+    Defect((12,), "differing parameters hold no motion", plant_defects.differing_moves,
+           ("line_drop",), 60.0, worlds=("calm", "parameters")),
     *(Defect(numbers, name, defect, only, pause, first=first)
       for numbers, name, defect, only, pause, first in plant_defects.ROWS),
 )  # fmt: skip

@@ -17,7 +17,7 @@ from heliotrope.sun import broadcast_values
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.clocks import TickCounter
 from heliotrope.twin.boards.outfit import RECEIVER, outfits, sha256
-from heliotrope.twin.world.simulation import SITE, START
+from support.midsummer import SITE, START
 from support.twin_defects import DEFECTS
 
 TOKEN, ADDRESS = 5, 11

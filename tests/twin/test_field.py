@@ -24,7 +24,7 @@ from heliotrope.twin.boards.outfit import (
 )
 from heliotrope.twin.field.field import Field
 from heliotrope.twin.wind import Wind
-from heliotrope.twin.world.simulation import SITE, START
+from support.midsummer import SITE, START
 
 TOKEN, COUNT = 0xF1E1D, 3
 

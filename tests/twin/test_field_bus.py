@@ -19,7 +19,7 @@ from heliotrope.twin.boards.clocks import SimulatedTime
 from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STEPS_PER_TURN, STOW
 from heliotrope.twin.field.field import Field
 from heliotrope.twin.field.field_bus import FieldBus, _stuffed, _unstuffed
-from heliotrope.twin.world.simulation import SITE
+from support.midsummer import SITE
 
 TOKEN = 77
 

@@ -30,6 +30,7 @@ BEAM_OUT = frozenset({APPROACHING, IDLE, TRACKING, SEARCHING})
 
 _MOVING = 1 << names.FLAGS.index("MOVING")
 _UNKNOWN = 1 << names.FLAGS.index("COUNTS_UNKNOWN")
+_SWITCHED_OFF = 1 << names.FLAGS.index("LOCAL_SWITCH")
 _AT_STOW = 1 << names.FLAGS.index("AT_STOW")
 _DIAGNOSING = 1 << names.FLAGS.index("DIAGNOSING")
 
@@ -212,6 +213,8 @@ class Goals:
             return None
         if watch.name in _LEAVE and node.flags & _UNKNOWN:
             return "its step counts are unknown, so nothing shows where its beam is"
+        if watch.name in _LEAVE and node.flags & (_SWITCHED_OFF | _AT_STOW) == _SWITCHED_OFF:
+            return "its drives are switched off at the mirror, away from stow"
         goal = GOALS[watch.name]
         watch.sure = watch.sure or goal.shown(node.state, node.flags)
         counted = goal.near or (watch.shift is not None and not watch.sure)

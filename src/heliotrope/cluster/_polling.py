@@ -21,6 +21,9 @@ from heliotrope.safety import alarms
 
 #: A node that missed this many questions in a row is asked only every fifth second.
 _ABSENT, _PROBE = 3, 5
+#: A node shows a sun that jumped until it is restarted; the alarm ends after this time, s.
+_JUMP_SHOWS = 60.0
+_SUN_JUMPED = 1 << names.FLAGS.index("SUN_JUMPED")
 
 
 class Polling:
@@ -52,6 +55,7 @@ class Polling:
         self._next = 0  # the place at which the last round was cut off
         self._silent: set[int] = set()
         self._strange: set[int] = set()
+        self._jumped: dict[str, float] = {}
         self.overruns = 0
 
     @property
@@ -113,6 +117,8 @@ class Polling:
         node.take_status(status)
         if node.fault != before:
             self._report_fault(node)
+        if bool(node.flags & _SUN_JUMPED) != (node.name in self._jumped):
+            self._report_sun(node)
         if (
             self._watch.verdict.dark
             and node.state in BEAM_OUT
@@ -130,8 +136,20 @@ class Polling:
         else:
             self._reports.clear(alarms.NODE_FAULT.ended(node.name))
 
+    def _report_sun(self, node: ClusterNode) -> None:
+        """Report the first jump of the sun since a local controller was started."""
+        if node.flags & _SUN_JUMPED:
+            self._jumped[node.name] = node.heard_at
+            self._reports.alarm(alarms.SUN_JUMPED.raised(node.name))
+        else:
+            del self._jumped[node.name]
+            self._reports.clear(alarms.SUN_JUMPED.ended(node.name))
+
     def end_second(self, now: float) -> None:
         """Give up goals that take too long, and report silent heliostats."""
+        for name, at in self._jumped.items():
+            if now - at > _JUMP_SHOWS:
+                self._reports.clear(alarms.SUN_JUMPED.ended(name))
         self._goals.second(self._nodes, now)
         limit = self._config.silence
         for node in self._nodes:

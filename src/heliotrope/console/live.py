@@ -22,6 +22,8 @@ from heliotrope.plant.operations.views import FieldFrame
 
 #: Flags that come and go with every step or sun vector, which would change every row.
 _RESTLESS = sum(1 << meanings.FLAGS.index(name) for name in ("MOVING", "SUN_FRESH"))
+#: Flag of drives that are switched off at the mirror: it confirms *out of service*.
+_SWITCHED_OFF = 1 << meanings.FLAGS.index("LOCAL_SWITCH")
 
 
 def rows_of(frame: FieldFrame) -> npt.NDArray[Any]:
@@ -33,7 +35,7 @@ def rows_of(frame: FieldFrame) -> npt.NDArray[Any]:
     rows["sightings"] = np.minimum(frame.sightings, 65_535)
     rows["flags"] = frame.flags & (0xFFFF ^ _RESTLESS)
     rows["state"], rows["fault"] = frame.state, frame.fault
-    rows["on"], rows["held"] = frame.on, frame.held
+    rows["on"], rows["held"] = frame.on, np.where(frame.flags & _SWITCHED_OFF, 2, 1) * frame.held
     return rows
 
 

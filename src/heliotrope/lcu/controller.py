@@ -60,6 +60,8 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
     JOURNAL,
     LATCHED,
 ) = range(11)
+#: A cause that locks and is no fault: the drives are switched off at the mirror.
+SWITCH = 11
 
 #: States in which settings may change: those that move nothing, those of the pose, those of the
 #: machine. The last two change at rest only.
@@ -199,6 +201,8 @@ class Controller:
         self._uptime_s = (self._uptime_s + self._uptime_ms // 1000) & 0xFFFFFFFF
         self._uptime_ms %= 1000
         fresh = self.sun.look(now_ms, elapsed)
+        if self._present >> SWITCH:  # when they are on again, nothing moves at once
+            self._heard.start(now_ms, self.config.silence_ms)
         silent = self._heard.over(now_ms)
         goes_on = self.motion.following() and self.state != states.FAULT
         held = self.state in HELD and self.motion.kind == HOLD and not silent
@@ -210,12 +214,9 @@ class Controller:
     def _lapses(self, fresh: bool, silent: bool, dark: bool) -> None:
         """Pass expired time limits to the state table."""
         state, kind = self.state, self.motion.kind
-        if state in states.NEED_SUN and not fresh:
-            self._event("LAPSED")
-        elif state == states.IDLE:
-            if silent or (kind == STANDBY and not fresh):
-                self._event("LAPSED")
-        elif state == states.STOWING and kind == RETURN and not fresh:
+        idle = state == states.IDLE
+        follows = (idle and kind == STANDBY) or (state == states.STOWING and kind == RETURN)
+        if (idle and silent) or (not fresh and (follows or state in states.NEED_SUN)):
             self._event("LAPSED")
         elif state == states.DEFOCUSED:
             if dark:
@@ -295,10 +296,16 @@ class Controller:
         self.out.append((NOTE, self.state, data))
 
     def on_fault(self, number: int, now_ms: int, halt: bool) -> "list[tuple[Any, ...]]":
-        """Latch a fault that the caller has found; ``halt`` stops the motors at once."""
+        """Latch a fault that the caller has found; ``halt`` stops the motors at once.
+
+        SWITCH locks instead, and while it is present nothing makes a step; the lock outlasts it.
+        """
         self.out.clear()
         self._time(now_ms)
-        self._latch(number)
+        if number == SWITCH:
+            self._event("LOCK")
+        else:
+            self._latch(number)
         self._present |= 1 << number
         if halt:
             self.motion.hold()
@@ -387,9 +394,12 @@ class Controller:
     ) -> None:
         who, name = messages.who_of(number), messages.name_of(number)
         if who == messages.ANYONE:
-            # Never refused, whatever the verdict.
-            self._event(name)
+            # Never refused, whatever the verdict, except by drives without power.
             result = messages.DONE
+            if not self._present >> SWITCH:
+                self._event(name)
+            elif not self.motion.at_stow():
+                result = messages.REFUSED_SWITCH
         elif who < 0 or who == messages.NODE:
             return
         elif verdict != messages.DONE:
@@ -474,9 +484,10 @@ class Controller:
                 motion.cut,
                 self._clock_jumped,
                 self._ticks_jumped,
-                self._present != 0,
+                self._present % (1 << SWITCH),
                 motion.kind == DIAGNOSE,
                 self.sun.leaps,
+                self._present >> SWITCH,
             )
         ):
             bits |= bool(value) << i
@@ -488,6 +499,8 @@ class Controller:
         """Obey a fresh command of the authority; return the result for ACK."""
         if name in ("AIM", "LOCK_AIM", "ROUGH", "STANDBY"):
             return self._adjust(name, values, payload)
+        if self._present >> SWITCH and name != "LOCK":
+            return messages.REFUSED_SWITCH
         motion = self.motion
         if name in ("UNLOCK", "CLEAR_FAULT"):
             return self._release(name)
@@ -504,9 +517,9 @@ class Controller:
             result = self._may_approach()
         elif name in ("JOG", "GOTO", "DIAGNOSE"):
             result = self._may_move(name, values)
-        if result != messages.DONE:
-            return result
-        return messages.DONE if self._event(name) else messages.REFUSED_STATE
+        if result == messages.DONE:
+            self._event(name)
+        return result
 
     def _release(self, name: str) -> int:
         """Leave LOCKED or FAULT."""

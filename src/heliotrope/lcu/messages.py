@@ -185,7 +185,8 @@ def fields_of(number: int) -> list[str]:
     BAD_VALUE,
     BUSY,
     NOT_STORED,
-) = range(9)
+    REFUSED_SWITCH,
+) = range(10)
 RESULTS = (
     "done",
     "not in this state",
@@ -196,4 +197,5 @@ RESULTS = (
     "value out of range",
     "busy",
     "flash failed",
+    "drives switched off at the mirror",
 )

@@ -28,7 +28,8 @@ HOLD, MOVE, DEFOCUS, APPROACH, RETURN, STOW, STANDBY, TRACK, SEARCH, DIAGNOSE = 
 #: interpolation between them while the angles change by at most this (rad; the chord is then off
 #: by at most 1e-6 rad).
 RENEW_MS, KNOT_MS, KNOT_LIMIT = 200, 4000, 1e-3
-#: A path is followed by poses whose beams are at most this far apart, rad.
+#: A path is followed by poses that divide each straight line evenly. In the mean their beams are at
+#: most this far apart, rad; where the line passes nearest, further.
 PIECE = 0.1
 #: Time that the spiral rests on a point, ms.
 DWELL_MS = 2000
@@ -412,7 +413,7 @@ class Motion:
     def _pieces(
         self, points: "list[tuple[float, float, float]]"
     ) -> "list[tuple[float, float, float]]":
-        """Return the points, with more between them where the beam would turn by over ``PIECE``."""
+        """Return the points, with more between them; see ``PIECE``."""
         pointing = self.config.pointing
         assert pointing is not None
         found = [points[0]]

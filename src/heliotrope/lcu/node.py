@@ -176,7 +176,8 @@ class Node:
     def on_fault(self, number: int, now_ms: int, halt: bool) -> None:
         """Latch a fault (of ``controller``) that the board has found; ``halt`` stops the motors.
 
-        The cause counts as present until ``fault_gone``.
+        The cause counts as present until ``fault_gone``. ``controller.SWITCH``, always with
+        ``halt``, is no fault: the drives have been switched off at the mirror, and it is locked.
         """
         undone = self.timer.stop() if halt else (0, 0)
         self._obey(self.controller.on_fault(number, now_ms, halt), now_ms)

@@ -249,22 +249,15 @@ def _leaving(
     """Return the last contact in the pose of the entry, m, (N, V); at least the first."""
     last = found[..., 1].copy()
     radius, near, spread = mirrors.arrays()
-    for i, v in np.argwhere(np.isfinite(last)):
-        one, end = np.empty((1, 1)), np.empty((1, 1))
-        pose = found[i, v]
+    for v in range(len(table)):
+        hit = np.flatnonzero(np.isfinite(last[:, v]))
+        end = np.empty((2, len(hit), 1))
+        pose = found[hit, v]
+        given = np.ascontiguousarray(pose[:, 2:5]), np.ascontiguousarray(pose[:, 5:8]), reach[hit]
         kernels.enter(
-            table[v : v + 1],
-            corners,
-            pose[None, 2:5],
-            pose[None, 5:8],
-            reach[i : i + 1],
-            radius[i : i + 1],
-            near[i : i + 1],
-            spread[i : i + 1],
-            one,
-            end,
+            table[v : v + 1], corners, *given, radius[hit], near[hit], spread[hit], end[0], end[1]
         )
-        last[i, v] = np.fmax(last[i, v], end[0, 0])
+        last[hit, v] = np.fmax(last[hit, v], end[1, :, 0])
     return last
 
 

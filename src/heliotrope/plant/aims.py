@@ -1,6 +1,6 @@
 """Aim points for heliostats, and the proof that a beam may go to its point."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from heliotrope.optics import Hazard, MirrorOptics, beams, crossing, find_entrie
 
 #: Length over which an unobstructed beam is followed, m.
 FAR = 3000.0
+_ON_ITS_WAY = "on its way there"
 
 
 def spread(vertices: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
@@ -93,6 +94,11 @@ class BeamCheck:
     eyes
         Places from which people may look into resting beams, ENU, m, (P, 3); None: the design's.
 
+    Attributes
+    ----------
+    position
+        Places of the heliostats, ENU, m, (N, 3).
+
     Raises
     ------
     InputError
@@ -112,6 +118,7 @@ class BeamCheck:
         self.volumes = tuple(design.keep_outs if volumes is None else volumes)
         places = [*design.eyes.values()] if eyes is None else eyes
         self.eyes = as_vectors(np.reshape(as_float(places), (-1, 3)), "eyes")
+        self.position = design.position[rows]
         self.armature = Armature(design.armature.table[rows])
         self.drives = Drive(design.drives.table[rows])
         groups = design.groups.values()
@@ -132,9 +139,12 @@ class BeamCheck:
         sun: FloatArray,
         counts: FloatArray | None = None,
     ) -> Tracking:
-        """Return the poses for aims (K, 3) of heliostats (K,), those nearest to counts (K, 2)."""
+        """Return the poses for aims (K, 3) of heliostats (K,), those nearest to counts (K, 2).
+
+        The sun is (3,) or (K, 3).
+        """
         # At night nothing moves; the pose for an overhead sun shows the beam's way just as well.
-        source = sun if sun[2] > 0.0 else np.array([0.0, 0.0, 1.0])
+        source = np.where(sun[..., 2:] > 0.0, sun, np.array([0.0, 0.0, 1.0]))
         return track(
             Armature(self.armature.table[rows]),
             source,
@@ -229,7 +239,12 @@ class BeamCheck:
         return found
 
     def on_the_way(
-        self, rows: npt.NDArray[np.intp], counts: FloatArray, aims: FloatArray, sun: FloatArray
+        self,
+        rows: npt.NDArray[np.intp],
+        counts: FloatArray,
+        aims: FloatArray,
+        sun: FloatArray,
+        motion: Callable[[npt.NDArray[np.intp], FloatArray, FloatArray], FloatArray],
     ) -> dict[str, str]:
         """Return the heliostats whose beams would enter a volume on the way to their aims, and why.
 
@@ -241,6 +256,8 @@ class BeamCheck:
             Step counts of their axes, (K, 2).
         aims, sun
             As in `problems`.
+        motion
+            Returns the angles that the axes pass between counts; see `Ways.motion`.
         """
         found: dict[str, str] = {}
         solved = self.poses(rows, aims, sun)
@@ -251,8 +268,7 @@ class BeamCheck:
             )
         good = status == TrackingStatus.OK
         if good.any():
-            begin = Drive(self.drives.table[rows]).angles(counts)
-            path = np.stack([begin, solved.chosen(solved.angles)], axis=-2)[good]
+            path = motion(rows[good], counts[good], solved.chosen(solved.counts)[good])
             found |= self.moving(rows[good], path, sun)
         return found
 
@@ -291,7 +307,11 @@ class BeamCheck:
         return found
 
     def moving(
-        self, rows: npt.NDArray[np.intp], path: FloatArray, sun: FloatArray
+        self,
+        rows: npt.NDArray[np.intp],
+        path: FloatArray,
+        sun: FloatArray,
+        when: str = _ON_ITS_WAY,
     ) -> dict[str, str]:
         """Return the heliostats whose beams would enter a volume on a path of their axes, and why.
 
@@ -302,11 +322,13 @@ class BeamCheck:
         path
             Angles that the axes pass, rad, (K, W, 2).
         sun
-            As in `problems`.
+            Unit vectors, (3,) or (K, 3).
+        when
+            Where that is, in words.
         """
         found: dict[str, str] = {}
-        if len(rows) and self.volumes and sun[2] > 0.0:
-            self._check_motion(found, rows, path, sun)
+        if len(rows) and self.volumes and sun[..., 2].max() > 0.0:
+            self._check_motion(found, rows, path, sun, when)
         return found
 
     def inside(self, row: int, poses: FloatArray, sun: FloatArray) -> npt.NDArray[np.bool_]:
@@ -339,11 +361,16 @@ class BeamCheck:
             self._check_motion(found, rows[good], path[good], sun)
 
     def _check_motion(
-        self, found: dict[str, str], rows: npt.NDArray[np.intp], path: FloatArray, sun: FloatArray
+        self,
+        found: dict[str, str],
+        rows: npt.NDArray[np.intp],
+        path: FloatArray,
+        sun: FloatArray,
+        when: str = _ON_ITS_WAY,
     ) -> None:
         armature, mirrors = Armature(self.armature.table[rows]), _rows_of(self.mirrors, rows)
         motion = sweep(armature, path, sun, mirrors, self.volumes, reach=FAR)
-        self._tell(found, rows, motion.entered, motion.distance, "on its way there")
+        self._tell(found, rows, motion.entered, motion.distance, when)
 
     def _tell(
         self,

@@ -16,6 +16,7 @@ from heliotrope.plant.assigned import Points
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.leaving import way_out
 from heliotrope.plant.refusals import BEAM_REFUSED, RefusedError
+from heliotrope.plant.ways import Ways
 from heliotrope.safety import Act, Reading
 
 Rows = npt.NDArray[np.intp]
@@ -27,8 +28,10 @@ _MOVES = 200
 #: States whose motions were commanded: the whole way is looked at. Of every other state the present
 #: pose and the end of the motion are, as a way to safety is never held up.
 _COMMANDED = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)
-#: An approach turns by more than this (rad) only when it leaves stow: azimuth first.
+#: Where stow is not known: an approach turns by more than this (rad) only when it leaves stow.
 _FROM_STOW = 0.15
+#: Commands whose whole motion is proven before they are sent.
+_PROVEN = ("APPROACH", "IDLE", "JOG", "GOTO", "DIAGNOSE")
 #: States from which IDLE moves a heliostat straight to its standby point.
 _TO_STANDBY = (states.TRACKING, states.SEARCHING, states.DEFOCUSED, states.IDLE)
 
@@ -69,7 +72,7 @@ class BeamWatch:
     points
         Assigned aims and standby points.
     sun
-        Returns the unit vector to the sun now, (3,).
+        Returns the unit vector to the sun, (3,), some seconds from now.
     machines
         Limits and resting places of heliostats, by name, as far as they are known.
 
@@ -84,13 +87,12 @@ class BeamWatch:
         check: BeamCheck,
         field: FieldState,
         points: Points,
-        sun: Callable[[], FloatArray],
+        sun: Callable[[float], FloatArray],
         machines: Mapping[str, Machine],
     ) -> None:
         self._check, self._field, self.points, self._sun = check, field, points, sun
         self._machines = machines
-        axes = [m.azimuth_axis if (m := machines.get(n)) else 0 for n in field.names]
-        self._azimuth = np.array(axes, dtype=np.intp)
+        self._ways = Ways(check, machines)
         self._seen: frozenset[str] = frozenset()
         self._turn = 0
         self._at = -np.inf
@@ -109,7 +111,7 @@ class BeamWatch:
         """
         aims, standbys = self.points.aims, self.points.standbys
         start = np.where(tracking[:, None], aims[rows], standbys[rows])
-        stopped, light = name == "AIM", self._sun()
+        stopped, light = name == "AIM", self._sun(0.0)
         wrong = self._check.problems(rows, wanted, light, start=start, stopped=stopped)
         if not stopped:
             wrong |= self._check.glare(rows, wanted, standbys, light)
@@ -126,28 +128,44 @@ class BeamWatch:
         BeamError
             If none may.
         """
-        if not self._check.volumes or name not in ("JOG", "GOTO", "DIAGNOSE", "IDLE"):
+        if not self._check.volumes or name not in _PROVEN:
             return heliostats, {}
         rows = np.array([self._field.place(n) for n in heliostats], dtype=np.intp)
         # A heliostat without known counts is left to its local controller.
         rows = rows[np.isfinite(self._field.counted_at[rows])]
-        light = self._sun()
-        wrong: dict[str, str] = {}
-        if name == "IDLE":
-            rows = rows[self._field.among(_TO_STANDBY, now)[rows]]
-            known = np.isfinite(self.points.standbys[rows]).all(axis=-1)
-            wrong = {
-                self._field.names[row]: "its standby point is not known here; give it one "
-                "(STANDBY) first, or stow it"
-                for row in rows[~known]
-            }
-            rows, path = self._to_standby(rows[known], light)
+        if name == "APPROACH":
+            wrong = self._from_stow(rows)
+        elif name == "IDLE":
+            wrong = self._back_to_standby(rows[self._field.among(_TO_STANDBY, now)[rows]])
         else:
             path = self._by_counts(name, values, rows)
-        wrong |= self._check.moving(rows, path, light)
+            wrong = self._check.moving(rows, path, self._sun(0.0))
         if wrong and len(wrong) == len(heliostats):
             raise BeamError(name, wrong)
         return tuple(n for n in heliostats if n not in wrong), wrong
+
+    def _from_stow(self, rows: Rows) -> dict[str, str]:
+        """Return which heliostats have no free way from stow to standby, and why."""
+        rows, wrong = self._resting(rows)
+        stow, counts = self._ways.stow[rows], self._field.counts(rows)
+        begin = np.where(np.isfinite(stow), stow, counts)
+        return wrong | self._ways.approach(rows, begin, self.points.standbys[rows], self._sun)
+
+    def _back_to_standby(self, rows: Rows) -> dict[str, str]:
+        """Return which heliostats may not go straight to their standby points, and why."""
+        rows, wrong = self._resting(rows)
+        light = self._sun(0.0)
+        rows, path = self._to_standby(rows, light)
+        return wrong | self._check.moving(rows, path, light)
+
+    def _resting(self, rows: Rows) -> tuple[Rows, dict[str, str]]:
+        """Return the heliostats whose standby points are known, and why the others do not go."""
+        known = np.isfinite(self.points.standbys[rows]).all(axis=-1)
+        return rows[known], {
+            self._field.names[row]: "its standby point is not known here; give it one "
+            "(STANDBY) first, or stow it"
+            for row in rows[~known]
+        }
 
     def rewriting(self, heliostat: str, armature: FloatArray, drives: FloatArray) -> str:
         """Return why new parameters may not be written where a heliostat stands, "" if they may.
@@ -177,7 +195,7 @@ class BeamWatch:
 
     def _from_here(self, rows: Rows) -> dict[str, str]:
         """Return which heliostats may not go from where they stand to standby, and why."""
-        light = self._sun()
+        light = self._sun(0.0)
         here = self._angles(rows, self._field.posed[rows])
         wrong = self._check.moving(rows, np.repeat(here[:, None], 2, axis=1), light)
         known = rows[np.isfinite(self.points.standbys[rows]).all(axis=-1)]
@@ -203,8 +221,8 @@ class BeamWatch:
         }
         if not unknown.all():
             known = rows[~unknown]
-            counts, light = self._field.counts(known), self._sun()
-            found |= self._check.on_the_way(known, counts, aims[~unknown], light)
+            counts, light = self._field.counts(known), self._sun(0.0)
+            found |= self._check.on_the_way(known, counts, aims[~unknown], light, self._ways.motion)
             if name == "SEARCH":
                 found |= self._check.around(known, aims[~unknown], values[1], light)
         return found
@@ -212,14 +230,15 @@ class BeamWatch:
     def _to_standby(self, rows: Rows, light: FloatArray) -> tuple[Rows, FloatArray]:
         counts = self._field.counts(rows)
         found = self._check.poses(rows, self.points.standbys[rows], light, counts)
-        path = np.stack([self._angles(rows, counts), found.chosen(found.angles)], axis=-2)
         good = found.chosen(found.status) == TrackingStatus.OK
-        return rows[good], path[good]
+        rows, ends = rows[good], found.chosen(found.counts)[good]
+        return rows, self._ways.motion(rows, counts[good], ends)
 
     def _by_counts(self, name: str, values: Sequence[float], rows: Rows) -> FloatArray:
         """Return the angles that a command passes, from where the axes stand, (K, W, 2)."""
-        begin = self._angles(rows, self._field.counts(rows))
+        counts = self._field.counts(rows)
         if name == "DIAGNOSE":
+            begin = self._angles(rows, counts)
             nudges = NUDGE * np.array([(1, 0), (-1, 0), (0, 0), (0, 1), (0, -1)])
             return np.stack([begin, *(begin + nudge for nudge in nudges)], axis=-2)
         ends = np.broadcast_to(np.asarray(values, dtype=np.float64), (len(rows), 2))
@@ -228,7 +247,7 @@ class BeamWatch:
             ends = self._field.goals(rows)
             if axis < 2:  # the local controller refuses any other axis
                 ends[:, axis] += steps
-        return np.stack([begin, self._angles(rows, ends)], axis=-2)
+        return self._ways.motion(rows, counts, ends)
 
     def _angles(self, rows: Rows, counts: FloatArray) -> FloatArray:
         angles: FloatArray = Drive(self._check.drives.table[rows]).angles(counts)
@@ -274,7 +293,7 @@ class BeamWatch:
         if node["state"] == states.STOWING or (again and stands):
             return Act.STOW
         machine = self._machines.get(name)
-        return way_out(self._check, machine, row, self._field.posed[row], self._sun())
+        return way_out(self._check, machine, row, self._field.posed[row], self._sun(0.0))
 
     def _look(self, now: float) -> None:
         field = self._field
@@ -286,24 +305,27 @@ class BeamWatch:
         moves = np.asarray((np.abs(end - begin) > _MOVES).any(axis=-1))
         chosen = moves | (every % TURNS == self._turn)
         rows, moves, state = every[chosen], moves[chosen], state[chosen]
-        first, last = self._angles(rows, begin[chosen]), self._angles(rows, end[chosen])
-        commanded = np.isin(state, _COMMANDED)
-        light = self._sun()
-        path = np.stack([first, self._corner(rows, state, first, last), last], axis=-2)
-        path[~commanded] = first[~commanded, None]
-        wrong = self._check.moving(rows, path, light)
-        ends = moves & ~commanded
-        wrong |= self._check.moving(rows[ends], np.repeat(last[ends, None], 2, axis=1), light)
+        begin, end = begin[chosen], end[chosen]
+        light = self._sun(0.0)
+        follows = moves & np.isin(state, _COMMANDED)
+        turns = follows & self._leaves_stow(rows, state, begin, end)
+        both, ends = follows & ~turns, moves & ~follows
+        stand = np.concatenate([rows[~follows], rows[ends]])
+        at = self._angles(stand, np.concatenate([begin[~follows], end[ends]]))
+        wrong = self._check.moving(stand, np.repeat(at[:, None], 2, axis=1), light)
+        path = self._ways.turns(rows[turns], begin[turns], end[turns])
+        wrong |= self._check.moving(rows[turns], path, light)
+        path = self._ways.motion(rows[both], begin[both], end[both], ramps=False)
+        wrong |= self._check.moving(rows[both], path, light)
         looked = {field.names[row] for row in rows}
         self._seen = frozenset(wrong) | (self._seen - looked)
 
-    def _corner(
-        self, rows: Rows, state: npt.NDArray[np.integer], first: FloatArray, last: FloatArray
-    ) -> FloatArray:
-        """Return the corner of each way (K, 2): azimuth first where an approach leaves stow."""
-        far = (np.abs(last - first) > _FROM_STOW).any(axis=-1)
-        turns = np.equal(state, states.APPROACHING) & far
-        axis = self._azimuth[rows]
-        corner = first.copy()
-        corner[turns, axis[turns]] = last[turns, axis[turns]]
-        return corner
+    def _leaves_stow(
+        self, rows: Rows, state: npt.NDArray[np.integer], begin: FloatArray, end: FloatArray
+    ) -> npt.NDArray[np.bool_]:
+        """Return which approaches (K,) leave stow: the other axis has not moved yet."""
+        each, other = np.arange(len(rows)), 1 - self._ways.azimuth[rows]
+        stow = self._ways.stow[rows][each, other]
+        turned = np.abs(self._angles(rows, end) - self._angles(rows, begin)).max(axis=-1)
+        far = np.where(np.isfinite(stow), begin[each, other] == stow, turned > _FROM_STOW)
+        return np.asarray(np.equal(state, states.APPROACHING) & far)

@@ -52,6 +52,7 @@ from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
 from heliotrope.plant.disk import AtOnce, Disk, Work
+from heliotrope.plant.doubts import Doubts
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.identity import Identities
@@ -61,7 +62,7 @@ from heliotrope.plant.orders import PlantOrders, whole
 from heliotrope.plant.parameters import ParameterSync, Tables, change_of_beam
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety import Act, Alarm, Condition, conditions
+from heliotrope.safety import Act, Alarm, Condition, alarms, conditions
 from heliotrope.sun import fast_vector
 
 #: Commands that bring beams to the receiver or move them across it.
@@ -114,7 +115,7 @@ class PlantController:
 
     Attributes
     ----------
-    design, settings, field, authority, wanted, counters, beliefs
+    design, settings, field, authority, wanted, counters, beliefs, doubts
         See their classes.
     beams
         Mirrors and keep-out volumes; see `BeamCheck`.
@@ -178,6 +179,7 @@ class PlantController:
             self._clusters.connection,
             self._tell,
         )
+        self.doubts = Doubts(self.field, design, self.aims, self._tell)
         self._orders = PlantOrders(
             clock,
             audit,
@@ -189,7 +191,11 @@ class PlantController:
         )
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
         self._joiner = JoinDispatcher(
-            self._joining, self._orders, self._ways, self.settings.join_life
+            self._joining,
+            self._orders,
+            self._ways,
+            self.settings.join_life,
+            self.doubts.barred,
         )
         self._sync = ParameterSync(
             self.field,
@@ -284,6 +290,7 @@ class PlantController:
         self.counters.problems.extend(self.field.take(end.name, status, now))
         self._agreement.take(end.name, status)
         self._give_up(self._identities.look(end.name))
+        self.doubts.look(end.name)
         if not self.field.knows_order(end.name) and now - self._named_at[end.name] >= _ASK_NAMES:
             # The message that names the rows was lost; the statistics come in the same order.
             self._named_at[end.name] = now
@@ -325,9 +332,9 @@ class PlantController:
         """Return the monotonic time, s."""
         return self.clock.monotonic()
 
-    def sun_vector(self) -> FloatArray:
-        """Return the unit vector to the sun now, ENU, (3,)."""
-        return fast_vector(self.clock.utc().timestamp(), self.design.site)
+    def sun_vector(self, ahead: float = 0.0) -> FloatArray:
+        """Return the unit vector to the sun now, or some seconds ahead, ENU, (3,)."""
+        return fast_vector(self.clock.utc().timestamp() + ahead, self.design.site)
 
     @property
     def emergency(self) -> EmergencyOrder | None:
@@ -457,7 +464,8 @@ class PlantController:
             Their role must be high enough for the row.
         condition, subject
             As the alarm names them. A row that a cluster watches has the cluster as subject; the
-            cluster decides, and ends the alarm if it agrees.
+            cluster decides, and ends the alarm if it agrees. For `counts_doubtful` it confirms that
+            the person has seen the heliostat where it should be.
 
         Raises
         ------
@@ -466,7 +474,9 @@ class PlantController:
         """
         person.must_be(Role.OPERATOR, condition)
         role = person.role.acknowledges_as
-        if condition in self._sentinel.table.rows or subject not in self._clusters.ends:
+        if condition == alarms.COUNTS_DOUBTFUL.name:
+            self.doubts.confirm(subject)
+        elif condition in self._sentinel.table.rows or subject not in self._clusters.ends:
             refusal = self._sentinel.table.acknowledge(condition, person.name, role, subject)
             if refusal:
                 raise refusals.NOT_ACKNOWLEDGED.error(reason=refusal)
@@ -724,15 +734,16 @@ class PlantController:
 
         Raises
         ------
-        BeamError
-            If none may.
+        RefusedError
+            If none may; the reason of the whole plant or of a cluster comes before their own.
         """
         wrong = {} if name == "LOCK" else self._identities.barred(names)
         if name in MOTIONS:
             wrong = self._sync.differing(names) | wrong
         if name in JOINING:
-            wrong |= self._sentinel.barred(names)
+            wrong |= self._sentinel.barred(names) | self.doubts.barred(names)
         if wrong and len(wrong) == len(names):
+            self._refuse_now(name, names)
             raise BeamError(name, wrong)
         return tuple(n for n in names if n not in wrong), wrong
 
@@ -803,7 +814,10 @@ class PlantController:
         tracking = self.field.among(_ON_AIM, self.now())[rows]
         moves = tracking if name == "AIM" else self.field.among((states.IDLE,), self.now())[rows]
         moved = [names[i] for i in np.flatnonzero(moves)]
-        if wrong := self._sync.differing(moved) | self._identities.barred(moved):
+        wrong = self._sync.differing(moved) | self._identities.barred(moved)
+        if name == "AIM":
+            wrong |= self.doubts.barred(moved, wanted[moves])
+        if wrong:
             raise BeamError(name, wrong)
         self._ways.check_points(name, rows, wanted, tracking)
 

@@ -1,6 +1,7 @@
 """The queue of heliostats that join the receiver, at a bounded rate and after a bounded wait."""
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from heliotrope.links.messages import Stage
@@ -92,17 +93,25 @@ class JoinDispatcher:
         Of the plant.
     life
         Life of a command whose turn has come, s.
+    barred
+        Returns which of some heliostats may not join for another reason, and why.
     """
 
     def __init__(
-        self, queue: JoinQueue, orders: PlantOrders, beams: BeamWatch, life: float
+        self,
+        queue: JoinQueue,
+        orders: PlantOrders,
+        beams: BeamWatch,
+        life: float,
+        barred: Callable[[tuple[str, ...]], dict[str, str]],
     ) -> None:
         self._queue, self._orders, self._beams, self._life = queue, orders, beams, life
+        self._barred = barred
 
     def beat(self, now: float, token: int) -> None:
         """Send the heliostats whose turn it is."""
         for job, part in self._queue.admit(now, token):
-            wrong = self._beams.joining(job.name, job.values, part)
+            wrong = self._beams.joining(job.name, job.values, part) | self._barred(part)
             job.ticket.block(wrong)
             clear = [name for name in part if name not in wrong]
             self._orders.command(job.ticket, job.name, job.values, clear, token, self._life)

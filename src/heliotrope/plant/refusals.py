@@ -142,6 +142,12 @@ NOT_HEARD = Refusal(
     "it has not been heard since its cluster connected, so its board is not known",
     "Wait for its next status, a second at most. If none comes, see to its cluster or its supply.",
 )
+COUNTS_DOUBTFUL = Refusal(
+    "counts doubtful",
+    "A heliostat that lost its power in motion is sent to the receiver.",
+    "its step counts may be wrong since a power cut in motion, and nobody has confirmed them",
+    "Look where its mirror stands, then acknowledge the alarm `counts_doubtful`; or calibrate it.",
+)
 PARAMETERS_NOT_HERE = Refusal(
     "parameters not here",
     "Parameters that change a pose are given where the beam would move or is not proven free.",

@@ -138,6 +138,17 @@ CONSOLE = AlarmKind(
     "Use heliotrope ctl on the plant's computer meanwhile; if it returns, look at its messages.",
     over="the console answers again",
 )
+COUNTS_DOUBTFUL = AlarmKind(
+    "counts_doubtful",
+    _PLANT,
+    Severity.WARNING,
+    "A local controller lost its power in motion, so its step counts may be wrong.",
+    "{subject}: its step counts may be wrong since a power cut in motion",
+    "It does not join the receiver; targets, standby, DEFOCUS and STOW go on as before.",
+    "Look where its mirror stands. If that is right, acknowledge; if not, an engineer locks it and "
+    "gives its step counts (ZERO). A calibration visit confirms it too.",
+    over="{subject}: its step counts are confirmed, or have been given again",
+)
 RECORDS = AlarmKind(
     "records",
     _PLANT,
@@ -202,7 +213,7 @@ BEAM_BLOCKED = AlarmKind(
     "beam_blocked",
     _PLANT,
     Severity.WARNING,
-    "The beam of a heliostat would enter a keep-out volume at its aim or on the way there.",
+    "The beam of a heliostat would enter a keep-out volume at its aim or on its way there.",
     "{subject}: {reason}",
     "Automatic control leaves it where it is and tries again every five minutes.",
     "Give it another aim point, or correct the volume in the plant file.",
@@ -268,6 +279,16 @@ NODE_UNINTELLIGIBLE = AlarmKind(
     "Its reports are ignored, so it counts as silent.",
     "Install the same firmware version on heliostat and cluster.",
     over="{subject}: its state is known again",
+)
+SUN_JUMPED = AlarmKind(
+    "sun_jumped",
+    _CLUSTER,
+    Severity.WARNING,
+    "A local controller was sent a sun that cannot follow from the one before.",
+    "{subject}: its cluster sent a sun that cannot follow from the one before",
+    "It refused that sun, or took it after a lapse; if it was tracking, it has turned away.",
+    "Check the clock, the time source and the site of the cluster.",
+    over="{subject}: a minute ago; another jump shows only after its local controller is restarted",
 )
 PLANT_UNINTELLIGIBLE = AlarmKind(
     "plant_unintelligible",

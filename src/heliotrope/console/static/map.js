@@ -210,7 +210,10 @@ export class FieldMap {
     for (let row = 0; row < n; row++) {
       if (!store.out[row]) continue;
       const [px, py] = this.toScreen(this.x[row], this.y[row]), r = Math.max(6, half + 3);
-      c.beginPath(); c.arc(px, py, r, 0, 2 * Math.PI); c.moveTo(px - r, py); c.lineTo(px + r, py); c.stroke();
+      c.beginPath(); c.arc(px, py, r, 0, 2 * Math.PI); c.moveTo(px - r, py); c.lineTo(px + r, py);
+      // Confirmed by the switch at the mirror: a second bar.
+      if (store.out[row] === 2) { c.moveTo(px, py - r); c.lineTo(px, py + r); }
+      c.stroke();
     }
     if (half > 3) {
       c.fillStyle = night ? "#12161b" : "#f4f5f6";
@@ -285,7 +288,7 @@ export class FieldMap {
   showLegend() {
     const view = VIEWS[this.view], box = this.legend;
     if (!this.x) return;
-    const out = store.out.reduce((sum, one) => sum + one, 0);
+    const out = store.out.reduce((sum, one) => sum + (one > 0), 0);
     box.replaceChildren(Object.assign(document.createElement("b"), { textContent: view.title }));
     if (view.scale) {
       const bar = document.createElement("canvas");
@@ -391,7 +394,7 @@ export class FieldMap {
     if (row < 0) { tip.style.display = "none"; return; }
     const error = 1e3 * store.error[row];
     tip.textContent = `${store.field.names[row]} · ${store.stateName(row)}` +
-      (Number.isNaN(error) ? " · not calibrated" : ` · ±${error.toFixed(2)} mrad`) + (store.out[row] ? " · OUT OF SERVICE" : "");
+      (Number.isNaN(error) ? " · not calibrated" : ` · ±${error.toFixed(2)} mrad`) + (store.out[row] ? " · OUT OF SERVICE" : "") + (store.out[row] === 2 ? ", confirmed at the mirror" : "");
     tip.style.display = "block";
     tip.style.left = `${Math.min(px + 14, this.width - 190)}px`;
     tip.style.top = `${py + 14}px`;

@@ -28,6 +28,7 @@ ON_BEAM = (states.TRACKING, states.SEARCHING, states.APPROACHING, states.IDLE)
 #: Flag of a heliostat whose step counts mean nothing.
 COUNTS_UNKNOWN = 1 << meanings.FLAGS.index("COUNTS_UNKNOWN")
 _AT_STOW = 1 << meanings.FLAGS.index("AT_STOW")
+_SWITCHED_OFF = 1 << meanings.FLAGS.index("LOCAL_SWITCH")
 
 Mask = npt.NDArray[np.bool_]
 
@@ -124,6 +125,11 @@ class EmergencyOrder:
             self.ticket.advance(ready, Stage.DONE)
 
 
+def switched_off(flags: npt.NDArray[Any]) -> Mask:
+    """Return whether drives are switched off at the mirror, away from stow: it cannot obey."""
+    return np.asarray((flags & _SWITCHED_OFF != 0) & (flags & _AT_STOW == 0))
+
+
 def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) -> Mask:
     """Return which rows (K,) of `NODE` show that DEFOCUS or STOW has been carried out.
 
@@ -140,7 +146,7 @@ def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) 
     """
     # A heliostat that stands at stow and is IDLE has not obeyed: it may go on to track.
     off = ~np.isin(rows["state"], ON_BEAM)
-    known = rows["flags"] & COUNTS_UNKNOWN == 0
+    known = (rows["flags"] & COUNTS_UNKNOWN == 0) & ~switched_off(rows["flags"])
     stowed = off & known & ((rows["state"] == states.STOWED) | (rows["flags"] & _AT_STOW != 0))
     if act is Act.STOW:
         return np.asarray(stowed)

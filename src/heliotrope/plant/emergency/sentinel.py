@@ -15,7 +15,12 @@ from heliotrope.links.clock import Clock
 from heliotrope.links.messages import Progress, Stage
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.beam_watch import BeamWatch
-from heliotrope.plant.emergency.order import COUNTS_UNKNOWN, ON_BEAM, EmergencyOrder
+from heliotrope.plant.emergency.order import (
+    COUNTS_UNKNOWN,
+    ON_BEAM,
+    EmergencyOrder,
+    switched_off,
+)
 from heliotrope.plant.emergency.table import TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoinQueue
@@ -215,9 +220,8 @@ class Sentinel:
         if self.order is not None and ticket is self.order.ticket:
             if progress.stage is Stage.DONE:
                 flags = self._field.rows["flags"]
-                heliostats = tuple(
-                    n for n in heliostats if not flags[self._field.index[n]] & COUNTS_UNKNOWN
-                )
+                good = (flags & COUNTS_UNKNOWN == 0) & ~switched_off(flags)
+                heliostats = tuple(n for n in heliostats if good[self._field.index[n]])
             self.order.take_stage(heliostats, progress.stage, self._clock.monotonic())
 
     def take_rows(self, cluster: str, now: float) -> None:
@@ -240,6 +244,11 @@ class Sentinel:
             name = self._field.names[row]
             if int(self._field.rows["flags"][row]) & COUNTS_UNKNOWN:
                 order.unknown[name] = self._last_of(row, now)
+            elif switched_off(self._field.rows["flags"][row]):
+                order.unknown[name] = (
+                    f"{name}: its drives are switched off at the mirror, so it is not proven to be "
+                    "off; it was not at stow"
+                )
             else:
                 order.unknown.pop(name, None)
 

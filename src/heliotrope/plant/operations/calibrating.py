@@ -113,8 +113,13 @@ class Calibrating:
     async def visit(
         self, target: str, ready: npt.NDArray[np.bool_], person: Person, token: int
     ) -> str:
-        """Calibrate the next of the ready heliostats (N,); return its name, "" if none is due."""
-        chosen = self._scheduler.next(target, ready)
+        """Calibrate the next of the ready heliostats (N,); return its name, "" if none is due.
+
+        Heliostats whose step counts are in doubt come first: a photograph ends it.
+        """
+        doubtful = ready & self._plant.doubts.standing
+        chosen = self._scheduler.next(target, doubtful) if doubtful.any() else None
+        chosen = chosen or self._scheduler.next(target, ready)
         if chosen is None:
             return ""
         name, begun = chosen.heliostat, self._now()

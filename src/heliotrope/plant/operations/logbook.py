@@ -23,6 +23,8 @@ _STEADY = ("lease", "status")
 _LONGEST = 240
 #: Alarms that the evaluation of the table raises and ends itself: nothing to acknowledge.
 _UNACKNOWLEDGED = (alarms.TIME_WENT_BACK.name, alarms.UNKNOWN_READING.name)
+#: Alarms whose acknowledgement the plant takes, beside the rows of the table.
+_CONFIRMED = (alarms.COUNTS_DOUBTFUL.name,)
 #: An alarm that is raised once and put right by the plant itself.
 _PASSING = (alarms.PARAMETERS_DIFFER.name,)
 
@@ -174,8 +176,8 @@ class Logbook:
 
     @staticmethod
     def is_plain(condition: str) -> bool:
-        """Whether an alarm belongs to no row of the safety table."""
-        return condition in alarms.KINDS and condition not in _UNACKNOWLEDGED
+        """Whether the acknowledgement of an alarm means nothing to the plant."""
+        return condition in alarms.KINDS and condition not in _UNACKNOWLEDGED + _CONFIRMED
 
     @property
     def open_alarms(self) -> int:

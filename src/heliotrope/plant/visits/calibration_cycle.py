@@ -42,6 +42,10 @@ from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.plant.visits.verification import Verification
 from heliotrope.plant.visits.visit import Visit
 
+#: Step counts in doubt are confirmed by photographs that miss by no more than this, rad RMS: the
+#: limit at which `pointing_disagrees` trips.
+PLACED = 3e-3
+
 
 @dataclass(frozen=True)
 class CycleResult:
@@ -161,15 +165,22 @@ class CalibrationCycle:
         plant.authority.check(person, token, "PARAMETERS")
         visit = Visit(plant, person, token, heliostat, plant.design.target(target))
         tracked = visit.state == states.TRACKING
-        aim = plant.aims[visit.row].copy()
+        aim, boots = plant.aims[visit.row].copy(), int(plant.field.rows["boots"][visit.row])
         async with visit:
             await visit.go(self.settings.arrival)
             taken = await self._photographing.take(visit, tell or _nobody)
         result = await self._learn(visit, taken, tell or _nobody)
+        if taken.used and self._missed(heliostat, taken) <= PLACED:
+            plant.doubts.confirm(heliostat, boots)
         if tracked and np.isfinite(aim).all():
             await visit.aim(aim)
             await visit.command("TRACK")
         return result
+
+    def _missed(self, heliostat: str, taken: Photographs) -> float:
+        """Return the beam error of photographs by what is believed now, rad RMS."""
+        seen = join([self._sighting(shot, counts) for shot, counts in taken.used])
+        return root_mean_square(beam_errors(self._plant.beliefs.present(heliostat), seen).beam)
 
     def _sighting(self, shot: Shot, counts: FloatArray) -> Sightings:
         plant = self._plant

@@ -14,7 +14,7 @@ import numpy as np
 
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
-from heliotrope.lcu.controller import Controller
+from heliotrope.lcu.controller import SWITCH, Controller
 from heliotrope.lcu.journal import Journal
 from heliotrope.lcu.node import Node
 from heliotrope.twin.boards.clocks import TickCounter
@@ -89,6 +89,8 @@ class Board:
         True time of the last event, in s.
     tilt
         Reading of the accelerometer, or None.
+    switched_off
+        Whether the drives are switched off at the mirror.
     """
 
     def __init__(
@@ -113,9 +115,12 @@ class Board:
         self.slip = [0, 0]
         self.now = 0.0
         self.tilt: tuple[float, float] | None = None
+        self.switched_off = False
         self._out = bytearray()
         self._looked = -math.inf
         self._restless = False
+        self._posed: tuple[float, float] | None = None
+        self._pose: tuple[FloatArray, FloatArray] = np.zeros(3), np.zeros(3)
         journal = Journal(self.flash)
         journal.load()
         journal.store(outfit.items)
@@ -147,6 +152,7 @@ class Board:
                 key=self.outfit.key,
                 sensor=lambda: self.tilt,
             )
+            self._switch()
         except PowerCutError:
             self._die()
             return
@@ -161,6 +167,21 @@ class Board:
             with contextlib.suppress(PowerCutError):
                 self.node.on_supply_failing(self.ticks.at(now))
         self._die()
+
+    def switch(self, now: float, *, off: bool) -> None:
+        """Switch the drives off, or on again, with the switch at the mirror."""
+        self._to(now)
+        self.switched_off = off
+        try:
+            self._switch()
+        except PowerCutError:
+            self._die()
+
+    def _switch(self) -> None:
+        if self.node is not None and self.switched_off:
+            self.node.on_fault(SWITCH, self.ticks.at(self.now), True)
+        elif self.node is not None:
+            self.node.fault_gone(SWITCH)
 
     def _die(self) -> None:
         for axis in self.axes:
@@ -258,10 +279,14 @@ class Board:
         counts = [axis.joint for axis in self.axes]
         if believed:
             counts = [axis.turned - slip for axis, slip in zip(self.axes, self.slip, strict=True)]
-        pose = self.outfit.mechanism.pose(counts)
+        key = (counts[0], counts[1])
+        if key != self._posed:  # observers ask several times for one position
+            pose = self.outfit.mechanism.pose(counts)
+            self._posed, self._pose = key, (pose.vertex, pose.normal)
+        vertex, normal = self._pose
         if self.wind is None or believed:
-            return pose.vertex, pose.normal
-        return pose.vertex, self.wind.turned(pose.normal, self.outfit.mechanism.position, self.now)
+            return vertex, normal
+        return vertex, self.wind.turned(normal, self.outfit.mechanism.position, self.now)
 
     def beam(self, sun: FloatArray, *, believed: bool = False) -> tuple[FloatArray, FloatArray]:
         """Return vertex (3,) and direction (3,) of the reflected ray.
@@ -280,9 +305,12 @@ class Board:
         self, sun: FloatArray, point: "tuple[float, float, float]", *, believed: bool = False
     ) -> float:
         """Return the distance of the ray from a point, m; infinite if it leads away from it."""
-        vertex, ray = self.beam(sun, believed=believed)
-        way = np.subtract(point, vertex)
-        along = float(way @ ray)
+        # By single numbers: for three of them numpy takes several times as long.
+        vertex, normal = (each.tolist() for each in self.mirror(believed=believed))
+        (a, b, c), (i, j, k), (s, t, u) = vertex, normal, sun.tolist()
+        twice = 2.0 * (i * s + j * t + k * u)
+        x, y, z = point[0] - a, point[1] - b, point[2] - c
+        along = x * (twice * i - s) + y * (twice * j - t) + z * (twice * k - u)
         if along <= 0.0:
             return math.inf
-        return math.sqrt(max(0.0, float(way @ way) - along * along))
+        return math.sqrt(max(0.0, x * x + y * y + z * z - along * along))

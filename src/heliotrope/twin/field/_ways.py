@@ -10,7 +10,7 @@ from heliotrope.lcu.motion import PIECE
 
 
 def pieces(corners: FloatArray, origin: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Return paths with points added where a beam would turn by more than `lcu.motion.PIECE`.
+    """Return paths with points added between corners; see `lcu.motion.PIECE`.
 
     Parameters
     ----------

@@ -74,6 +74,10 @@ class HeliostatAccount:
         Whether it has left stow and has not tracked since.
     stows
         Stow positions that it was ever given, steps.
+    by_way
+        Whether it has come to its standby point since it was last at stow or without power.
+    foot
+        Nearest that its beam came to the foot of the way in this approach, m; 0 if that is unknown.
     """
 
     def __init__(self, board: Board, now: float) -> None:
@@ -91,6 +95,8 @@ class HeliostatAccount:
         self.told: deque[tuple[float, tuple[Any, ...]]] = deque(maxlen=64)
         self.from_stow = False
         self.stows = {STOW}
+        self.by_way = False
+        self.foot = float("inf")
         self._history: deque[tuple[float, int]] = deque([(now, self.state)], maxlen=64)
         self._items = board.node.journal.items if board.node is not None else board.outfit.items
         self._pending: dict[str, bytes] = {}
@@ -108,9 +114,13 @@ class HeliostatAccount:
         """Note a new state."""
         if state == states.APPROACHING:
             self._leg = 1 if self.state == states.STOWED else 0
-            self.from_stow = True
+            self.from_stow, self.foot = True, float("inf")
         elif state in (states.TRACKING, states.SEARCHING, states.DEFOCUSED):
             self.from_stow = False
+        if state in (states.STOWED, states.STOWING):
+            self.by_way = False
+        elif (self.state, state) == (states.APPROACHING, states.IDLE):
+            self.by_way = True
         under_way = (states.APPROACHING, states.TRACKING, states.SEARCHING, states.LOCKED)
         by_itself = state == states.IDLE and self.state == states.APPROACHING
         if state in under_way or (state == states.IDLE and not by_itself):
@@ -136,7 +146,7 @@ class HeliostatAccount:
         self.in_hand, self.how, self.quiet = None, "", 0
         self._ordered.clear()
         self._leg, self._stowing_since = 0, None
-        self.from_stow = False
+        self.from_stow = self.by_way = False
         self.state = -1
         self._history.append((now, -1))
 
@@ -216,7 +226,7 @@ class HeliostatAccount:
 
     def jumped(self) -> None:
         """Note a jump of the counter: the board may take pending steps for done."""
-        self._leg = 0
+        self._leg, self.foot = 0, 0.0
 
     # -- deadlines -------------------------------------------------------------------------
 

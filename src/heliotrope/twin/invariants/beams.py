@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
+from heliotrope.lcu.node import Node
 from heliotrope.links.messages import Command, Progress, Stage
 from heliotrope.plant.controller import PlantController
-from heliotrope.safety import Act, Alarm
+from heliotrope.safety import Act, Alarm, alarms
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import RECEIVER, STANDBY, STOW, Ball
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Violation
@@ -59,8 +60,8 @@ class _Mirror:
     ----------
     aims, standbys
         Identities of orders and points: the last point that was reported as done, and all later.
-    state, settled_at
-        State last seen; when it must be where it was sent, s.
+    state, node, settled_at
+        State and program last seen; when it must be where it was sent, s.
     elsewhere, approached
         Whether its last motion led to step counts, not to its standby point; whether it has come to
         its standby point by the way from stow since it last had power or was at stow.
@@ -80,6 +81,7 @@ class _Mirror:
     aims: deque[tuple[str, Point]] = field(default_factory=lambda: deque(maxlen=40))
     standbys: deque[tuple[str, Point]] = field(default_factory=lambda: deque(maxlen=40))
     state: int = -1
+    node: Node | None = None
     settled_at: float = float("-inf")
     elsewhere: bool = False
     approached: bool = False
@@ -234,6 +236,8 @@ class BeamObserver:
         for mirror in self._mirrors.values():
             if mirror.cluster not in carried or named & {mirror.name, mirror.cluster}:
                 mirror.named_at = now
+            if mirror.node is not mirror.board.node:  # it was without power, however shortly
+                mirror.node, mirror.approached = mirror.board.node, False
             self._enters(mirror, mirror.board.state, now)
             on += mirror.state in _ON
             if mirror.state < 0:
@@ -272,7 +276,12 @@ class BeamObserver:
             self._check(14, good, now, mirror.name, saw)
 
     def _placed(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
-        """Check that a beam that was sent to a point is there."""
+        """Check that a beam that was sent to a point is there, or named and off.
+
+        A mirror at standby is off if its beam is neither on the receiver nor in a volume: no order
+        can bring one whose step counts are wrong to a better place, so its alarm is all that is
+        asked for, as long as it stands. Other alarms about standby have a better remedy.
+        """
         sent = _LIT.get(mirror.state)
         if sent is None or (mirror.left and not mirror.uncalled):
             mirror.astray_since = None
@@ -293,7 +302,14 @@ class BeamObserver:
         unnamed = 0.0 if since is None else now - max(since, mirror.named_at)
         saw = f"{beside}, and no alarm names it"
         self._check(12, unnamed <= NAMED_WITHIN, now, mirror.name, saw)
-        self._check(12, passed <= OFF_WITHIN, now, mirror.name, beside)
+        doubtful = self._alarms.get((alarms.COUNTS_DOUBTFUL.name, mirror.name), (0.0, False))[1]
+        off = doubtful and mirror.state == states.IDLE and not self._lights(mirror, sun)
+        self._check(12, off or passed <= OFF_WITHIN, now, mirror.name, beside)
+
+    def _lights(self, mirror: _Mirror, sun: FloatArray) -> bool:
+        """Whether a beam is on the receiver or inside a volume."""
+        inside = any(mirror.board.miss(sun, at) <= radius for at, radius in self._keep_outs)
+        return inside or mirror.board.miss(sun, RECEIVER) <= OFF
 
     def _dark(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
         """Check that a beam that nobody sent to the receiver, or into a volume, leaves."""

@@ -19,10 +19,12 @@ number    check
 7         After a boot the state is a safe one, the journal holds the old or the new record, and
           the step counts are right to within their stated uncertainty.
 8         Steps keep to range and rate; counted steps are those that were ordered.
-9         As 1, and the plant's lease too, while a clock or counter has jumped.
-10        Azimuth moves first from stow and last to stow; no beam crosses the receiver on the way.
+9         As 1, and the plant's lease too, while a clock or counter has jumped; no sun is sent by a
+          time that has jumped before a person has acknowledged it.
+10        Azimuth moves first from stow and last to stow; the beam goes by the foot of the way, and
+          crosses the receiver only once it has come to its standby point.
 11        Every command on the bus was accepted and reported once; no value is reported younger
-          or other than it is.
+          or other than it is. Where nothing fails (`world.tour`) it is done in time.
 12        A beam in a state that lights anything is where it was sent; otherwise an alarm names
           it within 10 s and it is off within 30 s.
 13        In no state does a beam stay on the receiver unsent, or in a keep-out volume, for 30 s.
@@ -43,7 +45,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages, states, wire
 from heliotrope.links.messages import NEVER, ClusterStatus, Progress, Stage
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, Ball
+from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, STANDBY, Ball
 from heliotrope.twin.invariants._account import HeliostatAccount, fingerprint
 from heliotrope.twin.invariants.ledger import FrameLedger, OrderLedger, PlantCommand, Sent
 
@@ -110,6 +112,14 @@ BY_COMMAND = {
     states.IDLE: ("IDLE", "UNLOCK", "CLEAR_FAULT"),
     states.STOWED: ("UNLOCK", "CLEAR_FAULT"), states.FAULT: ("UNLOCK",),
 }  # fmt: skip
+#: Foot of the way: below the standby point, at the height of the heliostats, m.
+FOOT = (STANDBY[0], STANDBY[1], 0.0)
+#: States that need a fresh sun.
+NEED_SUN = (states.APPROACHING, states.TRACKING, states.SEARCHING)
+#: An approach passes the foot of the way, on the ground below the standby point, within this, m.
+NEAR_FOOT = 6.0
+#: A time that has jumped is no longer used after this, s.
+JUMP_SEEN = 3.0
 #: States that a boot may end in.
 AFTER_BOOT = (states.UNCONFIGURED, states.STOWED, states.DEFOCUSED, states.LOCKED, states.FAULT)
 #: States that DEFOCUS and STOW always end: the beam is out by command, and no return path may lead
@@ -205,6 +215,7 @@ class Observer:
         self.frames = FrameLedger()
         self.orders = OrderLedger()
         self.leased_at = start
+        self._dark_since = float("inf")
         self.jumped_at = self.disturbed_at = float("-inf")
         self.autonomy = 0.0
         self.accounts = [HeliostatAccount(board, start) for board in boards]
@@ -252,6 +263,9 @@ class Observer:
             limit = PLANT_LEASE + self.autonomy + SUN_AFTER
             saw = f"it sends SUN {age:.2f} s after the plant's last lease, limit {limit:.2f} s"
             self.check(self._lease_number(now, 2), age <= limit, now, "cluster", saw)
+            dark = now - max(self._dark_since, self.disturbed_at)
+            saw = f"it sends SUN {dark:.1f} s after its time jumped, which nobody has acknowledged"
+            self.check(9, dark <= JUMP_SEEN or now < self._dark_since, now, "cluster", saw)
         elif sent.who in (messages.AUTHORITY, messages.KEY):
             self._authorised(sent, now)
         elif sent.who == messages.ANYONE:
@@ -345,6 +359,9 @@ class Observer:
         heard = what == "bytes"
         if heard:
             self._took(account, now)
+        if account.state == states.APPROACHING and account.foot > NEAR_FOOT:
+            miss = board.miss(self._sun(now), FOOT, believed=True)
+            account.foot = min(account.foot, miss)
         if account.board.state != account.state:
             self._changed(account, now, heard)
         self._leases(account, now)
@@ -395,8 +412,21 @@ class Observer:
         before, after = account.state, account.board.state
         account.entered(after, now)
         self.entered[after] += 1
-        if (before, after) in FREE:
-            return
+        if (before, after) not in FREE:
+            self._commanded(account, before, after, now, heard)
+        if after in (states.TRACKING, states.SEARCHING):
+            saw = (
+                f"from {states.STATES[before]} to {states.STATES[after]} without the way from stow"
+            )
+            self.check(10, account.by_way, now, account.name, saw)
+        elif (before, after) == (states.APPROACHING, states.IDLE):
+            saw = f"its beam came to standby {account.foot:.1f} m beside the foot of the way"
+            self.check(10, account.foot <= NEAR_FOOT, now, account.name, saw)
+
+    def _commanded(
+        self, account: HeliostatAccount, before: int, after: int, now: float, heard: bool
+    ) -> None:
+        """Check that a transition was commanded at this instant."""
         sent = account.in_hand if heard else None
         name = sent.name if sent is not None else ""
         good = name in BY_COMMAND.get(after, ())
@@ -406,7 +436,7 @@ class Observer:
 
     def _leases(self, account: HeliostatAccount, now: float) -> None:
         """Check that a state that needs the sun has a fresh one."""
-        if account.board.state in states.NEED_SUN:
+        if account.board.state in NEED_SUN:
             age = now - account.sun_at
             state = states.STATES[account.board.state]
             saw = f"{state} with a sun of {age:.3f} s, lease {LEASE:g} s"
@@ -483,11 +513,21 @@ class Observer:
         if place is not None:
             self.accounts[place].jumped()
 
+    def time_jumped(self, now: float) -> None:
+        """Note a jump of the cluster's time that it must notice."""
+        self.jumped(now)
+        self._dark_since = min(self._dark_since, now)
+
+    def time_acknowledged(self) -> None:
+        """Note that a person has acknowledged the jump."""
+        self._dark_since = float("inf")
+
     def disturbed(self, now: float, *, crashed: bool = False) -> None:
         """Note a failure of line, bus or cluster, which cancels what was due from the cluster."""
         self.disturbed_at = now
         self._emergencies.clear()
         if crashed:
+            self._dark_since = float("inf")
             for account in self.accounts:
                 account.forget()
 
@@ -591,7 +631,7 @@ class Observer:
             state = states.STATES[board.state]
             if passed > DEFOCUS_WITHIN:
                 saw = f"{state} {passed:.1f} s after {why}, limit {DEFOCUS_WITHIN:g} s"
-                self.check(2, board.state not in states.NEED_SUN, now, name, saw)
+                self.check(2, board.state not in NEED_SUN, now, name, saw)
                 miss = board.miss(sun, RECEIVER, believed=True)
                 crossing = account.crosses(miss <= OFF, now)
                 saw = (

@@ -6,6 +6,20 @@ from dataclasses import dataclass, field
 
 from heliotrope.lcu import messages, wire
 
+#: Who may send a message, by the first and the last number of a range: the ledger's own table.
+_WHO = (
+    (0x10, 0x12, messages.CLUSTER), (0x20, 0x21, messages.ANYONE),
+    (0x30, 0x47, messages.AUTHORITY), (0x50, 0x59, messages.KEY),
+)  # fmt: skip
+
+
+def who_of(number: int) -> int:
+    """Return who may send a message: a constant of `lcu.messages`."""
+    for first, last, who in _WHO:
+        if first <= number <= last:
+            return who
+    return messages.ASK if number % 2 and number < 0x0D else messages.NODE
+
 
 @dataclass(frozen=True)
 class Sent:
@@ -101,7 +115,7 @@ class FrameLedger:
             len(self._order),
             now,
             frame.name,
-            messages.who_of(frame.number),
+            who_of(frame.number),
             frame.to,
             frame.values() or (),
             frame.payload,

@@ -190,7 +190,10 @@ def _apply_to(pod: Pod, active: dict[str, Fault]) -> None:
 
 def _time_jump(pod: Pod, fault: Fault, now: float) -> None:
     seconds = kinds.time_jump(fault.size)
-    pod.observer.jumped(now)
+    if abs(seconds) > 1.0 and (pod.time is None or pod.time.quality != "none"):
+        pod.observer.time_jumped(now)
+    else:
+        pod.observer.jumped(now)
     if pod.time is None:
         pod.clock.jump(seconds)
     else:

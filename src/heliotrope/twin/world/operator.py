@@ -22,9 +22,10 @@ from heliotrope.links.messages import Command, encode
 from heliotrope.mechanism.board_items import items_of, packed
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.emergency.order import EmergencyOrder
 from heliotrope.plant.parameters import TAKES_POSE
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety import FLUX_READING, Act
+from heliotrope.safety import FLUX_READING, Act, alarms
 from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STANDBY, Outfit
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.plant_observer import VOID_WITHIN, PlantObserver
@@ -45,6 +46,8 @@ ONWARDS = {
 LATCHING = frozenset(
     {"operator_emergency", "nodes_unacknowledged", "flux_after_emergency", "clock_jump"}
 )
+#: Somebody who looks at a mirror sees from this many steps on that it stands wrong.
+_SEEN_WRONG = 300
 
 
 class Operator:
@@ -77,6 +80,8 @@ class Operator:
         Whether the plant's program is frozen, so that nobody can do anything.
     counts
         Number of actions of each kind.
+    refusal
+        Why the plant refused last.
     """
 
     def __init__(
@@ -94,6 +99,7 @@ class Operator:
         self.plant: PlantController | None = None
         self.away = self.waits = False
         self.counts: Counter[str] = Counter()
+        self.refusal = ""
         self._clock, self._observer, self._flux = clock, observer, flux
         self._beams, self._habits = beams, habits
         self._chance = random.Random(f"operator {seed}")
@@ -132,7 +138,7 @@ class Operator:
         try:
             token = plant.take_authority(person).token
         except RefusedError:
-            return self._seize(plant, person)
+            return self.seize(plant, person)
         now = self._clock.monotonic()
         if token == self._tokens.get(person.name):
             self._observer.kept(now)
@@ -140,7 +146,8 @@ class Operator:
             self._granted(person, token, seized=False)
         return None
 
-    def _seize(self, plant: PlantController, person: Person) -> None:
+    def seize(self, plant: PlantController, person: Person) -> None:
+        """Let a person break the authority of whoever has it, and go on duty."""
         try:
             token = plant.seize_authority(person, "on duty now").token
         except RefusedError:
@@ -162,7 +169,7 @@ class Operator:
             with contextlib.suppress(RefusedError):
                 plant.release_authority(self._duty, self._tokens.get(self._duty.name, 0))
                 self._observer.released(self._duty, self._clock.monotonic())
-        self._seize(plant, self._chance.choice([other, other, VIEWER]))
+        self.seize(plant, self._chance.choice([other, other, VIEWER]))
 
     # -- actions ---------------------------------------------------------------------------
 
@@ -175,8 +182,7 @@ class Operator:
                 continue
             if self._clock.monotonic() < self._rest_until:
                 continue
-            self._end_emergency(plant)
-            self._acknowledge(plant)
+            self.clear(plant)
             does = self._chance.choices(
                 [
                     self._onward,
@@ -197,15 +203,16 @@ class Operator:
             if self._chance.random() < 0.06:
                 await self._rogue()
 
-    def _give(
+    def give(
         self,
         plant: PlantController,
         what: str,
         heliostats: Sequence[str] = (),
         person: Person | None = None,
         token: int | None = None,
-    ) -> None:
-        """Give a command, and tell the observer if the plant accepts it."""
+        values: tuple[float, ...] | None = None,
+    ) -> Ticket | None:
+        """Give a command, and tell the observer if the plant accepts it; else return None."""
         who = person or self._duty
         mine = self._tokens.get(who.name, 0) if token is None else token
         names = heliostats or self._names
@@ -216,17 +223,23 @@ class Operator:
             elif what == "STANDBY":
                 ticket = plant.standby(who, mine, self._points(names, STANDBY, 0.5))
             else:
-                ticket = plant.command(who, mine, what, heliostats, self._values(what))
-        except RefusedError:
-            self.counts["refused"] += 1
-            return
-        self._accepted(who, mine, ticket, what)
+                numbers = self._values(what) if values is None else values
+                ticket = plant.command(who, mine, what, heliostats, numbers)
+        except RefusedError as error:
+            self._refused(error)
+            return None
+        return self._accepted(who, mine, ticket, what)
 
-    def _accepted(self, who: Person, token: int, ticket: Ticket, what: str) -> None:
+    def _refused(self, error: RefusedError) -> None:
+        self.counts["refused"] += 1
+        self.refusal = str(error)
+
+    def _accepted(self, who: Person, token: int, ticket: Ticket, what: str) -> Ticket:
         self.counts["accepted"] += 1
         now = self._clock.monotonic()
         self._observer.accepted(who, token, ticket, what, now)
         self._beams.resumed(ticket.heliostats, what, now)
+        return ticket
 
     def _astray(self, plant: PlantController) -> None:
         """Ask for a motion that leads a beam through the keep-out volume; it must be refused."""
@@ -267,8 +280,8 @@ class Operator:
         state = plant.field.of(name, plant.now()).state
         what = self._chance.choice(ONWARDS.get(state, ("APPROACH",)))
         if what == "APPROACH":
-            self._give(plant, "AIM", (name,))
-        self._give(plant, what, (name,))
+            self.give(plant, "AIM", (name,))
+        self.give(plant, what, (name,))
 
     def _everybody(self, plant: PlantController) -> None:
         for what in self._chance.choice(
@@ -285,10 +298,10 @@ class Operator:
             ]
         ):
             if what != "IDLE" or self._habits.idle:
-                self._give(plant, what)
+                self.give(plant, what)
 
     def _lock(self, plant: PlantController) -> None:
-        self._give(plant, "LOCK", (self._chance.choice(self._names),))
+        self.give(plant, "LOCK", (self._chance.choice(self._names),))
 
     def _wrong(self, plant: PlantController) -> None:
         """Command without authority: with an old token, with another person's, or as a viewer."""
@@ -299,7 +312,7 @@ class Operator:
         token = self._chance.choice(
             [self._tokens.get(other.name, 0), self._tokens.get(self._duty.name, 0), 0, 1]
         )
-        self._give(plant, what, (name,), who, token)
+        self.give(plant, what, (name,), who, token)
 
     def _parameters(self, plant: PlantController) -> None:
         """Push two calibration items to one heliostat, mostly to one whose beam is safe."""
@@ -309,7 +322,7 @@ class Operator:
             "biases": struct.pack("<ff", chance.gauss(0.0, 1e-4), chance.gauss(0.0, 1e-4)),
             "defocus": struct.pack("<ff", chance.uniform(0.08, 0.12), chance.uniform(0.05, 0.06)),
         }
-        self._push(plant, self._safe(plant), items)
+        self.push(plant, self._safe(plant), items)
 
     def _safe(self, plant: PlantController) -> str:
         """Return a heliostat, mostly one that may be written to."""
@@ -317,16 +330,17 @@ class Operator:
         names = [plant.field.names[row] for row in safe]
         return self._chance.choice(names if names and self._chance.random() < 0.8 else self._names)
 
-    def _push(
+    def push(
         self, plant: PlantController, name: str, items: dict[str, bytes], confirmed: str = ""
-    ) -> None:
+    ) -> Ticket | None:
+        """Push parameters to one heliostat; see `give`."""
         who, token = self._duty, self._tokens.get(self._duty.name, 0)
         try:
             ticket = plant.parameters(who, token, name, items, confirmed)
-        except RefusedError:
-            self.counts["refused"] += 1
-            return
-        self._accepted(who, token, ticket, "PARAMETERS")
+        except RefusedError as error:
+            self._refused(error)
+            return None
+        return self._accepted(who, token, ticket, "PARAMETERS")
 
     def _calibrate(self, plant: PlantController) -> None:
         """Change parameters of one heliostat: rightly, slightly wrongly, or much, unconfirmed."""
@@ -341,36 +355,49 @@ class Operator:
         elif what == "machine":
             low, high = (chance.randrange(-2000, 2000) for _ in range(2))
             stow = packed("stow", (MACHINE.stow[0] + low, MACHINE.stow[1] + high))
-            self._push(plant, name, chance.choice([{"stow": stow}, narrow_limits()]))
+            self.push(plant, name, chance.choice([{"stow": stow}, narrow_limits()]))
         elif what in ("another", "much"):
             wrong = {k: v + chance.choice([-1.0, 1.0]) * 0.02 for k, v in fit.causes.items()}
             other = self._fits[chance.choice([n for n in self._names if n != name] or [name])]
             source = other.mechanism if what == "another" else fit.mechanism.with_parameters(wrong)
             if other is not fit or what == "much":
-                self._push(plant, name, {"armature": items_of(source)["armature"]})
+                self.push(plant, name, {"armature": items_of(source)["armature"]})
         else:
             items = items_of(fit.mechanism if what == "right" else near)
             some = {k: items[k] for k in ("armature", "biases")}
-            self._push(plant, name, some, chance.choice(["", "measured twice"]))
+            self.push(plant, name, some, chance.choice(["", "measured twice"]))
 
     # -- safety ----------------------------------------------------------------------------
 
     def _emergency(self, plant: PlantController) -> None:
-        self.counts["emergencies"] += 1
         act = self._chance.choice([Act.DEFOCUS, Act.STOW])
-        now = self._clock.monotonic()
         # Wait until the order is done or overdue.
-        self._rest_until = now + self._chance.choice([2.0, 33.0, 33.0, 310.0])
-        who = self._chance.choice([VIEWER, self._duty])
-        plant.raise_emergency(who.name, act)
-        self._observer.obeyed(who.name, act.name, now)
+        pause = self._chance.choice([2.0, 33.0, 33.0, 310.0])
+        self._rest_until = self._clock.monotonic() + pause
+        self.raises(plant, self._chance.choice([VIEWER, self._duty]), act)
+
+    def raises(self, plant: PlantController, who: Person, act: Act) -> EmergencyOrder:
+        """Raise an emergency, which anybody may do."""
+        self.counts["emergencies"] += 1
+        order = plant.raise_emergency(who.name, act)
+        self._observer.obeyed(who.name, act.name, self._clock.monotonic())
         self._called = True
+        return order
 
     def _one_safe(self, plant: PlantController) -> None:
+        what = self._chance.choice(["DEFOCUS", "STOW"])
+        self.safe(plant, what, self._chance.choice(self._names))
+
+    def safe(self, plant: PlantController, what: str, name: str) -> Ticket:
         """Defocus or stow one heliostat, which anybody may do."""
-        what = self._chance.choice([plant.defocus, plant.stow])
-        what(VIEWER.name, (self._chance.choice(self._names),))
-        self._observer.obeyed(VIEWER.name, what.__name__.upper(), self._clock.monotonic())
+        ticket = (plant.defocus if what == "DEFOCUS" else plant.stow)(VIEWER.name, (name,))
+        self._observer.obeyed(VIEWER.name, what, self._clock.monotonic())
+        return ticket
+
+    def clear(self, plant: PlantController) -> None:
+        """Withdraw an emergency, and acknowledge all that waits for it."""
+        self._end_emergency(plant)
+        self._acknowledge(plant)
 
     def _end_emergency(self, plant: PlantController) -> None:
         if self._called:
@@ -382,7 +409,8 @@ class Operator:
         """Acknowledge every latched condition; the engineer stands in for the supervisor."""
         waiting: dict[tuple[str, str], bool] = {}
         for alarm in plant.alarms:
-            if alarm.condition in LATCHING:
+            doubtful = alarm.condition == alarms.COUNTS_DOUBTFUL.name
+            if alarm.condition in LATCHING or (doubtful and self._stands_right(alarm.subject)):
                 waiting[alarm.condition, alarm.subject] = alarm.active
         for (condition, subject), active in waiting.items():
             if active:
@@ -391,6 +419,16 @@ class Operator:
                     now = self._clock.monotonic()
                     self._observer.obeyed(ENGINEER.name, "ACKNOWLEDGE", now)
                     self.counts["acknowledgements"] += 1
+
+    def _stands_right(self, name: str) -> bool:
+        """Look at a mirror whose step counts are in doubt.
+
+        Whoever confirms one without looking makes its beam miss, and no software can know that: it
+        would be the person's fault that breaks invariant 12. So these persons do look.
+        """
+        boards = (board for pod in self._pods for board in pod.boards)
+        board = next(board for board in boards if board.outfit.name == name)
+        return max(abs(steps) for steps in board.slip) < _SEEN_WRONG
 
     # -- the rogue -------------------------------------------------------------------------
 

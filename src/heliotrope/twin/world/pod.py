@@ -16,6 +16,7 @@ from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.in_process import MemoryLine
 from heliotrope.links.messages import (
+    Acknowledge,
     ClusterStatus,
     Command,
     Emergency,
@@ -238,6 +239,8 @@ class PlantEar:
             whom = message.heliostats or tuple(self._addresses)
             observer.emergency(message.name, now, carried=self._pod.carried(now), heliostats=whom)
             self._beams.ordered_off(whom, now)
+        elif isinstance(message, Acknowledge) and message.condition == "clock_jump":
+            observer.time_acknowledged()
         elif isinstance(message, Command | Parameters):
             observer.ordered(self.order(message, now, known=self._plant.known(message.token)))
             if isinstance(message, Parameters) and (stow := message.items().get("stow")):

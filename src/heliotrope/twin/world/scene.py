@@ -6,13 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
+import numpy as np
+
 from heliotrope.sun import Site, vector
 from heliotrope.twin.boards.outfit import KEEP_OUT, KEEP_OUT_RADIUS, RECEIVER, STANDBY, Ball
 
 #: The sun is at least this high at the beginning and at the end of a drawn scene, rad.
 _LOWEST = math.radians(8.0)
-#: Nearest two heliostats, m.
-_APART = 6.0
+#: Nearest two heliostats, and nearest that a beam at rest passes the receiver, m.
+_APART, _BESIDE = 6.0, 8.0
 
 
 @dataclass(frozen=True)
@@ -49,10 +51,18 @@ def scene_of(worlds: Sequence[str], seed: int, seconds: float, heliostats: int) 
     while len(places) < heliostats:
         bearing, away = chance.uniform(-math.pi, math.pi), chance.uniform(40.0, 150.0)
         place = (away * math.sin(bearing), away * math.cos(bearing))
-        if all(math.dist(place, other) > _APART for other in places):
+        apart = all(math.dist(place, other) > _APART for other in places)
+        if apart and _beside(place) > _BESIDE:
             places.append(place)
     balls = tuple(_ball(chance, places) for _ in range(chance.randint(1, 3)))
     return Scene(site, start, tuple(places), balls)
+
+
+def _beside(place: tuple[float, float]) -> float:
+    """Return how far a beam from a place through the standby point passes the receiver, m."""
+    way = np.subtract(STANDBY, (*place, 2.0))
+    goal = np.subtract(RECEIVER, (*place, 2.0))
+    return float(np.linalg.norm(goal - way * (goal @ way) / (way @ way)))
 
 
 def _when(chance: random.Random, seconds: float) -> tuple[Site, datetime]:

@@ -52,6 +52,7 @@ from heliotrope.twin.world.instruments import READINGS, Instruments
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
 from heliotrope.twin.world.scene import Scene, scene_of
+from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
 from heliotrope.twin.world.worlds import Habits, PodErrors, checked, knows_boards, stored_by
 
 #: Longest interval between two looks at the boards, and between two judgements of everything, s.
@@ -161,6 +162,8 @@ class RunPlan:
         """Faults of the run."""
         if self.faults is not None:
             return self.faults
+        if TOUR in self.worlds:
+            return ()
         return tuple(
             kinds.drawn(
                 self.seed,
@@ -296,6 +299,9 @@ class Simulation:
             scene.keep_outs[0][0],
             None if self._measured else self._flux,
         )
+        self._tour: Tour | None = None
+        if TOUR in plan.worlds:
+            self._tour = Tour(self.operator, self.observer, self.boards, self._clock, plan.seed)
         self.plant: PlantController | None = None
         self._program: list[asyncio.Task[None]] = []
         for pod in self.pods:
@@ -431,16 +437,22 @@ class Simulation:
             for pod in self.pods:
                 pod.start(group)
             self.start_plant(group)
-            tasks = [self.operator.keep(), self.operator.work()]
+            tasks = [self.operator.keep(), self._persons()]
             if self._measured:
                 tasks.append(self.instruments.run())
             others = [group.create_task(each) for each in tasks]
             await self._turn(damage, group)
+            if self._tour is not None and self.plan.seconds >= TOUR_LENGTH:
+                saw = f"the tour is not over after {self.plan.seconds:g} s"
+                self.observer.check(11, self._tour.over, self._clock.monotonic(), saw)
             self.crash_plant(self._clock.monotonic())
             for pod in self.pods:
                 pod.crash()
             for task in others:
                 task.cancel()
+
+    async def _persons(self) -> None:
+        await (self.operator if self._tour is None else self._tour).work()
 
     async def _turn(self, damage: Damage, group: asyncio.TaskGroup) -> None:
         """Advance boards, faults and observers to the end."""

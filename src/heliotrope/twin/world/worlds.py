@@ -23,12 +23,15 @@ WORLDS = {
     "place": "date, hour, site, field and keep-out volumes are drawn; these lie across the ways",
     "sensors": "wind and flux are measured, by sensors that lie now and then",
     "parameters": "boards store wrong parameters from the start",
+    "tour": "nothing fails, and each heliostat is led through all commands, which must be done",
     "calibrations": "persons and beliefs change parameters, rightly or wrongly",
 }
 #: Name that lets each run draw its worlds: see `mixed`.
 ANY = "any"
 #: Worlds that hold, of which `mixed` chooses.
-MIX = ("calm", "swarm", "held", "frozen", "disk")
+MIX = (
+    "calm", "swarm", "held", "frozen", "disk", "place", "sensors", "parameters", "calibrations",
+)  # fmt: skip
 
 
 def checked(worlds: Sequence[str]) -> None:

@@ -1,0 +1,102 @@
+"""Heliostats whose step counts are in doubt, and the confirmations that they are right.
+
+A power cut in motion may leave the step counts of a local controller wrong by up to 1,000 steps,
+which it reports as COUNTS_DOUBTFUL until ZERO. Its beam may then stand beside its place without
+any other sign. Such a heliostat is named, and kept off the receiver until a photograph on a target
+or a person has confirmed its place. A confirmation holds for one boot: it says nothing of the next
+cut.
+"""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import names as meanings
+from heliotrope.plant import refusals
+from heliotrope.plant.field_state import FieldState, Mask
+from heliotrope.safety import Alarm, alarms
+
+_DOUBTFUL = 1 << meanings.FLAGS.index("COUNTS_DOUBTFUL")
+#: Counts that are not known at all are a fault of their own, which only ZERO ends.
+_UNKNOWN = 1 << meanings.FLAGS.index("COUNTS_UNKNOWN")
+
+
+class Doubts:
+    """Doubts of local controllers about their step counts.
+
+    Parameters
+    ----------
+    field
+        State of the field.
+    design
+        Its targets may be aimed at in doubt: a photograph there ends it.
+    aims
+        Assigned aims, ENU, m, (N, 3).
+    tell
+        Called with each alarm.
+
+    Attributes
+    ----------
+    standing
+        Heliostats whose counts are in doubt, (N,).
+    """
+
+    def __init__(
+        self, field: FieldState, design: Plant, aims: FloatArray, tell: Callable[[Alarm], None]
+    ) -> None:
+        self._field, self._aims, self._tell = field, aims, tell
+        self._receivers = np.array([each.center for each in design.receivers]).reshape(-1, 3)
+        self._targets = np.array([each.center for each in design.targets]).reshape(-1, 3)
+        self._reach = np.array([np.hypot(each.width, each.height) for each in design.targets])
+        #: Boots of each local controller when its place was confirmed, -1 before.
+        self._confirmed = np.full(len(field), -1, dtype=np.int64)
+        self.standing: Mask = np.zeros(len(field), dtype=np.bool_)
+
+    def look(self, cluster: str) -> None:
+        """Judge the heliostats of a cluster by its status."""
+        self._judge([self._field.index[name] for name in self._field.members[cluster]])
+
+    def confirm(self, heliostat: str, boots: int | None = None) -> None:
+        """Take the step counts of a heliostat as right until it boots again.
+
+        Parameters
+        ----------
+        heliostat
+            Name.
+        boots
+            Its number of boots when its place was seen; None: as last heard.
+        """
+        row = self._field.place(heliostat)
+        self._confirmed[row] = int(self._field.rows["boots"][row]) if boots is None else boots
+        self._judge([row])
+
+    def _judge(self, rows: list[int]) -> None:
+        found = self._field.rows[rows]
+        doubtful = found["flags"] & (_DOUBTFUL | _UNKNOWN) == _DOUBTFUL
+        doubtful &= found["boots"] != self._confirmed[rows]
+        changed = np.flatnonzero(doubtful != self.standing[rows])
+        self.standing[rows] = doubtful
+        for i in changed:
+            name, kind = self._field.names[rows[i]], alarms.COUNTS_DOUBTFUL
+            self._tell(kind.raised(name) if doubtful[i] else kind.ended(name))
+
+    def barred(self, heliostats: Iterable[str], points: FloatArray | None = None) -> dict[str, str]:
+        """Return which heliostats may not join their aims, or points (K, 3), and why."""
+        names = tuple(heliostats)
+        rows = [self._field.place(name) for name in names]
+        if not self.standing[rows].any():
+            return {}
+        on_target = self._on_target(self._aims[rows] if points is None else points)
+        wrong = self.standing[rows] & ~on_target
+        return {names[i]: refusals.COUNTS_DOUBTFUL.text for i in np.flatnonzero(wrong)}
+
+    def _on_target(self, points: FloatArray) -> Mask:
+        """Return which points (K, 3) are at a target, and nearer to it than to a receiver."""
+        apart, away = (
+            np.linalg.norm(points[:, None] - centers, axis=-1)
+            for centers in (self._targets, self._receivers)
+        )
+        near = apart.min(axis=1, initial=np.inf) < away.min(axis=1, initial=np.inf)
+        return np.asarray(near & (apart <= self._reach).any(axis=1))
