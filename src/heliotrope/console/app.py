@@ -11,15 +11,16 @@ from collections.abc import AsyncIterator, Callable
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, JSONResponse, Response
+from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, Response
 from starlette.staticfiles import StaticFiles
 
 from heliotrope import __version__
 from heliotrope.console import accounts, api, commands
 from heliotrope.console._attempts import Attempts
 from heliotrope.console._files import KEPT, PLAIN, STATIC, Files
-from heliotrope.console.auth import Console
+from heliotrope.console.auth import FOUND, Caller, Console
 from heliotrope.console.edge import Edge
+from heliotrope.console.emergencies import EmergencyOrders
 from heliotrope.console.guard import Guard
 from heliotrope.console.live import Stream
 from heliotrope.console.remote import RemotePeople, RemotePlant
@@ -56,7 +57,7 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
     chosen = settings or ConsoleSettings()
     people, stream = RemotePeople(plant), Stream(plant, chosen.period)
     attempts = Attempts(chosen.failures, chosen.failures_s, time.monotonic)
-    console = Console(plant, people, chosen, stream, attempts)
+    console = Console(plant, people, chosen, stream, attempts, EmergencyOrders())
 
     @contextlib.asynccontextmanager
     async def alive(app: FastAPI) -> AsyncIterator[None]:
@@ -144,6 +145,14 @@ def _pages(app: FastAPI) -> None:
     async def login() -> Response:
         return FileResponse(STATIC / "login.html", media_type="text/html; charset=utf-8")
 
+    plain = (STATIC / "emergency.html").read_text("utf-8")
+
     @app.get("/emergency", include_in_schema=False)
-    async def emergency() -> Response:
-        return FileResponse(STATIC / "emergency.html", media_type="text/html; charset=utf-8")
+    async def emergency(request: Request) -> Response:
+        console: Console = request.scope["heliotrope"]
+        who: Caller | None = request.scope[FOUND]
+        facts = {"csrf": "" if who is None else who.csrf, "emergency": console.emergency_port}
+        metas = "".join(
+            f'<meta name="heliotrope-{name}" content="{text}">' for name, text in facts.items()
+        )
+        return HTMLResponse(plain.replace("<main>", f"{metas}\n<main>"))

@@ -21,6 +21,7 @@ from starlette.requests import HTTPConnection
 
 from heliotrope.console import _secrets
 from heliotrope.console._attempts import Attempts
+from heliotrope.console.emergencies import EmergencyOrders
 from heliotrope.console.live import Stream
 from heliotrope.console.people import person_of
 from heliotrope.console.remote import RemotePeople, RemotePlant
@@ -57,8 +58,12 @@ class Console:
     settings: ConsoleSettings
     stream: Stream
     attempts: Attempts
+    emergencies: EmergencyOrders
     #: Concurrent password checks: each takes 50 ms of a core and 64 MiB.
     hashing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
+
+    #: Port of the way for EMERGENCY alone; 0: none.
+    emergency_port: int = 0
 
     #: Threads that wait for the store, which the plant's process has.
     threads: ThreadPoolExecutor = field(

@@ -3,6 +3,8 @@
 import asyncio
 import re
 
+from fastapi import HTTPException
+from starlette.datastructures import Headers
 from starlette.types import Message, Receive
 
 from heliotrope.errors import InputError
@@ -34,6 +36,16 @@ async def read_body(receive: Receive, most: int) -> bytes | None:
             return None
         if not message.get("more_body", False):
             return bytes(body)
+
+
+def length_of(headers: Headers, most: int) -> int:
+    """Return the length of a body, bytes; raises `HTTPException` if it is not allowed."""
+    if "transfer-encoding" in headers:
+        raise HTTPException(411, "send the length of the body (Content-Length)")
+    length = headers.get("content-length", "0")
+    if not (length.isascii() and length.isdigit() and len(length) < 20) or int(length) > most:
+        raise HTTPException(413, f"the body is longer than {most} bytes")
+    return int(length)
 
 
 def replayed(body: bytes, receive: Receive) -> Receive:

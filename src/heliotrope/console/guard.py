@@ -7,6 +7,7 @@ shape that it accepts; then safe headers on every answer.
 import contextlib
 from collections.abc import Callable
 from typing import Any
+from urllib.parse import urlsplit
 
 from fastapi import HTTPException
 from starlette.datastructures import Headers, MutableHeaders
@@ -78,7 +79,7 @@ class Guard:
 
         async def reply(message: Message) -> None:
             if message["type"] == "http.response.start":
-                self._dress(console, scope["path"], MutableHeaders(scope=message))
+                self._dress(console, scope, MutableHeaders(scope=message))
             await send(message)
 
         try:
@@ -118,7 +119,7 @@ class Guard:
         if scope["path"] == "/" and (who is None or who.by != "session"):
             await RedirectResponse("/login", 303)(scope, receive, send)
             return
-        length = _length(headers, found.largest)
+        length = bodies.length_of(headers, found.largest)
         with contextlib.ExitStack() as stack:
             if length > FORM and who is not None:
                 stack.enter_context(self._edge.large(who))
@@ -147,19 +148,32 @@ class Guard:
             raise HTTPException(405, "not this method", {"Allow": ", ".join(found.allow)})
         raise HTTPException(404, "nothing is at this address")
 
-    def _dress(self, console: Console, path: str, headers: Any) -> None:
+    def _dress(self, console: Console, scope: Scope, headers: Any) -> None:
         """Add the safe headers."""
-        headers["Content-Security-Policy"] = FRAME if path == "/" else STRICT
+        path, urgent = scope["path"], _urgent(console, scope)
+        policy = FRAME if path == "/" else STRICT
+        if path in ("/", "/emergency"):
+            policy = policy.replace("connect-src 'self'", f"connect-src 'self' {urgent}")
+        headers["Content-Security-Policy"] = policy
         headers["X-Content-Type-Options"] = "nosniff"
         headers["X-Frame-Options"] = "DENY"
         headers["Referrer-Policy"] = "no-referrer"
         headers["Cross-Origin-Opener-Policy"] = "same-origin"
         headers["Cross-Origin-Resource-Policy"] = "same-origin"
         headers["Permissions-Policy"] = "camera=(), microphone=(), geolocation=()"
-        if path.startswith("/api/") or path in ("/", "/login"):
+        if path.startswith("/api/") or path in ("/", "/login", "/emergency"):
             headers.setdefault("Cache-Control", "no-store")
         if console.settings.tls:
             headers["Strict-Transport-Security"] = "max-age=31536000"
+
+
+def _urgent(console: Console, scope: Scope) -> str:
+    """Return the origin of the way for EMERGENCY alone, as the page reaches it."""
+    host = urlsplit(f"//{Headers(scope=scope).get('host', '')}").hostname or ""
+    if not console.emergency_port or not host_known(console, host):
+        return ""
+    scheme = "https" if console.settings.tls or console.settings.plain else scope["scheme"]
+    return f"{scheme}://{host}:{console.emergency_port}"
 
 
 async def _framework(console: Console, scope: Scope, who: Caller) -> Found:
@@ -187,16 +201,6 @@ async def _check_socket(console: Console, connection: HTTPConnection, who: Calle
     if "origin" not in connection.headers or not same_origin(console, connection):
         await console.note(SecurityEvent.ORIGIN_REFUSED, connection, who.person.name)
         raise HTTPException(403, "this page comes from another site")
-
-
-def _length(headers: Headers, most: int) -> int:
-    """Return the length of a body, bytes; raises `HTTPException` if it is not allowed."""
-    if "transfer-encoding" in headers:
-        raise HTTPException(411, "send the length of the body (Content-Length)")
-    length = headers.get("content-length", "0")
-    if not (length.isascii() and length.isdigit() and len(length) < 20) or int(length) > most:
-        raise HTTPException(413, f"the body is longer than {most} bytes")
-    return int(length)
 
 
 async def _check_body(scope: Scope, body: bytes) -> None:

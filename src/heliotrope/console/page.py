@@ -76,7 +76,7 @@ async def _page(request: Request) -> Response | None:
     who = await find_caller(request.scope["heliotrope"], request)
     if who is None or who.by != "session":
         return RedirectResponse("/login", 303)
-    ui.add_head_html(_head(who))
+    ui.add_head_html(_head(who, request.scope["heliotrope"].emergency_port))
     ui.add_body_html(_EMERGENCY)
     with ui.header(elevated=False).classes("hx-header"):
         View("head")
@@ -123,10 +123,11 @@ def _tabs() -> None:
                 View(kind)
 
 
-def _head(who: Caller) -> str:
+def _head(who: Caller, port: int) -> str:
     facts = {
         "heliotrope-csrf": who.csrf,
         "heliotrope-person": who.person.name,
+        "heliotrope-emergency": str(port),
         "heliotrope-role": who.person.role.name.lower(),
     }
     metas = "".join(

@@ -9,6 +9,7 @@ import uvicorn
 
 from heliotrope.console._logs import limit
 from heliotrope.console.app import create
+from heliotrope.console.auth import Console
 from heliotrope.console.connections import (
     RESERVE,
     Doors,
@@ -19,6 +20,7 @@ from heliotrope.console.connections import (
 )
 from heliotrope.console.remote import RemotePlant
 from heliotrope.console.settings import ConsoleSettings
+from heliotrope.console.urgent import LIMITS, EmergencyWay
 from heliotrope.errors import InputError
 
 
@@ -127,7 +129,26 @@ class ConsoleServer:
                 f"console: {chosen.host} port {chosen.port} is not available; another program "
                 "may use it, choose another with --port"
             ) from None
-        return [Listener(line, self.app, Limits().within(left), shared)]
+        page = Listener(line, self.app, Limits().within(left - LIMITS.most), shared)
+        console: Console = self.app.state.console
+        way = EmergencyWay(console, lambda: page.port)
+        urgent = Listener(self._listen_urgent(page.port), way, LIMITS.within(left), shared)
+        console.emergency_port = urgent.port
+        return [page, urgent]
+
+    def _listen_urgent(self, page: int) -> socket.socket:
+        """Return the listening socket of the way for EMERGENCY alone."""
+        host, given = self.settings.host, self.settings.emergency_port
+        try:
+            if given is not None or (self.settings.port and page < 65_535):
+                return listening(host, page + 1 if given is None else given)
+        except OSError:
+            if given is not None:
+                raise InputError(
+                    f"console: {host} port {given} is not available; another program may use it, "
+                    "choose another with --emergency-port"
+                ) from None
+        return listening(host, 0)
 
     async def run(self) -> None:
         """Serve until closed.

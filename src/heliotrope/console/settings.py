@@ -34,6 +34,8 @@ class ConsoleSettings:
         Whether to serve the operator page beside the API.
     plain
         Whether other machines may connect without TLS, behind a proxy that has it.
+    emergency_port
+        Port that serves EMERGENCY alone; None: the next one, or a free one if that is taken.
 
     Raises
     ------
@@ -54,10 +56,12 @@ class ConsoleSettings:
     viewers: int = 200
     page: bool = True
     plain: bool = False
+    emergency_port: int | None = None
 
     def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65_535:
-            raise InputError(f"console: port {self.port}; give 1 to 65535, or 0 for a free one")
+        for port in (self.port, self.emergency_port or 0):
+            if not 0 <= port <= 65_535:
+                raise InputError(f"console: port {port}; give 1 to 65535, or 0 for a free one")
         if (self.certificate is None) != (self.key is None):
             raise InputError("console: TLS needs both files, --certificate and --key")
         for name in ("session_s", "failures_s", "period"):

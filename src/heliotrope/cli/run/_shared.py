@@ -48,6 +48,7 @@ class Shown:
     certificate: Path | None = None
     key: Path | None = None
     plain: bool = False
+    emergency_port: int | None = None
     console: bool = True
     browser: bool = True
     data: Path | None = None
@@ -89,6 +90,7 @@ class Shown:
             certificate=self.certificate,
             key=self.key,
             plain=self.plain,
+            emergency_port=self.emergency_port,
         )
 
 

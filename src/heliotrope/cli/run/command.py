@@ -136,6 +136,13 @@ def run(
             rich_help_panel=_CONSOLE,
         ),
     ] = False,
+    emergency_port: Annotated[
+        int | None,
+        typer.Option(
+            help="Port that serves EMERGENCY alone; default: the one after --port.",
+            rich_help_panel=_CONSOLE,
+        ),
+    ] = None,
     no_console: Annotated[
         bool, typer.Option("--no-console", help="Only print lines.", rich_help_panel=_CONSOLE)
     ] = False,
@@ -181,6 +188,7 @@ def run(
         certificate=certificate,
         key=key,
         plain=plain,
+        emergency_port=emergency_port,
         console=not no_console,
         browser=not no_browser,
         data=data,

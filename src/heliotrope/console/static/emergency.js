@@ -2,13 +2,34 @@
 (() => {
   const button = document.getElementById("emergency");
   const say = document.getElementById("emergency-said");
-  const word = document.querySelector('meta[name="heliotrope-csrf"]')?.content;
-  let csrf = word;
+  const meta = (name) => document.querySelector(`meta[name="heliotrope-${name}"]`)?.content;
+  let csrf = meta("csrf");
+  const port = Number(meta("emergency"));
 
   async function session() {
     const answer = await fetch("/api/v1/session", { credentials: "same-origin", cache: "no-store" });
     if (!answer.ok) throw new Error("sign in first");
     csrf = (await answer.json()).csrf;
+  }
+
+  async function send(where, given) {
+    const answer = await fetch(where, { method: "POST", keepalive: true, signal: AbortSignal.timeout(15000), ...given });
+    const data = await answer.json();
+    if (!answer.ok) throw Object.assign(new Error(data.detail), { status: answer.status });
+    return data;
+  }
+
+  // The same order by the ordinary way and by the one that serves nothing else; the plant gets it once, by its word.
+  function ways() {
+    const order = { act: "DEFOCUS", reason: "EMERGENCY button", call: `${Date.now()}-${Math.random()}` };
+    const found = [send("/api/v1/emergency", {
+      credentials: "same-origin", headers: { "X-CSRF-Token": csrf, "Content-Type": "application/json" }, body: JSON.stringify(order),
+    })];
+    // As text, so that the browser sends it at once, without asking first.
+    if (port) found.push(send(`${location.protocol}//${location.hostname}:${port}/api/v1/emergency`, {
+      credentials: "include", headers: { "Content-Type": "text/plain" }, body: JSON.stringify({ ...order, csrf }),
+    }));
+    return found;
   }
 
   async function call(again) {
@@ -17,17 +38,11 @@
     say.textContent = "sending …";
     try {
       if (!csrf) await session();
-      const answer = await fetch("/api/v1/emergency", {
-        method: "POST", credentials: "same-origin", keepalive: true,
-        headers: { "X-CSRF-Token": csrf, "Content-Type": "application/json" },
-        body: JSON.stringify({ act: "DEFOCUS", reason: "EMERGENCY button" }),
-      });
-      if (answer.status === 403 && again) { csrf = ""; return call(false); }
-      const data = await answer.json();
-      if (!answer.ok) throw new Error(data.detail);
+      const data = await Promise.any(ways()).catch((errors) => { throw errors.errors[0]; });
       say.textContent = `ordered: ${data.act} of ${data.heliostats} heliostats`;
       setTimeout(() => { say.textContent = ""; button.classList.remove("sent"); }, 15000);
     } catch (error) {
+      if (error.status === 403 && again) { csrf = ""; return call(false); }
       button.classList.remove("sent");
       say.textContent = `NOT SENT: ${error.message}. Use the hard-wired stop.`;
       say.classList.add("failed");

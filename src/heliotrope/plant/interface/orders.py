@@ -145,6 +145,9 @@ class EmergencyCall(Strict):
 
     act: Annotated[str, Field(pattern="^(DEFOCUS|STOW)$")] = "DEFOCUS"
     reason: Words = ""
+    call: Annotated[
+        str, Field(max_length=64, description="A random word: one order, however often it is sent.")
+    ] = ""
 
 
 class Acknowledged(Strict):

@@ -1,0 +1,129 @@
+"""EMERGENCY by a way of its own: the second listener."""
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import httpx
+import pytest
+
+from heliotrope.console.settings import ConsoleSettings
+from heliotrope.errors import InputError
+from support.live_console import LiveConsole
+
+Ask = Callable[..., httpx.Response]
+
+
+@pytest.fixture
+def way(console: LiveConsole) -> Iterator[httpx.Client]:
+    """Return a client of the second listener; the emergency is withdrawn afterwards."""
+    port = console.server.app.state.console.emergency_port
+    with httpx.Client(base_url=f"http://127.0.0.1:{port}", trust_env=False) as client:
+        yield client
+    console.calm()
+
+
+def ordered(console: LiveConsole) -> int:
+    """Return how many emergencies were ordered so far."""
+    events = console.call(lambda: console.live.operations.events(1000))
+    return sum("EMERGENCY" in event.text for event in events)
+
+
+def test_a_viewer_orders_it_once_by_both_ways(
+    console: LiveConsole, ask: Ask, way: httpx.Client, tokens: dict[str, str]
+) -> None:
+    before = ordered(console)
+    order = {"act": "DEFOCUS", "reason": "smoke", "call": "one word"}
+    bearer = {"Authorization": f"Bearer {tokens['viewer']}"}
+    answer = way.post("/api/v1/emergency", json=order, headers=bearer)
+    assert answer.status_code == 200, answer.text
+    assert answer.json()["on"]
+    assert ask("viewer", "POST", "emergency", order).json()["on"]
+    assert ordered(console) == before + 1
+    assert ask("viewer", "POST", "emergency", {**order, "call": "other"}).status_code == 200
+    assert ordered(console) == before + 2
+
+
+@pytest.mark.parametrize("word", [True, False])
+@pytest.mark.parametrize("origin", ["page", "elsewhere", "other port", None])
+def test_a_session_orders_it_from_its_page_only(
+    console: LiveConsole, signed_in: httpx.Client, way: httpx.Client, word: bool, origin: str | None
+) -> None:
+    before = ordered(console)
+    page = console.address.rstrip("/")
+    origins = {"page": page, "elsewhere": "http://evil.example", "other port": "http://127.0.0.1:1"}
+    headers = {"Content-Type": "text/plain"}
+    if origin is not None:
+        headers["Origin"] = origins[origin]
+    order: dict[str, Any] = {"reason": "smoke"}
+    if word:
+        order["csrf"] = signed_in.headers["X-CSRF-Token"]
+    cookies = {"heliotrope_session": signed_in.cookies["heliotrope_session"]}
+    answer = httpx.post(
+        f"{way.base_url}/api/v1/emergency",
+        json=order,
+        headers={**headers, "Cookie": f"heliotrope_session={cookies['heliotrope_session']}"},
+        trust_env=False,
+    )
+    good = word and origin in ("page", None)
+    assert answer.status_code == (200 if good else 403)
+    assert ordered(console) == before + good
+    shown = answer.headers.get("access-control-allow-origin")
+    assert shown == (page if origin == "page" else None)
+
+
+def test_it_serves_nothing_else(way: httpx.Client, tokens: dict[str, str]) -> None:
+    bearer = {"Authorization": f"Bearer {tokens['engineer']}"}
+    for method, path in (("GET", "/"), ("GET", "/api/v1/emergency"), ("POST", "/api/v1/stow")):
+        assert way.request(method, path, headers=bearer).status_code == 404
+    url = "/api/v1/emergency"
+    assert way.post(url).status_code == 401
+    assert way.post(url, headers=bearer, content=b"x" * 4000).status_code == 413
+    assert way.post(url, headers=bearer, content=b"[[").status_code == 422
+    assert way.post(url, headers=bearer, json={"act": "TRACK"}).status_code == 422
+    assert way.post(url, headers={**bearer, "Host": "evil.example"}).status_code == 421
+
+
+def test_held_connections_do_not_close_it(
+    console: LiveConsole, way: httpx.Client, tokens: dict[str, str]
+) -> None:
+    """Both ports are full of half-open connections; the order is given all the same."""
+    bearer = {"Authorization": f"Bearer {tokens['viewer']}"}
+    ports = [console.server.app.state.console.emergency_port, httpx.URL(console.address).port]
+    with ExitStack() as stack:
+        for port in ports:
+            for _ in range(250):
+                line = socket.create_connection(("127.0.0.1", port), timeout=10.0)
+                stack.enter_context(line).sendall(b"POST /api/v1/emergency HTTP/1.1\r\n")
+        begun = time.monotonic()
+        assert way.post("/api/v1/emergency", headers=bearer).status_code == 200
+        assert time.monotonic() - begun < 5.0
+
+
+def test_the_page_may_reach_it(console: LiveConsole, signed_in: httpx.Client) -> None:
+    port = console.server.app.state.console.emergency_port
+    answer = signed_in.get(f"{console.address}emergency")
+    assert (
+        f"connect-src 'self' http://127.0.0.1:{port};" in answer.headers["content-security-policy"]
+    )
+    assert f'name="heliotrope-emergency" content="{port}"' in answer.text
+    assert f'name="heliotrope-csrf" content="{signed_in.headers["X-CSRF-Token"]}"' in answer.text
+    assert 'csrf" content=""' in httpx.get(f"{console.address}emergency", trust_env=False).text
+
+
+def test_its_port(console: LiveConsole, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next one; another if that is taken, unless it was asked for."""
+    with socket.create_server(("127.0.0.1", 0)) as line:
+        taken = line.getsockname()[1]
+        monkeypatch.setattr(console.server, "settings", ConsoleSettings(port=taken - 1))
+        with console.server._listen_urgent(taken - 1) as other:
+            assert other.getsockname()[1] != taken
+        settings = ConsoleSettings(port=0, page=False, emergency_port=taken)
+        monkeypatch.setattr(console.server, "settings", settings)
+        with pytest.raises(InputError, match="choose another with --emergency-port"):
+            console.server._listen_urgent(taken - 1)
+    with pytest.raises(InputError, match="port 70000"):
+        ConsoleSettings(emergency_port=70_000)
+    assert ConsoleSettings.of(settings.given) == settings
