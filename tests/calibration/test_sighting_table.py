@@ -491,7 +491,7 @@ def test_an_unusable_table_is_refused(old: str, new: str, says: str, tmp_path: P
         ("s.csv", "Jülich,".encode("latin-1"), "not UTF-8"),
         ("s.txt", b"x", "the name ends in '.txt'; sightings are .csv or .parquet"),
         ("s.parquet", None, "there is no such file"),
-        ("s.parquet", b"", "not a Parquet table"),
+        ("s.parquet", b"", "the file is empty"),
         ("s.parquet", b"PAR1" + bytes(200), "not a Parquet table"),
     ],
 )

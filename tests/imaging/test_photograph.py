@@ -141,7 +141,9 @@ def test_memory_that_is_none_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not a folder; give one"):
         Memory.load(tmp_path / "file")
     (tmp_path / "target.npz").write_bytes(b"PK nothing")
-    with pytest.raises(FormatError, match="no model of an empty target"):
+    with pytest.raises(
+        FormatError, match="not a readable archive; it should be a model of an empty target"
+    ):
         Memory.load(tmp_path)
     with pytest.raises(InputError, match="give a folder"):
         learnt().save(tmp_path / "file" / "below")

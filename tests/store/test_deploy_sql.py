@@ -38,7 +38,7 @@ def test_the_store_begins_in_the_database_of_the_sql(server: str) -> None:
     url = f"postgresql://heliotrope@/heliotrope?host={host}"
     engine = create_engine(server.replace("postgresql:", "postgresql+psycopg:"))
     try:
-        with store(Shown(database=url, console=False)) as keeper:
+        with store(Shown(database=url, console=False)) as (keeper, _):
             assert keeper.people.empty()
         with engine.connect() as connection:
             owner = connection.execute(
