@@ -17,6 +17,7 @@ from heliotrope.files.limits import EXPANDED, MEMBERS, MIB, check_count, check_f
 _TAIL, _END, _END_64 = 22 + 65_535, b"PK\5\6", b"PK\6\7"
 #: Longest table of contents, bytes.
 _CONTENTS = 512 * MEMBERS
+#: What `zipfile` raises for a damaged archive; the last two for unknown versions and encryption.
 _DAMAGED = (zipfile.BadZipFile, OSError, ValueError, EOFError, NotImplementedError, RuntimeError)
 
 

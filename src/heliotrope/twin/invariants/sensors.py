@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence, Set
 from heliotrope.lcu import states
 from heliotrope.safety import Alarm
 from heliotrope.twin.boards.board import Board
+from heliotrope.twin.invariants.beams import NAMED_WITHIN, OFF_WITHIN
 from heliotrope.twin.invariants.invariants import InvariantError, Violation
 
 #: By reading: names of the alarms any of which names it, the limit, and for how long beyond it, s.
@@ -23,8 +24,6 @@ LIMITS = {
 }
 #: A reading older than this counts as gone, s.
 GONE = 5.0
-#: From then on: time to name it, and to be off, s.
-NAMED_WITHIN, OFF_WITHIN = 10.0, 30.0
 
 
 class SensorObserver:
