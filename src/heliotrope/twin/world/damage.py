@@ -190,7 +190,9 @@ def _apply_to(pod: Pod, active: dict[str, Fault]) -> None:
 
 def _time_jump(pod: Pod, fault: Fault, now: float) -> None:
     seconds = kinds.time_jump(fault.size)
-    if abs(seconds) > 1.0 and (pod.time is None or pod.time.quality != "none"):
+    # A program that starts later cannot know of the jump: the plant compares its time.
+    noticed = pod.runs and (pod.time is None or pod.time.quality != "none")
+    if abs(seconds) > 1.0 and noticed:
         pod.observer.time_jumped(now)
     else:
         pod.observer.jumped(now)
