@@ -101,6 +101,8 @@ class Connection:
         Of the other side.
     stage, since
         Stage, and when it began, s.
+    held
+        Since when it has held its place without progress, s; the end of a handshake is no progress.
     known
         When a request of a known caller was last completed, s; None for a stranger.
     transport
@@ -111,7 +113,7 @@ class Connection:
         self.address, self.line = address, line
         self.opening: asyncio.Task[None] | None = None
         self.transport: asyncio.Transport | None = None
-        self.stage, self.since = Stage.HANDSHAKE, now
+        self.stage, self.since, self.held = Stage.HANDSHAKE, now, now
         self.known: float | None = None
         self.scope: Scope | None = None
         self.length = 0
@@ -129,6 +131,8 @@ class Connection:
     def enter(self, stage: Stage, now: float) -> None:
         """Begin a stage."""
         self.stage, self.since = stage, now
+        if stage is not Stage.HEADER:
+            self.held = now
 
     def abort(self) -> None:
         """Close at once."""
@@ -343,7 +347,7 @@ def _close_unopened(found: Connection, task: "asyncio.Task[None]") -> None:
 
 def _rank(one: Connection) -> tuple[bool, float, int, float]:
     """Return the order in which connections are closed: first those that wait for a request."""
-    return (one.present, one.known or 0.0, max(one.stage, Stage.IDLE), one.since)
+    return (one.present, one.known or 0.0, max(one.stage, Stage.IDLE), one.held)
 
 
 class Doors:
