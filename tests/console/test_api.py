@@ -15,7 +15,6 @@ from pathlib import Path
 import httpx
 import pytest
 
-from heliotrope.console._attempts import Attempts
 from heliotrope.console._files import KEPT
 from heliotrope.console.client import Client, RemoteError
 from heliotrope.console.people import FIRST, first_start
@@ -169,8 +168,6 @@ def test_guessing_is_slowed(console: LiveConsole) -> None:
         answer = client.post(url, json={"name": "nobody here", "password": "x" * 12})
         assert answer.status_code == 429
         assert 0 < int(answer.headers["retry-after"]) <= 60
-    # The address has failed too; other tests come from it.
-    console.call(lambda: console.server.app.state.console.attempts.good("address 127.0.0.1"))
 
 
 def test_a_disabled_account_is_out_at_once(console: LiveConsole, ask: Ask, person: Ask) -> None:
@@ -289,7 +286,6 @@ def test_guessing_the_own_password_is_slowed(console: LiveConsole, ask: Ask, per
         guess = {"old": "x" * 12, "new": "another password"}
         seen = [client.put("session/password", json=guess).status_code for _ in range(6)]
     assert seen == [403] * 5 + [429]
-    console.call(lambda: console.server.app.state.console.attempts.good("address 127.0.0.1"))
 
 
 def test_nobody_takes_away_their_own_role(person: Ask) -> None:
@@ -655,18 +651,3 @@ def test_first_start_makes_one_account(tmp_path_factory: pytest.TempPathFactory)
 def test_settings_that_are_refused(options: dict[str, object], text: str) -> None:
     with pytest.raises(InputError, match=text):
         ConsoleSettings(**options)  # type: ignore[arg-type]
-
-
-def test_attempts_are_forgotten_after_the_span() -> None:
-    times = [0.0]
-    attempts = Attempts(3, 60.0, lambda: times[-1])
-    for now in (0.0, 10.0, 20.0):
-        times.append(now)
-        assert attempts.wait("a") == 0.0
-        attempts.begin("a")
-    assert attempts.wait("a") == 40.0
-    assert attempts.wait("b") == 0.0
-    times.append(60.0)
-    assert attempts.wait("a") == 0.0
-    attempts.good("a")
-    assert attempts.wait("a", "b") == 0.0

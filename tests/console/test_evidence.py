@@ -118,7 +118,7 @@ def test_a_lockout_raises_an_alarm(console: LiveConsole) -> None:
     alarms = {row.condition: row for row in console.call(console.live.operations.alarms)}
     assert alarms["sign_in_lockout"].active
     attempts = console.server.app.state.console.attempts
-    console.call(lambda: attempts.good("address 127.0.0.1", "name viewer"))
+    console.call(lambda: attempts.good("viewer", "127.0.0.1"))
 
 
 def test_a_refused_link_leaves_a_trace(console: LiveConsole) -> None:

@@ -1,52 +1,113 @@
-"""Recent failed sign-ins, by address and by name."""
+"""Recent failed sign-ins: of a name at an address, of a name, and from an address.
 
-from collections import deque
-from collections.abc import Callable
+Each of the three delays the next attempt, the longer the more failures there were. Only the first
+ends guessing (`AN_HOUR` attempts): the other two merely slow it, since whoever guesses could
+otherwise keep a person, or everybody at one address, out. A name that has signed in from an address
+is not delayed there by what others do.
+"""
+
+from collections import OrderedDict, deque
+from collections.abc import Callable, Collection
+from typing import TypeVar
+
+#: Time that a failure counts, s, and attempts for one name at one address in it.
+SPAN, AN_HOUR = 3600.0, 12
+#: Delay after each failure of a name at an address, s; the first ones cost nothing.
+_OWN = (0.0, 0.0, 0.0, 0.0, 15.0, 30.0, 60.0, 120.0, 240.0, 300.0, 300.0)
+#: Failures of a name, or from an address, that cost nothing; then the delay doubles from 1 s up to
+#: the longest, s.
+_FREE, _LONGEST_NAME, _LONGEST_ADDRESS = 20, 30.0, 10.0
+_KEPT = 64
+Pair = tuple[str, str]
+K = TypeVar("K")
+V = TypeVar("V")
 
 
 class Attempts:
-    """The failures by key within a time span.
+    """The failures of the last hour.
 
     Parameters
     ----------
-    most, span
-        Failures allowed within ``span`` s.
     monotonic
         Returns the time, s.
+    shared
+        Addresses of many people, such as trusted proxies, that are not counted as one caller.
     largest
-        Number of keys that are kept; the oldest are dropped first.
+        Number of names, addresses and pairs of them that are kept; the longest unused are dropped
+        first.
     """
 
     def __init__(
-        self, most: int, span: float, monotonic: Callable[[], float], largest: int = 10_000
+        self,
+        monotonic: Callable[[], float],
+        shared: Collection[str] = (),
+        largest: int = 10_000,
     ) -> None:
-        self._most, self._span, self._now, self._largest = most, span, monotonic, largest
-        self._failures: dict[str, deque[float]] = {}
+        self._now, self._shared, self._largest = monotonic, frozenset(shared), largest
+        self._pairs: OrderedDict[Pair, deque[float]] = OrderedDict()
+        self._names: OrderedDict[str, deque[tuple[float, Pair]]] = OrderedDict()
+        self._addresses: OrderedDict[str, deque[tuple[float, Pair]]] = OrderedDict()
+        self._good: OrderedDict[Pair, None] = OrderedDict()
 
-    def wait(self, *keys: str) -> float:
+    def wait(self, name: str, address: str) -> float:
         """Return the time to wait before the next attempt, s; 0 if it may be made now."""
-        now, longest = self._now(), 0.0
-        for key in keys:
-            times = self._failures.get(key)
-            while times and now - times[0] >= self._span:
-                times.popleft()
-            if times is not None and not times:
-                del self._failures[key]
-            elif times and len(times) >= self._most:
-                longest = max(longest, times[-self._most] + self._span - now)
-        return longest
+        now, pair = self._now(), (name, address)
+        until = _own_until(self._pairs.get(pair, ()), now)
+        if pair not in self._good:
+            until = max(
+                until,
+                _shared_until(self._names.get(name, ()), now, _LONGEST_NAME),
+                _shared_until(self._addresses.get(address, ()), now, _LONGEST_ADDRESS),
+            )
+        return max(0.0, until - now)
 
-    def begin(self, *keys: str) -> None:
+    def begin(self, name: str, address: str) -> None:
         """Count an attempt as failed until `good` says otherwise.
 
         Counting only after the slow password check would let many attempts through at once.
         """
-        for key in keys:
-            self._failures.setdefault(key, deque(maxlen=self._most)).append(self._now())
-            if len(self._failures) > self._largest:
-                del self._failures[next(iter(self._failures))]
+        now, pair = self._now(), (name, address)
+        _kept(self._pairs, pair, AN_HOUR, self._largest).append(now)
+        _kept(self._names, name, _KEPT, self._largest).append((now, pair))
+        if address not in self._shared:
+            _kept(self._addresses, address, _KEPT, self._largest).append((now, pair))
 
-    def good(self, *keys: str) -> None:
-        """Forget the failures of keys that have signed in."""
-        for key in keys:
-            self._failures.pop(key, None)
+    def good(self, name: str, address: str) -> None:
+        """Forget the failures of a name at an address where it has signed in, and no others."""
+        pair = (name, address)
+        self._pairs.pop(pair, None)
+        for failures in (self._names.get(name), self._addresses.get(address)):
+            if failures is not None:
+                others = [one for one in failures if one[1] != pair]
+                failures.clear()
+                failures.extend(others)
+        self._good[pair] = None
+        self._good.move_to_end(pair)
+        if len(self._good) > self._largest:
+            self._good.popitem(last=False)
+
+
+def _kept(kept: "OrderedDict[K, deque[V]]", key: K, most: int, largest: int) -> "deque[V]":
+    """Return the failures of a key, which is now the last used."""
+    found = kept.setdefault(key, deque(maxlen=most))
+    kept.move_to_end(key)
+    if len(kept) > largest:
+        kept.popitem(last=False)
+    return found
+
+
+def _own_until(times: Collection[float], now: float) -> float:
+    """Return when a name may try again at an address, s."""
+    recent = [at for at in times if now - at < SPAN]
+    if not recent:
+        return now
+    if len(recent) >= AN_HOUR:
+        return recent[0] + SPAN
+    return recent[-1] + _OWN[len(recent) - 1]
+
+
+def _shared_until(failures: Collection[tuple[float, Pair]], now: float, longest: float) -> float:
+    """Return when anybody may try again for a name, or from an address, s."""
+    recent = [at for at, _ in failures if now - at < SPAN]
+    more = len(recent) - _FREE
+    return recent[-1] + min(longest, 2.0**more) if more >= 0 else now

@@ -14,12 +14,11 @@ from heliotrope.console.auth import (
     Console,
     Engineer,
     Here,
-    checked,
-    log_in,
     refused,
     same_origin,
 )
 from heliotrope.console.people import ROLES
+from heliotrope.console.sign_in import checked, log_in
 from heliotrope.plant.authority import Role
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.people import Account

@@ -56,7 +56,7 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
     """
     chosen = settings or ConsoleSettings()
     people, stream = RemotePeople(plant), Stream(plant, chosen.period)
-    attempts = Attempts(chosen.failures, chosen.failures_s, time.monotonic)
+    attempts = Attempts(time.monotonic, chosen.proxies)
     console = Console(plant, people, chosen, stream, attempts, EmergencyOrders())
 
     @contextlib.asynccontextmanager

@@ -7,7 +7,7 @@ elsewhere cannot read. Programs have a token (``Authorization: Bearer``).
 
 import asyncio
 import contextlib
-import math
+import ipaddress
 import time
 from collections import deque
 from collections.abc import Callable
@@ -29,7 +29,7 @@ from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.security import SPAN, SecurityEvent, plain
-from heliotrope.store.people import Account, ApiToken, Session
+from heliotrope.store.people import ApiToken, Session
 
 T = TypeVar("T")
 COOKIE = "heliotrope_session"
@@ -102,7 +102,7 @@ class Console:
         now = time.monotonic()
         if len(times) < MOST_NOTED or now - times[0] >= SPAN:
             times.append(now)
-            await self.plant.note(kind, who, address_of(connection), plain(detail))
+            await self.plant.note(kind, who, address_of(self, connection), plain(detail))
 
     def forget(self) -> None:
         """Drop the shared answers that a change may have made stale."""
@@ -160,9 +160,23 @@ def console_of(connection: HTTPConnection) -> Console:
     return cast("Console", connection.app.state.console)
 
 
-def address_of(connection: HTTPConnection) -> str:
-    """Return the address that a request comes from."""
-    return connection.client.host if connection.client else ""
+def address_of(console: Console, connection: HTTPConnection) -> str:
+    """Return the address that a request comes from: what a trusted proxy says, or the other end's.
+
+    Each proxy adds the address that it saw at the end of ``X-Forwarded-For``, so the last one that
+    is no proxy's counts; what a caller writes there itself stands before.
+    """
+    address = connection.client.host if connection.client else ""
+    proxies = console.settings.proxies
+    if address in proxies:
+        for text in reversed(",".join(connection.headers.getlist("x-forwarded-for")).split(",")):
+            try:
+                said = str(ipaddress.ip_address(text.strip()))
+            except ValueError:
+                break
+            if said not in proxies:
+                return said
+    return address
 
 
 Here = Annotated[Console, Depends(here)]
@@ -305,59 +319,3 @@ class AtLeast:
 
 Operator = Annotated[Caller, Depends(AtLeast(Role.OPERATOR))]
 Engineer = Annotated[Caller, Depends(AtLeast(Role.ENGINEER))]
-
-
-async def log_in(
-    console: Console, name: str, password: str, connection: HTTPConnection
-) -> tuple[str, float]:
-    """Check a password; return the secret of a new session and its end, POSIX s.
-
-    Raises
-    ------
-    HTTPException
-        401 if name or password is wrong; 429 after too many failures.
-    """
-    account = await checked(console, name, password, connection, SecurityEvent.SIGN_IN_FAILED)
-    now, lifetime = console.now(), console.settings.session_s
-    secret = await console.ask(
-        lambda: console.people.open_session(account.name, now, lifetime, address_of(connection))
-    )
-    await console.note(SecurityEvent.SIGNED_IN, connection, name)
-    return secret, now + lifetime
-
-
-async def _known(console: Console, name: str) -> str:
-    """Return a name if it is an account's: what else people type there may be a password."""
-    known = await console.ask(lambda: console.people.account(name))
-    return name if known is not None else ""
-
-
-async def checked(
-    console: Console, name: str, password: str, connection: HTTPConnection, failure: SecurityEvent
-) -> Account:
-    """Return the account for a name and password; a wrong one is recorded as ``failure``.
-
-    Raises
-    ------
-    HTTPException
-        401 if name or password is wrong; 429 after too many failures.
-    """
-    keys = (f"name {name}", f"address {address_of(connection)}")
-    if (wait := console.attempts.wait(*keys)) > 0.0:
-        seconds = math.ceil(wait)
-        await console.note(SecurityEvent.LOCKED_OUT, connection, await _known(console, name))
-        raise HTTPException(
-            429,
-            f"too many failed sign-ins; try again in {seconds} s",
-            {"Retry-After": str(seconds)},
-        )
-    console.attempts.begin(*keys)
-    account = await console.ask(lambda: console.people.account(name))
-    kept = account.password_hash if account is not None and not account.disabled else None
-    async with console.hashing:
-        good = await asyncio.to_thread(_secrets.verify_password, kept, password)
-    if not good or account is None:
-        await console.note(failure, connection, name if account is not None else "")
-        raise HTTPException(401, "name or password is wrong")
-    console.attempts.good(*keys)
-    return account

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from fastapi import HTTPException
 from starlette.requests import HTTPConnection
 
-from heliotrope.console.auth import Caller, Console, find_caller, secret_of
+from heliotrope.console.auth import Caller, Console, address_of, find_caller, secret_of
 from heliotrope.console.buckets import Buckets
 
 #: Requests of strangers: from one address, and from all; 1/s, and at once.
@@ -52,7 +52,7 @@ class Edge:
         """
         secret = secret_of(connection)
         if secret is None or secret not in self._seen:
-            self._count_stranger(connection)
+            self._count_stranger(console, connection)
         found = None if secret is None else await find_caller(console, connection)
         if secret is None or found is None:
             self._seen.pop(secret or ("", ""), None)
@@ -63,8 +63,8 @@ class Edge:
             self._seen.popitem(last=False)
         return found
 
-    def _count_stranger(self, connection: HTTPConnection) -> None:
-        address = network_of(connection.client.host if connection.client else "")
+    def _count_stranger(self, console: Console, connection: HTTPConnection) -> None:
+        address = network_of(address_of(console, connection))
         _refuse(self._stranger.take(address) or self._strangers.take(""))
 
     def count(self, who: Caller) -> None:

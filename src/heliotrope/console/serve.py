@@ -120,8 +120,8 @@ class ConsoleServer:
 
     def _listen(self) -> list[Listener]:
         left = raise_descriptors() - RESERVE
-        shared = ("127.0.0.1", "::1")
         chosen = self.settings
+        shared = ("127.0.0.1", "::1", *chosen.proxies)
         try:
             line = listening(chosen.host, chosen.port)
         except OSError:

@@ -24,8 +24,6 @@ class ConsoleSettings:
         TLS certificate and its key, PEM files; None: plain HTTP.
     session_s
         Length of a session, s.
-    failures, failures_s
-        Failed sign-ins allowed from one address or for one name within a span, s.
     period
         Time between messages of the live stream, s.
     viewers
@@ -34,6 +32,8 @@ class ConsoleSettings:
         Whether to serve the operator page beside the API.
     plain
         Whether other machines may connect without TLS, behind a proxy that has it.
+    proxies
+        Addresses of trusted proxies: ``X-Forwarded-For`` names the caller of their requests.
     emergency_port
         Port that serves EMERGENCY alone; None: the next one, or a free one if that is taken.
 
@@ -50,12 +50,11 @@ class ConsoleSettings:
     certificate: Path | None = None
     key: Path | None = None
     session_s: float = 36_000.0
-    failures: int = 5
-    failures_s: float = 60.0
     period: float = 1.0
     viewers: int = 200
     page: bool = True
     plain: bool = False
+    proxies: tuple[str, ...] = ()
     emergency_port: int | None = None
 
     def __post_init__(self) -> None:
@@ -64,9 +63,11 @@ class ConsoleSettings:
                 raise InputError(f"console: port {port}; give 1 to 65535, or 0 for a free one")
         if (self.certificate is None) != (self.key is None):
             raise InputError("console: TLS needs both files, --certificate and --key")
-        for name in ("session_s", "failures_s", "period"):
+        for name in ("session_s", "period"):
             if not getattr(self, name) > 0.0:
                 raise InputError(f"console: {name} of {getattr(self, name)} s must be above 0")
+        for proxy in self.proxies:
+            _check_address(proxy)
         if not self.local and not self.tls and not self.plain:
             raise InputError(
                 f"console: {self.host} is reached from other machines, and without TLS passwords "
@@ -78,13 +79,15 @@ class ConsoleSettings:
     def of(cls, given: Mapping[str, Any]) -> "ConsoleSettings":
         """Return the settings of `given`."""
         files = {name: Path(given[name]) for name in ("certificate", "key") if given[name]}
-        return cls(**{**given, "names": tuple(given["names"]), **files})
+        tuples = {name: tuple(given[name]) for name in ("names", "proxies")}
+        return cls(**{**given, **tuples, **files})
 
     @property
     def given(self) -> dict[str, Any]:
         """The settings as JSON values, for the console's process."""
         files = {name: str(getattr(self, name) or "") or None for name in ("certificate", "key")}
-        return {**asdict(self), "names": list(self.names), **files}
+        lists = {"names": list(self.names), "proxies": list(self.proxies)}
+        return {**asdict(self), **lists, **files}
 
     @property
     def tls(self) -> bool:
@@ -110,3 +113,12 @@ class ConsoleSettings:
         """Return the address for a browser."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'https' if self.tls else 'http'}://{host}:{port}/"
+
+
+def _check_address(text: str) -> None:
+    try:
+        if str(ipaddress.ip_address(text)) == text:
+            return
+    except ValueError:
+        pass
+    raise InputError(f"console: proxy {text!r}; give the IP address that the console sees")

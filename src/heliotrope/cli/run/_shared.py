@@ -48,6 +48,7 @@ class Shown:
     certificate: Path | None = None
     key: Path | None = None
     plain: bool = False
+    proxies: tuple[str, ...] = ()
     emergency_port: int | None = None
     console: bool = True
     browser: bool = True
@@ -90,6 +91,7 @@ class Shown:
             certificate=self.certificate,
             key=self.key,
             plain=self.plain,
+            proxies=self.proxies,
             emergency_port=self.emergency_port,
         )
 

@@ -136,6 +136,13 @@ def run(
             rich_help_panel=_CONSOLE,
         ),
     ] = False,
+    proxy: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="IP address of a trusted proxy, which names the callers; may be repeated.",
+            rich_help_panel=_CONSOLE,
+        ),
+    ] = None,
     emergency_port: Annotated[
         int | None,
         typer.Option(
@@ -188,6 +195,7 @@ def run(
         certificate=certificate,
         key=key,
         plain=plain,
+        proxies=tuple(proxy or ()),
         emergency_port=emergency_port,
         console=not no_console,
         browser=not no_browser,
