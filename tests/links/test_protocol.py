@@ -29,7 +29,7 @@ from heliotrope.safety import Alarm, Severity
 ROWS = np.zeros(3, NODE)
 ROWS["primary"] = (-5, 7, 2**31 - 1)
 MESSAGES = [
-    Lease(17, 3.0, 60.0),
+    Lease(17, 3.0, 60.0, "20260621T101500-0a1b2c3d"),
     Command("c1", "AIM", (0.0, 1.5, 50.0), ("A1", "Ü 2"), 17, 5.0),
     Emergency("e1", "DEFOCUS"),
     Parameters.of("p1", "A1", {"biases": b"\x00\n12", "stow": b"", "armature": b"\xff"}, 17),

@@ -137,6 +137,7 @@ class Plant:
         self.leases = True
         self.token = TOKEN
         self.autonomy = 0.0
+        self.run = "first"
 
     async def listen(self) -> None:
         async for data in received(self.link):
@@ -145,7 +146,7 @@ class Plant:
     async def lease(self) -> None:
         while True:
             if self.leases:
-                await self.send(Lease(self.token, autonomy=self.autonomy))
+                await self.send(Lease(self.token, autonomy=self.autonomy, run=self.run))
             await asyncio.sleep(1.0)
 
     async def send(self, message: Message) -> None:

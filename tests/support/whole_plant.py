@@ -20,7 +20,7 @@ from heliotrope.field.target import Receiver, Target
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, sleep_until
 from heliotrope.links.connection import CarriedLink
-from heliotrope.links.in_process import memory_pair
+from heliotrope.links.in_process import MemoryLine, memory_pair
 from heliotrope.links.link import Link, running
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.board_items import Wanted, items_of
@@ -107,6 +107,7 @@ class WholePlant:
         self.clusters: list[Cluster] = []
         self.parts: list[Any] = []
         links: dict[str, Link] = {}
+        self.lines: dict[str, MemoryLine] = {}
         for k in range(clusters):
             members, stations = [], []
             for i in (2 * k, 2 * k + 1):
@@ -124,7 +125,8 @@ class WholePlant:
                 board = self.boards[names[i]] = Board(fit, seed=seed + i)
                 stations.append(board)
                 members.append(Member(names[i], address, serial=5000 + i, key=fit.key))
-            near, far, _ = memory_pair(clock, names=("plant", f"K{k + 1}"), seed=10 * seed + k)
+            near, far, line = memory_pair(clock, names=("plant", f"K{k + 1}"), seed=10 * seed + k)
+            self.lines[f"K{k + 1}"] = line
             links[f"K{k + 1}"] = near
             self.parts.append(near)
             self._cluster(ClusterConfig(f"K{k + 1}", SITE, tuple(members)), stations, far)

@@ -95,7 +95,10 @@ class PlantLink:
 
     def _take(self, message: Message) -> None:
         if isinstance(message, Lease):
-            refusal = self._watch.take(message, self._clock.monotonic())
+            now = self._clock.monotonic()
+            if not self._watch.runs.admits(message.run, now):
+                return
+            refusal = self._watch.take(message, now)
             if refusal:
                 self._reports.alarm(alarms.LEASE_REFUSED.raised(problem=refusal))
             else:
@@ -144,6 +147,8 @@ class PlantLink:
                 names=self._names if told else (),
                 site=self._site,
                 block=self._nodes.rows(now),
+                run=self._watch.runs.holder,
+                barred=self._watch.runs.barred,
             )
         )
         self._reports.publish()

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from heliotrope.cluster._reports import Reports
+from heliotrope.cluster._runs import Runs
 from heliotrope.cluster.timekeeping import Time
 from heliotrope.links.messages import Lease
 from heliotrope.safety import (
@@ -83,6 +84,8 @@ class Watch:
         Token of the command authority in the last lease; 0: nobody has it.
     verdict
         Demands of the safety table in this second.
+    runs
+        Run of the plant that the cluster belongs to, and those that it refuses.
     """
 
     def __init__(
@@ -102,6 +105,7 @@ class Watch:
         self._offset: float | None = None
         self.token = 0
         self.verdict = Verdict()
+        self.runs = Runs()
 
     def _table(self) -> tuple[Condition, ...]:
         rows = watched_by(conditions(self._autonomy), Watcher.CLUSTER)
@@ -130,6 +134,7 @@ class Watch:
         self.token = lease.token
         self._lease = Reading(_PLANT_LEASE - lease.lifetime, now)
         self._over = now + lease.lifetime
+        self.runs.took(lease.run, now, self._over)
         return ""
 
     def lease_left(self, now: float) -> float:
@@ -166,6 +171,11 @@ class Watch:
             self._reports.alarm(alarms.TIME_SOURCE.raised(problem=time.note))
         else:
             self._reports.clear(alarms.TIME_SOURCE.ended())
+        if rivals := self.runs.rivals(now):
+            runs = ", ".join(rivals)
+            self._reports.alarm(alarms.TWO_PLANTS.raised(runs=runs, holder=self.runs.holder))
+        else:
+            self._reports.clear(alarms.TWO_PLANTS.ended())
         before = self.verdict.act
         self._state, actions = evaluate(readings, self._state, now)
         self._alarm(actions)

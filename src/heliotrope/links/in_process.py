@@ -124,6 +124,8 @@ class MemoryLine:
         self.faults = faults or Faults()
         self.reachable = True
         self.generation = 0
+        #: Who has each end: a newcomer takes it over, as at a broker.
+        self.holders: list[object] = [None, None]
         chance = random.Random(seed)
         self.lanes = (
             _Lane(clock, random.Random(chance.random())),
@@ -160,7 +162,8 @@ class MemoryLine:
         Parameters
         ----------
         place
-            0 or 1. The previous link at that end must have ended.
+            0 or 1. Of several links at one place the one that connected last has the line, as with
+            one client identifier at a broker; the other loses it, and connects again.
         name
             Name of the other end.
         clock
@@ -175,7 +178,7 @@ class _MemoryCarrier:
     """One end of a line."""
 
     def __init__(self, line: MemoryLine, end: int) -> None:
-        self._line = line
+        self._line, self._end = line, end
         self._out, self._in = line.lanes[end], line.lanes[1 - end]
         self._generation = -1
 
@@ -184,11 +187,15 @@ class _MemoryCarrier:
         if not self._line.reachable:
             raise LinkError("the line is not reachable")
         self._generation = self._line.generation
+        self._line.holders[self._end] = self
+        self._in.news.set()  # whoever had it notices
         return b""
 
     def _check(self) -> None:
         if self._generation != self._line.generation:
             raise LinkLostError("the line was dropped")
+        if self._line.holders[self._end] is not self:
+            raise LinkLostError("another program has taken the line over")
 
     async def ready(self) -> None:
         """Return at once: there is nothing to wait for."""

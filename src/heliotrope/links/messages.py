@@ -74,13 +74,15 @@ class Lease:
     """The plant is present, and commands under this token (0: nobody may command).
 
     The cluster may go on for ``lifetime`` s after its arrival, and for ``autonomy`` s more. Its
-    expiry on the link limits how long it may be under way.
+    expiry on the link limits how long it may be under way. ``run`` names one start of one plant;
+    "" from an older plant.
     """
 
     kind: ClassVar[str] = "lease"
     token: int
     lifetime: float = 3.0
     autonomy: float = 0.0
+    run: str = ""
 
 
 @dataclass(frozen=True)
@@ -192,6 +194,7 @@ class ClusterStatus:
     ``utc_s`` is the cluster's own time (POSIX seconds), ``time_error_s`` the bound of its error.
     ``site`` holds `Site.numbers`, for which it computes the sun; () from an older cluster.
     ``lease_left`` in s; below 0 the plant's lease is over. ``cycle_s`` is the last poll cycle.
+    ``run`` is the run of the plant that it belongs to, ``barred`` those that get no lease.
     """
 
     kind: ClassVar[str] = "status"
@@ -206,6 +209,8 @@ class ClusterStatus:
     names: tuple[str, ...] = ()
     block: bytes = b""
     site: tuple[float, ...] = ()
+    run: str = ""
+    barred: tuple[str, ...] = ()
 
     def nodes(self) -> "npt.NDArray[Any]":
         """Return the rows, of dtype `NODE`, read only.

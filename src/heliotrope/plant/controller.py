@@ -60,6 +60,7 @@ from heliotrope.plant.joining import JoinDispatcher, JoiningJob, JoinQueue
 from heliotrope.plant.lockouts import Lockout, locked_out
 from heliotrope.plant.orders import PlantOrders, whole
 from heliotrope.plant.parameters import ParameterSync, Tables, change_of_beam
+from heliotrope.plant.rivals import Rivals
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act, Alarm, Condition, alarms, conditions
@@ -121,6 +122,8 @@ class PlantController:
         Mirrors and keep-out volumes; see `BeamCheck`.
     alarms
         The last alarms, oldest first.
+    name
+        Name of this run of the plant: UTC of its start, and random digits.
     out_of_service
         Heliostats that only EMERGENCY, DEFOCUS and STOW move, by name; see `Lockout`.
     aims, standbys
@@ -180,23 +183,20 @@ class PlantController:
             self._tell,
         )
         self.doubts = Doubts(self.field, design, self.aims, self._tell)
+        self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
+        self._rivals = Rivals(self.name, self._tell)
         self._orders = PlantOrders(
             clock,
             audit,
             place,
             self._clusters,
-            f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}",
+            self.name,
             self.settings.lifetime,
             self.settings.patience,
         )
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
-        self._joiner = JoinDispatcher(
-            self._joining,
-            self._orders,
-            self._ways,
-            self.settings.join_life,
-            self.doubts.barred,
-        )
+        life, barred = self.settings.join_life, self.doubts.barred
+        self._joiner = JoinDispatcher(self._joining, self._orders, self._ways, life, barred)
         self._sync = ParameterSync(
             self.field,
             self.wanted,
@@ -258,7 +258,8 @@ class PlantController:
 
     def _lease(self) -> Lease:
         self.counters.leases += 1
-        return Lease(self.authority.token, self.settings.lease, self.settings.autonomy)
+        settings = self.settings
+        return Lease(self.authority.token, settings.lease, settings.autonomy, self.name)
 
     def _greet(self, end: ClusterEnd) -> None:
         """Repeat orders to a cluster that has connected, and compare its parameters."""
@@ -289,6 +290,7 @@ class PlantController:
         self.counters.statuses += 1
         self.counters.problems.extend(self.field.take(end.name, status, now))
         self._agreement.take(end.name, status)
+        self._rivals.take(end.name, status)
         self._give_up(self._identities.look(end.name))
         self.doubts.look(end.name)
         if not self.field.knows_order(end.name) and now - self._named_at[end.name] >= _ASK_NAMES:
@@ -888,7 +890,7 @@ class PlantController:
         rows = [self.field.place(n) for n in heliostats]
         clusters = {self.field.clusters[self.field.cluster[row]] for row in rows}
         reason = "" if name == "LOCK" else self._sentinel.refusal(clusters)
-        if reason:
+        if reason := reason or self._rivals.refusal(clusters):
             raise refusals.NOT_NOW.error(what=name, reason=reason)
 
 

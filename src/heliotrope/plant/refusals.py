@@ -83,7 +83,7 @@ REASON_MISSING = Refusal(
 )
 NOT_NOW = Refusal(
     "not accepted now",
-    "An emergency holds, or a row of the safety table refuses new motions.",
+    "An emergency holds, a row of the safety table refuses new motions, or a second plant runs.",
     "{what}: not accepted now: {reason}",
     "Look up the alarm that the text names. LOCK, DEFOCUS and STOW are still accepted.",
 )

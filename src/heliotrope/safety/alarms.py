@@ -128,6 +128,16 @@ IDENTITY = AlarmKind(
     "Stow both; then correct their addresses, or write the parameters of the mirror that is there.",
     over="{subject}: its own parameters answer again",
 )
+SECOND_PLANT = AlarmKind(
+    "second_plant",
+    _PLANT,
+    Severity.ALARM,
+    "Clusters belong to another plant with the same keys, which was there before this one.",
+    "this plant (run {run}) is the second one with its keys: {clusters} belong to run {holder}",
+    "They take only DEFOCUS, STOW and EMERGENCY from this plant, until it is restarted.",
+    "Switch one of the two plants off; if the other is off, restart this one.",
+    over="the clusters belong to no other plant any more",
+)
 CONSOLE = AlarmKind(
     "console",
     _PLANT,
@@ -308,6 +318,17 @@ LEASE_REFUSED = AlarmKind(
     "The cluster ignores the lease, and defocuses when the last valid one ends.",
     "Correct the plant's settings lease and autonomy.",
     over="the plant's lease is accepted again",
+)
+TWO_PLANTS = AlarmKind(
+    "two_plants",
+    _CLUSTER,
+    Severity.ALARM,
+    "A second plant with the same keys asks for the lease while the first one renews it.",
+    "a second plant with the same keys is running: run {runs}; the cluster belongs to run {holder}",
+    "The cluster obeys the plant that it belongs to; of the other it takes only DEFOCUS, STOW and "
+    "EMERGENCY.",
+    "Switch the second plant off; a run is named after the UTC time at which its plant started.",
+    over="the second plant has not asked for a minute",
 )
 TIME_SOURCE = AlarmKind(
     "time_source",
