@@ -20,6 +20,7 @@ from heliotrope.cluster.program import line_of, time_of
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.lcu import messages, wire
 from heliotrope.links.clock import SystemClock, VirtualClock
+from heliotrope.links.papers import Papers
 from support.clusters import SITE, config_of
 
 ROOT = Path(__file__).parents[2]
@@ -303,18 +304,18 @@ def test_rows_tell_what_was_heard_and_how_old_it_is() -> None:
 def test_links_and_times_are_made_as_the_file_says(folder: Path) -> None:
     clock = SystemClock()
     installation = read_cluster(folder / "C1.toml")
-    assert _link(installation, clock).name == "plant at 10.0.0.2:4840"
+    assert _link(installation, clock, Papers(clock)).name == "plant at 10.0.0.2:4840"
     changed(folder, "tcp://10.0.0.2:4840", "mqtt://broker/heliotrope/example")
     changed(folder, 'gpsd = "localhost"', "error_s = 0.25")
     installation = read_cluster(folder / "C1.toml")
     assert (installation.port, installation.prefix) == (1883, "heliotrope/example")
-    assert "broker" in _link(installation, clock).name
+    assert "broker" in _link(installation, clock, Papers(clock)).name
     keeper = time_of(installation, clock)
     assert (keeper.time().quality, keeper.time().error) == ("system", 0.25)
     changed(folder, 'example"', 'example"\nauthority = "no.pem"')
     changed(folder, "mqtt://", "mqtts://")
     with pytest.raises(InputError, match=r"no\.pem"):
-        _link(read_cluster(folder / "C1.toml"), clock)
+        _link(read_cluster(folder / "C1.toml"), clock, Papers(clock))
 
 
 def test_unless_an_error_is_stated_the_kernel_is_asked(

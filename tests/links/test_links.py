@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 
 from heliotrope.errors import FormatError, InputError
-from heliotrope.links.addresses import Keys
 from heliotrope.links.clock import SystemClock, VirtualClock, run_virtual, sleep_until
 from heliotrope.links.envelope import OVERHEAD, Conversation
 from heliotrope.links.in_process import Faults, memory_pair
+from heliotrope.links.keys import Keys
 from heliotrope.links.link import (
     Backoff,
     Heartbeat,
@@ -36,10 +36,9 @@ from heliotrope.links.tcp import (
     _NEWCOMERS_EACH,
     TcpServer,
     _Newcomers,
-    client_tls,
-    server_tls,
     tcp_link,
 )
+from heliotrope.links.tls import client_tls, server_tls
 
 SETTINGS = LinkSettings(period=0.5, deadline=1.5)
 #: For real sockets: quick beats, so that a test need not wait.
@@ -229,7 +228,7 @@ def test_nothing_of_an_earlier_connection_is_taken() -> None:
     pair = Pair()
     pair.meet()
     before = pair.a.data(b"before", None)
-    pair.b.restart(b"")
+    pair.b.restart(lambda: (b"",))
     assert pair.b.feed(before)[0] is None
     pair.meet()
     assert pair.b.feed(before)[0] is None
@@ -239,11 +238,11 @@ def test_nothing_of_an_earlier_connection_is_taken() -> None:
 
 def test_a_message_does_not_pass_under_another_key_nor_come_back_to_its_sender() -> None:
     pair = Pair()
-    pair.a.restart(KEY)
-    pair.b.restart(OTHER_KEY)
+    pair.a.restart(lambda: (KEY,))
+    pair.b.restart(lambda: (OTHER_KEY,))
     pair.meet()
     assert pair.a.alive_at == pair.b.alive_at == -float("inf")
-    pair.b.restart(KEY)
+    pair.b.restart(lambda: (KEY,))
     pair.meet()
     envelope = pair.a.data(b"aim", None)
     refused = pair.counts[0].refused
@@ -257,7 +256,7 @@ def test_a_restarted_end_is_taken_up_at_once_and_a_stale_one_is_not() -> None:
     pair.base.advance(0.1)
     stale = pair.a.beats()
     pair.base.advance(0.1)
-    pair.a.restart(b"")
+    pair.a.restart(lambda: (b"",))
     pair.meet()
     assert pair.b.feed(pair.a.data(b"new", None))[0] is not None
     alive = pair.b.alive_at
@@ -999,7 +998,7 @@ def test_a_key_in_a_file_is_whole_bytes(size: int, odd: bool, tmp_path: Path) ->
     path.write_text(f'plant = "{text}"\n', encoding="utf-8")
     path.chmod(0o600)
     if 16 <= size <= 64 and not odd:
-        assert Keys(path, "clusters").plant == bytes(range(size))
+        assert Keys(path, "clusters").plant == (bytes(range(size)),)
     else:
         with pytest.raises(FormatError, match=f"a key of {len(text)} characters; give 16 to 64"):
             Keys(path, "clusters")

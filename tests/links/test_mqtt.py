@@ -17,7 +17,7 @@ from heliotrope.errors import InputError
 from heliotrope.links.clock import SystemClock, sleep_until
 from heliotrope.links.link import Link, LinkSettings, SendOutcome, running
 from heliotrope.links.mqtt import Broker, mqtt_link
-from heliotrope.links.tcp import client_tls
+from heliotrope.links.tls import client_tls
 from support.broker import MOSQUITTO, Mosquitto, mosquitto_for
 
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)

@@ -11,6 +11,7 @@ import typer
 from heliotrope import __version__
 from heliotrope.cli._ctl import app as ctl_app
 from heliotrope.cli._field_layout import layout
+from heliotrope.cli._keys import app as keys_app
 from heliotrope.cli._store import app as store_app
 from heliotrope.cli.calibrate import calibrate
 from heliotrope.cli.camera import app as camera_app
@@ -69,6 +70,7 @@ app.command(cls=GroupedCommand)(run)
 app.add_typer(ctl_app, name="ctl")
 app.add_typer(store_app, name="store")
 app.command()(cluster)
+app.add_typer(keys_app, name="keys")
 app.command()(simulate)
 app.command()(fetch)
 app.command()(demo)

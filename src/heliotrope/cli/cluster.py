@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from heliotrope.cluster.controller import Cluster
     from heliotrope.links.clock import Clock
     from heliotrope.links.link import Link
+    from heliotrope.links.papers import Papers
+    from heliotrope.links.tls import TlsSource
+    from heliotrope.safety import Alarm
 
 
 def cluster(
@@ -26,6 +29,8 @@ def cluster(
         raise InputError(f"--every {every:g} s is not within 1 to 86400 s")
     try:
         from heliotrope.cluster.config_file import read_cluster
+        from heliotrope.links.clock import SystemClock
+        from heliotrope.links.papers import Papers
     except ImportError as error:
         raise InputError(
             f"cluster: {error.name} is not installed; say pip install 'heliotrope[control]'"
@@ -34,6 +39,11 @@ def cluster(
     if check:
         count = len(installation.config.heliostats)
         print(f"{config}: cluster {installation.config.name} of {count} heliostats")
+        clock = SystemClock()
+        papers = Papers(clock)
+        _link(installation, clock, papers)
+        for line in papers.lines():
+            print(line)
         return
     import asyncio
 
@@ -51,10 +61,14 @@ async def _run(installation: "Installation", every: float) -> None:
     from heliotrope.cluster.serial_bus import SerialBus
     from heliotrope.links.clock import SystemClock
     from heliotrope.links.link import running
+    from heliotrope.links.papers import Papers
 
     clock = SystemClock()
     bus = SerialBus(installation.bus_url, clock, installation.bus)
-    link, time = _link(installation, clock), time_of(installation, clock)
+    papers = Papers(clock)
+    link, time = _link(installation, clock, papers), time_of(installation, clock)
+    if installation.key_file is not None:
+        papers.renew("key file", [installation.key_file], installation.take_keys)
     cluster = Cluster(
         installation.config,
         bus,
@@ -68,7 +82,12 @@ async def _run(installation: "Installation", every: float) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, ending.set)
-    async with running(bus, link, time), running(cluster):
+
+    def tell(alarm: "Alarm") -> None:
+        print(f"{installation.config.name}: {alarm.text}", flush=True)
+        cluster.take_alarm(alarm)
+
+    async with running(bus, link, time), running(cluster), papers.watched(tell):
         await _log(cluster, ending, every)
     print(f"{installation.config.name}: ended, DEFOCUS sent", flush=True)
 
@@ -84,23 +103,22 @@ async def _log(cluster: "Cluster", ending: "asyncio.Event", every: float) -> Non
             print(cluster.line(), flush=True)
 
 
-def _link(installation: "Installation", clock: "Clock") -> "Link":
-    name, key = installation.config.name, installation.plant_key
-    if installation.scheme == "tcp":
-        from heliotrope.links.tcp import client_tls, tcp_link
+def _link(installation: "Installation", clock: "Clock", papers: "Papers") -> "Link":
+    from heliotrope.links.papers import authority_of
 
-        authority = installation.plant.authority
-        tls = None if authority is None else client_tls(authority)
-        return tcp_link(installation.host, installation.port, name, key, clock, tls=tls)
-    from heliotrope.links.mqtt import Broker, mqtt_link
-    from heliotrope.links.tcp import client_tls
-
+    name, keys = installation.config.name, installation.plant_keys
     authority = installation.plant.authority
-    tls = None
-    if installation.scheme == "mqtts":
+    tls: TlsSource = None if authority is None else authority_of(papers, Path(authority))
+    if installation.scheme == "tcp":
+        from heliotrope.links.tcp import tcp_link
+
+        return tcp_link(installation.host, installation.port, name, keys, clock, tls=tls)
+    from heliotrope.links.mqtt import Broker, mqtt_link
+
+    if installation.scheme == "mqtts" and tls is None:
         import ssl
 
-        tls = ssl.create_default_context() if authority is None else client_tls(authority)
+        tls = ssl.create_default_context()
     broker = Broker(
         installation.host,
         installation.port,
@@ -108,4 +126,4 @@ def _link(installation: "Installation", clock: "Clock") -> "Link":
         installation.password or None,
         tls,
     )
-    return mqtt_link(broker, installation.prefix, name, key, clock, plant=False)
+    return mqtt_link(broker, installation.prefix, name, keys, clock, plant=False)

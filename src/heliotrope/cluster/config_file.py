@@ -1,6 +1,6 @@
 """The cluster file (TOML), from which a cluster controller starts; its keys are in another file."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 from urllib.parse import urlsplit
@@ -12,7 +12,8 @@ from heliotrope.cluster.gpsd import PORT
 from heliotrope.cluster.serial_bus import BusSettings
 from heliotrope.errors import FormatError, InputError
 from heliotrope.files.documents import read_document, read_toml
-from heliotrope.links.addresses import Keys, Table, check_encryption, url_parts
+from heliotrope.links.addresses import Table, check_encryption, url_parts
+from heliotrope.links.keys import HELIOSTATS, KeyRing, Keys
 from heliotrope.sun import Site
 
 _CHRONY = "chronyd now keeps the computer's clock"
@@ -170,8 +171,10 @@ class Installation:
         ``[plant]``.
     scheme, host, port, prefix
         Of the plant's URL; ``prefix`` of MQTT topics.
-    plant_key, password
-        Of the link; of the MQTT broker.
+    key_file
+        File of the keys; None: there is none.
+    plant_keys, password
+        Of the link, replaced by `take_keys`; of the MQTT broker.
     error
         Bound of the clock's error that the operator vouches for, s; None: the kernel's is used.
     gpsd
@@ -190,12 +193,26 @@ class Installation:
     host: str
     port: int
     prefix: str
-    plant_key: bytes
-    password: str
+    key_file: Path | None
+    plant_keys: KeyRing = field(repr=False)
+    password: str = field(repr=False)
     error: float | None
     gpsd: tuple[str, int] | None
     state: Path
     emergency_line: Path | None
+
+    def take_keys(self) -> None:
+        """Read the key file again, and give the link its keys; those of heliostats stay.
+
+        Raises
+        ------
+        FormatError
+            If it cannot be used, or has no key of the plant any more.
+        """
+        found = Keys(self.key_file, HELIOSTATS)
+        if not found.plant:
+            raise FormatError(self.key_file, "its key is gone; the link needs it", "plant")
+        self.plant_keys.keys = found.plant
 
 
 def read_cluster(path: str | Path) -> Installation:
@@ -209,9 +226,10 @@ def read_cluster(path: str | Path) -> Installation:
     path = Path(path)
     _refuse_old(path)
     document = read_document(path, "cluster", ClusterDocument, TABLES)
-    secrets = Keys(path.parent / document.keys if document.keys else None, "heliostats")
+    key_file = path.parent / document.keys if document.keys else None
+    secrets = Keys(key_file, HELIOSTATS)
     try:
-        return _install(path, document, secrets)
+        return _install(path, document, key_file, secrets)
     except FormatError:
         raise
     except InputError as error:
@@ -226,7 +244,9 @@ def _refuse_old(path: Path) -> None:
             raise FormatError(path, _OLD_TIME[key], f"time.{key}")
 
 
-def _install(path: Path, document: ClusterDocument, secrets: Keys) -> Installation:
+def _install(
+    path: Path, document: ClusterDocument, key_file: Path | None, secrets: Keys
+) -> Installation:
     site, bus, polling = document.site, document.bus, document.polling
     names = [each.name for each in document.heliostats]
     secrets.check(names)
@@ -242,7 +262,7 @@ def _install(path: Path, document: ClusterDocument, secrets: Keys) -> Installati
             site.delta_t_s,
         ),
         heliostats=tuple(
-            Member(each.name, each.address, each.serial, secrets.members.get(each.name, b""))
+            Member(each.name, each.address, each.serial, *secrets.members.get(each.name, ()))
             for each in document.heliostats
         ),
         answer=bus.answer_s,
@@ -265,7 +285,8 @@ def _install(path: Path, document: ClusterDocument, secrets: Keys) -> Installati
         host=host,
         port=port,
         prefix=prefix,
-        plant_key=secrets.plant,
+        key_file=key_file,
+        plant_keys=KeyRing(*secrets.plant),
         password=secrets.password,
         error=document.time.error_s,
         gpsd=_gpsd_at(path, document.time.gpsd),

@@ -42,6 +42,7 @@ from heliotrope.cluster.timekeeping import Time, TimeKeeper
 from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Bus, Link, LinkClosedError, LinkError
+from heliotrope.safety import Alarm
 from heliotrope.sun import broadcast_values
 
 #: Polling ends this long after the beginning of the second, s.
@@ -90,7 +91,7 @@ class Cluster:
         kept = kept or Kept(None)
         self.nodes = Nodes(config)
         now, present = clock.monotonic(), time.time()
-        reports = Reports()
+        reports = self._reports = Reports()
         goals = Goals(reports)
         self._exchange = Exchange(bus, clock, config.answer, config.stored_answer)
         self._watch = Watch(config.name, config.longest_autonomy, reports, now, line)
@@ -223,6 +224,10 @@ class Cluster:
             # When this second should have begun by the time, within half a second.
             ahead = (present.gps_s - self.config.phase + 0.5) % 1.0 - 0.5
         return begin + 1.0 - max(-_STEER, min(_STEER, ahead))
+
+    def take_alarm(self, alarm: Alarm) -> None:
+        """Report an alarm of the program around the cluster, raised or over."""
+        (self._reports.alarm if alarm.active else self._reports.clear)(alarm)
 
     def line(self) -> str:
         """Return the state in one line, for a log."""

@@ -15,7 +15,7 @@ Begin with `Link` and `memory_pair`.
 """
 
 from heliotrope.lcu import packet12
-from heliotrope.links.addresses import Keys, url_parts
+from heliotrope.links.addresses import url_parts
 from heliotrope.links.clock import (
     Clock,
     SystemClock,
@@ -32,6 +32,7 @@ from heliotrope.links.clock import (
 from heliotrope.links.connection import CarriedLink, Carrier
 from heliotrope.links.envelope import Conversation
 from heliotrope.links.in_process import Faults, MemoryLine, memory_pair
+from heliotrope.links.keys import KeyRing, Keys
 from heliotrope.links.link import (
     Backoff,
     Bus,
@@ -65,7 +66,8 @@ from heliotrope.links.messages import (
     encode,
 )
 from heliotrope.links.tapped import LinkListener, TappedLink
-from heliotrope.links.tcp import TcpServer, client_tls, server_tls, tcp_link
+from heliotrope.links.tcp import TcpServer, tcp_link
+from heliotrope.links.tls import RenewedTls, client_tls, server_tls
 
 __all__ = [
     "Acknowledge",
@@ -83,6 +85,7 @@ __all__ = [
     "Faults",
     "Heartbeat",
     "Inbox",
+    "KeyRing",
     "Keys",
     "Lease",
     "Link",
@@ -96,6 +99,7 @@ __all__ = [
     "Parameters",
     "Progress",
     "ProtocolError",
+    "RenewedTls",
     "SendOutcome",
     "Stage",
     "Statistics",

@@ -1,11 +1,8 @@
-"""Strict tables, URLs of links and key files, shared by the files of plants and clusters.
+"""Strict tables and URLs of links, shared by the files of plants and clusters.
 
-Addresses and limits may be shared and kept under version control; keys may not. Keys stand in a
-separate file that only its owner may read.
+Addresses and limits may be shared and kept under version control; keys may not: see `links.keys`.
 """
 
-import string
-from difflib import get_close_matches
 from ipaddress import ip_address
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -13,14 +10,7 @@ from urllib.parse import urlsplit
 from pydantic import BaseModel, ConfigDict
 
 from heliotrope.errors import FormatError
-from heliotrope.files.documents import read_toml
 
-_SHORTEST_KEY, _LONGEST_KEY = 16, 64
-_OTHERS = 0o077
-_MISSING = {
-    "heliostats": "the cluster has no such heliostat",
-    "clusters": "the plant has no such cluster",
-}
 _PORTS = {"tcp": None, "mqtt": 1883, "mqtts": 8883}
 
 
@@ -90,73 +80,3 @@ def check_encryption(path: Path, host: str, where: str, accepted: bool) -> None:
             "unencrypted = true if nobody else can reach the network between them",
             where,
         )
-
-
-class Keys:
-    """A key file: ``plant``, ``password`` and a table of keys; keys are hexadecimal.
-
-    Parameters
-    ----------
-    path
-        None: there is no file, and there are no keys.
-    table
-        Name of the table: "heliostats" in a cluster's file, "clusters" in a plant's.
-
-    Attributes
-    ----------
-    plant, password
-        b"" and "" where absent.
-    members
-        Keys of the table, by name.
-
-    Raises
-    ------
-    FormatError
-        If others may read the file, or a value is not a key.
-    """
-
-    def __init__(self, path: Path | None, table: str) -> None:
-        self._path, self._table = path, table
-        self.plant, self.password = b"", ""
-        self.members: dict[str, bytes] = {}
-        if path is None:
-            return
-        # An empty file has no keys; members without a key are refused later.
-        empty = path.is_file() and path.stat().st_size == 0
-        raw = {} if empty else read_toml(path, "a key file")
-        if path.stat().st_mode & _OTHERS:
-            mode = path.stat().st_mode & 0o777
-            raise FormatError(path, f"others may read it (mode {mode:o}); run chmod 600 on it")
-        for key in raw:
-            if key not in ("plant", "password", table):
-                raise FormatError(path, f"{key!r} is not known; give plant, password, {table}")
-        if "plant" in raw:
-            self.plant = self._key("plant", raw["plant"])
-        password, keys = raw.get("password", ""), raw.get(table, {})
-        if not isinstance(password, str) or not isinstance(keys, dict):
-            raise FormatError(path, f"password must be a text, and {table} a table of keys")
-        self.password = password
-        self.members = {name: self._key(name, value) for name, value in keys.items()}
-
-    def _key(self, name: str, value: object) -> bytes:
-        text = value if isinstance(value, str) else ""
-        good = set(text) <= set(string.hexdigits) and len(text) % 2 == 0
-        if not (good and _SHORTEST_KEY <= len(text) // 2 <= _LONGEST_KEY):
-            # The value is not shown: it would end up in a log.
-            raise FormatError(
-                self._path,
-                f"a key of {len(text)} characters; give {_SHORTEST_KEY} to "
-                f"{_LONGEST_KEY} bytes in hexadecimal, as of: openssl rand -hex 32",
-                name,
-            )
-        return bytes.fromhex(text)
-
-    def check(self, names: list[str]) -> None:
-        """Refuse keys of members that do not exist."""
-        for name in self.members:
-            if name not in names:
-                close = get_close_matches(name, names, n=1)
-                hint = f"; did you mean {close[0]!r}?" if close else "; remove it"
-                raise FormatError(
-                    self._path, f"{_MISSING[self._table]}{hint}", f"{self._table}.{name}"
-                )

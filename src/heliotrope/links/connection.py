@@ -10,7 +10,7 @@ from typing import Protocol
 
 from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock, sleep_until
-from heliotrope.links.envelope import Conversation
+from heliotrope.links.envelope import Conversation, SealKeys
 from heliotrope.links.link import (
     Backoff,
     Heartbeat,
@@ -31,8 +31,8 @@ class Carrier(Protocol):
     It raises only `LinkLostError` and OSError (and LinkError while it opens).
     """
 
-    async def open(self) -> bytes:
-        """Connect, and return the key of this connection; cancelled if it takes too long."""
+    async def open(self) -> SealKeys:
+        """Connect, and return the keys of this connection; cancelled if it takes too long."""
         ...
 
     async def ready(self) -> None:
@@ -118,6 +118,11 @@ class CarriedLink:
         # The other end reports what it has heard with its own heartbeat, up to a period later.
         heard = max(opened, self._talk.heard_at) + self._settings.period
         return min(max(opened, self._talk.alive_at), heard) + self._settings.deadline
+
+    @property
+    def behind(self) -> bool:
+        """Whether it is connected, but the other end has not yet shown that it has the new key."""
+        return self.connected and self._talk.behind
 
     @property
     def closed(self) -> bool:
@@ -260,23 +265,23 @@ class CarriedLink:
         while True:
             try:
                 async with asyncio.timeout(None if self._patient else self._settings.open_limit):
-                    key = await self._carrier.open()
+                    keys = await self._carrier.open()
             except TimeoutError:
                 self._failed(f"no connection within {self._settings.open_limit:g} s")
             except (LinkError, OSError) as error:
                 self._failed(str(error) or type(error).__name__)
             else:
-                await self._converse(key)
+                await self._converse(keys)
             await asyncio.sleep(0.0 if self._patient else self._backoff.next())
 
     def _failed(self, problem: str) -> None:
         self._statistics.failures += 1
         self._problem = problem
 
-    async def _converse(self, key: bytes) -> None:
+    async def _converse(self, keys: SealKeys) -> None:
         self._statistics.opened += 1
         self._statistics.reconnects = self._statistics.opened - 1
-        self._talk.restart(key)
+        self._talk.restart(keys)
         lost = asyncio.Event()
         parts = (self._read(), self._heart.run(self._beat), self._watch(self._clock.monotonic()))
         self._open = True

@@ -32,6 +32,12 @@ _LONGEST = 0xFFFFFFFF
 OVERHEAD = _HEADER.size + _MAC_SIZE
 #: Two clocks are assumed to agree in rate within this: twice the largest slew of NTP.
 _DRIFT = 1e-3
+#: Returns the keys of a connection now, the newest first; never empty.
+SealKeys = Callable[[], tuple[bytes, ...]]
+
+
+def _mac(key: bytes, data: bytes) -> bytes:
+    return hmac.digest(key, data, "sha256")[:_MAC_SIZE]
 
 
 @dataclass(slots=True)
@@ -69,7 +75,8 @@ class Conversation:
 
     Notes
     -----
-    The MAC is HMAC-SHA256 truncated to 16 bytes. Without a key it still detects damage.
+    The MAC is HMAC-SHA256 truncated to 16 bytes. With an empty key it still detects damage.
+    While a new key takes over from an old one, envelopes under either are accepted.
     Each connection has a new session, so that nothing from an older one is accepted.
     """
 
@@ -84,11 +91,12 @@ class Conversation:
         self._settings = settings
         self._statistics = statistics
         self._entropy = entropy
-        self.restart(b"")
+        self.restart(lambda: (b"",))
 
-    def restart(self, key: bytes) -> None:
-        """Begin a new session under a key; nothing of the old session is accepted any more."""
-        self._key = key
+    def restart(self, keys: SealKeys) -> None:
+        """Begin a new session under some keys; nothing of the old session is accepted any more."""
+        self._keys = keys
+        self._proved: bytes | None = None
         self._session = int.from_bytes(self._entropy(8), "little") or 1
         self._count = 0
         self._peer: _Peer | None = None
@@ -96,12 +104,30 @@ class Conversation:
         self.alive_at = -math.inf
         self.heard_at = -math.inf
 
+    @property
+    def behind(self) -> bool:
+        """Whether the other end has not yet shown that it has the newest key."""
+        keys = self._keys()
+        return len(keys) > 1 and self._proved != keys[0]
+
+    def _sealing(self) -> tuple[bytes, ...]:
+        """Return the keys for heartbeats: the newest that both ends have, and newer ones.
+
+        The last is the one for messages. Both stand in each other's list while a new key takes
+        over, so a newer one is offered with every heartbeat until the other end uses it.
+        """
+        keys = self._keys()
+        return keys[: keys.index(self._proved) + 1] if self._proved in keys else keys
+
     def beats(self) -> list[bytes]:
-        """Return the heartbeats to send: one, or two while a new session asks to be heard."""
+        """Return the heartbeats to send: one, or two while a new session asks to be heard.
+
+        While the other end may not have a newer key, they are sent under both.
+        """
         known = [peer for peer in (self._peer, self._candidate) if peer is not None]
         self._candidate = None
         ends: list[_Peer | None] = [*known] or [None]
-        return [self._seal(_BEAT, peer, 0, b"") for peer in ends]
+        return [self._seal(_BEAT, peer, 0, b"", key) for key in self._sealing() for peer in ends]
 
     def data(self, message: bytes, expires: float | None) -> bytes:
         """Return the envelope of a message that is sent now.
@@ -116,9 +142,11 @@ class Conversation:
             lifetime = math.floor((expires - self._clock.monotonic()) * 1e6)
             if lifetime <= 0:
                 raise TimeoutError
-        return self._seal(_DATA, self._peer, lifetime, message)
+        return self._seal(_DATA, self._peer, lifetime, message, self._sealing()[-1])
 
-    def _seal(self, kind: int, peer: _Peer | None, lifetime: int, message: bytes) -> bytes:
+    def _seal(
+        self, kind: int, peer: _Peer | None, lifetime: int, message: bytes, key: bytes
+    ) -> bytes:
         now = self._clock.monotonic()
         self._count += 1
         session, echo, held = 0, 0, 0
@@ -128,8 +156,17 @@ class Conversation:
         header = _HEADER.pack(
             kind, self._session, session, self._count, math.floor(now * 1e6), echo, held, lifetime
         )
-        mac = hmac.digest(self._key, header + message, "sha256")[:_MAC_SIZE]
-        return header + message + mac
+        return header + message + _mac(key, header + message)
+
+    def _opens(self, body: bytes, mac: bytes) -> bool:
+        """Whether an envelope is sealed with one of the keys; note the newest that was used."""
+        keys = self._keys()
+        for key in keys:
+            if hmac.compare_digest(mac, _mac(key, body)):
+                if self._proved not in keys or keys.index(key) < keys.index(self._proved):
+                    self._proved = key
+                return True
+        return False
 
     def feed(self, envelope: bytes) -> tuple[tuple[bytes, float] | None, bool]:
         """Take an envelope as it arrived.
@@ -145,9 +182,7 @@ class Conversation:
         now = self._clock.monotonic()
         self._statistics.last_received = now
         body, mac = envelope[:-_MAC_SIZE], envelope[-_MAC_SIZE:]
-        if len(body) < _HEADER.size or not hmac.compare_digest(
-            mac, hmac.digest(self._key, body, "sha256")[:_MAC_SIZE]
-        ):
+        if len(body) < _HEADER.size or not self._opens(body, mac):
             self._statistics.refused += 1
             return None, False
         kind, session, heard, count, stamp, echo, held, lifetime = _HEADER.unpack_from(body)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
 from heliotrope.links.connection import CarriedLink
+from heliotrope.links.envelope import SealKeys
 from heliotrope.links.link import LinkError, LinkLostError, LinkSettings
 
 
@@ -182,14 +183,14 @@ class _MemoryCarrier:
         self._out, self._in = line.lanes[end], line.lanes[1 - end]
         self._generation = -1
 
-    async def open(self) -> bytes:
+    async def open(self) -> SealKeys:
         """Connect, unless the line refuses."""
         if not self._line.reachable:
             raise LinkError("the line is not reachable")
         self._generation = self._line.generation
         self._line.holders[self._end] = self
         self._in.news.set()  # whoever had it notices
-        return b""
+        return lambda: (b"",)
 
     def _check(self) -> None:
         if self._generation != self._line.generation:

@@ -24,7 +24,6 @@ import asyncio
 import contextlib
 import math
 import socket
-import ssl
 from dataclasses import dataclass
 
 import aiomqtt
@@ -36,8 +35,10 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
 from heliotrope.links.connection import CarriedLink
+from heliotrope.links.envelope import SealKeys
+from heliotrope.links.keys import KeyRing, ring_of
 from heliotrope.links.link import LinkError, LinkLostError, LinkSettings, Statistics
-from heliotrope.links.tcp import check_key
+from heliotrope.links.tls import TlsSource, context_of
 
 #: Consecutive messages that the broker may leave unconfirmed before the connection is given up.
 #: Below 20, the number from which paho would keep messages back and send them later.
@@ -63,7 +64,7 @@ class Broker:
     username, password
         None: the broker asks for none.
     tls
-        None: unencrypted; `heliotrope.links.tcp.client_tls` makes one from files.
+        None: unencrypted; `heliotrope.links.tls.client_tls` makes one from files.
     keepalive_s
         MQTT's own, in whole seconds. Nothing rests on it; it lets the broker clean up.
     """
@@ -72,7 +73,7 @@ class Broker:
     port: int = 1883
     username: str | None = None
     password: str | None = None
-    tls: ssl.SSLContext | None = None
+    tls: TlsSource = None
     keepalive_s: int = 60
 
 
@@ -111,7 +112,7 @@ class _MqttCarrier:
         self,
         broker: Broker,
         ends: _Ends,
-        key: bytes,
+        ring: KeyRing,
         statistics: Statistics,
         limit: float,
         *,
@@ -119,7 +120,7 @@ class _MqttCarrier:
     ) -> None:
         self._broker = broker
         self._ends = ends
-        self._key = key
+        self._ring = ring
         self._statistics = statistics
         self._limit = limit
         self._reports = reports
@@ -141,7 +142,7 @@ class _MqttCarrier:
             timeout=_NO_LIMIT,
             keepalive=broker.keepalive_s,
             max_queued_incoming_messages=_WAITING,
-            tls_context=broker.tls,
+            tls_context=context_of(broker.tls),
             socket_options=[(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)],
         )
         inner = client._client  # noqa: SLF001 (aiomqtt offers no other way)
@@ -149,7 +150,7 @@ class _MqttCarrier:
         _write_while_open(inner)
         return client
 
-    async def open(self) -> bytes:
+    async def open(self) -> SealKeys:
         """Connect and subscribe."""
         client = self._make()
         try:
@@ -171,7 +172,7 @@ class _MqttCarrier:
             raise
         self._client = client
         self._unconfirmed = 0
-        return self._key
+        return lambda: self._ring.keys
 
     def _connected(self) -> aiomqtt.Client:
         if self._client is None:
@@ -278,7 +279,7 @@ def mqtt_link(
     broker: Broker,
     prefix: str,
     cluster: str,
-    key: bytes,
+    key: bytes | KeyRing,
     clock: Clock,
     settings: LinkSettings | None = None,
     *,
@@ -296,7 +297,7 @@ def mqtt_link(
         Name of the cluster, one level of a topic.
     key
         Shared by both ends, at least 16 bytes: messages under another key are refused, whatever the
-        broker admits.
+        broker admits. The keys of a ring may change while the link runs.
     clock, settings
         As in `CarriedLink`.
     plant
@@ -307,11 +308,11 @@ def mqtt_link(
     InputError
         Names that cannot form a topic, or a key that is too short.
     """
-    check_key(cluster, key)
+    ring = ring_of(cluster, key)
     settings = settings or LinkSettings()
     statistics = Statistics()
     ends = _ends(prefix, cluster, plant=plant)
-    carrier = _MqttCarrier(broker, ends, key, statistics, settings.open_limit, reports=not plant)
+    carrier = _MqttCarrier(broker, ends, ring, statistics, settings.open_limit, reports=not plant)
     name = f"cluster {cluster}" if plant else "plant"
     where = f"{name} via {broker.host}:{broker.port}"
     return CarriedLink(where, carrier, clock, settings, statistics)

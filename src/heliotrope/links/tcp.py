@@ -24,19 +24,18 @@ import ssl
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
-from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
 from heliotrope.links.connection import CarriedLink
-from heliotrope.links.envelope import OVERHEAD
+from heliotrope.links.envelope import OVERHEAD, SealKeys
+from heliotrope.links.keys import KeyRing, ring_of
 from heliotrope.links.link import LinkError, LinkLostError, LinkSettings
+from heliotrope.links.tls import TlsSource, context_of
 
 _NONCE, _PROOF = 32, 32
 _LONGEST_NAME = 64
 #: Longest frame accepted from a client that has not yet proved its identity.
 _GREETING = _NONCE + _PROOF + _LONGEST_NAME
-_SHORTEST_KEY = 16
 _LENGTH = 4
 #: Frames that may wait in a connection before it stops reading its socket.
 _WAITING = 64
@@ -174,24 +173,21 @@ def _proof(key: bytes, label: bytes, server: bytes, client: bytes, name: bytes) 
     return hmac.digest(key, b"heliotrope link 1 " + label + server + client + name, "sha256")
 
 
-def check_key(name: str, key: bytes) -> None:
-    """Refuse a key or a name that cannot be used.
+def _derived(ring: KeyRing, server: bytes, client: bytes, name: bytes) -> SealKeys:
+    """Return the connection's keys: one for each of the ring, whenever it changes."""
+    made: dict[bytes, bytes] = {}
 
-    Raises
-    ------
-    InputError
-        A key of less than 16 bytes, or a name that is empty or longer than 64 bytes.
-    """
-    if len(key) < _SHORTEST_KEY:
-        raise InputError(
-            f"cluster {name}: a key of {len(key)} bytes; give at least {_SHORTEST_KEY} random ones"
-        )
-    if not 0 < len(name.encode()) <= _LONGEST_NAME:
-        raise InputError(f"cluster {name!r}: a name has 1 to {_LONGEST_NAME} bytes")
+    def keys() -> tuple[bytes, ...]:
+        for key in ring.keys:
+            if key not in made:
+                made[key] = _proof(key, b"session", server, client, name)
+        return tuple(made[key] for key in ring.keys)
+
+    return keys
 
 
-async def _introduce(pipe: _Pipe, name: str, key: bytes) -> bytes:
-    """Authenticate both ends, and return the key of the connection: the client's side."""
+async def _introduce(pipe: _Pipe, name: str, key: bytes, ring: KeyRing) -> SealKeys:
+    """Authenticate both ends, and return the connection's keys: the client's side."""
     server, client, title = await pipe.read(), secrets.token_bytes(_NONCE), name.encode()
     if len(server) != _NONCE:
         raise LinkError("the program that answers there does not speak this protocol")
@@ -204,26 +200,27 @@ async def _introduce(pipe: _Pipe, name: str, key: bytes) -> bytes:
         ) from None
     if not hmac.compare_digest(answer, _proof(key, b"server", server, client, title)):
         raise LinkError(f"the server does not know the key of cluster {name}; it is not ours")
-    return _proof(key, b"session", server, client, title)
+    return _derived(ring, server, client, title)
 
 
-async def _greet(pipe: _Pipe, keys: Mapping[str, bytes], largest: int) -> tuple[str, bytes]:
-    """Authenticate the client, and return its name and the connection's key: the server's side."""
+async def _greet(pipe: _Pipe, rings: Mapping[str, KeyRing], largest: int) -> tuple[str, SealKeys]:
+    """Authenticate the client; return its name and the connection's keys: the server's side."""
     server = secrets.token_bytes(_NONCE)
     pipe.write(server)
     frame = await pipe.read()
     client, proof, title = frame[:_NONCE], frame[_NONCE : _NONCE + _PROOF], frame[_NONCE + _PROOF :]
     name = title.decode(errors="replace")
+    ring = rings.get(name, KeyRing())
     # An unknown name takes the same computation as a known one, so that timing reveals nothing.
-    key = keys.get(name, b"")
-    right = hmac.compare_digest(
-        proof, _proof(key or bytes(_SHORTEST_KEY), b"client", server, client, title)
-    )
-    if not (key and right):
+    for key in ring.keys or (bytes(_NONCE),):
+        right = hmac.compare_digest(proof, _proof(key, b"client", server, client, title))
+        if right and ring.keys:
+            break
+    else:
         raise LinkError(f"{name!r} could not prove that it is a cluster of this plant")
     pipe.largest = largest
     pipe.write(_proof(key, b"server", server, client, title))
-    return name, _proof(key, b"session", server, client, title)
+    return name, _derived(ring, server, client, title)
 
 
 # -- both sides ------------------------------------------------------------------------
@@ -232,14 +229,14 @@ async def _greet(pipe: _Pipe, keys: Mapping[str, bytes], largest: int) -> tuple[
 class _TcpCarrier:
     """A carrier over pipes that are connected elsewhere."""
 
-    def __init__(self, connect: Callable[[], Awaitable[tuple[_Pipe, bytes]]]) -> None:
+    def __init__(self, connect: Callable[[], Awaitable[tuple[_Pipe, SealKeys]]]) -> None:
         self._connect = connect
         self._pipe: _Pipe | None = None
 
-    async def open(self) -> bytes:
-        """Return a pipe whose other end is authenticated, and its key."""
-        self._pipe, key = await self._connect()
-        return key
+    async def open(self) -> SealKeys:
+        """Connect a pipe whose other end is authenticated; return its keys."""
+        self._pipe, keys = await self._connect()
+        return keys
 
     def _connected(self) -> _Pipe:
         if self._pipe is None:
@@ -266,27 +263,34 @@ class _TcpCarrier:
             await pipe.close()
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Client:
     """A carrier that connects to the server."""
 
     host: str
     port: int
     name: str
-    key: bytes
+    ring: KeyRing
     largest: int
-    tls: ssl.SSLContext | None
+    tls: TlsSource
+    _turn: int = 0
 
-    async def connect(self) -> tuple[_Pipe, bytes]:
+    async def connect(self) -> tuple[_Pipe, SealKeys]:
         pipe = _Pipe(self.largest)
+        keys = self.ring.keys
+        key = keys[self._turn % len(keys)]
         try:
             await asyncio.get_running_loop().create_connection(
-                lambda: pipe, self.host, self.port, ssl=self.tls
+                lambda: pipe, self.host, self.port, ssl=context_of(self.tls)
             )
-            return pipe, await _introduce(pipe, self.name, self.key)
-        except BaseException:
+            found = await _introduce(pipe, self.name, key, self.ring)
+        except BaseException as error:
+            # The server may not have the new key yet: the next attempt is with the old one.
+            self._turn = self._turn + 1 if isinstance(error, LinkError) else 0
             await pipe.close()
             raise
+        self._turn = 0
+        return pipe, found
 
 
 class _Newcomers:
@@ -324,19 +328,19 @@ class _Slot:
     """The place where a cluster's connection waits for its link; a new one ends the previous."""
 
     def __init__(self) -> None:
-        self._offer: tuple[_Pipe, bytes] | None = None
+        self._offer: tuple[_Pipe, SealKeys] | None = None
         self._last: _Pipe | None = None
         self._offered = asyncio.Event()
 
-    def offer(self, pipe: _Pipe, key: bytes) -> None:
+    def offer(self, pipe: _Pipe, keys: SealKeys) -> None:
         """Take over an authenticated connection of this cluster."""
         if self._last is not None:
             self._last.lose("the cluster connected again")
         self._last = pipe
-        self._offer = (pipe, key)
+        self._offer = (pipe, keys)
         self._offered.set()
 
-    async def take(self) -> tuple[_Pipe, bytes]:
+    async def take(self) -> tuple[_Pipe, SealKeys]:
         """Wait for the cluster."""
         while self._offer is None:
             self._offered.clear()
@@ -355,11 +359,11 @@ def tcp_link(
     host: str,
     port: int,
     name: str,
-    key: bytes,
+    key: bytes | KeyRing,
     clock: Clock,
     settings: LinkSettings | None = None,
     *,
-    tls: ssl.SSLContext | None = None,
+    tls: TlsSource = None,
 ) -> CarriedLink:
     """Return a cluster's link to its plant.
 
@@ -368,7 +372,7 @@ def tcp_link(
     host, port
         Address of the plant's server.
     name, key
-        Name and key of this cluster, as the plant knows them.
+        Name and key of this cluster, as the plant knows them; the keys of a ring may change.
     clock, settings
         As in `CarriedLink`.
     tls
@@ -379,9 +383,9 @@ def tcp_link(
     InputError
         A name or key that cannot be used.
     """
-    check_key(name, key)
+    ring = ring_of(name, key)
     settings = settings or LinkSettings()
-    client = _Client(host, port, name, key, settings.largest + OVERHEAD, tls)
+    client = _Client(host, port, name, ring, settings.largest + OVERHEAD, tls)
     return CarriedLink(f"plant at {host}:{port}", _TcpCarrier(client.connect), clock, settings)
 
 
@@ -393,7 +397,7 @@ class TcpServer:
     host, port
         Where to listen; port 0: any free port, shown by ``port``.
     keys
-        Name and key of each cluster; at least 16 bytes each.
+        Name and key of each cluster, at least 16 bytes each; the keys of a ring may change.
     clock, settings
         As in `CarriedLink`; `LinkSettings.open_limit` is the time limit of the handshake.
     tls
@@ -420,16 +424,14 @@ class TcpServer:
         self,
         host: str,
         port: int,
-        keys: Mapping[str, bytes],
+        keys: Mapping[str, bytes | KeyRing],
         clock: Clock,
         settings: LinkSettings | None = None,
         *,
-        tls: ssl.SSLContext | None = None,
+        tls: TlsSource = None,
     ) -> None:
-        for name, key in keys.items():
-            check_key(name, key)
         self._host, self._wanted = host, port
-        self._keys = dict(keys)
+        self._rings = {name: ring_of(name, key) for name, key in keys.items()}
         self._settings = settings or LinkSettings()
         self._tls = tls
         self._slots = {name: _Slot() for name in keys}
@@ -505,9 +507,9 @@ class TcpServer:
         try:
             limit = self._settings.open_limit
             async with asyncio.timeout(limit):
-                await pipe.begin(self._tls, limit)
-                name, key = await _greet(pipe, self._keys, self._settings.largest + OVERHEAD)
-            self._slots[name].offer(pipe, key)
+                await pipe.begin(context_of(self._tls), limit)
+                name, keys = await _greet(pipe, self._rings, self._settings.largest + OVERHEAD)
+            self._slots[name].offer(pipe, keys)
             admitted = True
         except (LinkError, OSError) as error:
             self.refused += 1
@@ -517,81 +519,3 @@ class TcpServer:
             if not admitted:
                 with contextlib.suppress(OSError):
                     await pipe.close()
-
-
-# -- TLS -------------------------------------------------------------------------------
-
-
-def _load(context: ssl.SSLContext, certificate: str | Path, key: str | Path) -> None:
-    try:
-        context.load_cert_chain(certificate, key)
-    except (OSError, ssl.SSLError) as error:
-        raise InputError(
-            f"TLS: certificate {certificate} and key {key} cannot be used ({error}); give two PEM "
-            "files that belong together"
-        ) from None
-
-
-def _trust(context: ssl.SSLContext, authority: str | Path) -> None:
-    try:
-        context.load_verify_locations(authority)
-    except (OSError, ssl.SSLError) as error:
-        raise InputError(
-            f"TLS: authority {authority} cannot be used ({error}); give a PEM file"
-        ) from None
-
-
-def server_tls(
-    certificate: str | Path, key: str | Path, authority: str | Path | None = None
-) -> ssl.SSLContext:
-    """Return the server's TLS context from PEM files.
-
-    Parameters
-    ----------
-    certificate, key
-        The server's own.
-    authority
-        Authority that signed the clusters' certificates; None: clusters need no certificate, as
-        they have keys.
-
-    Raises
-    ------
-    InputError
-        Files that cannot be used.
-    """
-    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-    context.minimum_version = ssl.TLSVersion.TLSv1_2
-    _load(context, certificate, key)
-    if authority is not None:
-        _trust(context, authority)
-        context.verify_mode = ssl.CERT_REQUIRED
-    return context
-
-
-def client_tls(
-    authority: str | Path,
-    certificate: str | Path | None = None,
-    key: str | Path | None = None,
-) -> ssl.SSLContext:
-    """Return a cluster's TLS context from PEM files.
-
-    Parameters
-    ----------
-    authority
-        Authority that signed the server's certificate; no other is trusted.
-    certificate, key
-        The cluster's own, both or neither.
-
-    Raises
-    ------
-    InputError
-        Files that cannot be used.
-    """
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.minimum_version = ssl.TLSVersion.TLSv1_2
-    _trust(context, authority)
-    if (certificate is None) != (key is None):
-        raise InputError("TLS: a certificate needs its key, and a key its certificate; give both")
-    if certificate is not None and key is not None:
-        _load(context, certificate, key)
-    return context

@@ -17,11 +17,15 @@ from pydantic import Field
 
 from heliotrope.errors import FormatError
 from heliotrope.files.documents import read_document
-from heliotrope.links.addresses import Keys, Table, check_encryption, url_parts
+from heliotrope.links.addresses import Table, check_encryption, url_parts
 from heliotrope.links.clock import Clock
+from heliotrope.links.connection import CarriedLink
+from heliotrope.links.keys import CLUSTERS, KeyRing, Keys
 from heliotrope.links.link import Link
 from heliotrope.links.mqtt import Broker, mqtt_link
-from heliotrope.links.tcp import TcpServer, client_tls, server_tls
+from heliotrope.links.papers import Papers, authority_of
+from heliotrope.links.tcp import TcpServer
+from heliotrope.links.tls import RenewedTls, TlsSource, server_tls
 from heliotrope.plant.sensors import FED, SensorFiles
 
 
@@ -87,14 +91,14 @@ class LinksFile:
     document
         Its tables.
     keys
-        By cluster.
+        By cluster; replaced while the links run when the key file changes.
     password
         For the broker.
     """
 
     path: Path
     document: LinksDocument
-    keys: Mapping[str, bytes] = field(repr=False)
+    keys: Mapping[str, KeyRing] = field(repr=False)
     password: str = field(repr=False)
 
     def check(self, homes: Mapping[str, tuple[str, ...]]) -> None:
@@ -140,42 +144,60 @@ class LinksFile:
             Certificates that cannot be used.
         """
         self.check(homes)
-        made = PlantLinks()
+        made = PlantLinks(Papers(clock))
         folder = self.path.parent
+        if self.document.keys:
+            made.papers.renew("key file", [folder / self.document.keys], self._take_keys)
         made.sensors = SensorFiles({n: folder / f for n, f in self.document.sensors.items()})
         served = {n: self.keys[n] for n, how in self.document.clusters.items() if how == "tcp"}
         if served:
             self._serve(made, served, clock)
         for name, how in self.document.clusters.items():
             if how == "mqtt":
-                made.links[name] = self._meet(name, clock)
+                made.links[name] = self._meet(name, clock, made.papers)
                 made.parts.append(made.links[name])
             elif how != "tcp":
                 made.local[name] = folder / how
         return made
 
-    def _serve(self, made: "PlantLinks", keys: Mapping[str, bytes], clock: Clock) -> None:
+    def _take_keys(self) -> None:
+        """Read the key file again, and give the links their keys."""
+        path = self.path.parent / self.document.keys
+        found = _keys_of(path, self.document)
+        for name in self.keys:
+            if name not in found.members:
+                raise FormatError(path, "its key is gone; the links need it", f"clusters.{name}")
+        for name, ring in self.keys.items():
+            ring.keys = found.members[name]
+
+    def _serve(self, made: "PlantLinks", keys: Mapping[str, KeyRing], clock: Clock) -> None:
         table = self.document.tcp
         assert table is not None
         tls = None
         if table.certificate and table.key:
             folder = self.path.parent
+            own = folder / table.certificate, folder / table.key
             authority = folder / table.authority if table.authority else None
-            tls = server_tls(folder / table.certificate, folder / table.key, authority)
+            tls = RenewedTls(lambda: server_tls(*own, authority))
+            files = [*own] if authority is None else [*own, authority]
+            made.papers.renew("certificate of the cluster port", files, tls.renew)
+            made.papers.watch_end(own[0])
+            if authority is not None:
+                made.papers.watch_end(authority)
         host, port = _listen(self.path, table.listen)
         made.server = TcpServer(host, port, keys, clock, tls=tls)
         made.links.update(made.server.links)
         made.parts.append(made.server)
 
-    def _meet(self, name: str, clock: Clock) -> Link:
+    def _meet(self, name: str, clock: Clock, papers: Papers) -> CarriedLink:
         table = self.document.mqtt
         assert table is not None
         scheme, host, port, prefix = url_parts(self.path, table.url, "mqtt.url")
-        tls = None
+        tls: TlsSource = None
         if scheme == "mqtts":
             tls = ssl.create_default_context()
             if table.authority is not None:
-                tls = client_tls(self.path.parent / table.authority)
+                tls = authority_of(papers, self.path.parent / table.authority)
         broker = Broker(host, port, table.username, self.password or None, tls)
         return mqtt_link(broker, prefix, name, self.keys[name], clock, plant=True)
 
@@ -186,6 +208,8 @@ class PlantLinks:
 
     Attributes
     ----------
+    papers
+        Their keys and certificates, to be watched beside the plant.
     links
         Links over TCP and MQTT, by cluster.
     parts
@@ -198,6 +222,7 @@ class PlantLinks:
         Readings of the safety table from files.
     """
 
+    papers: Papers
     links: dict[str, Link] = field(default_factory=dict)
     parts: list[Any] = field(default_factory=list)
     local: dict[str, Path] = field(default_factory=dict)
@@ -205,10 +230,19 @@ class PlantLinks:
     sensors: SensorFiles = field(default_factory=lambda: SensorFiles({}))
 
     def facts(self) -> dict[str, str]:
-        """Return why the last connection was refused, by name; empty if none was."""
-        if self.server is None or not self.server.refused:
-            return {}
-        return {"refused link": f"{self.server.last_refusal} ({self.server.refused} so far)"}
+        """Return, by name, why the last connection was refused and whose new key is not used."""
+        found = {}
+        if self.server is not None and self.server.refused:
+            told = f"{self.server.last_refusal} ({self.server.refused} so far)"
+            found["refused link"] = told
+        behind = [
+            name
+            for name, link in self.links.items()
+            if isinstance(link, CarriedLink) and link.behind
+        ]
+        if behind:
+            found["old key still used"] = ", ".join(behind)
+        return found
 
 
 def read_links(path: str | Path) -> LinksFile:
@@ -221,11 +255,17 @@ def read_links(path: str | Path) -> LinksFile:
     """
     path = Path(path)
     document = read_document(path, "links", LinksDocument, TABLES)
-    keys = Keys(path.parent / document.keys if document.keys else None, "clusters")
-    keys.check(list(document.clusters))
-    found = LinksFile(path, document, keys.members, keys.password)
+    keys = _keys_of(path.parent / document.keys if document.keys else None, document)
+    rings = {name: KeyRing(*each) for name, each in keys.members.items()}
+    found = LinksFile(path, document, rings, keys.password)
     _check(found)
     return found
+
+
+def _keys_of(path: Path | None, document: LinksDocument) -> Keys:
+    keys = Keys(path, CLUSTERS)
+    keys.check(list(document.clusters))
+    return keys
 
 
 def _check(found: LinksFile) -> None:
@@ -270,8 +310,8 @@ def _check(found: LinksFile) -> None:
 def _keyless(path: Path, name: str) -> FormatError:
     return FormatError(
         path,
-        "a cluster and its plant prove themselves to each other by a key; put one into the key "
-        "file, table [clusters]",
+        "a cluster and its plant prove themselves to each other by a key; make one with "
+        "heliotrope keys new",
         f"clusters.{name}",
     )
 

@@ -189,6 +189,28 @@ ORDERS_REFUSED = AlarmKind(
     "Ask that person; revoke the token or disable the account if it is not them.",
     over="no order was refused for ten minutes",
 )
+CERTIFICATE = AlarmKind(
+    "certificate",
+    _PLANT,
+    Severity.WARNING,
+    "A certificate ends within 30 days, or its end is unknown; an alarm once it has ended. It "
+    "comes again each day.",
+    "{problem}",
+    "Standing connections go on; once it has ended, no new one with TLS is made.",
+    "Renew it, and put the new files in its place; they are taken within seconds.",
+    over="{subject}: this certificate was renewed, or a new day begins",
+    worse=Severity.ALARM,
+)
+RENEWAL = AlarmKind(
+    "renewal",
+    _PLANT,
+    Severity.WARNING,
+    "A key file or a certificate was changed while the program runs, and cannot be used.",
+    "the changed {subject} cannot be used: {problem}",
+    "The keys or certificates that were read before stay in force.",
+    "Correct the file: it is read again every two seconds. A restart with it as it is fails.",
+    over="the {subject} was read again and is in force",
+)
 RECORD_REFUSED = AlarmKind(
     "record_refused",
     _PLANT,

@@ -66,7 +66,7 @@ class Shown:
                 "run: --database must be postgresql://user@host/name; for SQLite give --data alone"
             )
         if self.certificate is not None and self.key is not None:
-            from heliotrope.links.tcp import server_tls
+            from heliotrope.links.tls import server_tls
 
             server_tls(self.certificate, self.key)
         if self.console:

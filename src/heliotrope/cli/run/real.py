@@ -23,6 +23,7 @@ from heliotrope.store.keeper import Keeper
 
 if TYPE_CHECKING:
     from heliotrope.cluster.program import LocalCluster
+    from heliotrope.links.papers import Papers
     from heliotrope.plant.links_file import PlantLinks
 
 
@@ -53,6 +54,8 @@ def run_real(design: Plant, choice: RealChoice, shown: Shown) -> None:
             design.machine(name)
     if choice.check:
         _print_check(design, _cameras(design, choice, shown, clock))
+        for text in _papers(outside, shown).lines():
+            print(text)
         return
     if shown.data is None and shown.database is None:
         raise InputError(
@@ -60,6 +63,14 @@ def run_real(design: Plant, choice: RealChoice, shown: Shown) -> None:
         )
     with one_error(), asyncio.Runner() as runner:
         runner.run(_run(design, choice, shown, outside))
+
+
+def _papers(outside: "_Outside", shown: Shown) -> "Papers":
+    """Return keys and certificates of the links, and the certificate of the console."""
+    papers = outside.links.papers
+    if shown.console and shown.certificate is not None:
+        papers.watch_end(shown.certificate)
+    return papers
 
 
 def _print_check(design: Plant, cameras: RealCameras | None) -> None:
@@ -142,4 +153,6 @@ async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outsid
         live = PlantAssembly(design, ports, settings)
         if live.plant.unwatched:
             print(f"no readings for: {', '.join(live.plant.unwatched)}", flush=True)
-        await at_work(live, keeper, shown, folder, ending)
+        papers = _papers(outside, shown)
+        async with papers.watched(live.logbook.take_alarm):
+            await at_work(live, keeper, shown, folder, ending)

@@ -1,0 +1,117 @@
+"""``heliotrope keys``: make and replace the keys of the links between plant and clusters."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from heliotrope.cli._common import print_json, print_table
+
+if TYPE_CHECKING:
+    from heliotrope.links.keys import KeyFile
+
+app = typer.Typer(
+    help="Make and replace the keys of the links between plant and clusters.",
+    no_args_is_help=True,
+)
+
+PlantFile = Annotated[Path, typer.Argument(help="Key file of the plant.")]
+Clusters = Annotated[list[str], typer.Argument(help="Names of clusters.")]
+FolderOption = Annotated[
+    Path,
+    typer.Option("--to", help="Folder for the files that carry the new keys to the clusters."),
+]
+
+
+@app.callback()
+def _root() -> None:
+    """Make and replace the keys of the links between plant and clusters."""
+
+
+def _open(path: Path) -> "KeyFile":
+    from heliotrope.errors import InputError
+
+    try:
+        from heliotrope.links.keys import KeyFile
+    except ImportError as error:
+        raise InputError(
+            f"keys: {error.name} is not installed; say pip install 'heliotrope[control]'"
+        ) from None
+    return KeyFile(path)
+
+
+@app.command()
+def new(file: PlantFile, clusters: Clusters, to: FolderOption) -> None:
+    """Make a key for each cluster, in the plant's file and in one to carry to the cluster."""
+    from heliotrope.links.keys import carried_files
+
+    found = _open(file)
+    carried_files(to, clusters)  # refuses before anything is written
+    _carry(to, found.new(clusters))
+    print(f"{file}: new keys for {', '.join(clusters)}")
+
+
+@app.command()
+def rotate(file: PlantFile, clusters: Clusters, to: FolderOption) -> None:
+    """Make a second key for each cluster; plant and cluster may both keep running."""
+    from heliotrope.links.keys import carried_files
+
+    found = _open(file)
+    carried_files(to, clusters)  # refuses before anything is written
+    _carry(to, found.rotate(clusters))
+    print(f"{file}: new keys beside the old ones for {', '.join(clusters)}")
+
+
+@app.command()
+def take(
+    file: Annotated[Path, typer.Argument(help="Key file of the cluster.")],
+    carried: Annotated[Path, typer.Argument(help="File that keys new or keys rotate made.")],
+) -> None:
+    """Take a carried key into the cluster's file, beside the old one if there is one."""
+    from heliotrope.errors import InputError
+    from heliotrope.links.keys import fingerprint
+
+    found = _open(carried).links
+    if list(found) != ["plant"] or len(found["plant"]) != 1:
+        raise InputError(f"{carried}: it carries no key of a cluster; make one with keys rotate")
+    (key,) = found["plant"]
+    _open(file).take(key)
+    print(f"{file}: key {fingerprint(key)} taken; delete {carried}")
+
+
+@app.command()
+def end(
+    file: Annotated[Path, typer.Argument(help="Key file of the plant or of a cluster.")],
+    names: Annotated[
+        list[str] | None, typer.Argument(help="Names of clusters; default: all with an old key.")
+    ] = None,
+) -> None:
+    """Remove the old keys: from now on only the new ones are accepted."""
+    ended = _open(file).end(names or [])
+    print(f"{file}: old keys removed: {', '.join(ended)}")
+
+
+@app.command(name="list")
+def list_(
+    file: Annotated[Path, typer.Argument(help="Key file of the plant or of a cluster.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Print whose keys a file has, by fingerprints that reveal nothing; the newest first."""
+    from heliotrope.errors import InputError
+    from heliotrope.links.keys import fingerprint
+
+    if not file.exists():
+        raise InputError(f"{file}: there is no such file; heliotrope keys new makes it")
+    links = _open(file).links
+    shown = {name: [fingerprint(key) for key in keys] for name, keys in links.items()}
+    if as_json:
+        print_json(shown)
+        return
+    print_table(["name", "key", "old key"], [[n, k[0], *k[1:], ""][:3] for n, k in shown.items()])
+
+
+def _carry(folder: Path, keys: dict[str, bytes]) -> None:
+    from heliotrope.links.keys import carry
+
+    for path in carry(folder, keys):
+        print(f"{path}: carry it to its cluster, say heliotrope keys take there, and delete it")

@@ -1,0 +1,368 @@
+"""Keys of the links between plant and clusters: key files, and keys that change while links run.
+
+Each cluster shares one key with its plant. While a new key takes over from an old one, an end has
+both: it accepts either, and uses the new one as soon as the other end has shown that it has it too
+(`envelope.Conversation`). So it does not matter which end gets the new key first, nothing is lost,
+and no connection ends.
+
+Keys stand in a file of their own that only its owner may read: ``plant`` and ``password``, and a
+table of keys, as hexadecimal text. Where there are two keys, they stand in a list, the new one
+first.
+"""
+
+import hashlib
+import os
+import secrets
+import string
+from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+import tomli_w
+
+from heliotrope.errors import FormatError, InputError
+from heliotrope.files.documents import read_toml
+
+_SHORTEST_KEY, _LONGEST_KEY = 16, 64
+_SIZE = 32
+#: The new key and the one before.
+_MOST = 2
+_OTHERS = 0o077
+#: Tables of keys: of a plant's file, and of a cluster's.
+CLUSTERS, HELIOSTATS = "clusters", "heliostats"
+_MISSING = {
+    HELIOSTATS: "the cluster has no such heliostat",
+    CLUSTERS: "the plant has no such cluster",
+}
+_LONGEST_NAME = 64
+
+#: Keys of one link, the newest first.
+LinkKeys = tuple[bytes, ...]
+
+
+class KeyRing:
+    """The keys of one link; they may be replaced while it runs.
+
+    Attributes
+    ----------
+    keys
+        The newest first; it is replaced as a whole, so any thread may read it.
+    """
+
+    def __init__(self, *keys: bytes) -> None:
+        self.keys: LinkKeys = keys
+
+    @property
+    def newest(self) -> bytes:
+        """The newest key, b"" if there is none."""
+        return self.keys[0] if self.keys else b""
+
+
+def ring_of(name: str, key: bytes | KeyRing) -> KeyRing:
+    """Return the keys of a cluster's link.
+
+    Raises
+    ------
+    InputError
+        A key of less than 16 bytes, or a name that is empty or longer than 64 bytes.
+    """
+    ring = key if isinstance(key, KeyRing) else KeyRing(key)
+    for each in ring.keys or (b"",):
+        if len(each) < _SHORTEST_KEY:
+            raise InputError(
+                f"cluster {name}: a key of {len(each)} bytes; give at least {_SHORTEST_KEY} "
+                "random ones"
+            )
+    if not 0 < len(name.encode()) <= _LONGEST_NAME:
+        raise InputError(f"cluster {name!r}: a name has 1 to {_LONGEST_NAME} bytes")
+    return ring
+
+
+class Keys:
+    """A key file.
+
+    Parameters
+    ----------
+    path
+        None: there is no file, and there are no keys.
+    table
+        Name of the table: `HELIOSTATS` in a cluster's file, `CLUSTERS` in a plant's.
+
+    Attributes
+    ----------
+    plant, password
+        () and "" where absent.
+    members
+        Keys of the table, by name.
+
+    Raises
+    ------
+    FormatError
+        If others may read the file, or a value is not a key.
+    """
+
+    def __init__(self, path: Path | None, table: str) -> None:
+        self._path, self._table = path, table
+        self.plant: LinkKeys = ()
+        self.password = ""
+        self.members: dict[str, LinkKeys] = {}
+        if path is None:
+            return
+        # An empty file has no keys; members without a key are refused later.
+        empty = path.is_file() and path.stat().st_size == 0
+        raw = {} if empty else read_toml(path, "a key file")
+        if path.stat().st_mode & _OTHERS:
+            mode = path.stat().st_mode & 0o777
+            raise FormatError(path, f"others may read it (mode {mode:o}); run chmod 600 on it")
+        for key in raw:
+            if key not in ("plant", "password", table):
+                raise FormatError(path, f"{key!r} is not known; give plant, password, {table}")
+        if "plant" in raw:
+            self.plant = self._keys("plant", raw["plant"], _MOST)
+        password, keys = raw.get("password", ""), raw.get(table, {})
+        if not isinstance(password, str) or not isinstance(keys, dict):
+            raise FormatError(path, f"password must be a text, and {table} a table of keys")
+        self.password = password
+        most = _MOST if table == CLUSTERS else 1
+        self.members = {name: self._keys(name, value, most) for name, value in keys.items()}
+
+    def _keys(self, name: str, value: object, most: int) -> LinkKeys:
+        values = value if isinstance(value, list) else [value]
+        if not 1 <= len(values) <= most:
+            raise FormatError(self._path, f"{len(values)} keys; give 1 to {most}", name)
+        keys = tuple(self._key(name, each) for each in values)
+        if len(set(keys)) < len(keys):
+            raise FormatError(self._path, "the same key twice; give each once", name)
+        return keys
+
+    def _key(self, name: str, value: object) -> bytes:
+        text = value if isinstance(value, str) else ""
+        good = set(text) <= set(string.hexdigits) and len(text) % 2 == 0
+        if not (good and _SHORTEST_KEY <= len(text) // 2 <= _LONGEST_KEY):
+            # The value is not shown: it would end up in a log.
+            raise FormatError(
+                self._path,
+                f"a key of {len(text)} characters; give {_SHORTEST_KEY} to {_LONGEST_KEY} bytes "
+                "in hexadecimal, as heliotrope keys new makes it",
+                name,
+            )
+        return bytes.fromhex(text)
+
+    def check(self, names: list[str]) -> None:
+        """Refuse keys of members that do not exist."""
+        for name in self.members:
+            if name not in names:
+                close = get_close_matches(name, names, n=1)
+                hint = f"; did you mean {close[0]!r}?" if close else "; remove it"
+                raise FormatError(
+                    self._path, f"{_MISSING[self._table]}{hint}", f"{self._table}.{name}"
+                )
+
+
+def fingerprint(key: bytes) -> str:
+    """Return a short name of a key that tells nothing about it."""
+    return hashlib.sha256(b"heliotrope key " + key).hexdigest()[:8]
+
+
+# -- changing key files ------------------------------------------------------------------
+
+
+class KeyFile:
+    """A key file to be changed; every change is written whole, with mode 600, or not at all.
+
+    Parameters
+    ----------
+    path
+        The file; a missing or empty one has no keys.
+
+    Raises
+    ------
+    FormatError
+        See `Keys`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._held: Keys | None = None
+        there = path.exists() and path.stat().st_size > 0
+        self._table = HELIOSTATS if there and HELIOSTATS in read_toml(path, "a key file") else ""
+        if there or path.exists():
+            self._held = Keys(path, self._table or CLUSTERS)
+
+    @property
+    def links(self) -> dict[str, LinkKeys]:
+        """The keys of links, by name: of clusters, or ``plant`` of a cluster's own file."""
+        if self._held is None:
+            return {}
+        found = {"plant": self._held.plant} if self._held.plant else {}
+        return found if self._table else {**found, **self._held.members}
+
+    def new(self, clusters: Sequence[str]) -> dict[str, bytes]:
+        """Make a key for each cluster that has none; return them.
+
+        Raises
+        ------
+        InputError
+            If a cluster has a key, or the file is a cluster's own.
+        """
+        self._check_plant(clusters)
+        for name in clusters:
+            if name in self.links:
+                raise InputError(
+                    f"{self.path}: cluster {name} has a key already; to replace it while plant and "
+                    "cluster run, say heliotrope keys rotate"
+                )
+        made = {name: secrets.token_bytes(_SIZE) for name in clusters}
+        self._write({name: (key,) for name, key in made.items()})
+        return made
+
+    def rotate(self, clusters: Sequence[str]) -> dict[str, bytes]:
+        """Make a new key for each cluster beside its present one; return the new ones.
+
+        Raises
+        ------
+        InputError
+            If a cluster has no key, or two already.
+        """
+        self._check_plant(clusters)
+        made = {name: secrets.token_bytes(_SIZE) for name in clusters}
+        self._write({name: self._beside(name, key) for name, key in made.items()})
+        return made
+
+    def take(self, key: bytes) -> None:
+        """Take a new key of the plant into a cluster's file, beside the one that is there.
+
+        Raises
+        ------
+        InputError
+            If the file has that key, or two others, or is a plant's.
+        """
+        if any(name != "plant" for name in self.links):
+            raise InputError(f"{self.path}: it is a plant's key file; take belongs to a cluster's")
+        if key in self.links.get("plant", ()):
+            raise InputError(f"{self.path}: it has the key {fingerprint(key)} already")
+        self._write({"plant": self._beside("plant", key) if self.links else (key,)})
+
+    def end(self, names: Sequence[str]) -> list[str]:
+        """Remove the old keys of some names (() for all that have one); return those names.
+
+        Raises
+        ------
+        InputError
+            If a name has no old key.
+        """
+        links = self.links
+        chosen = list(names) or [name for name, keys in links.items() if len(keys) > 1]
+        for name in chosen or [""]:
+            if len(links.get(name, ())) < _MOST:
+                who = f"{name} has" if name else "nobody has"
+                raise InputError(f"{self.path}: {who} an old key beside a new one; nothing to end")
+        self._write({name: links[name][:1] for name in chosen})
+        return chosen
+
+    def _beside(self, name: str, key: bytes) -> LinkKeys:
+        known = self.links.get(name, ())
+        if not known:
+            raise InputError(f"{self.path}: {name} has no key; say heliotrope keys new")
+        if len(known) == _MOST:
+            raise InputError(
+                f"{self.path}: {name} has two keys already; say heliotrope keys end when its other "
+                "end uses the new one"
+            )
+        return (key, *known)
+
+    def _check_plant(self, clusters: Iterable[str]) -> None:
+        if self._table:
+            raise InputError(
+                f"{self.path}: it is a cluster's key file; make keys in the plant's, and take them "
+                "here with heliotrope keys take"
+            )
+        for name in clusters:
+            ring_of(name, bytes(_SIZE))
+
+    def _write(self, changes: Mapping[str, LinkKeys]) -> None:
+        held = self._held
+        members = {} if held is None else dict(held.members)
+        plant: LinkKeys = () if held is None else held.plant
+        for name, keys in changes.items():
+            if name == "plant":
+                plant = keys
+            else:
+                members[name] = keys
+        document: dict[str, object] = {}
+        if plant:
+            document["plant"] = _texts(plant)
+        if held is not None and held.password:
+            document["password"] = held.password
+        if members:
+            named = {name: _texts(keys) for name, keys in members.items()}
+            document[self._table or CLUSTERS] = named
+        write_private(self.path, tomli_w.dumps(document))
+        self._held = Keys(self.path, self._table or CLUSTERS)
+
+
+def _texts(keys: LinkKeys) -> str | list[str]:
+    return keys[0].hex() if len(keys) == 1 else [key.hex() for key in keys]
+
+
+def carried_files(folder: Path, clusters: Sequence[str]) -> list[Path]:
+    """Return the files in which new keys are carried to clusters.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder, a cluster is named twice, its name is that of no file, or a file
+        exists: keys are never overwritten.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder")
+    if len(set(clusters)) < len(clusters):
+        raise InputError("keys: a cluster is named twice; name each once")
+    files = []
+    for name in clusters:
+        if name != Path(name).name or name.startswith("."):
+            raise InputError(f"cluster {name!r}: no file can have that name")
+        files.append(folder / f"{name}.key.toml")
+        if files[-1].exists():
+            raise InputError(f"{files[-1]}: it exists, and keys are never overwritten; move it")
+    return files
+
+
+def carry(folder: Path, keys: Mapping[str, bytes]) -> list[Path]:
+    """Write a file for each cluster with its new key, to be carried to it; return the files."""
+    files = carried_files(folder, list(keys))
+    for path, key in zip(files, keys.values(), strict=True):
+        write_private(path, tomli_w.dumps({"plant": key.hex()}), new=True)
+    return files
+
+
+def write_private(path: Path, text: str, *, new: bool = False) -> None:
+    """Write a file that only its owner may read, whole or not at all.
+
+    An existing file is replaced and keeps its owner, unless ``new`` forbids that it exists.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(handle, "wb") as stream:
+            os.fchmod(stream.fileno(), 0o600)
+            if path.exists() and not new:
+                there = path.stat()
+                if (there.st_uid, there.st_gid) != (os.geteuid(), os.getegid()):
+                    os.fchown(stream.fileno(), there.st_uid, there.st_gid)
+            stream.write(text.encode())
+            stream.flush()
+            os.fsync(stream.fileno())
+        if new:
+            os.link(beside, path)  # fails where the file exists by now
+        else:
+            beside.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    finally:
+        beside.unlink(missing_ok=True)

@@ -1,0 +1,210 @@
+"""Papers of a program: key files and certificates, taken while it runs when they are renewed.
+
+Files are looked at every two seconds, in a thread: a slow disk holds nothing up. What cannot be
+used raises an alarm, and what was in force stays so. The ends of certificates are watched.
+"""
+
+import asyncio
+import contextlib
+import math
+from collections.abc import AsyncIterator, Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from heliotrope.errors import FormatError, HeliotropeError, InputError
+from heliotrope.links.clock import Clock
+from heliotrope.links.tls import RenewedTls, client_tls
+from heliotrope.safety import Alarm, alarms
+
+#: Time between two looks at the files, s.
+LOOKED = 2.0
+#: An alarm stands in the last days of a certificate, and comes again each day.
+DAYS = 30
+_DAY = 86_400.0
+#: What changes when a file does: time, inode, size and mode; None: it is not there.
+_State = tuple[int, ...] | None
+
+
+class _Renewal:
+    """Files that are read again when they change."""
+
+    def __init__(self, files: Sequence[Path], take: Callable[[], None]) -> None:
+        self._files, self._take = tuple(files), take
+        self._seen: tuple[_State, ...] | None = None
+
+    def look(self) -> str:
+        """Take the files if they have changed; return why they cannot be used, "" if they can.
+
+        Files that cannot be used are tried again at each look.
+        """
+        found = tuple(_state(file) for file in self._files)
+        if found == self._seen:
+            return ""
+        try:
+            self._take()
+        except HeliotropeError as error:
+            self._seen = None
+            return str(error)
+        self._seen = found
+        return ""
+
+
+class _Certificate:
+    """A certificate whose end is watched."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._seen: _State = None
+        self.end: datetime | None = None
+        self.problem = ""
+
+    def look(self) -> None:
+        """Read its end again if the file has changed."""
+        found = _state(self.path)
+        if self.end is not None and found == self._seen:
+            return
+        try:
+            self.end, self.problem, self._seen = end_of(self.path), "", found
+        except HeliotropeError as error:
+            self.end, self.problem = None, str(error)
+
+    def days(self, now: datetime) -> int | None:
+        """Return the whole days that are left, below 0 once it has ended; None: unknown."""
+        if self.end is None:
+            return None
+        return math.floor((self.end - now).total_seconds() / _DAY)
+
+    def line(self, now: datetime) -> str:
+        """Return its end in words."""
+        days = self.days(now)
+        if days is None or self.end is None:
+            return f"the end of certificate {self.path} is unknown ({self.problem})"
+        day = f"{self.end:%Y-%m-%d %H:%M} UTC"
+        if days < 0:
+            return f"certificate {self.path} ended on {day}"
+        return f"certificate {self.path} ends on {day}, in {days} days"
+
+
+class Papers:
+    """Key files and certificates of a program.
+
+    Parameters
+    ----------
+    clock
+        Its UTC decides about the ends of certificates.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._renewals: dict[str, _Renewal] = {}
+        self._certificates: list[_Certificate] = []
+        self._problems: dict[str, str] = {}
+        self._told: dict[Path, tuple[int | None, str]] = {}
+
+    def renew(self, name: str, files: Sequence[Path], take: Callable[[], None]) -> None:
+        """Call ``take`` in a thread whenever one of some files changes, and once at the start."""
+        self._renewals[name] = _Renewal(files, take)
+
+    def watch_end(self, path: Path) -> None:
+        """Watch the end of a certificate, or of the first to end in a file of several."""
+        self._certificates.append(_Certificate(path))
+
+    def lines(self) -> list[str]:
+        """Return the end of each certificate in words."""
+        for each in self._certificates:
+            each.look()
+        now = self._clock.utc()
+        return [each.line(now) for each in self._certificates]
+
+    @contextlib.asynccontextmanager
+    async def watched(self, on_alarm: Callable[[Alarm], None]) -> AsyncIterator[None]:
+        """Look at the files during a block, and raise and end alarms."""
+        failure: Exception | None = None
+        async with asyncio.TaskGroup() as group:
+            task = group.create_task(self._run(on_alarm))
+            try:
+                yield
+            except Exception as error:  # noqa: BLE001 (it goes on as it came, not in a group)
+                failure = error
+            task.cancel()
+        if failure is not None:
+            raise failure
+
+    async def _run(self, on_alarm: Callable[[Alarm], None]) -> None:
+        while True:
+            for alarm in await asyncio.to_thread(self.look):
+                on_alarm(alarm)
+            await asyncio.sleep(LOOKED)
+
+    def look(self) -> list[Alarm]:
+        """Take files that have changed; return alarms that begin, end, or come again."""
+        found = []
+        for name, renewal in self._renewals.items():
+            problem = renewal.look()
+            if problem != self._problems.get(name, ""):
+                kind = alarms.RENEWAL
+                found.append(kind.raised(name, problem=problem) if problem else kind.ended(name))
+            self._problems[name] = problem
+        now = self._clock.utc()
+        for each in self._certificates:
+            each.look()
+            found += self._end_of(each, now)
+        return found
+
+    def _end_of(self, each: _Certificate, now: datetime) -> list[Alarm]:
+        kind, days, path = alarms.CERTIFICATE, each.days(now), each.path
+        state = (days, each.problem)
+        if self._told.get(path) == state:
+            return []
+        stood = path in self._told
+        name = path.name
+        # A new day is a new occurrence, even for somebody who acknowledged the last one.
+        over = [kind.ended(name)] if stood else []
+        if days is not None and days >= DAYS:
+            self._told.pop(path, None)
+            return over
+        self._told[path] = state
+        worse = days is not None and days < 0
+        return [*over, kind.raised(name, worse=worse, problem=each.line(now))]
+
+
+def _state(path: Path) -> _State:
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_ino, found.st_size, found.st_mode
+
+
+def end_of(path: Path) -> datetime:
+    """Return the end of a PEM certificate; of several, the first to end.
+
+    Raises
+    ------
+    InputError
+        If the package that reads certificates is not installed.
+    FormatError
+        If the file cannot be read, or holds no certificate.
+    """
+    try:
+        from cryptography import x509
+    except ImportError:
+        raise InputError(
+            "cryptography is not installed; say pip install 'heliotrope[control]'"
+        ) from None
+    try:
+        found = x509.load_pem_x509_certificates(path.read_bytes())
+        ends = [each.not_valid_after_utc for each in found]
+    except OSError as error:
+        raise FormatError(path, f"cannot be read ({error.strerror})") from None
+    except ValueError:
+        raise FormatError(path, "holds no PEM certificate") from None
+    return min(ends).astimezone(UTC)
+
+
+def authority_of(papers: Papers, path: Path) -> RenewedTls:
+    """Return the TLS of a client that trusts an authority alone, renewed with its file."""
+    tls = RenewedTls(lambda: client_tls(path))
+    papers.renew("certificate of the authority", [path], tls.renew)
+    papers.watch_end(path)
+    return tls
