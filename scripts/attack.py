@@ -233,11 +233,16 @@ def _token(port: int, password: str) -> str:
     with httpx.Client(
         base_url=f"http://127.0.0.1:{port}/api/v1/", trust_env=False, timeout=30.0
     ) as client:
-        given = client.post("session", json={"name": "engineer", "password": password})
-        client.headers["X-CSRF-Token"] = given.raise_for_status().json()["csrf"]
+        own = f"{password}-own"
+        for word in (password, own):
+            given = client.post("session", json={"name": "engineer", "password": word})
+            client.headers["X-CSRF-Token"] = given.raise_for_status().json()["csrf"]
+            if word == password:
+                change = client.put("session/password", json={"old": word, "new": own})
+                change.raise_for_status()
         made = client.post(
             "tokens",
-            json={"label": "attack", "role": "viewer", "days": 1, "own_password": password},
+            json={"label": "attack", "role": "viewer", "days": 1, "own_password": own},
         )
         return str(made.raise_for_status().json()["secret"])
 

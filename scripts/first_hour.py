@@ -109,6 +109,15 @@ def main() -> None:
             page.fill("[name=name]", "engineer")
             page.fill("[name=password]", password)
             page.click("button")
+            page.wait_for_url("**/account")
+            own = f"{password}-own"
+            for name, text in (("old", password), ("new", own), ("again", own)):
+                page.fill(f"[name={name}]", text)
+            page.click("button")
+            page.wait_for_url("**/login")
+            page.fill("[name=name]", "engineer")
+            page.fill("[name=password]", own)
+            page.click("button")
             take(page, plant, given.learnt, given.into)
             browser.close()
     finally:

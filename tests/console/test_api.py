@@ -195,6 +195,7 @@ def test_no_secret_is_in_logs_or_files(
     caplog.set_level(logging.DEBUG)
     given = {"name": "desk-5", "role": "operator", "password": "a very own password"}
     person("engineer", "POST", "accounts", given)
+    console.settle("desk-5", given["password"])
     with _client(console) as client:
         wrong = {"name": "desk-5", "password": "not quite the password"}
         assert client.post("session", json=wrong).status_code == 401

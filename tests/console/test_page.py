@@ -54,7 +54,7 @@ def test_log_in_and_look(field: LiveConsole, enter: Callable[[str], Any]) -> Non
 
 
 def test_first_start(field: LiveConsole, browser: Any, tmp_path: Path) -> None:
-    """What the first start prints signs in; it is not printed again."""
+    """What the first start prints signs in once, to change it; it is not printed again."""
     keeper = Keeper(tmp_path / "store.sqlite", inline=True)
     password = first_start(keeper.people, time.time())
     console = field.server.app.state.console
@@ -65,6 +65,16 @@ def test_first_start(field: LiveConsole, browser: Any, tmp_path: Path) -> None:
         page.goto(f"{field.address}login")
         page.fill("[name=name]", FIRST)
         page.fill("[name=password]", password)
+        page.click("button")
+        page.wait_for_url("**/account")
+        assert "Change it before you go on" in page.inner_text("#due")
+        page.fill("[name=old]", password)
+        for name in ("new", "again"):
+            page.fill(f"[name={name}]", "a password of my own")
+        page.click("button")
+        page.wait_for_url("**/login")
+        page.fill("[name=name]", FIRST)
+        page.fill("[name=password]", "a password of my own")
         page.click("button")
         page.wait_for_selector(".hx-legend b")
         assert first_start(keeper.people, time.time()) is None

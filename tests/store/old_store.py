@@ -24,8 +24,13 @@ from heliotrope.store.records import AuditEntry, CampaignEntry, Event, PlannedVi
 FILE = Path(__file__).with_name("data") / "written_0002.json"
 NAMES = ("A1", "Größe/2")
 NAN = float("nan")
-#: Links hold digests of the records of the other tables.
-TABLES = [t.name for t in tables.metadata.sorted_tables if not t.name.endswith("_link")]
+#: Links hold digests of the records of the other tables; the others came later.
+LATER = ("password_due",)
+TABLES = [
+    t.name
+    for t in tables.metadata.sorted_tables
+    if not t.name.endswith("_link") and t.name not in LATER
+]
 
 SEEN: Sightings = sightings(
     [0, 1, 0],

@@ -62,6 +62,7 @@ def fill(keeper: Keeper, seen: Sightings) -> None:
     keeper.writer.do(lambda c: change_points(c, {"AIM": {"A": (1.0, 2.0, 3.0)}}, {}))
     keeper.writer.do(lambda c: c.execute(tables.about.insert().values(name="plant", value="x")))
     keeper.people.add("anna", "hash", "engineer", 1.0)
+    keeper.people.add("ben", "hash", "operator", 1.0, due=True)
     keeper.people.open_session("anna", 1.0, 1e12)
     keeper.people.add_token("anna", "report", "viewer", 1.0)
     keeper.writer.confirmed().result(10.0)

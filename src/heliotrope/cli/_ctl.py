@@ -102,6 +102,20 @@ def token(
 
 
 @app.command()
+def password(
+    context: typer.Context,
+    name: Annotated[str, typer.Option(help="Name of your account.")] = "engineer",
+) -> None:
+    """Change your own password; your sessions and tokens end."""
+    old = typer.prompt("Password", hide_input=True)
+    new = typer.prompt("New password", hide_input=True, confirmation_prompt=True)
+    with _sign_in_client(context) as client:
+        client.change_password(name, old, new)
+        client.ask("DELETE", "session")
+    print(f"password of {name} changed")
+
+
+@app.command()
 def account(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the account.")],
@@ -112,7 +126,7 @@ def account(
         bool, typer.Option("--reset", help="Make a new password; it is printed once.")
     ] = False,
 ) -> None:
-    """Make or disable an account, or give it a new password."""
+    """Make or disable an account, or give it a password that must be changed at first use."""
     if disable and reset:
         raise InputError("ctl: give --disable or --reset, not both")
     own = typer.prompt("Your password", hide_input=True)
@@ -121,7 +135,10 @@ def account(
         again = {"own_password": own}
         if reset:
             made = client.ask("POST", f"accounts/{name}/password", again)
-            print(f"new password of {name}, shown only now: {made['password']}")
+            print(
+                f"new password of {name}, shown only now, to be changed at first use: "
+                f"{made['password']}"
+            )
         elif disable:
             client.ask("PATCH", f"accounts/{name}", {"disabled": True, **again})
         else:

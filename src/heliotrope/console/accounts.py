@@ -17,7 +17,7 @@ from heliotrope.console.auth import (
     refused,
     same_origin,
 )
-from heliotrope.console.people import ROLES
+from heliotrope.console.people import ROLES, person_of
 from heliotrope.console.sign_in import checked, log_in
 from heliotrope.plant.authority import Role
 from heliotrope.plant.operations.security import SecurityEvent
@@ -33,6 +33,7 @@ def _who(who: Caller) -> models.CallerState:
         by=who.by,
         expires=who.expires,
         csrf=who.csrf,
+        owes=who.owes,
     )
 
 
@@ -55,7 +56,7 @@ async def sign_in(
     if not same_origin(console, request):
         await console.note(SecurityEvent.ORIGIN_REFUSED, request)
         raise HTTPException(403, "this page comes from another site; sign in at the console itself")
-    secret, expires = await log_in(console, given.name, given.password, request)
+    account, secret, expires = await log_in(console, given.name, given.password, request)
     response.set_cookie(
         COOKIE,
         secret,
@@ -65,11 +66,9 @@ async def sign_in(
         samesite="strict",
         secure=console.settings.tls or console.settings.plain,
     )
-    account = await console.ask(lambda: console.people.account(given.name))
-    role = account.role if account is not None else "viewer"
-    return models.CallerState(
-        name=given.name, role=role, by="session", expires=expires, csrf=_secrets.csrf_of(secret)
-    )
+    owes = "password" if account.password_due else ""
+    who = Caller(person_of(account.name, account.role), "session", secret, expires, owes)
+    return _who(who)
 
 
 @router.delete("/session", status_code=204, tags=["people"])
@@ -93,6 +92,8 @@ async def own_password(
 ) -> None:
     """Change your own password; your sessions, including this one, and your tokens end."""
     await _confirm(console, who, request, given.old)
+    if given.new == given.old:
+        raise HTTPException(422, "this is your password already; give another one")
     await _set_password(console, who.person.name, given.new)
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
     await console.note(SecurityEvent.PASSWORD_CHANGED, request, who.person.name)
@@ -102,14 +103,14 @@ async def own_password(
 async def reset_password(
     console: Here, who: Engineer, request: Request, name: Named, given: models.Confirmed
 ) -> models.GivenPassword:
-    """Give a person a new password, shown once; all their sessions and tokens end."""
+    """Give a person a new password, to be changed at first use; sessions and tokens end."""
     await _confirm(console, who, request, given.own_password)
     if name == who.person.name:
         raise HTTPException(409, f"{name}: change your own password with PUT session/password")
     if await console.ask(lambda: console.people.account(name)) is None:
         raise HTTPException(404, f"there is no account {name}")
     password = _secrets.new_password()
-    await _set_password(console, name, password)
+    await _set_password(console, name, password, due=True)
     await console.note(SecurityEvent.PASSWORD_RESET, request, who.person.name, name)
     return models.GivenPassword(name=name, password=password)
 
@@ -125,11 +126,11 @@ async def accounts(console: Here, who: Engineer) -> list[models.AccountState]:
 async def new_account(
     console: Here, who: Engineer, request: Request, given: models.NewAccount
 ) -> models.AccountState:
-    """Create an account."""
+    """Create an account; its password must be changed at first use."""
     await _confirm(console, who, request, given.own_password)
     kept = await _hashed(console, given.password)
     made = await console.ask(
-        lambda: console.people.add(given.name, kept, given.role, console.now())
+        lambda: console.people.add(given.name, kept, given.role, console.now(), due=True)
     )
     what = f"{given.name}, {given.role}"
     await console.note(SecurityEvent.ACCOUNT_MADE, request, who.person.name, what)
@@ -151,7 +152,12 @@ async def change_account(
     kept = await _hashed(console, given.password) if given.password is not None else None
     made = await console.ask(
         lambda: console.people.change(
-            name, console.now(), role=given.role, password_hash=kept, disabled=given.disabled
+            name,
+            console.now(),
+            role=given.role,
+            password_hash=kept,
+            disabled=given.disabled,
+            due=True,
         )
     )
     console.known.clear()
@@ -227,9 +233,11 @@ async def _hashed(console: Console, password: str) -> str:
         return await asyncio.to_thread(_secrets.hash_password, password)
 
 
-async def _set_password(console: Console, name: str, password: str) -> None:
+async def _set_password(console: Console, name: str, password: str, *, due: bool = False) -> None:
     kept = await _hashed(console, password)
-    await console.ask(lambda: console.people.change(name, console.now(), password_hash=kept))
+    await console.ask(
+        lambda: console.people.change(name, console.now(), password_hash=kept, due=due)
+    )
     console.known.clear()
 
 

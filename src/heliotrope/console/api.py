@@ -210,6 +210,9 @@ async def live(socket: WebSocket) -> None:
         await socket.close(4401, "sign in, or send a valid token")
         return
     await socket.accept()
+    if found.owes:
+        await socket.close(4403, "change your password first")
+        return
     if console.stream.viewers >= console.settings.viewers:
         await socket.close(4429, f"{console.settings.viewers} viewers are connected already")
         return

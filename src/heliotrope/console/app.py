@@ -133,7 +133,7 @@ def _routes(settings: ConsoleSettings) -> Routes:
     own = {"/api/v1/openapi.json": Role.VIEWER}
     if settings.page:
         own["/favicon.ico"] = Role.VIEWER
-    return Routes(ROUTERS, [*files, *page, "/login", "/emergency"], own)
+    return Routes(ROUTERS, [*files, *page, "/login", "/emergency", "/account"], own)
 
 
 def _pages(app: FastAPI) -> None:
@@ -145,14 +145,18 @@ def _pages(app: FastAPI) -> None:
     async def login() -> Response:
         return FileResponse(STATIC / "login.html", media_type="text/html; charset=utf-8")
 
-    plain = (STATIC / "emergency.html").read_text("utf-8")
+    plain = {
+        name: (STATIC / f"{name}.html").read_text("utf-8") for name in ("emergency", "account")
+    }
 
     @app.get("/emergency", include_in_schema=False)
-    async def emergency(request: Request) -> Response:
+    @app.get("/account", include_in_schema=False)
+    async def with_emergency(request: Request) -> Response:
         console: Console = request.scope["heliotrope"]
         who: Caller | None = request.scope[FOUND]
         facts = {"csrf": "" if who is None else who.csrf, "emergency": console.emergency_port}
         metas = "".join(
             f'<meta name="heliotrope-{name}" content="{text}">' for name, text in facts.items()
         )
-        return HTMLResponse(plain.replace("<main>", f"{metas}\n<main>"))
+        text = plain[request.scope["path"].strip("/")]
+        return HTMLResponse(text.replace("<main>", f"{metas}\n<main>"))

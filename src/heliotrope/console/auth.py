@@ -47,6 +47,21 @@ MOST_NOTED = 100
 #: The shared answer that never changes.
 FIXED = "field"
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
+_API = "/api/v1"
+#: What a person may do who owes something: stop the field, see who they are, and leave.
+#: `commands` lets STOW and DEFOCUS pass.
+_ALWAYS = frozenset(
+    {("POST", f"{_API}/{path}") for path in ("emergency", "stow", "defocus", "commands")}
+    | {(method, f"{_API}/session") for method in ("GET", "HEAD", "DELETE")}
+)
+_SAFE = "; EMERGENCY, DEFOCUS and STOW are accepted all the same"
+#: What a person may owe: the requests that settle it, and what a refusal says.
+DUES = {
+    "password": (
+        frozenset({("PUT", f"{_API}/session/password")}),
+        "change your password first: on the page /account, or by `heliotrope ctl password`" + _SAFE,
+    ),
+}
 
 
 @dataclass
@@ -137,12 +152,15 @@ class Caller:
         Secret of the session or token.
     expires
         POSIX s; None for never.
+    owes
+        What the person must do before anything else, see `DUES`; "" for nothing.
     """
 
     person: Person
     by: str
     secret: str = field(repr=False)
     expires: float | None
+    owes: str = ""
 
     @property
     def csrf(self) -> str:
@@ -227,7 +245,8 @@ async def _look_up(console: Console, by: str, secret: str) -> tuple[float, Calle
     if found is None:
         console.known.pop((by, secret), None)
         return None
-    who = Caller(person_of(found.name, found.role), by, secret, found.expires)
+    owes = "password" if isinstance(found, Session) and found.password_due else ""
+    who = Caller(person_of(found.name, found.role), by, secret, found.expires, owes)
     if len(console.known) > MOST_KNOWN:
         console.known.clear()
     known = console.known[by, secret] = (time.monotonic(), who)
@@ -260,7 +279,8 @@ async def caller(connection: HTTPConnection, console: Here) -> Caller:
     Raises
     ------
     HTTPException
-        401 if unknown; 403 if a page from elsewhere may have sent the request.
+        401 if unknown; 403 if a page from elsewhere may have sent the request, or if the caller
+        owes something.
     """
     if FOUND in connection.scope:
         found = cast("Caller | None", connection.scope[FOUND])
@@ -279,7 +299,23 @@ async def caller(connection: HTTPConnection, console: Here) -> Caller:
         if not same_origin(console, connection) or not _secrets.same(word, found.csrf):
             await console.note(SecurityEvent.ORIGIN_REFUSED, connection, found.person.name)
             raise HTTPException(403, "the header X-CSRF-Token is missing or not this session's")
+    if (connection.scope.get("method", "GET"), connection.scope["path"]) not in _ALWAYS:
+        settle(found, connection)
     return found
+
+
+def settle(who: Caller, connection: HTTPConnection) -> None:
+    """Admit a caller who owes nothing, or whose request settles it.
+
+    Raises
+    ------
+    HTTPException
+        403 for any other request.
+    """
+    if who.owes:
+        requests, text = DUES[who.owes]
+        if (connection.scope.get("method", "GET"), connection.scope["path"]) not in requests:
+            raise HTTPException(403, text)
 
 
 Anyone = Annotated[Caller, Depends(caller)]

@@ -85,8 +85,21 @@ class Client:
         RemoteError
             If name or password is wrong.
         """
+        self._http.cookies.clear()
         who = self.ask("POST", "session", {"name": name, "password": password})
         self._http.headers["X-CSRF-Token"] = who["csrf"]
+
+    def change_password(self, name: str, old: str, new: str) -> None:
+        """Change your own password, and sign in with the new one.
+
+        Raises
+        ------
+        RemoteError
+            If name or password is wrong, or the new one is not accepted.
+        """
+        self.sign_in(name, old)
+        self.ask("PUT", "session/password", {"old": old, "new": new})
+        self.sign_in(name, new)
 
     async def live(self) -> AsyncIterator[LiveMessage]:
         """Yield the messages of the live stream: the whole field, then the changes.

@@ -10,7 +10,7 @@ from fastapi.responses import JSONResponse
 
 from heliotrope.console import models
 from heliotrope.console.api import REFUSALS, Named, answer
-from heliotrope.console.auth import Anyone, Here, Operator, refused
+from heliotrope.console.auth import Anyone, Here, Operator, refused, settle
 from heliotrope.errors import InputError
 from heliotrope.plant.authority import OPERATOR_COMMANDS, Role
 from heliotrope.plant.interface import orders
@@ -94,6 +94,7 @@ async def command(
     if name in ("STOW", "DEFOCUS"):
         found = await console.plant.ask(name.lower(), who.person, heliostats=order.heliostats)
         return models.TicketState(**found)
+    settle(who, request)
     if name not in OPERATOR_COMMANDS and who.person.role < Role.ENGINEER:
         await refused(console, request, who)
         raise HTTPException(403, f"{name}: {who.person.name} is operator; this needs engineer")

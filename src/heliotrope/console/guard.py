@@ -25,6 +25,7 @@ from heliotrope.console.auth import (
     host_known,
     refused,
     same_origin,
+    settle,
 )
 from heliotrope.console.edge import Edge
 from heliotrope.console.routes import FORM, READ, TINY, Found, Routes
@@ -116,8 +117,8 @@ class Guard:
             AtLeast(found.role).admitted(who)
         if who is not None and not _is_emergency(scope):
             self._edge.count(who)
-        if scope["path"] == "/" and (who is None or who.by != "session"):
-            await RedirectResponse("/login", 303)(scope, receive, send)
+        if (place := _elsewhere(scope["path"], who)) is not None:
+            await RedirectResponse(place, 303)(scope, receive, send)
             return
         length = bodies.length_of(headers, found.largest)
         with contextlib.ExitStack() as stack:
@@ -152,7 +153,7 @@ class Guard:
         """Add the safe headers."""
         path, urgent = scope["path"], _urgent(console, scope)
         policy = FRAME if path == "/" else STRICT
-        if path in ("/", "/emergency"):
+        if path in ("/", "/emergency", "/account"):
             policy = policy.replace("connect-src 'self'", f"connect-src 'self' {urgent}")
         headers["Content-Security-Policy"] = policy
         headers["X-Content-Type-Options"] = "nosniff"
@@ -161,7 +162,7 @@ class Guard:
         headers["Cross-Origin-Opener-Policy"] = "same-origin"
         headers["Cross-Origin-Resource-Policy"] = "same-origin"
         headers["Permissions-Policy"] = "camera=(), microphone=(), geolocation=()"
-        if path.startswith("/api/") or path in ("/", "/login", "/emergency"):
+        if path.startswith("/api/") or path in ("/", "/login", "/emergency", "/account"):
             headers.setdefault("Cache-Control", "no-store")
         if console.settings.tls:
             headers["Strict-Transport-Security"] = "max-age=31536000"
@@ -182,6 +183,7 @@ async def _framework(console: Console, scope: Scope, who: Caller) -> Found:
     if not same_origin(console, connection):
         await console.note(SecurityEvent.ORIGIN_REFUSED, connection, who.person.name)
         raise HTTPException(403, "this page comes from another site")
+    settle(who, connection)
     if scope["method"] in READ:
         return Found(200)
     if scope["path"].startswith(SOCKET) and scope["method"] == "POST":
@@ -198,6 +200,7 @@ async def _check_socket(console: Console, connection: HTTPConnection, who: Calle
         raise HTTPException(404, "nothing is at this address")
     if who is None or who.by != "session":
         raise HTTPException(401, "sign in")
+    settle(who, connection)
     if "origin" not in connection.headers or not same_origin(console, connection):
         await console.note(SecurityEvent.ORIGIN_REFUSED, connection, who.person.name)
         raise HTTPException(403, "this page comes from another site")
@@ -210,6 +213,15 @@ async def _check_body(scope: Scope, body: bytes) -> None:
             await bodies.check(body)
         except InputError as error:
             raise HTTPException(422, str(error)) from None
+
+
+def _elsewhere(path: str, who: Caller | None) -> str | None:
+    """Return the page to which a caller must go before the one that was asked for."""
+    if path not in ("/", "/account"):
+        return None
+    if who is None or who.by != "session":
+        return "/login"
+    return "/account" if who.owes and path == "/" else None
 
 
 def _is_emergency(scope: Scope) -> bool:

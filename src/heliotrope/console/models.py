@@ -75,6 +75,7 @@ class CallerState(BaseModel):
     by: str = Field(description='"session" or "token"')
     expires: float | None = Field(description="POSIX s")
     csrf: str = Field("", description="Send it as X-CSRF-Token with every change")
+    owes: str = Field("", description='"password": change it before anything else; "" for nothing')
 
 
 class Confirmed(Strict):

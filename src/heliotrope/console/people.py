@@ -21,12 +21,13 @@ def first_start(people: People, now: float) -> str | None:
 
     Returns
     -------
-    The account's password, to be printed once; None if there are accounts already.
+    The account's password, to be printed once and changed at first use; None if there are accounts
+    already.
     """
     if not people.empty():
         return None
     password = _secrets.new_password()
-    people.add(FIRST, _secrets.hash_password(password), "engineer", now)
+    people.add(FIRST, _secrets.hash_password(password), "engineer", now, due=True)
     return password
 
 

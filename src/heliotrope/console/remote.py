@@ -120,11 +120,12 @@ class RemotePeople:
         """Return all accounts by name."""
         return tuple(Account(**one) for one in self._ask("accounts"))
 
-    def add(self, name: str, password_hash: str, role: str, now: float) -> Account:
+    def add(
+        self, name: str, password_hash: str, role: str, now: float, *, due: bool = False
+    ) -> Account:
         """Make an account; see `People.add`."""
-        return Account(
-            **self._ask("add", name=name, password_hash=password_hash, role=role, now=now)
-        )
+        given = {"name": name, "password_hash": password_hash, "role": role, "now": now}
+        return Account(**self._ask("add", **given, due=due))
 
     def change(
         self,
@@ -134,6 +135,7 @@ class RemotePeople:
         password_hash: str | None = None,
         role: str | None = None,
         disabled: bool | None = None,
+        due: bool = False,
     ) -> Account:
         """Change an account; see `People.change`."""
         return Account(
@@ -144,6 +146,7 @@ class RemotePeople:
                 password_hash=password_hash,
                 role=role,
                 disabled=disabled,
+                due=due,
             )
         )
 

@@ -15,8 +15,8 @@ from heliotrope.store.people import Account
 
 async def log_in(
     console: Console, name: str, password: str, connection: HTTPConnection
-) -> tuple[str, float]:
-    """Check a password; return the secret of a new session and its end, POSIX s.
+) -> tuple[Account, str, float]:
+    """Check a password; return account, and secret of a new session and its end, POSIX s.
 
     Raises
     ------
@@ -31,7 +31,7 @@ async def log_in(
         )
     )
     await console.note(SecurityEvent.SIGNED_IN, connection, name)
-    return secret, now + lifetime
+    return account, secret, now + lifetime
 
 
 async def _known(console: Console, name: str) -> str:

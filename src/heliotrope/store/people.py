@@ -10,8 +10,9 @@ import secrets
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Table, literal, select
+from sqlalchemy import ColumnElement, Connection, Select, Table, literal, select
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.store import _rows as rows
@@ -21,6 +22,9 @@ from heliotrope.store.records import StoreError
 from heliotrope.store.writer import Writer
 
 _ACCOUNT, _SESSION, _TOKEN = tables.account, tables.session, tables.api_token
+_DUE = tables.password_due
+_DUE_OF = _DUE.c.name == _ACCOUNT.c.name
+_IS_DUE = _DUE.c.name.is_not(None).label("password_due")
 ROLES = ("viewer", "operator", "engineer")
 
 
@@ -40,6 +44,8 @@ class Account:
         Whether the account is disabled.
     created, changed
         POSIX s.
+    password_due
+        Whether the password must be changed at its next use: somebody else has given it.
     """
 
     name: str
@@ -48,6 +54,7 @@ class Account:
     disabled: bool
     created: float
     changed: float
+    password_due: bool = False
 
 
 @dataclass(frozen=True)
@@ -63,6 +70,7 @@ class Session:
     since: float
     expires: float
     note: str = ""
+    password_due: bool = False
 
 
 @dataclass(frozen=True)
@@ -143,17 +151,17 @@ class People:
     def accounts(self) -> tuple[Account, ...]:
         """Return all accounts by name."""
         with self._database.reading() as connection:
-            return tuple(
-                rows.records(connection, Account, select(_ACCOUNT).order_by(_ACCOUNT.c.name))
-            )
+            return tuple(rows.records(connection, Account, _accounts().order_by(_ACCOUNT.c.name)))
 
     def account(self, name: str) -> Account | None:
         """Return an account, None if the name is unknown."""
         with self._database.reading() as connection:
             return _find(connection, name)
 
-    def add(self, name: str, password_hash: str, role: str, now: float) -> Account:
-        """Make an account.
+    def add(
+        self, name: str, password_hash: str, role: str, now: float, *, due: bool = False
+    ) -> Account:
+        """Make an account; a password that is ``due`` must be changed at first use.
 
         Raises
         ------
@@ -169,14 +177,15 @@ class People:
             raise InputError(f"account {name!r}: give a name of 1 to 100 printable characters")
         if not password_hash:
             raise InputError(f"account {name}: a password hash is needed to sign in")
-        made = Account(name, role, password_hash, disabled=False, created=now, changed=now)
+        made = Account(name, role, password_hash, False, now, now, due)
 
         def work(connection: Connection) -> None:
             if _find(connection, name) is not None:
                 raise InputError(
                     f"account {name}: it exists already; change it, or give another name"
                 )
-            connection.execute(_ACCOUNT.insert().values(asdict(made)))
+            connection.execute(_ACCOUNT.insert().values(rows.row_of(_ACCOUNT, made)))
+            _set_due(connection, name, due=due)
 
         self._writer.do(work)
         return made
@@ -189,8 +198,11 @@ class People:
         password_hash: str | None = None,
         role: str | None = None,
         disabled: bool | None = None,
+        due: bool = False,
     ) -> Account:
         """Change an account. A new password, and disabling it, end its sessions and tokens.
+
+        A new password that is ``due`` must be changed at first use.
 
         Raises
         ------
@@ -213,6 +225,8 @@ class People:
             values = {**new, "changed": now}
             connection.execute(_ACCOUNT.update().where(_ACCOUNT.c.name == name).values(values))
             _check_engineers(connection, name)
+            if password_hash is not None:
+                _set_due(connection, name, due=due)
             if password_hash is not None or disabled:
                 for table in (_SESSION, _TOKEN):
                     connection.execute(table.delete().where(table.c.name == name))
@@ -235,7 +249,7 @@ class People:
 
         def work(connection: Connection) -> None:
             _need(connection, name)
-            for table in (_SESSION, _TOKEN, _ACCOUNT):
+            for table in (_SESSION, _TOKEN, _DUE, _ACCOUNT):
                 connection.execute(table.delete().where(table.c.name == name))
             _check_engineers(connection, name)
 
@@ -268,7 +282,8 @@ class People:
 
     def session(self, secret: str, now: float) -> Session | None:
         """Return the session of a secret; None if there is none, or it is no longer valid."""
-        joined = select(_SESSION, _ACCOUNT.c.role, _ACCOUNT.c.disabled).join(_ACCOUNT)
+        columns = (_SESSION, _ACCOUNT.c.role, _ACCOUNT.c.disabled, _IS_DUE)
+        joined = select(*columns).select_from(_SESSION.join(_ACCOUNT).outerjoin(_DUE, _DUE_OF))
         query = joined.where(_SESSION.c.key == _key(secret), _SESSION.c.expires > now)
         with self._database.reading() as connection:
             row = connection.execute(query).mappings().first()
@@ -415,8 +430,19 @@ def _check_role(role: str) -> None:
         raise UnknownNameError("role", role, ROLES)
 
 
+def _accounts() -> Select[Any]:
+    return select(_ACCOUNT, _IS_DUE).select_from(_ACCOUNT.outerjoin(_DUE, _DUE_OF))
+
+
+def _set_due(connection: Connection, name: str, *, due: bool) -> None:
+    """Note whether a password must be changed at first use."""
+    _delete(connection, _DUE, _DUE.c.name == name)
+    if due:
+        connection.execute(_DUE.insert().values(name=name))
+
+
 def _find(connection: Connection, name: str) -> Account | None:
-    found = rows.records(connection, Account, select(_ACCOUNT).where(_ACCOUNT.c.name == name))
+    found = rows.records(connection, Account, _accounts().where(_ACCOUNT.c.name == name))
     return found[0] if found else None
 
 

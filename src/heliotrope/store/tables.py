@@ -390,6 +390,13 @@ account = Table(
     CheckConstraint("role IN ('viewer', 'operator', 'engineer')", name="role"),
 )
 
+#: Accounts whose password somebody else has given: it must be changed at first use.
+password_due = Table(
+    "password_due",
+    metadata,
+    Column("name", Text, ForeignKey(account.c.name, ondelete="CASCADE"), primary_key=True),
+)
+
 session = Table(
     "session",
     metadata,
