@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from heliotrope.cluster import _goals, _nodes, _reports, _watch
+from heliotrope.cluster import _goals, _nodes, _reports, _runs, _watch
 from heliotrope.lcu import (
     controller,
     journal,
@@ -296,6 +296,11 @@ def _off_when_acknowledged(patch: pytest.MonkeyPatch) -> None:
         patch.delitem(_goals.GOALS, name)
 
 
+def _two_plants_obeyed(patch: pytest.MonkeyPatch) -> None:
+    """A cluster takes the lease of every plant with its key."""
+    patch.setattr(_runs.Runs, "admits", lambda self, run, now: True)
+
+
 def _brown_out_as_queued(patch: pytest.MonkeyPatch) -> None:
     """The last record counts the steps that were queued and are not made any more."""
     failing = node.Node.on_supply_failing
@@ -375,6 +380,8 @@ DEFECTS = (
            ("sensor_silent",), 20.0, worlds=("calm", "sensors")),
     Defect((12,), "differing parameters hold no motion", plant_defects.differing_moves,
            ("line_drop",), 60.0, worlds=("calm", "parameters")),
+    Defect((4,), "a cluster obeys two plants", _two_plants_obeyed, ("plant_twice",), 20.0,
+           worlds=("twice", "calm"), first=3),
     *(Defect(numbers, name, defect, only, pause, first=first)
       for numbers, name, defect, only, pause, first in plant_defects.ROWS),
 )  # fmt: skip

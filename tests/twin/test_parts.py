@@ -19,6 +19,7 @@ from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime, TickCoun
 from heliotrope.twin.boards.flash import NorFlash, PowerCutError
 from heliotrope.twin.boards.motors import MotorAxis
 from heliotrope.twin.boards.outfit import RECEIVER, outfits
+from heliotrope.twin.invariants.runs import RunAccount
 from heliotrope.twin.records import RecordsDisk
 from heliotrope.twin.world.scene import USUAL, scene_of
 from heliotrope.twin.world.simulation import RunPlan
@@ -235,3 +236,27 @@ def test_a_drawn_scene_has_sun_and_free_mirrors() -> None:
         for middle, radius in scene.keep_outs:
             assert math.dist(middle, RECEIVER) > radius + 5.0
             assert all(math.dist(middle, (*place, 2.0)) > radius + 5.0 for place in scene.places)
+
+
+def test_the_run_that_is_obeyed_is_the_only_one_while_its_leases_come() -> None:
+    runs = RunAccount()
+    runs.leased("a", 3.0, 0.0)
+    runs.leased("b", 3.0, 0.5)
+    assert runs.obeyed(["a-1.1"], 1.0) == ""
+    runs.leased("a", 3.0, 2.0)
+    # Either may be meant where both gave the same order.
+    assert runs.obeyed(["a-2.1", "b-1.1"], 4.0) == ""
+    wrong = runs.obeyed(["b-2.1"], 4.0)
+    assert wrong == "run b is obeyed while run a, which was obeyed, has the lease for 1.00 s more"
+    assert runs.obeyed(["b-2.1"], 5.0) == ""
+    assert runs.obeyed(["a-3.1"], 5.5) == ""  # b's lease came at 0.5 s, and is over
+
+
+def test_a_lease_that_comes_too_late_proves_nothing() -> None:
+    runs = RunAccount()
+    runs.leased("a", 3.0, 0.0)
+    assert runs.obeyed(["a-1.1"], 1.0) == ""
+    runs.leased("a", 3.0, 3.5)
+    assert runs.obeyed(["b-1.1"], 4.0) == ""
+    runs.forget()
+    assert runs.obeyed(["a-2.1"], 4.1) == ""

@@ -13,7 +13,8 @@ number    check
           receiver in 30 s and at stow in 5 min.
 3         TRACKING and SEARCHING, and every way out of STOWED and FAULT, begin with a genuine
           command at that instant.
-4         DEFOCUS and STOW act at once, whoever sends them; nothing else acts without authority.
+4         DEFOCUS and STOW act at once, whoever sends them; nothing else acts without authority,
+          and of two plants with the same keys one is obeyed at a time.
 5         Duplicate, late, replayed and expired commands change nothing.
 6         A damaged frame changes nothing.
 7         After a boot the state is a safe one, the journal holds the old or the new record, and
@@ -48,6 +49,7 @@ from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, STANDBY, Ball
 from heliotrope.twin.invariants._account import HeliostatAccount, fingerprint
 from heliotrope.twin.invariants.ledger import FrameLedger, OrderLedger, PlantCommand, Sent
+from heliotrope.twin.invariants.runs import RunAccount
 
 #: Returns the true direction to the sun, (3,), at a time in s.
 SunAt = Callable[[float], FloatArray]
@@ -193,8 +195,8 @@ class Observer:
     ----------
     checks
         Number of checks of each invariant.
-    frames, orders
-        The ledgers.
+    frames, orders, runs
+        The ledgers, and the account of the plants' runs.
     leased_at
         When the plant last sent a lease on a healthy line, s.
     jumped_at, disturbed_at
@@ -214,6 +216,7 @@ class Observer:
         self.checks: Counter[int] = Counter(dict.fromkeys(TITLES, 0))
         self.frames = FrameLedger()
         self.orders = OrderLedger()
+        self.runs = RunAccount()
         self.leased_at = start
         self._dark_since = float("inf")
         self.jumped_at = self.disturbed_at = float("-inf")
@@ -285,6 +288,8 @@ class Observer:
         latest = max((order.until for order in allowed), default=0.0)
         late = f"{where} {now - latest:.2f} s after its order has expired"
         self.check(5, bool(fresh), now, "cluster", late)
+        wrong = self.runs.obeyed((order.identity for order in fresh), now)
+        self.check(4, not wrong, now, "cluster", f"{where}: {wrong}")
         if fresh:
             self._unreported.append((now, where, addresses, fresh))
 

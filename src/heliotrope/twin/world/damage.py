@@ -47,6 +47,10 @@ class SimulatedPlant(Protocol):
         """End the plant's program at once."""
         ...
 
+    def run_twice(self, group: asyncio.TaskGroup, *, on: bool) -> None:
+        """Run a second plant with the same keys, or end it."""
+        ...
+
     def hang_plant(self, now: float, *, silent: bool, frozen: bool) -> None:
         """Silence the plant's program, or freeze it, or let it go on."""
         ...
@@ -157,6 +161,7 @@ class Damage:
         # The plant does not start without room for its records.
         if "plant_crash" not in everywhere and not of.disk.full and of.plant is None:
             of.start_plant(group)
+        of.run_twice(group, on="plant_twice" in everywhere)
         frozen, silent = "plant_frozen" in everywhere, "plant_silent" in everywhere
         of.hang_plant(now, silent=silent, frozen=frozen)
 

@@ -43,6 +43,7 @@ KINDS_OF_WORLDS = {
         "cluster_frozen": (8, "the program of the cluster stands still, and goes on"),
         "plant_frozen": (4, "the program of the plant stands still, and goes on"),
     },
+    "twice": {"plant_twice": (8, "a second plant with the same keys runs")},
     "disk": {"disk_slow": (10, "the disk of the plant's records is slow")},
     "sensors": {
         "sensor_stuck": (3, "a sensor shows its last value for ever"),
@@ -60,6 +61,7 @@ _LONGEST = {
     "power_cut": 20.0, "brown_out": 20.0, "flash_cut": 5.0, "time_lost": 60.0,
     "sensor_stuck": 60.0, "sensor_jumps": 30.0, "sensor_silent": 60.0, "sensor_nan": 60.0,
     "cluster_frozen": 90.0, "plant_frozen": 90.0, "disk_slow": 60.0,
+    "plant_twice": 60.0,
 }  # fmt: skip
 #: A heliostat that is cut off for this long must be at stow, s.
 _LONG = 330.0

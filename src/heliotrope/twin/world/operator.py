@@ -185,7 +185,7 @@ class Operator:
             self.clear(plant)
             does = self._chance.choices(
                 [
-                    self._onward,
+                    self.onward,
                     self._everybody,
                     self._parameters,
                     self._emergency,
@@ -275,7 +275,8 @@ class Operator:
             return (float(chance.randrange(2)),)
         return ()
 
-    def _onward(self, plant: PlantController) -> None:
+    def onward(self, plant: PlantController) -> None:
+        """Lead one heliostat on, by its state."""
         name = self._chance.choice(self._names)
         state = plant.field.of(name, plant.now()).state
         what = self._chance.choice(ONWARDS.get(state, ("APPROACH",)))

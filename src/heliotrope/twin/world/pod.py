@@ -133,11 +133,12 @@ class Pod:
         self.bus = self._new_bus()
         seed = self._chance.getrandbits(31)
         link = self.link = self.line.end(1, "plant", self.clock, seed=seed)
+        heard = TappedLink(link, self._true, _ClusterEar(self.observer))
         keeper = self.time or SystemTime(self.clock)
         fits = [board.outfit for board in self.boards]
         members = tuple(Member(o.name, self.addresses[o.name], o.serial, o.key) for o in fits)
         config = ClusterConfig(self.name, self._site, members)
-        cluster = Cluster(config, self.bus, link, self.clock, keeper, self._kept)
+        cluster = Cluster(config, self.bus, heard, self.clock, keeper, self._kept)
         context = context_of(self.name) if self.freezes else None
         self._running = [
             group.create_task(each, context=context) for each in (link.run(), cluster.run())
@@ -148,6 +149,7 @@ class Pod:
         for task in self._running:
             task.cancel()
         self._running = []
+        self.observer.runs.forget()
         self.link = None
         self.line.drop()
         self.freeze(on=False)
@@ -192,6 +194,28 @@ class Pod:
             values = frame.values()
             if name is not None and frame.name == "STATUS" and values:
                 self.plant.heard(name, int(values[0]), now)
+
+
+class _ClusterEar:
+    """Listens at a cluster's end of its line, for the leases that really reach it."""
+
+    def __init__(self, observer: Observer) -> None:
+        self._observer = observer
+
+    async def posted(self, data: bytes, now: float) -> None:
+        """Let the cluster send."""
+
+    def sent(self, data: bytes, now: float) -> None:
+        """Let the cluster send."""
+
+    async def waits(self) -> None:
+        """Let the cluster receive."""
+
+    def received(self, data: bytes, now: float) -> None:
+        """Note a lease."""
+        message = decode(data)
+        if isinstance(message, Lease):
+            self._observer.runs.leased(message.run, message.lifetime, now)
 
 
 class PlantEar:

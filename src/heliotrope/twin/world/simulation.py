@@ -53,6 +53,7 @@ from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
 from heliotrope.twin.world.scene import Scene, scene_of
 from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
+from heliotrope.twin.world.twice import SecondPlant
 from heliotrope.twin.world.worlds import Habits, PodErrors, checked, knows_boards, stored_by
 
 #: Longest interval between two looks at the boards, and between two judgements of everything, s.
@@ -302,6 +303,7 @@ class Simulation:
         self._tour: Tour | None = None
         if TOUR in plan.worlds:
             self._tour = Tour(self.operator, self.observer, self.boards, self._clock, plan.seed)
+        self._second = self._second_plant(fits) if "twice" in plan.worlds else None
         self.plant: PlantController | None = None
         self._program: list[asyncio.Task[None]] = []
         for pod in self.pods:
@@ -386,6 +388,29 @@ class Simulation:
             for each in (*(link.run() for link in links.values()), plant.run())
         ]
 
+    def _second_plant(self, fits: Sequence[Outfit]) -> SecondPlant:
+        return SecondPlant(
+            self._clock,
+            self.plan.seed,
+            self._design,
+            self._homes,
+            SETTINGS,
+            TABLE,
+            self._wanted,
+            self._assigned,
+            self.pods,
+            fits,
+            self._scene.keep_outs[0],
+            self.beams,
+            self._flux,
+            self._alarmed,
+        )
+
+    def run_twice(self, group: asyncio.TaskGroup, *, on: bool) -> None:
+        """Run a second plant with the same keys, or end it."""
+        if self._second is not None:
+            self._second.turn(group, on=on)
+
     def _alarmed(self, alarm: Alarm) -> None:
         self.beams.alarmed(alarm, self._clock.monotonic())
         self.readings.alarmed(alarm)
@@ -438,6 +463,8 @@ class Simulation:
                 pod.start(group)
             self.start_plant(group)
             tasks = [self.operator.keep(), self._persons()]
+            if self._second is not None:
+                tasks += [self._second.operator.keep(), self._second.work()]
             if self._measured:
                 tasks.append(self.instruments.run())
             others = [group.create_task(each) for each in tasks]
@@ -446,6 +473,7 @@ class Simulation:
                 saw = f"the tour is not over after {self.plan.seconds:g} s"
                 self.observer.check(11, self._tour.over, self._clock.monotonic(), saw)
             self.crash_plant(self._clock.monotonic())
+            self.run_twice(group, on=False)
             for pod in self.pods:
                 pod.crash()
             for task in others:

@@ -25,12 +25,14 @@ WORLDS = {
     "parameters": "boards store wrong parameters from the start",
     "tour": "nothing fails, and each heliostat is led through all commands, which must be done",
     "calibrations": "persons and beliefs change parameters, rightly or wrongly",
+    "twice": "a second plant with the same keys runs for a while, on the same lines",
 }
 #: Name that lets each run draw its worlds: see `mixed`.
 ANY = "any"
 #: Worlds that hold, of which `mixed` chooses.
 MIX = (
     "calm", "swarm", "held", "frozen", "disk", "place", "sensors", "parameters", "calibrations",
+    "twice",
 )  # fmt: skip
 
 

@@ -1,0 +1,51 @@
+"""The observer of the runs of plants: a cluster obeys one at a time.
+
+A run that is obeyed has the lease, and keeps it as long as its leases reach the cluster in time. No
+motion of another run may be put on the bus before that lease has ended. Nothing here rests on what
+a cluster reports: leases count when they reach it, and obedience shows on the bus.
+"""
+
+from collections.abc import Iterable
+
+#: The cluster's clock, and the interval between two of its looks, s.
+SLACK = 0.1
+
+
+class RunAccount:
+    """Account of the leases that reached a cluster, and of the run that it obeys."""
+
+    def __init__(self) -> None:
+        self._over: dict[str, float] = {}
+        self._obeyed = ""
+
+    def leased(self, run: str, lifetime: float, now: float) -> None:
+        """Note a lease that has reached the cluster."""
+        if run == self._obeyed and now >= self._over.get(run, now):
+            self._obeyed = ""  # it has lost the lease, and may or may not have it again
+        self._over[run] = now + lifetime
+
+    def forget(self) -> None:
+        """Note that the cluster's program has ended."""
+        self._over.clear()
+        self._obeyed = ""
+
+    def obeyed(self, orders: Iterable[str], now: float) -> str:
+        """Note a frame that carries out one of some orders; return what is wrong, "" if nothing.
+
+        Parameters
+        ----------
+        orders
+            Identities of the plant's orders, which begin with the name of its run.
+        now
+            s.
+        """
+        runs = {identity.rpartition("-")[0] for identity in orders}
+        left = self._over.get(self._obeyed, now) - now
+        if self._obeyed and self._obeyed not in runs and left > SLACK:
+            return (
+                f"run {min(runs)} is obeyed while run {self._obeyed}, which was obeyed, has the "
+                f"lease for {left:.2f} s more"
+            )
+        if len(runs) == 1:
+            (self._obeyed,) = runs
+        return ""
