@@ -109,7 +109,7 @@ class GuoParameters:
     ) -> None:
         values = (tilt, tilt_azimuth, azimuth_zero, elevation_zero, tau_1, mu, offset)
         for field, value in zip(fields(self), values, strict=True):
-            array = _numbers(value, f"Guo's parameter {field.name}").copy()
+            array = numbers(value, f"Guo's parameter {field.name}").copy()
             array.flags.writeable = False
             object.__setattr__(self, field.name, array)
         common_shape(**vars(self))
@@ -165,29 +165,6 @@ class GuoTracking:
         return np.where(self.reachable, "ok", "unreachable")
 
 
-@dataclass(frozen=True, eq=False)
-class AxisAccuracy:
-    """Zeros and scatter of the two axes, all in rad, shape (...).
-
-    Attributes
-    ----------
-    gamma_0, alpha_0
-        Mean of demanded minus measured, the estimates of ``azimuth_zero`` and
-        ``elevation_zero``.
-    sigma_gamma, sigma_alpha
-        Standard deviation about the mean.
-    sigma_normal
-        Standard deviation of the normal in two dimensions (a tracking error): a turn
-        of the azimuth axis moves the normal by cos α times as much.
-    """
-
-    gamma_0: FloatArray
-    sigma_gamma: FloatArray
-    alpha_0: FloatArray
-    sigma_alpha: FloatArray
-    sigma_normal: FloatArray
-
-
 def mirror_normal(
     to_target: npt.ArrayLike,
     sun: npt.ArrayLike,
@@ -221,12 +198,12 @@ def mirror_normal(
     target = as_vectors(to_target, "to_target")
     distance = as_float(np.linalg.norm(target, axis=-1))
     at_pivot = "the target is at the pivot (0 m); give the vector from pivot to target"
-    _refuse(distance == 0.0, "to_target", lambda _: at_pivot)
+    refuse(distance == 0.0, "to_target", lambda _: at_pivot)
     s, t = normalize(sun, "sun"), normalize(target, "to_target")
-    height = _numbers(offset, "offset")
+    height = numbers(offset, "offset")
     shape = common_shape(to_target=t[..., 0], sun=s[..., 0], offset=height)
     distance, height = np.broadcast_to(distance, shape), np.broadcast_to(height, shape)
-    _refuse(
+    refuse(
         np.abs(height) >= distance,
         "offset",
         lambda i: f"{height[i]:g} m reaches the target, {distance[i]:g} m away; give metres",
@@ -276,7 +253,7 @@ def forward(alpha: npt.ArrayLike, gamma: npt.ArrayLike, parameters: GuoParameter
         If a number is not finite or the shapes do not broadcast.
     """
     p = parameters
-    a, g = _numbers(alpha, "alpha"), _numbers(gamma, "gamma")
+    a, g = numbers(alpha, "alpha"), numbers(gamma, "gamma")
     common_shape(alpha=a, gamma=g, **vars(p))
     a, g = a + p.elevation_zero, g + p.azimuth_zero
     x = np.sin(p.mu) * np.cos(p.tau_1) - np.cos(p.mu) * np.sin(a) * np.sin(p.tau_1)
@@ -314,7 +291,7 @@ def angles(normal: npt.ArrayLike, parameters: GuoParameters) -> GuoTracking:
     n = normalize(normal, "normal")
     shape = common_shape(normal=n[..., 0], **vars(p))
     tau_1, mu = np.broadcast_to(p.tau_1, shape), np.broadcast_to(p.mu, shape)
-    _refuse(
+    refuse(
         np.abs(np.cos(mu) * np.cos(tau_1)) < LEAST_COSINE,
         "Guo's parameters",
         lambda i: (
@@ -480,7 +457,7 @@ def from_heliotrope(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
     for name in values:
         if name not in _HELIOTROPE_NAMES:
             raise UnknownNameError("parameter of Guo's model", name, _HELIOTROPE_NAMES)
-    v = {name: _numbers(values.get(name, 0.0), name) for name in _HELIOTROPE_NAMES}
+    v = {name: numbers(values.get(name, 0.0), name) for name in _HELIOTROPE_NAMES}
     common_shape(**v)
     tilt_north, tilt_east = v["tilt_north"], v["tilt_east"]
     east = np.sin(tilt_east)
@@ -531,75 +508,6 @@ def from_malan(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
     return from_heliotrope({MALAN_NAMES[name]: value for name, value in values.items()})
 
 
-def axis_accuracy(
-    measured_alpha: npt.ArrayLike,
-    measured_gamma: npt.ArrayLike,
-    ideal_alpha: npt.ArrayLike,
-    ideal_gamma: npt.ArrayLike,
-    *,
-    azimuth_weight: npt.ArrayLike = 1.0,
-) -> AxisAccuracy:
-    """Return the zero and the scatter of each axis from a set of measurements.
-
-    Differences are taken on the circle, so 359.9° and 0.1° are 0.2° apart. Source: Guo
-    (43)-(47), reconstructed: mean and standard deviation (n − 1) per axis.
-
-    Parameters
-    ----------
-    measured_alpha, measured_gamma, ideal_alpha, ideal_gamma
-        Encoder positions, and the angles that the model demands for the same sightings,
-        rad, shape (..., n), n ≥ 2 measurements.
-    azimuth_weight
-        Weights of the azimuth, shape (..., n): equal if the axis itself scatters,
-        cos² α if the measured normals do, whose scatter the azimuth shows magnified.
-
-    Raises
-    ------
-    InputError
-        If fewer than two measurements are given, shapes differ, weights are negative or
-        all 0, or the differences spread over half a turn (branches mixed).
-    """
-    values = (measured_alpha, measured_gamma, ideal_alpha, ideal_gamma, azimuth_weight)
-    names = ("measured_alpha", "measured_gamma", "ideal_alpha", "ideal_gamma", "azimuth_weight")
-    given = {k: _numbers(v, k) for k, v in zip(names, values, strict=True)}
-    shape = common_shape(**given)
-    if not shape or shape[-1] < 2:
-        raise InputError(f"axis accuracy: shape {shape}; the last axis must hold 2 or more")
-    alpha, gamma, alpha_i, gamma_i, weight = (np.broadcast_to(a, shape) for a in given.values())
-    if (weight < 0.0).any() or (weight.sum(axis=-1) == 0.0).any():
-        raise InputError("azimuth_weight: weights must not be negative nor all 0; give cos² α")
-    gamma_0, gamma_rest = _circular(gamma_i - gamma, weight, "gamma")
-    alpha_0, alpha_rest = _circular(alpha_i - alpha, np.ones(shape), "alpha")
-    n = shape[-1]
-    across = np.cos(alpha_i) ** 2 * gamma_rest**2
-    variance_gamma = (weight * gamma_rest**2).sum(axis=-1) / weight.sum(axis=-1) * n / (n - 1)
-    return AxisAccuracy(
-        gamma_0=gamma_0,
-        sigma_gamma=as_float(np.sqrt(variance_gamma)),
-        alpha_0=alpha_0,
-        sigma_alpha=as_float(np.sqrt((alpha_rest**2).sum(axis=-1) / (n - 1))),
-        sigma_normal=as_float(np.sqrt((alpha_rest**2 + across).sum(axis=-1) / (n - 1))),
-    )
-
-
-def _circular(
-    difference: FloatArray, weight: FloatArray, name: str
-) -> tuple[FloatArray, FloatArray]:
-    """Return the weighted mean of angles along the last axis, and what remains."""
-    middle = np.arctan2(
-        (weight * np.sin(difference)).sum(axis=-1, keepdims=True),
-        (weight * np.cos(difference)).sum(axis=-1, keepdims=True),
-    )
-    rest = wrap_signed(difference - middle)
-    _refuse(
-        np.abs(rest) > 0.5 * np.pi,
-        f"ideal minus measured {name}",
-        lambda i: f"{np.degrees(rest[i]):.1f}° from the mean, limit ±90°; do not mix branches",
-    )
-    shift = (weight * rest).sum(axis=-1, keepdims=True) / weight.sum(axis=-1, keepdims=True)
-    return wrap_signed(middle + shift)[..., 0], as_float(rest - shift)
-
-
 def _tilt_rotation(tilt: FloatArray, tilt_azimuth: FloatArray) -> FloatArray:
     """Return the rotation by ψ_t that leans the vertical towards the azimuth ψ_a."""
     # About U × d for the horizontal direction d at azimuth ψ_a.
@@ -616,16 +524,17 @@ def _twist(
     return as_float(np.arctan2(turn[..., 1, 0], turn[..., 0, 0]))
 
 
-def _numbers(value: npt.ArrayLike, name: str) -> FloatArray:
+def numbers(value: npt.ArrayLike, name: str) -> FloatArray:
+    """Return ``value`` as an array of finite numbers; an error names it."""
     try:
         array = as_float(value)
     except (TypeError, ValueError):
         raise InputError(f"{name}: {value!r} is not an array of numbers") from None
-    _refuse(~np.isfinite(array), name, lambda i: f"{array[i]} is not finite; give a number")
+    refuse(~np.isfinite(array), name, lambda i: f"{array[i]} is not finite; give a number")
     return array
 
 
-def _refuse(
+def refuse(
     wrong: npt.NDArray[np.bool_], what: str, problem: Callable[[tuple[int, ...]], str]
 ) -> None:
     """Raise for the first place where ``wrong`` holds, naming it."""

@@ -10,7 +10,7 @@ from heliotrope.calibration.evaluation import ErrorSummary, summarise
 from heliotrope.calibration.learn.learning import Learned, Prediction, predict
 from heliotrope.calibration.sightings import ray_directions
 from heliotrope.geometry import FloatArray, azimuth_elevation, bisector
-from heliotrope.mechanism.guo import AxisAccuracy, axis_accuracy
+from heliotrope.mechanism.axis_accuracy import AxisAccuracy, axis_accuracy
 
 #: Heliostats with fewer sightings are listed but do not enter the overall figures.
 ENOUGH = 20

@@ -1,0 +1,102 @@
+"""Zeros and scatter of each axis of a heliostat: Guo's evaluation of tracking data, (43)-(47)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float, common_shape, wrap_signed
+from heliotrope.mechanism.guo import numbers, refuse
+
+
+@dataclass(frozen=True, eq=False)
+class AxisAccuracy:
+    """Zeros and scatter of the two axes, all in rad, shape (...).
+
+    Attributes
+    ----------
+    gamma_0, alpha_0
+        Mean of demanded minus measured, the estimates of ``azimuth_zero`` and
+        ``elevation_zero``.
+    sigma_gamma, sigma_alpha
+        Standard deviation about the mean.
+    sigma_normal
+        Standard deviation of the normal in two dimensions (a tracking error): a turn
+        of the azimuth axis moves the normal by cos α times as much.
+    """
+
+    gamma_0: FloatArray
+    sigma_gamma: FloatArray
+    alpha_0: FloatArray
+    sigma_alpha: FloatArray
+    sigma_normal: FloatArray
+
+
+def axis_accuracy(
+    measured_alpha: npt.ArrayLike,
+    measured_gamma: npt.ArrayLike,
+    ideal_alpha: npt.ArrayLike,
+    ideal_gamma: npt.ArrayLike,
+    *,
+    azimuth_weight: npt.ArrayLike = 1.0,
+) -> AxisAccuracy:
+    """Return the zero and the scatter of each axis from a set of measurements.
+
+    Differences are taken on the circle, so 359.9° and 0.1° are 0.2° apart. Source: Guo
+    (43)-(47), reconstructed: mean and standard deviation (n − 1) per axis.
+
+    Parameters
+    ----------
+    measured_alpha, measured_gamma, ideal_alpha, ideal_gamma
+        Encoder positions, and the angles that the model demands for the same sightings,
+        rad, shape (..., n), n ≥ 2 measurements.
+    azimuth_weight
+        Weights of the azimuth, shape (..., n): equal if the axis itself scatters,
+        cos² α if the measured normals do, whose scatter the azimuth shows magnified.
+
+    Raises
+    ------
+    InputError
+        If fewer than two measurements are given, shapes differ, weights are negative or
+        all 0, or the differences spread over half a turn (branches mixed).
+    """
+    values = (measured_alpha, measured_gamma, ideal_alpha, ideal_gamma, azimuth_weight)
+    names = ("measured_alpha", "measured_gamma", "ideal_alpha", "ideal_gamma", "azimuth_weight")
+    given = {k: numbers(v, k) for k, v in zip(names, values, strict=True)}
+    shape = common_shape(**given)
+    if not shape or shape[-1] < 2:
+        raise InputError(f"axis accuracy: shape {shape}; the last axis must hold 2 or more")
+    alpha, gamma, alpha_i, gamma_i, weight = (np.broadcast_to(a, shape) for a in given.values())
+    if (weight < 0.0).any() or (weight.sum(axis=-1) == 0.0).any():
+        raise InputError("azimuth_weight: weights must not be negative nor all 0; give cos² α")
+    gamma_0, gamma_rest = _circular(gamma_i - gamma, weight, "gamma")
+    alpha_0, alpha_rest = _circular(alpha_i - alpha, np.ones(shape), "alpha")
+    n = shape[-1]
+    across = np.cos(alpha_i) ** 2 * gamma_rest**2
+    variance_gamma = (weight * gamma_rest**2).sum(axis=-1) / weight.sum(axis=-1) * n / (n - 1)
+    return AxisAccuracy(
+        gamma_0=gamma_0,
+        sigma_gamma=as_float(np.sqrt(variance_gamma)),
+        alpha_0=alpha_0,
+        sigma_alpha=as_float(np.sqrt((alpha_rest**2).sum(axis=-1) / (n - 1))),
+        sigma_normal=as_float(np.sqrt((alpha_rest**2 + across).sum(axis=-1) / (n - 1))),
+    )
+
+
+def _circular(
+    difference: FloatArray, weight: FloatArray, name: str
+) -> tuple[FloatArray, FloatArray]:
+    """Return the weighted mean of angles along the last axis, and what remains."""
+    middle = np.arctan2(
+        (weight * np.sin(difference)).sum(axis=-1, keepdims=True),
+        (weight * np.cos(difference)).sum(axis=-1, keepdims=True),
+    )
+    rest = wrap_signed(difference - middle)
+    refuse(
+        np.abs(rest) > 0.5 * np.pi,
+        f"ideal minus measured {name}",
+        lambda i: f"{np.degrees(rest[i]):.1f}° from the mean, limit ±90°; do not mix branches",
+    )
+    shift = (weight * rest).sum(axis=-1, keepdims=True) / weight.sum(axis=-1, keepdims=True)
+    return wrap_signed(middle + shift)[..., 0], as_float(rest - shift)
