@@ -30,6 +30,27 @@ def test_malan_figures(tmp_path: Path) -> None:
         assert picture[..., :3].std() > 0.02
 
 
+def test_guo_figures(tmp_path: Path) -> None:
+    found = _load("guo_figures").main(tmp_path)
+    # Figure 1: τ₁ = 5° and μ = −0.92° are what lies between the axes and the normal.
+    first = found["figure 1"]
+    assert first["between the axes (deg)"] == pytest.approx(85.0, abs=1e-9)
+    assert first["normal from the elevation axis (deg)"] == pytest.approx(90.92, abs=1e-9)
+    assert first["beam past target (µm)"] < 1e-3
+    # Figure 2: his published zeros, from nine readings that scatter as his.
+    second = found["figure 2"]
+    assert second["gamma_0_deg"] == pytest.approx(-237.43, abs=4 * 0.014 / 3)
+    assert second["alpha_0_deg"] == pytest.approx(22.832, abs=4 * 0.011 / 3)
+    assert 0.004 < second["sigma_gamma_deg"] < 0.03
+    assert 0.003 < second["sigma_alpha_deg"] < 0.024
+    third = found["figure 3"]
+    assert third["x of alpha = 40 deg (m)"] == pytest.approx(third["x by (41) (m)"], abs=1e-12)
+    assert third["alpha by (42) (deg)"] == pytest.approx(40.0, abs=1e-9)
+    for name in ("figure 4", "figure 5"):
+        assert max(found[name].values()) < 1e-14
+    assert imread(tmp_path / "guo-figures.png")[..., :3].std() > 0.02
+
+
 def test_malan_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = imread(_load("malan_noise").main(tmp_path))
     assert picture[..., :3].std() > 0.02

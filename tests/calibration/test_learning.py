@@ -43,11 +43,16 @@ def measured(
     each: int = 4,
     noise: float = 2e-4,
     moved: dict[tuple[int, str], FloatArray] | None = None,
+    known: dict[str, float] | None = None,
 ) -> tuple[Sightings, dict[str, FloatArray]]:
-    """Sightings over a year, ``each`` a day; ``moved`` shifts a parameter by row and day."""
+    """Return sightings over a year, ``each`` a day; ``moved`` shifts a parameter by row and day.
+
+    ``known`` gives a parameter the same value everywhere.
+    """
     rng = np.random.default_rng(seed)
     count = len(nominal)
     truth = {n: rng.normal(0, s, count) for n, s in PRIORS.items()}
+    truth |= {n: np.full(count, value) for n, value in (known or {}).items()}
     parts = []
     for day in range(days):
         now = {n: v.copy() for n, v in truth.items()}
@@ -329,3 +334,21 @@ def test_nothing_to_learn_from_is_the_prior() -> None:
     assert spread[0, place, place] > 5 * spread[1, place, place]
     empty = learn(nominal, seen.take([]), "guo6")
     assert np.isfinite(empty.parameters_at([0], [START])[0]).all()
+
+
+def test_guos_zeros_are_those_before_the_fit_and_his_scatter_that_after_it() -> None:
+    nominal = field(2, seed=3)
+    # His zeros are measured minus true: our biases with the opposite sign.
+    seen, _ = measured(
+        nominal, 8, noise=2e-4, known={"azimuth_bias": -8e-3, "elevation_bias": 6e-3}
+    )
+    found = learn(nominal, seen, "guo6", used=split(seen, "random", 0.7))
+    for figures in assess(("A", "B"), found).heliostats:
+        assert figures.axes is not None
+        # The held-out mean has the error of a dozen sightings and of the correlation with tilt.
+        assert figures.axes.gamma_0 == pytest.approx(8e-3, abs=1e-3)
+        assert figures.axes.alpha_0 == pytest.approx(-6e-3, abs=0.5e-3)
+        # 0.2 mrad of the beam is 0.1 mrad of the normal; azimuth shows it magnified.
+        assert 0.05e-3 < figures.axes.sigma_alpha < 0.2e-3
+        assert 0.05e-3 < figures.axes.sigma_gamma < 0.6e-3
+        assert figures.document()["gamma_0_mrad"] == pytest.approx(8.0, abs=1.0)

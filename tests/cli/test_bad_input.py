@@ -368,6 +368,8 @@ ARGUMENTS: list[tuple[list[str], str]] = [
     (["sun", "--pressure", "5"], "500"),
     (["sun", "--time", "2026-13-01T00:00Z"], "is not ISO 8601"),
     (["calibrate", "NOWHERE"], "there is no such file"),
+    (["parameters", "psi_t=much"], "write NAME=VALUE with a number"),
+    (["parameters", "psi=1"], "psi_t"),
     (["evaluate", "NOWHERE"], "there is no such file"),
     (["evaluate", "PAINT", "--fraction", "0"], "must lie between 0 and 1"),
     (["evaluate", "PAINT", "--model", "tilt_north,lean"], "lean"),

@@ -116,6 +116,32 @@ def test_track_gives_both_branches(call: Any, plant_file: Path) -> None:
     assert found["branches"][found["best"]]["reachable"]
 
 
+def test_track_by_guo_agrees_with_the_armature(call: Any, plant_file: Path) -> None:
+    question = ("track", plant_file, "--heliostat", "P1A", "--time", "2026-12-21T10:00+02:00")
+    his = json.loads(call(*question, "--law", "guo", "--json"))
+    ours = json.loads(call(*question, "--json"))
+    best = ours["branches"][ours["best"]]
+    nearest = min(his["branches"], key=lambda b: abs(b["counts"][1] - best["counts"][1]))
+    np.testing.assert_allclose(nearest["angles_rad"], best["angles_rad"], rtol=0, atol=1e-7)
+    assert nearest["from_armature_mrad"] < 1e-4
+    assert set(his["guo"]) == {"psi_a", "psi_t", "gamma_0", "tau_1", "alpha_0", "mu", "H_z"}
+    assert "τ₁" in call(*question, "--law", "guo")
+
+
+def test_parameters_converts_malans_table_6_1(call: Any) -> None:
+    values = ("eptN=-13.27", "eptE=-4.56", "eNO=-1.92", "gb=-3.79", "ab=1.12")
+    found = json.loads(call("parameters", "--from", "malan", *values, "--json"))
+    # The pedestal leans to the south-south-west, as he says of his roof.
+    assert found["guo"]["psi_a_deg"] == pytest.approx(198.97, abs=0.01)
+    assert found["guo"]["psi_t_deg"] == pytest.approx(
+        np.degrees(np.hypot(13.27, 4.56) / 1e3), rel=1e-3
+    )
+    assert found["guo"]["alpha_0_deg"] == pytest.approx(-np.degrees(1.12e-3))
+    assert found["malan"]["eptN_mrad"] == pytest.approx(-13.27)
+    shown = call("parameters", "psi_t=1.854", "psi_a=236.06", "mu=-0.92")
+    assert "not in Malan's parameters: canting" in shown
+
+
 def test_track_a_day(call: Any, plant_file: Path) -> None:
     arguments = (
         "track",
@@ -272,6 +298,10 @@ def test_calibrate_a_plant_with_a_table(call: Any, plant_file: Path, tmp_path: P
             "--json",
         )
     )
+    his = next(iter(found["guo"].values()))
+    # A tilt to the north of 5 mrad, and a bias of −3 mrad: a zero of +3 mrad in his sense.
+    assert his["psi_t_deg"] == pytest.approx(np.degrees(5e-3), rel=0.1)
+    assert his["gamma_0_deg"] == pytest.approx(np.degrees(3e-3), rel=0.1)
     values = [h["parameters"]["tilt_north"] for h in found["heliostats"].values()]
     np.testing.assert_allclose(np.median(values), 5e-3, atol=2e-4)
     # The field takes it back: as a plant, and as a calibration beside the old one.

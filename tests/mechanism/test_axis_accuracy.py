@@ -25,8 +25,9 @@ def test_zeros_and_scatter_are_recovered():
     gamma = wrap_signed(gamma_i + 0.007 + rng.normal(0, 0.8 * MRAD, n))
     found = axis_accuracy(alpha, gamma, alpha_i, gamma_i)
     standard_error = MRAD / np.sqrt(n)
-    assert found.alpha_0 == pytest.approx(0.004, abs=5 * standard_error)
-    assert found.gamma_0 == pytest.approx(-0.007, abs=5 * standard_error)
+    # Measured minus computed, (44) and (46).
+    assert found.alpha_0 == pytest.approx(-0.004, abs=5 * standard_error)
+    assert found.gamma_0 == pytest.approx(0.007, abs=5 * standard_error)
     assert found.sigma_alpha == pytest.approx(0.3 * MRAD, rel=0.03)
     assert found.sigma_gamma == pytest.approx(0.8 * MRAD, rel=0.03)
     mean_square_cosine = np.mean(np.cos(alpha_i) ** 2)
@@ -54,7 +55,7 @@ def test_mean_and_deviation_do_not_depend_on_where_the_circle_is_cut(n, shift, s
     alpha_i = rng.uniform(0, 1, n)
     gamma_i = rng.uniform(0, TAU, n)
     found = axis_accuracy(
-        alpha_i - noise[0], wrap_signed(gamma_i - shift - noise[1]), alpha_i, gamma_i
+        alpha_i + noise[0], wrap_signed(gamma_i + shift + noise[1]), alpha_i, gamma_i
     )
     assert abs(wrap_signed(found.gamma_0 - shift - noise[1].mean())) < 1e-13
     assert found.sigma_gamma == pytest.approx(np.std(noise[1], ddof=1), abs=1e-13)
@@ -93,7 +94,7 @@ def test_weights_by_cosine_keep_the_keyhole_from_ruling_the_azimuth():
         (lambda: axis_accuracy(0, 0, 0, [0, 0], azimuth_weight=0), "must not be .* all 0"),
         (
             lambda: axis_accuracy(0, 0, 0, [0.1, PI, 0.1]),
-            r"measured gamma\[1\]: .* from the mean, limit ±90°; do not mix branches",
+            r"computed gamma\[1\]: .* from the mean, limit ±90°; do not mix branches",
         ),
         (lambda: axis_accuracy(0, 0, [0.1, 0.1, PI], 0), r"alpha\[2\]: .* do not mix branches"),
     ],

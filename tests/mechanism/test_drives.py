@@ -77,13 +77,14 @@ def test_the_three_forms_of_a_jack_are_one(sense: int) -> None:
     grigoriev = drives.linear_grigoriev(a, b, length, rate, angle_zero=angle, sense=sense)
     included = np.arccos((a * a + b * b - length * length) / (2 * a * b))
     at_zero = angle + sense * included
-    guo = drives.linear_guo(a, b, at_zero, included, rate, sense=sense)
+    guo = drives.linear_guo(a, b, np.pi - angle, length, rate)
     paint = drives.linear_paint(1 / rate, length, a, b, at_zero, clockwise=int(sense < 0))
     counts = np.linspace(0, 60000, 13)
     # The law of cosines itself.
     stroke = length + rate * counts
     wanted = angle + sense * np.arccos((a * a + b * b - stroke**2) / (2 * a * b))
-    for drive in (grigoriev, guo, paint):
+    # Guo's angle falls as the jack lengthens: his triangle is on the other side.
+    for drive in (grigoriev, paint, *([guo] if sense < 0 else [])):
         np.testing.assert_allclose(drive.angles(counts), wanted, rtol=0, atol=1e-12)
 
 
@@ -125,7 +126,7 @@ def test_slope_is_the_derivative(kind: str) -> None:
         (lambda: drives.linear_paint(0, 0.08, 0.34, 0.32, 0), "must not be 0"),
         (lambda: drives.linear_paint(1e5, 0.9, 0.34, 0.32, 0), "do not form a triangle"),
         (lambda: drives.linear_paint(1e5, 0.01, 0.34, 0.32, 0), "do not form a triangle"),
-        (lambda: drives.linear_guo(0.3, 0.3, 0, 4.0, 1e-5), r"in \(0, π\)"),
+        (lambda: drives.linear_guo(0.3, 0.3, 0.5, 0.7, 1e-5), r"do not form a triangle"),
         (lambda: drives.direct(rate=0.0), "is 0 or infinite"),
         (lambda: drives.direct().angles(np.nan), "counts hold NaN"),
     ],

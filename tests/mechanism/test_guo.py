@@ -125,9 +125,9 @@ def test_forward_is_a_product_of_rotations(parameters):
     lean_about = [-np.cos(p.tilt_azimuth), np.sin(p.tilt_azimuth), 0.0]
     frame = (
         rotation(lean_about, p.tilt)
-        @ rotation(-UP, gamma + p.azimuth_zero)
+        @ rotation(-UP, gamma - p.azimuth_zero)
         @ rotation(NORTH, -p.tau_1)
-        @ rotation(EAST, alpha + p.elevation_zero)
+        @ rotation(EAST, alpha - p.elevation_zero)
         @ rotation(-UP, p.mu)
     )
     assert angle_between(forward(alpha, gamma, p), frame @ NORTH).max() < 1e-14
@@ -148,7 +148,7 @@ def test_a_tilt_leans_the_azimuth_axis_towards_its_azimuth(azimuth_deg, towards)
 def test_the_branches_hold_the_position_that_made_the_normal(parameters, alpha, gamma):
     assume(abs(np.cos(parameters.mu) * np.cos(parameters.tau_1)) > 0.05)
     # At α = ±90° the branches meet and an error of the normal is magnified without bound.
-    assume(abs(np.cos(alpha + parameters.elevation_zero)) > 0.01)
+    assume(abs(np.cos(alpha - parameters.elevation_zero)) > 0.01)
     normal = forward(alpha, gamma, parameters)
     found = angles(normal, parameters)
     assert found.reachable
@@ -167,7 +167,7 @@ def test_the_branches_hold_the_position_that_made_the_normal(parameters, alpha, 
 def test_angles_lie_in_their_ranges(parameters, azimuth, elevation):
     assume(abs(np.cos(parameters.mu) * np.cos(parameters.tau_1)) > 0.05)
     found = angles(direction(azimuth, elevation), parameters)
-    joint = found.alpha + parameters.elevation_zero
+    joint = found.alpha - parameters.elevation_zero
     slack = 1e-14
     assert -PI / 2 - slack <= joint[0] <= PI / 2 + slack <= joint[1] + 2 * slack
     assert joint[1] <= 3 * PI / 2 + slack
@@ -208,8 +208,8 @@ def test_at_the_keyhole_the_residual_is_better_than_by_arcsin():
 def test_on_the_azimuth_axis_the_azimuth_joint_stays_at_zero(up, tau_1, mu):
     p = GuoParameters(azimuth_zero=0.25, elevation_zero=0.5, tau_1=tau_1, mu=mu)
     found = angles([0.0, 0.0, up], p)
-    assert found.gamma == pytest.approx(TAU - 0.25)
-    assert wrap_signed(found.alpha + 0.5 - up * PI / 2) == pytest.approx(0.0, abs=1e-15)
+    assert found.gamma == pytest.approx(0.25)
+    assert wrap_signed(found.alpha - 0.5 - up * PI / 2) == pytest.approx(0.0, abs=1e-15)
     assert found.residual == pytest.approx(abs(mu - tau_1), abs=1e-15)
 
 
@@ -286,13 +286,13 @@ RELATIONS = {
     "tilt to the other side (37)": lambda p: replace(
         p, tilt=-p.tilt, tilt_azimuth=p.tilt_azimuth + PI
     ),
-    "elevation axis end for end": lambda p: replace(
+    "elevation axis end for end (40)": lambda p: replace(
         p,
         tau_1=PI - p.tau_1,
         azimuth_zero=p.azimuth_zero + PI,
         elevation_zero=p.elevation_zero + PI,
     ),
-    "mirror over the axis": lambda p: replace(
+    "mirror over the axis (39)": lambda p: replace(
         p, mu=PI - p.mu, elevation_zero=p.elevation_zero + PI
     ),
 }
@@ -312,7 +312,7 @@ def test_regularise_undoes_every_relation(name, parameters):
     a, b = regularise(parameters), regularise(RELATIONS[name](parameters))
     assert same_machine(a, b)
     # At the edge of a range two neighbours may come out at its two ends.
-    edges = (a.tilt, PI - a.tilt, PI / 2 - abs(a.tau_1), PI / 2 - abs(a.mu))
+    edges = (a.tilt, PI - a.tilt, PI / 2 - abs(a.tau_1), PI / 2 - abs(a.elevation_zero))
     assume(min(edges) > 1e-9)
     for field in vars(a):
         if field != "offset":
@@ -357,7 +357,7 @@ POSES = {
         (1, 1, 1),
     ),
     "azimuth drive reversed": lambda p: (
-        {"tilt": p.tilt + PI, "azimuth_zero": 2 * p.tilt_azimuth - p.azimuth_zero}
+        {"tilt": p.tilt + PI, "azimuth_zero": -2 * p.tilt_azimuth - p.azimuth_zero}
         | {"tau_1": -p.tau_1, "elevation_zero": p.elevation_zero + PI},
         (1, -1),
         (1, 1, 1),
@@ -383,9 +383,13 @@ def test_regularise_gives_natural_ranges_and_the_same_machine(parameters):
     assert 0 <= once.tilt <= PI
     assert 0 <= once.tilt_azimuth < TAU
     assert -PI <= once.azimuth_zero < PI
-    assert -PI <= once.elevation_zero < PI
+    assert abs(once.elevation_zero) <= PI / 2
     assert abs(once.tau_1) <= PI / 2
-    assert abs(once.mu) <= PI / 2
+    # The sign of this product is the same for all equivalent sets.
+    product_of_cosines = np.cos(parameters.tau_1) * np.cos(parameters.mu)
+    product_of_cosines = product_of_cosines * np.cos(parameters.elevation_zero)
+    assume(abs(product_of_cosines) > 1e-9)
+    assert (abs(once.mu) <= PI / 2) == (product_of_cosines > 0)
     assert once.offset == parameters.offset
     assert same_machine(parameters, once)
     twice = regularise(once)
@@ -407,6 +411,14 @@ def test_regularise_at_the_ends_of_the_tilt(tilt):
     assert regularise(once).tilt_azimuth == once.tilt_azimuth
     if tilt == 0:
         assert once.tilt_azimuth == 0
+
+
+def test_an_elevation_zero_beyond_a_right_angle_becomes_a_mirror_that_looks_back():
+    start = GuoParameters(elevation_zero=np.radians(170.0), mu=np.radians(2.0))
+    once = regularise(start)
+    assert np.degrees(once.elevation_zero) == pytest.approx(-10.0, abs=1e-12)
+    assert np.degrees(once.mu) == pytest.approx(178.0, abs=1e-12)
+    assert same_machine(start, once)
 
 
 def test_regularise_leaves_natural_parameters_alone():
@@ -451,7 +463,7 @@ def test_mapping_there_and_back(parameters):
 def test_the_twist_is_half_the_product_of_the_tilts():
     north, east = 0.003, -0.002
     parameters = from_heliotrope({"tilt_north": north, "tilt_east": east})
-    assert parameters.azimuth_zero == pytest.approx(north * east / 2, rel=1e-4)
+    assert parameters.azimuth_zero == pytest.approx(-north * east / 2, rel=1e-4)
 
 
 def test_a_field_is_mapped_at_once():
@@ -471,12 +483,12 @@ def test_malan_there_and_back(values):
 
 
 def test_from_the_sun_to_the_length_of_a_jack():
-    side_a, side_b, included = 0.4, 1.1, 1.2
-    jack = linear_guo(side_a, side_b, 0.6, included, 1e-5)
+    side_a, side_b, slope, at_zero = 0.4, 1.1, 0.7, 0.9
+    jack = linear_guo(side_a, side_b, slope, at_zero, 1e-5)
     found = track([0.0, 60.0, 40.0], direction(2.5, 0.8), GuoParameters(tau_1=0.004, mu=0.003))
     alpha = found.alpha[0]
-    length = np.sqrt(side_a**2 + side_b**2 - 2 * side_a * side_b * np.cos(included + alpha - 0.6))
-    at_zero = np.sqrt(side_a**2 + side_b**2 - 2 * side_a * side_b * np.cos(included))
+    # (41) as printed.
+    length = np.sqrt(side_a**2 + side_b**2 + 2 * side_a * side_b * np.cos(alpha + slope))
     assert jack.counts(alpha) == pytest.approx((length - at_zero) / 1e-5, abs=1e-8)
     assert jack.angles(jack.counts(alpha)) == pytest.approx(alpha, abs=1e-13)
 

@@ -22,6 +22,7 @@ from heliotrope.cli.evaluate import evaluate
 from heliotrope.cli.fetch import fetch
 from heliotrope.cli.field import app as field_app
 from heliotrope.cli.image import image
+from heliotrope.cli.parameters import parameters
 from heliotrope.cli.plan import plan
 from heliotrope.cli.run.command import GroupedCommand, run
 from heliotrope.cli.simulate import simulate
@@ -59,6 +60,7 @@ field_app.command()(layout)
 
 app.command()(sun)
 app.command()(track)
+app.command()(parameters)
 app.add_typer(field_app, name="field")
 app.add_typer(camera_app, name="camera")
 app.command()(image)

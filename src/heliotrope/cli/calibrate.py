@@ -64,6 +64,20 @@ def calibrate(
     print(f"report: {page}")
 
 
+def _print_guo(content: "CalibrationReport") -> None:
+    from heliotrope.mechanism.guo_names import NAMES
+
+    found = content.guo
+    if found is None:
+        return
+    six = [name for name, (_, _, unit) in NAMES.items() if unit == "°"]
+    print_table(
+        ["heliostat", *(NAMES[name][0] for name in six)],
+        [[row, *(f"{values[f'{n}_deg']:.4f}" for n in six)] for row, values in found.items()],
+        title="Guo's six parameters, °",
+    )
+
+
 def _print(content: "CalibrationReport") -> None:
     def shown(value: float) -> str:
         return f"{1e3 * value:.2f}" if math.isfinite(value) else "–"
@@ -95,6 +109,7 @@ def _print(content: "CalibrationReport") -> None:
         rows,
         title="beam error, mrad",
     )
+    _print_guo(content)
     a = content.assessment
     if a is not None and math.isfinite(a.median_of_medians):
         print(

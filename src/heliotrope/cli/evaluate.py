@@ -1,6 +1,7 @@
 """``heliotrope evaluate``: how well held-out sightings are predicted."""
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
@@ -60,6 +61,20 @@ def evaluate(
         print(line)
 
 
+def _print_axes(document: dict[str, Any], shown: Callable[[Any], str]) -> None:
+    keys = ("gamma_0_mrad", "sigma_gamma_mrad", "alpha_0_mrad", "sigma_alpha_mrad")
+    rows = [
+        [name, *(shown(h[key]) for key in keys)]
+        for name, h in document["heliostats"].items()
+        if keys[0] in h
+    ]
+    print_table(
+        ["heliostat", "γ₀", "σγ", "α₀", "σα"],
+        rows,
+        title="each axis, mrad: zero before the fit, scatter after it (Guo (44)-(47))",
+    )
+
+
 def _print(document: dict[str, Any]) -> None:
     def shown(value: Any, digits: int = 2) -> str:
         return f"{value:.{digits}f}" if value is not None and math.isfinite(value) else "–"
@@ -93,6 +108,7 @@ def _print(document: dict[str, Any]) -> None:
         rows,
         title=f"beam error of held-out sightings, mrad ({document['split']} split)",
     )
+    _print_axes(document, shown)
     group = f"heliostats with {document['enough']} or more"
     if not document["enough"]:
         group = "all heliostats (none has 20 sightings)"

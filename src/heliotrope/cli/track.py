@@ -1,7 +1,7 @@
 """``heliotrope track``: drive positions of a heliostat."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -13,6 +13,8 @@ from heliotrope.cli._common import (
     print_json,
     print_table,
 )
+from heliotrope.cli._track_guo import track_by_guo
+from heliotrope.errors import InputError
 
 if TYPE_CHECKING:
     from heliotrope.field.plant import Plant
@@ -37,6 +39,10 @@ def track(
     calibration: Annotated[
         Path | None, typer.Option(help="calibration.json of heliotrope calibrate to apply first.")
     ] = None,
+    law: Annotated[
+        Literal["armature", "guo"],
+        typer.Option(help="armature: any mechanism; guo: the closed form for azimuth-elevation."),
+    ] = "armature",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Print normal, joint angles and drive counts of both branches, or of a day."""
@@ -54,6 +60,8 @@ def track(
     mechanism = plant.heliostat(heliostat)
     goal = np.array(_aim(plant, aim, target))
     moment = parse_time(time)
+    if every is not None and law == "guo":
+        raise InputError("--law guo prints one moment; leave out --every, or track by the armature")
     if every is not None:
         times = solar.daylight(moment.date(), plant.site, every=parse_duration(every))
         result = tracking.track(mechanism, solar.vector(times, plant.site), goal)
@@ -63,6 +71,9 @@ def track(
         vector = normalize(parse_point(sun, "sun"), "sun")
     else:
         vector = solar.vector(moment, plant.site)
+    if law == "guo":
+        track_by_guo(heliostat, mechanism, vector, goal, moment, as_json)
+        return
     result = tracking.track(mechanism, vector, goal)
     joints = [mechanism.joints[j] for j in mechanism.driven]
     document = {
@@ -82,8 +93,6 @@ def track(
 
 
 def _aim(plant: "Plant", aim: str | None, target: str | None) -> Any:
-    from heliotrope.errors import InputError
-
     if aim is not None and target is not None:
         raise InputError("give --aim or --target, not both")
     if aim is not None:

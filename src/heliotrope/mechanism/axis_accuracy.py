@@ -17,7 +17,7 @@ class AxisAccuracy:
     Attributes
     ----------
     gamma_0, alpha_0
-        Mean of demanded minus measured, the estimates of ``azimuth_zero`` and
+        Mean of measured minus computed, the estimates of ``azimuth_zero`` and
         ``elevation_zero``.
     sigma_gamma, sigma_alpha
         Standard deviation about the mean.
@@ -36,20 +36,20 @@ class AxisAccuracy:
 def axis_accuracy(
     measured_alpha: npt.ArrayLike,
     measured_gamma: npt.ArrayLike,
-    ideal_alpha: npt.ArrayLike,
-    ideal_gamma: npt.ArrayLike,
+    computed_alpha: npt.ArrayLike,
+    computed_gamma: npt.ArrayLike,
     *,
     azimuth_weight: npt.ArrayLike = 1.0,
 ) -> AxisAccuracy:
     """Return the zero and the scatter of each axis from a set of measurements.
 
-    Differences are taken on the circle, so 359.9° and 0.1° are 0.2° apart. Source: Guo
-    (43)-(47), reconstructed: mean and standard deviation (n − 1) per axis.
+    Differences are measured minus computed, taken on the circle: 359.9° and 0.1° are 0.2°
+    apart. Source: Guo (43)-(47), mean and standard deviation (n − 1) per axis.
 
     Parameters
     ----------
-    measured_alpha, measured_gamma, ideal_alpha, ideal_gamma
-        Encoder positions, and the angles that the model demands for the same sightings,
+    measured_alpha, measured_gamma, computed_alpha, computed_gamma
+        Encoder positions, and the angles (43) that the model gives for the same sightings,
         rad, shape (..., n), n ≥ 2 measurements.
     azimuth_weight
         Weights of the azimuth, shape (..., n): equal if the axis itself scatters,
@@ -61,8 +61,14 @@ def axis_accuracy(
         If fewer than two measurements are given, shapes differ, weights are negative or
         all 0, or the differences spread over half a turn (branches mixed).
     """
-    values = (measured_alpha, measured_gamma, ideal_alpha, ideal_gamma, azimuth_weight)
-    names = ("measured_alpha", "measured_gamma", "ideal_alpha", "ideal_gamma", "azimuth_weight")
+    values = (measured_alpha, measured_gamma, computed_alpha, computed_gamma, azimuth_weight)
+    names = (
+        "measured_alpha",
+        "measured_gamma",
+        "computed_alpha",
+        "computed_gamma",
+        "azimuth_weight",
+    )
     given = {k: numbers(v, k) for k, v in zip(names, values, strict=True)}
     shape = common_shape(**given)
     if not shape or shape[-1] < 2:
@@ -70,8 +76,8 @@ def axis_accuracy(
     alpha, gamma, alpha_i, gamma_i, weight = (np.broadcast_to(a, shape) for a in given.values())
     if (weight < 0.0).any() or (weight.sum(axis=-1) == 0.0).any():
         raise InputError("azimuth_weight: weights must not be negative nor all 0; give cos² α")
-    gamma_0, gamma_rest = _circular(gamma_i - gamma, weight, "gamma")
-    alpha_0, alpha_rest = _circular(alpha_i - alpha, np.ones(shape), "alpha")
+    gamma_0, gamma_rest = _circular(gamma - gamma_i, weight, "gamma")
+    alpha_0, alpha_rest = _circular(alpha - alpha_i, np.ones(shape), "alpha")
     n = shape[-1]
     across = np.cos(alpha_i) ** 2 * gamma_rest**2
     variance_gamma = (weight * gamma_rest**2).sum(axis=-1) / weight.sum(axis=-1) * n / (n - 1)
@@ -95,7 +101,7 @@ def _circular(
     rest = wrap_signed(difference - middle)
     refuse(
         np.abs(rest) > 0.5 * np.pi,
-        f"ideal minus measured {name}",
+        f"measured minus computed {name}",
         lambda i: f"{np.degrees(rest[i]):.1f}° from the mean, limit ±90°; do not mix branches",
     )
     shift = (weight * rest).sum(axis=-1, keepdims=True) / weight.sum(axis=-1, keepdims=True)

@@ -342,42 +342,38 @@ def linear_grigoriev(
 def linear_guo(
     side_a: npt.ArrayLike,
     side_b: npt.ArrayLike,
-    angle_at_zero: npt.ArrayLike,
-    included_at_zero: npt.ArrayLike,
+    slope: npt.ArrayLike,
+    length_at_zero: npt.ArrayLike,
     metres_per_count: npt.ArrayLike,
-    *,
-    sense: npt.ArrayLike = 1,
     **values: npt.ArrayLike,
 ) -> Drive:
-    """Return a jack given by its included angle at the encoder's zero.
-
-    Guo et al. 2013, (41)-(42), reconstructed: the length is that of the triangle
-    with included angle β₀ + sense · (α − α₀), and the counts are proportional to its change.
+    """Return the screw of an elevation axis with the constants of Guo's figure 3.
 
     Parameters
     ----------
-    side_a, side_b
-        Distances from the joint to the ends of the actuator, m.
-    angle_at_zero
-        α₀, joint angle at 0 counts, rad.
-    included_at_zero
-        β₀, angle between the two sides at 0 counts, rad, in (0, π).
+    side_a
+        a, distance OA from the axis to the moving end of the screw, m.
+    side_b
+        b, distance OB from the axis to its fixed end, m.
+    slope
+        β₀, slope of OB against the horizontal, rad.
+    length_at_zero
+        x₀, length of the screw at 0 counts, m.
     metres_per_count
-        Change of the actuator's length per count, m.
-    sense
-        +1 if the included angle grows with the joint's angle.
+        Change of the screw's length per count, m; the counts times this are his x.
     values
         Any of ``SLOTS``.
+
+    Notes
+    -----
+    Guo et al. 2013, (41)-(42) as printed: x = √(a² + b² + 2ab cos(α + β₀)) − x₀. The angle
+    AOB is 180° − α − β₀, so the screw shortens as the mirror rises. For a screw that
+    lengthens use `linear_grigoriev`.
     """
-    _check_sense(sense)
-    a, b, included = as_float(side_a), as_float(side_b), as_float(included_at_zero)
-    if not ((included > 0) & (included < np.pi)).all():
-        raise InputError(
-            f"linear drive: included angle at zero {included_at_zero!r} rad must lie in (0, π)"
-        )
-    length = np.sqrt((a - b) ** 2 + 4.0 * a * b * np.sin(0.5 * included) ** 2)
-    zero = as_float(angle_at_zero) - as_float(sense) * included
-    return linear_grigoriev(a, b, length, metres_per_count, angle_zero=zero, sense=sense, **values)
+    zero = np.pi - as_float(slope)
+    return linear_grigoriev(
+        side_a, side_b, length_at_zero, metres_per_count, angle_zero=zero, sense=-1, **values
+    )
 
 
 def _check_sense(sense: npt.ArrayLike) -> None:

@@ -4,7 +4,7 @@ Six small angles and the offset of the mirror describe the machine; its two join
 angles follow from the position of the sun without iteration. In the frame ENU the
 normal at drive positions (γ, α) is
 
-$$n = R_{tilt}(ψ_a, ψ_t)\,R_U(-(γ + γ_0))\,R_N(-τ_1)\,R_E(α + α_0)\,(\sin μ, \cos μ, 0)$$
+$$n = R_{tilt}(ψ_a, ψ_t)\,R_U(-(γ - γ_0))\,R_N(-τ_1)\,R_E(α - α_0)\,(\sin μ, \cos μ, 0)$$
 
 where R_X is the right-handed rotation about X and R_tilt leans the azimuth axis by ψ_t
 towards the azimuth ψ_a. `forward` evaluates it, `angles` inverts it,
@@ -14,8 +14,7 @@ Source: Guo, Sun, Wang and Zhang, "Properties of a general azimuth-elevation tra
 angle formula for a heliostat with a mirror-pivot offset and other angular errors",
 Solar Energy 96 (2013) 159-167; here "Guo". Its frame is left-handed (north, east,
 height); the angles are the same in ours. Its actuator, (41)-(42), is
-`heliotrope.mechanism.drives.linear_guo`. An equation called *reconstructed* is
-derived here; its printed form may look different. The derivations, and the proof that
+`heliotrope.mechanism.drives.linear_guo`. The derivations, and the proof that
 `regularise` uses every symmetry there is, are in `docs/explanation/guo.md`.
 """
 
@@ -71,9 +70,8 @@ class GuoParameters:
         ψ_t, angle of the azimuth axis from the vertical, and ψ_a, azimuth towards which
         it leans, rad.
     azimuth_zero, elevation_zero
-        γ₀ and α₀, rad: joint angle = drive position + zero, so they are our
-        ``azimuth_bias`` and ``elevation_bias``. A zero that a paper subtracts from the
-        nominal angle enters with the opposite sign.
+        γ₀ and α₀, rad: measured minus true angle, (44) and (46), so joint angle = drive
+        position − zero. Our ``azimuth_bias`` and ``elevation_bias`` have the opposite sign.
     tau_1
         τ₁, angle by which the right-hand end of the elevation axis (looking the way the
         mirror faces) is raised out of square with the azimuth axis, rad.
@@ -141,7 +139,7 @@ class GuoTracking:
     Attributes
     ----------
     alpha
-        Elevation drive, rad, shape (..., 2). The joint angle ``alpha + elevation_zero``
+        Elevation drive, rad, shape (..., 2). The joint angle ``alpha − elevation_zero``
         lies in [−π/2, π/2] on branch 0 and in [π/2, 3π/2], over the top, on branch 1.
     gamma
         Azimuth drive in [0, 2π), rad, shape (..., 2).
@@ -177,7 +175,7 @@ def mirror_normal(
     Validity: |offset| below the distance. With h = offset / distance the error of (5) is
     below h⁴/40 rad up to h = 1/2, so 4e-9 rad for 0.5 m at 25 m; the exact form leaves
     1e-15 rad up to h = 0.99. There is no division by sin θ: retroreflection (θ = 0) is
-    an ordinary case. Source: Guo (5) and (26), reconstructed.
+    an ordinary case. Source: Guo (5), and (26) divided by cos τ.
 
     Parameters
     ----------
@@ -255,7 +253,7 @@ def forward(alpha: npt.ArrayLike, gamma: npt.ArrayLike, parameters: GuoParameter
     p = parameters
     a, g = numbers(alpha, "alpha"), numbers(gamma, "gamma")
     common_shape(alpha=a, gamma=g, **vars(p))
-    a, g = a + p.elevation_zero, g + p.azimuth_zero
+    a, g = a - p.elevation_zero, g - p.azimuth_zero
     x = np.sin(p.mu) * np.cos(p.tau_1) - np.cos(p.mu) * np.sin(a) * np.sin(p.tau_1)
     y = np.cos(p.mu) * np.cos(a)
     z = np.sin(p.mu) * np.sin(p.tau_1) + np.cos(p.mu) * np.sin(a) * np.cos(p.tau_1)
@@ -273,7 +271,7 @@ def angles(normal: npt.ArrayLike, parameters: GuoParameters) -> GuoTracking:
 
     Accuracy: the residual is below 1e-14 rad everywhere, at the keyhole too, where α by
     arcsin would leave 1e-8 rad. Source: the part of Guo (1)-(28) that leads from the
-    normal to the angles, reconstructed in half angles, with (22) by atan2.
+    normal to the angles, with (19) in half angles and (22) by atan2.
 
     Parameters
     ----------
@@ -303,8 +301,8 @@ def angles(normal: npt.ArrayLike, parameters: GuoParameters) -> GuoTracking:
     # The branches lie along a first axis here, so that the parameters broadcast.
     co_elevation = _co_elevation(c, tau_1, mu)
     beta = np.stack([co_elevation, -co_elevation])
-    alpha = 0.5 * np.pi - beta - p.elevation_zero
-    gamma = wrap_positive(_azimuth(c, beta, tau_1, mu) - p.azimuth_zero)
+    alpha = 0.5 * np.pi - beta + p.elevation_zero
+    gamma = wrap_positive(_azimuth(c, beta, tau_1, mu) + p.azimuth_zero)
     residual = as_float(angle_between(n, forward(alpha, gamma, p)).max(axis=0))
     return GuoTracking(
         alpha=np.moveaxis(alpha, 0, -1),
@@ -373,27 +371,33 @@ def regularise(parameters: GuoParameters) -> GuoParameters:
 
     A fit may stop at any of the equivalent sets. This one has ψ_t in [0, π/2] (in
     (π/2, π] only if the azimuth axis points below the horizon, which no relation can
-    raise), ψ_a in [0, 2π), γ₀ and α₀ in [−π, π), τ₁ and μ in [−π/2, π/2]; ψ_a is 0
-    where there is no tilt. `forward` is the same to 1e-14 for every drive position.
-    Values already in their ranges are not touched, so a second call changes nothing.
+    raise), ψ_a in [0, 2π), γ₀ in [−π, π), τ₁ and α₀ in [−π/2, π/2]; ψ_a is 0 where there
+    is no tilt. μ lies in [−π/2, π/2] as well unless cos τ₁ cos μ cos α₀ < 0: no relation
+    changes the sign of this product, so one of the three must then lie beyond, and μ does.
+    `forward` is the same to 1e-14 for every drive position. Values already in their ranges
+    are not touched, so a second call changes nothing.
 
-    Source: Guo (31)-(40), reconstructed from (29) except (37).
+    Source: Guo (31)-(37), (39) and (40). His ranges are "for example" 0 to 360° for γ₀,
+    ψ_t and ψ_a; ours for γ₀ is ±180°, so that a zero of −6 mrad reads as such.
     """
     p = parameters
     tilt = _wrap(p.tilt)
     # Without this the second call would take π for −π and turn ψ_a.
     tilt = np.where(tilt == -np.pi, np.pi, tilt)
     turned = np.where(tilt < 0.0, p.tilt_azimuth + np.pi, p.tilt_azimuth)
+    # (40), then (39); the end of the range absorbs what rounding adds.
     tau_1, tau_folded = _fold(_wrap(p.tau_1))
-    mu, mu_folded = _fold(_wrap(p.mu))
+    elevation = _wrap(p.elevation_zero + np.pi * tau_folded)
+    over = np.abs(elevation) > 0.5 * np.pi
+    turned_over = np.clip(_wrap(elevation + np.pi), -0.5 * np.pi, 0.5 * np.pi)
     return replace(
         p,
         tilt=np.abs(tilt),
         tilt_azimuth=np.where(tilt == 0.0, 0.0, wrap_positive(turned)),
         azimuth_zero=_wrap(p.azimuth_zero + np.pi * tau_folded),
-        elevation_zero=_wrap(p.elevation_zero + np.pi * (tau_folded ^ mu_folded)),
+        elevation_zero=np.where(over, turned_over, elevation),
         tau_1=tau_1,
-        mu=mu,
+        mu=np.where(over, _wrap(np.pi - p.mu), _wrap(p.mu)),
     )
 
 
@@ -430,8 +434,8 @@ def to_heliotrope(parameters: GuoParameters) -> dict[str, FloatArray]:
     return {
         "tilt_north": tilt_north,
         "tilt_east": tilt_east,
-        "azimuth_bias": as_float(p.azimuth_zero - twist),
-        "elevation_bias": p.elevation_zero,
+        "azimuth_bias": as_float(-p.azimuth_zero - twist),
+        "elevation_bias": -p.elevation_zero,
         "non_orthogonality": -p.tau_1,
         "canting": p.mu,
         "pivot_offset": p.offset,
@@ -467,8 +471,8 @@ def from_heliotrope(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
     return GuoParameters(
         tilt=tilt,
         tilt_azimuth=tilt_azimuth,
-        azimuth_zero=v["azimuth_bias"] + _twist(tilt, tilt_azimuth, tilt_north, tilt_east),
-        elevation_zero=v["elevation_bias"],
+        azimuth_zero=-v["azimuth_bias"] - _twist(tilt, tilt_azimuth, tilt_north, tilt_east),
+        elevation_zero=-v["elevation_bias"],
         tau_1=-v["non_orthogonality"],
         mu=v["canting"],
         offset=v["pivot_offset"],

@@ -147,7 +147,7 @@ _ANY_DRIVE = (
             "encoder zero",
             "actual = ideal + bias",
             0.010,
-            ("Malan γ_bias, α_bias", "Guo γ₀, α₀"),
+            ("Malan γ_bias, α_bias", "Guo −γ₀, −α₀"),
         ),
     ),
     (

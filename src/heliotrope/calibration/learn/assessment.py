@@ -1,6 +1,6 @@
 """How well a field was learnt: errors of the held-out sightings."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,9 +9,12 @@ import numpy.typing as npt
 from heliotrope.calibration.evaluation import ErrorSummary, summarise
 from heliotrope.calibration.learn.learning import Learned, Prediction, predict
 from heliotrope.calibration.sightings import ray_directions
-from heliotrope.geometry import FloatArray, azimuth_elevation, bisector
+from heliotrope.errors import InputError
 from heliotrope.mechanism.axis_accuracy import AxisAccuracy, axis_accuracy
+from heliotrope.mechanism.tracking import track
 
+#: Distance at which an aim stands for a direction, m.
+FAR = 1e6
 #: Heliostats with fewer sightings are listed but do not enter the overall figures.
 ENOUGH = 20
 
@@ -33,8 +36,9 @@ class HeliostatFigures:
     coverage
         Share of the held-out sightings within their 90 % ellipse.
     axes
-        Zeros and scatter of azimuth and elevation of the normal (Guo (43)-(47)); None with fewer
-        than two held-out sightings.
+        Zeros of azimuth and elevation before the fit (of the first and second axis where there is
+        no azimuth) and their scatter after it, Guo (43)-(47); None with fewer than two held-out
+        sightings, for a single axis, or where a mistake puts an axis over the top.
     outliers, regimes, steps
         Numbers in the training part.
     """
@@ -185,12 +189,37 @@ def _one(
 
 
 def _axes(learned: Learned, rows: npt.NDArray[np.intp]) -> AxisAccuracy | None:
+    """Return the zeros before the fit and the scatter after it, of sightings ``rows``.
+
+    Guo's γ', α' are the drives' angles: those of the nominal drives for the zeros, (44) and
+    (46), so that a zero is found as such and not what the fit leaves of it; those of the
+    learnt drives for the scatter, (45) and (47). His γ, α, (43), are the angles at which the
+    learnt mechanism sends the source to the destination that was seen.
+    """
     seen = learned.sightings.take(rows)
-    pose = learned.mechanism_at(seen.heliostat, seen.time).pose(seen.counts)
-    azimuth, elevation = azimuth_elevation(pose.normal)
-    source, way = ray_directions(seen, pose.vertex)
-    wanted_azimuth, wanted_elevation = azimuth_elevation(bisector(source, way))
-    weight: FloatArray = np.cos(wanted_elevation) ** 2
-    return axis_accuracy(
-        elevation, azimuth, wanted_elevation, wanted_azimuth, azimuth_weight=weight
-    )
+    learnt = learned.mechanism_at(seen.heliostat, seen.time)
+    vertex = learnt.pose(seen.counts).vertex
+    source, way = ray_directions(seen, vertex)
+    aim = np.where(seen.destination_at_infinity[:, None], vertex + FAR * way, seen.destination)
+    solved = track(learnt, source, aim, current=seen.counts)
+    good = solved.chosen(solved.reachable)
+    driven = [learnt.joints[j] for j in learnt.driven]
+    if good.sum() < 2 or len(driven) != 2:
+        return None
+    gamma = driven.index("azimuth") if "azimuth" in driven else 0
+    alpha = 1 - gamma
+    computed = solved.chosen(solved.angles)[good]
+    found = []
+    for mechanism in (learned.mechanism[seen.heliostat], learnt):
+        angles = mechanism.drives.angles(seen.counts)[good]
+        try:
+            found.append(
+                axis_accuracy(
+                    angles[:, alpha], angles[:, gamma], computed[:, alpha], computed[:, gamma]
+                )
+            )
+        except InputError:
+            # A mistaken sighting may lie over the top; its axes say nothing.
+            return None
+    before, after = found
+    return replace(after, gamma_0=before.gamma_0, alpha_0=before.alpha_0)

@@ -12,8 +12,11 @@ from heliotrope.calibration.learn.assessment import Assessment
 from heliotrope.calibration.learn.learning import Learned, left_out_errors
 from heliotrope.calibration.report.results import FieldParameters, at_moment
 from heliotrope.calibration.uncertainty import BlindSpot, unobservable
+from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
+from heliotrope.mechanism.guo_names import in_his_names, of_mechanism
+from heliotrope.mechanism.parameters import MODELS
 
 
 @dataclass(frozen=True)
@@ -127,6 +130,28 @@ class CalibrationReport:
         covariance = r.covariance[i][:count, :count]
         return unobservable(r.names[:count], covariance, self.learned.hyper.spread[:count], line)
 
+    @cached_property
+    def guo(self) -> dict[str, dict[str, float]] | None:
+        """Guo's six parameters of each heliostat with sightings, degrees; None for other models.
+
+        They are those of the whole machine, in the ranges of `regularise`; what only drifts
+        (`canting_secondary`) is not among them.
+        """
+        r = self.results
+        if not set(r.model) <= set(MODELS["guo6"]):
+            return None
+        moved = self.learned.mechanism.with_parameters(
+            {name: r.values[:, r.names.index(name)] for name in r.model}
+        )
+        try:
+            found = in_his_names(of_mechanism(moved, zeros=True)[0])
+        except InputError:
+            return None
+        return {
+            row.name: {f"{n}_deg": float(found[n][row.index]) for n in found if n != "H_z"}
+            for row in self.rows
+        }
+
     def document(self) -> dict[str, Any]:
         """Return the figures for JSON."""
         found = self.results
@@ -153,4 +178,6 @@ class CalibrationReport:
         if self.assessment is not None:
             document["held_out_median_of_medians_mrad"] = 1e3 * self.assessment.median_of_medians
             document["held_out_coverage_90"] = self.assessment.coverage
+        if self.guo is not None:
+            document["guo"] = self.guo
         return document

@@ -1,0 +1,93 @@
+"""``heliotrope parameters``: one machine in the parameters of Guo, of Malan and of this program."""
+
+import math
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from heliotrope.cli._common import print_json, print_table
+from heliotrope.errors import InputError
+
+if TYPE_CHECKING:
+    from heliotrope.mechanism.guo import GuoParameters
+
+Names = Literal["guo", "malan", "heliotrope"]
+
+
+def parameters(
+    values: Annotated[
+        list[str],
+        typer.Argument(help="NAME=VALUE: Guo's in °, the others in mrad; lengths in m."),
+    ],
+    source: Annotated[Names, typer.Option("--from", help="Whose names the values have.")] = "guo",
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Convert error parameters of an azimuth-elevation heliostat."""
+    machine = _machine(source, _parsed(values))
+    document = {"guo": _guo(machine), "heliotrope": _heliotrope(machine)}
+    try:
+        document["malan"] = _malan(machine)
+    except InputError as reason:
+        document["malan"] = {"reason": str(reason)}
+    if as_json:
+        print_json(document)
+        return
+    rows = [
+        [whose, name, f"{value + 0.0:.6g}"]
+        for whose, found in document.items()
+        for name, value in found.items()
+        if isinstance(value, float)
+    ]
+    print_table(["in the names of", "parameter", "value"], rows)
+    if "reason" in document["malan"]:
+        print(f"not in Malan's parameters: {document['malan']['reason']}")
+
+
+def _parsed(values: list[str]) -> dict[str, float]:
+    found = {}
+    for text in values:
+        name, _, value = text.partition("=")
+        try:
+            found[name.strip()] = float(value)
+        except ValueError:
+            found[name.strip()] = math.nan
+        if not math.isfinite(found[name.strip()]):
+            raise InputError(f"{text!r}: write NAME=VALUE with a number, for example psi_t=1.854")
+    return found
+
+
+def _machine(source: Names, values: dict[str, float]) -> "GuoParameters":
+    from heliotrope.mechanism import guo, guo_names
+
+    if source == "guo":
+        return guo_names.from_his_names(values)
+    scaled = {n: v if n == "pivot_offset" else 1e-3 * v for n, v in values.items()}
+    return guo.from_malan(scaled) if source == "malan" else guo.from_heliotrope(scaled)
+
+
+def _guo(machine: "GuoParameters") -> dict[str, Any]:
+    from heliotrope.mechanism.guo_names import NAMES, in_his_names
+
+    return {
+        f"{name}_deg" if NAMES[name][2] == "°" else f"{name}_m": float(value)
+        for name, value in in_his_names(machine).items()
+    }
+
+
+def _heliotrope(machine: "GuoParameters") -> dict[str, Any]:
+    from heliotrope.mechanism.guo import to_heliotrope
+
+    return {
+        **{
+            f"{name}_mrad": 1e3 * float(value)
+            for name, value in to_heliotrope(machine).items()
+            if name != "pivot_offset"
+        },
+        "pivot_offset_m": float(machine.offset),
+    }
+
+
+def _malan(machine: "GuoParameters") -> dict[str, Any]:
+    from heliotrope.mechanism.guo import to_malan
+
+    return {f"{name}_mrad": 1e3 * float(value) for name, value in to_malan(machine).items()}
