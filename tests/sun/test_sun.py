@@ -16,7 +16,7 @@ from heliotrope import sun
 from heliotrope.errors import InputError, TimeError, UnknownNameError
 from heliotrope.geometry import MRAD, angle_between, direction
 from heliotrope.lcu import wire
-from heliotrope.sun import ephemeris
+from heliotrope.sun import ephemeris, grena
 from support import data
 
 URAD = 1e-6
@@ -375,10 +375,35 @@ def test_delta_t_is_espenak_and_meeus() -> None:
     assert angle_between(sun.vector(moment, given), sun.vector(moment, other)) > 1e-6
 
 
-@pytest.mark.parametrize("algorithm", ["grena", "grena2008", "Grena2008"])
-def test_grena_is_refused(algorithm: str) -> None:
-    with pytest.raises(InputError, match=r"out of its validity since 2023 and 1.6 mrad wrong"):
-        sun.position(NOON, JUELICH, algorithm=algorithm)
+@pytest.mark.parametrize("site", [STELLENBOSCH, JUELICH, sun.Site(0.0, -120.0, 0.0)])
+def test_grena_keeps_his_accuracy_over_his_twenty_years(site: sun.Site) -> None:
+    """Grena 2008: ±0.0027°, 2003 to 2022; SPA's own error is a ninth of that."""
+    rng = np.random.default_rng(2008)
+    seconds = rng.uniform(grena.FIRST, grena.LAST, 20_000)
+    his = sun.position(seconds, site, algorithm="grena2008")
+    spa = sun.position(seconds, site)
+    up = spa.true_elevation > 0.0
+    apart = np.degrees(angle_between(his.true_vector, spa.true_vector))
+    assert apart[up].max() < 0.0027
+    # A wrong coefficient would show: his errors are of this size, not smaller.
+    assert apart[up].max() > 0.0015
+    # His refraction is within his accuracy of SPA's from 1° upwards.
+    high = spa.elevation > np.radians(1.0)
+    assert np.degrees(angle_between(his.vector, spa.vector))[high].max() < 0.0027
+
+
+@pytest.mark.parametrize("time", ["2002-12-31T23:59:59Z", "2023-01-01T00:00:00Z", NOON])
+def test_grena_is_refused_outside_his_years(time: Any) -> None:
+    with pytest.raises(InputError, match="outside its validity, 2003 to 2022"):
+        sun.position(time, JUELICH, algorithm="grena2008")
+
+
+def test_grena_agrees_on_malans_days() -> None:
+    times = [
+        datetime(2012, 9, day, hour, tzinfo=UTC) for day in (2, 6, 7, 8) for hour in range(5, 16)
+    ]
+    his = sun.position(times, STELLENBOSCH, algorithm="grena2008").vector
+    assert angle_between(his, sun.vector(times, STELLENBOSCH)).max() < 0.047 * MRAD
 
 
 def test_unknown_algorithm_is_refused() -> None:

@@ -1,6 +1,6 @@
 """``heliotrope sun``: position of the sun."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -20,6 +20,10 @@ def sun(
         str | None,
         typer.Option(help="Print the whole day of TIME at this interval: 30s, 10min."),
     ] = None,
+    algorithm: Annotated[
+        Literal["spa", "grena2008"],
+        typer.Option(help="spa; grena2008: Malan's choice, a cross-check for 2003 to 2022."),
+    ] = "spa",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Print the sun's position, and when it rises, culminates and sets."""
@@ -42,7 +46,7 @@ def sun(
         import pandas as pd
 
         moments = pd.DatetimeIndex([moment]).tz_convert("UTC")
-    found = solar.position(moments, site)
+    found = solar.position(moments, site, algorithm=algorithm)
     rows = [
         {
             "time": t.isoformat(),
