@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from matplotlib.path import Path as Polygon
 
-from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere, Volume, outline
+from heliotrope.field.target import Receiver
+from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere, Volume, around, outline
 from heliotrope.optics import clearance
 
 
@@ -35,3 +36,22 @@ def test_the_outline_holds_all_points_of_the_volume_and_no_more(volume: Volume) 
     assert inside[depth < -0.1].all()
     assert not inside[depth > 0.15].any()
     assert inside.sum() > 100
+
+
+@pytest.mark.parametrize("kind", ["planar", "convex_cylinder", "external_cylinder"])
+def test_a_volume_around_a_receiver_holds_it_and_some_room(kind: str) -> None:
+    rng = np.random.default_rng(8)
+    receiver = Receiver(
+        "r", kind, np.array([1.0, -2.0, 50.0]), np.array([0.6, -0.8, 0.0]), 6.0, 8.0
+    )
+    turn, across, up = rng.uniform((0.0, -3.0, -4.0), (2.0 * np.pi, 3.0, 4.0), (500, 3)).T
+    right = np.array([0.8, 0.6, 0.0])
+    points = receiver.center + up[:, None] * [0.0, 0.0, 1.0]
+    if kind == "external_cylinder":
+        points += 3.0 * np.stack([np.sin(turn), np.cos(turn), np.zeros(500)], axis=-1)
+    else:
+        points += across[:, None] * right
+    assert clearance(points, [around(receiver, 0.5)]).max() < -0.45
+    # It is no larger than the ball about the receiver's diagonal and that room.
+    away = receiver.center + 5.8 * np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    assert clearance(away, [around(receiver, 0.5)]).min() > 0.0

@@ -1,7 +1,7 @@
 """Commands that move axes by counts are proven too: no beam enters a keep-out volume."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,6 +13,7 @@ import pytest
 from heliotrope.field.example import prototype
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver
 from heliotrope.field.volumes import Box, Sphere
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import names, states
@@ -41,16 +42,17 @@ from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 #: South of the tower; P5A stands due south of it and shines to the tower.
 WALKWAY = Sphere("walkway", (0.0, -12.0, 8.0), 1.0)
+SOUTH = np.array([0.0, -1.0, 0.0])
 WEST, EAST = (-8.0, 0.0, 8.0), (8.0, 0.0, 16.5)
 DESIGN = replace(prototype(), keep_outs=(WALKWAY,))
 
 
-def play(folder: Path, scene: Callable[[Bench], Awaitable[None]]) -> Bench:
-    """Run a scene in virtual time, on a plant that declares the walkway."""
+def play(folder: Path, scene: Callable[[Bench], Awaitable[None]], design: Plant = DESIGN) -> Bench:
+    """Run a scene in virtual time, on a plant that declares the walkway, or on another."""
     made: list[Bench] = []
 
     async def main(clock: VirtualClock) -> None:
-        bench = Bench(clock, folder, design=DESIGN)
+        bench = Bench(clock, folder, design=design)
         made.append(bench)
         async with running(bench):
             await scene(bench)
@@ -432,7 +434,7 @@ def inside(
 def test_who_would_cross_a_volume_on_the_way_from_stow_is_known_beforehand() -> None:
     """The oracle: the true beams of simulated heliostats that go, every 50 ms."""
     design = gated(96)
-    mechanism, machine = design.groups["azel"].calibrated, design.machine(design.names[0])
+    machine = design.machine(design.names[0])
     assert machine.standby is not None
     check = BeamCheck(design, design.names)
 
@@ -446,26 +448,58 @@ def test_who_would_cross_a_volume_on_the_way_from_stow_is_known_beforehand() -> 
     assert all("gate" in text and "from stow to standby" in text for text in found.values())
     refused = np.array([name in found for name in design.names])
 
-    field = Field(mechanism, machine)
     crossed, near = np.zeros((2, 96), dtype=np.bool_)
+    for normal, vertex, light in goes(design, NOON):
+        crossed |= inside(check, normal, vertex, light, 0.0)
+        near |= inside(check, normal, vertex, light, 0.02)
+    assert 10 < crossed.sum() < 86
+    assert not (crossed & ~refused).any()
+    assert not (refused & ~near).any()
+
+
+def goes(design: Plant, begin: datetime) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Let simulated heliostats go from stow to standby: normals, vertices, sun, every 50 ms."""
+    field = Field(design.groups["azel"].calibrated, design.machine(design.names[0]))
     for tick in range(1200):
+        at = begin.timestamp() + 0.05 * tick
         if tick % 20 == 0:
-            at = NOON.timestamp() + tick // 20
-            values = broadcast_values(int(gps_seconds(NOON)) + tick // 20, at, design.site)
+            values = broadcast_values(int(gps_seconds(begin)) + tick // 20, at, design.site)
             assert values is not None
             field.take_sun(values)
             if tick == 0:
                 field.order("APPROACH")
         field.advance(50)
-        light = sun(0.05 * tick)
-        crossed |= inside(check, *field.stand(), light, 0.0)
-        near |= inside(check, *field.stand(), light, 0.02)
+        yield *field.stand(), vector(at, design.site)
         if not (field.state == states.APPROACHING).any():
             break
     assert (field.state == states.IDLE).all()
-    assert 10 < crossed.sum() < 86
-    assert not (crossed & ~refused).any()
-    assert not (refused & ~near).any()
+
+
+def test_who_would_cross_the_receiver_on_the_way_from_stow_is_known_beforehand() -> None:
+    """The oracle: how near the middle of each true beam comes to the middle of the receiver."""
+    design = malan_plant(96)
+    machine, middle = design.machine(design.names[0]), design.receivers[0].center
+    half = 0.5 * np.hypot(design.receivers[0].width, design.receivers[0].height)
+    begin = datetime(2026, 11, 22, 14, tzinfo=UTC)
+
+    def sun(ahead: float) -> FloatArray:
+        return vector(begin.timestamp() + ahead, design.site)
+
+    check, rows = BeamCheck(design, design.names), np.arange(96)
+    stow, standby = (np.tile(np.array(x, dtype=float), (96, 1)) for x in _rest(machine))
+    found = Ways(check, dict.fromkeys(design.names, machine)).approach(rows, stow, standby, sun)
+    text = "the beam crosses receiver receiver on its way from stow to standby; try again"
+    assert all(text in each for each in found.values())
+    refused = np.array([name in found for name in design.names])
+    nearest = np.full(96, np.inf)
+    for normal, vertex, light in goes(design, begin):
+        way = 2.0 * (normal @ light)[:, None] * normal - light
+        along = ((middle - vertex) * way).sum(axis=-1)
+        miss = np.linalg.norm(middle - vertex - along[:, None] * way, axis=-1)
+        nearest = np.minimum(nearest, np.where(along > 0.0, miss, np.inf))
+    assert 10 < refused.sum() < 60
+    assert nearest[~refused].min() > half + 0.4
+    assert nearest[refused].max() < half + 2.0
 
 
 def _rest(machine: Machine) -> tuple[tuple[int, int], tuple[float, float, float]]:
@@ -560,6 +594,31 @@ def test_an_approach_is_refused_by_name_and_the_others_go(tmp_path: Path) -> Non
             plant.command(OPERATOR, token, "APPROACH", (name,))
 
     play(tmp_path, scene)
+
+
+def test_an_approach_across_the_receiver_is_refused_by_name(tmp_path: Path) -> None:
+    """It needs no keep-out volume, and beams are still sent to the receiver."""
+    furnace = Receiver("furnace", "planar", np.array([0.0, -12.0, 8.0]), SOUTH, 1.0, 1.0)
+    design = replace(prototype(), receivers=(furnace,), keep_outs=())
+
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        token = await bench.commanded()
+        # A standby point that is not known here: nothing can be proven, and no volume is near.
+        assert not plant.command(OPERATOR, token, "APPROACH").blocked
+        rest_on(plant.standbys, (4.0, 0.0, 14.0))
+        ticket = plant.command(OPERATOR, token, "APPROACH")
+        assert 0 < len(ticket.blocked) < len(plant.field)
+        text = "the beam crosses receiver furnace on its way from stow to standby"
+        assert all(text in each for each in ticket.blocked.values())
+        first = next(iter(ticket.blocked))
+        with pytest.raises(RefusedError, match=f"APPROACH {first}: the beam crosses"):
+            plant.command(OPERATOR, token, "APPROACH", (first,))
+        assert await plant.aim(OPERATOR, token, {first: furnace.center}).end(5.0)
+        await stands(bench, first, states.IDLE, counts(plant, first, (4.0, 0.0, 14.0)))
+        assert await plant.command(OPERATOR, token, "TRACK", (first,)).end(10.0)
+
+    play(tmp_path, scene, design)
 
 
 def test_automatic_control_raises_those_with_a_free_way_and_names_the_others() -> None:

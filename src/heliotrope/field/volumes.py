@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
+from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray, as_float, as_vectors
 
 
@@ -114,6 +115,20 @@ class Prism:
 
 
 Volume = Sphere | Box | Cylinder | Prism
+
+
+def around(receiver: Receiver, room: float) -> Volume:
+    """Return a volume that holds a receiver and ``room`` (m) on every side of it.
+
+    An external cylinder is held by a cylinder, every other aperture by the ball about its centre.
+    """
+    name = f"receiver {receiver.name}"
+    if receiver.kind == "external_cylinder":
+        half = np.array([0.0, 0.0, 0.5 * receiver.height + room])
+        ends = receiver.center - half, receiver.center + half
+        return Cylinder(name, *ends, 0.5 * receiver.width + room)
+    return Sphere(name, receiver.center, 0.5 * np.hypot(receiver.width, receiver.height) + room)
+
 
 #: Number of points that draw a circle on a map.
 _ROUND = 24

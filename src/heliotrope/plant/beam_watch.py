@@ -128,7 +128,8 @@ class BeamWatch:
         BeamError
             If none may.
         """
-        if not self._check.volumes or name not in _PROVEN:
+        solids = self._check.solids if name == "APPROACH" else ()
+        if name not in _PROVEN or not (self._check.volumes or solids):
             return heliostats, {}
         rows = np.array([self._field.place(n) for n in heliostats], dtype=np.intp)
         # A heliostat without known counts is left to its local controller.
@@ -147,6 +148,8 @@ class BeamWatch:
     def _from_stow(self, rows: Rows) -> dict[str, str]:
         """Return which heliostats have no free way from stow to standby, and why."""
         rows, wrong = self._resting(rows)
+        if not self._check.volumes:
+            wrong = {}  # a way to a point that is not known here is not proven
         stow, counts = self._ways.stow[rows], self._field.counts(rows)
         begin = np.where(np.isfinite(stow), stow, counts)
         return wrong | self._ways.approach(rows, begin, self.points.standbys[rows], self._sun)

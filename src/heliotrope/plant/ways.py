@@ -29,6 +29,7 @@ _PARTS = 3
 _PAUSE = 0.15
 #: Time over which the sun is taken to move evenly, s.
 _LONG = 60.0
+_WHEN = "on its way from stow to standby"
 
 
 class Ways:
@@ -37,7 +38,7 @@ class Ways:
     Parameters
     ----------
     check
-        Mirrors and keep-out volumes.
+        Mirrors, keep-out volumes and receivers.
     machines
         Limits and resting places of heliostats, by name, as far as they are known.
 
@@ -184,7 +185,8 @@ class Ways:
             first, last = at[left], np.round(solved.chosen(solved.counts)[good])
             moves = self.turns if place == 0 else self.motion
             path = moves(rows[left], first, last)
-            wrong = check.moving(rows[left], path, light, "on its way from stow to standby")
+            wrong = check.crossing(rows[left], path, light, _WHEN)
+            wrong |= check.moving(rows[left], path, light, _WHEN)
             time[left] += self.lasts(rows[left], first, last, turns=place == 0)
             at[left] = last
             if wrong:

@@ -245,10 +245,12 @@ BEAM_BLOCKED = AlarmKind(
     "beam_blocked",
     _PLANT,
     Severity.WARNING,
-    "The beam of a heliostat would enter a keep-out volume at its aim or on its way there.",
+    "The beam of a heliostat would enter a keep-out volume at its aim or on its way there, or "
+    "cross a receiver on its way from stow.",
     "{subject}: {reason}",
     "Automatic control leaves it where it is and tries again every five minutes.",
-    "Give it another aim point, or correct the volume in the plant file.",
+    "Wait where a receiver is in the way: the sun moves on. Else give it another aim point, or "
+    "correct the volume in the plant file.",
     over="{subject}: it has left the blocked position",
 )
 CAMERA = AlarmKind(
