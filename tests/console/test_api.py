@@ -49,6 +49,8 @@ NEEDED = {
     ("PUT", "calibration"): "operator",
     ("DELETE", "emergency"): "operator",
     ("PUT", "session/password"): "viewer",
+    **{(method, "session/factor"): "viewer" for method in ("POST", "PUT", "DELETE")},
+    ("DELETE", "accounts/{name}/factor"): "engineer",
     ("POST", "accounts/{name}/password"): "engineer",
     ("GET", "accounts"): "engineer",
     ("POST", "accounts"): "engineer",

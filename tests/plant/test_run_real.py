@@ -276,7 +276,9 @@ def test_a_real_plant_over_tcp_mqtt_and_its_own_bus(
         address = plant.says(r"console: (\S+)")[1]
         password = first_password(plant)
         with Client(url=address) as client:
-            client.change_password("engineer", password, "a password of one's own")
+            client.sign_in("engineer", password)
+            client.change_password(password, "a password of one's own")
+            client.sign_in("engineer", "a password of one's own")
             _tracked_and_stowed(client, lines)
         plant.says("4 tracking")
         code, text = plant.end(signal.SIGINT)
@@ -362,7 +364,9 @@ def test_a_slow_disk_holds_up_no_lease_and_no_emergency(tmp_path: Path) -> None:
         near = Near(port)
         stack.callback(near.end)
         with Client(url=address, timeout=60.0) as client:
-            client.change_password("engineer", password, "a password of one's own")
+            client.sign_in("engineer", password)
+            client.change_password(password, "a password of one's own")
+            client.sign_in("engineer", "a password of one's own")
             until(lambda: client.get("clusters")[0]["alive"], lambda: client.get("clusters"))
             slow.touch()
             begun = time.monotonic()

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pyotp import TOTP
 from sqlalchemy import select, text
 
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
@@ -19,6 +20,7 @@ from heliotrope.store import backup as backups
 from heliotrope.store import tables
 from heliotrope.store.audit import begin, change_points
 from heliotrope.store.database import HEAD, Database
+from heliotrope.store.factors import KEY_FILE
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import (
     AuditEntry,
@@ -35,7 +37,7 @@ NOW = datetime(2026, 6, 21, 12, tzinfo=UTC)
 NAMES = ("A", "B", "C")
 
 
-def fill(keeper: Keeper, seen: Sightings) -> None:
+def fill(keeper: Keeper, seen: Sightings, key_file: Path) -> None:
     """Put something into every table."""
     numbers = keeper.record_sightings(NAMES, seen, target="west")
     keeper.record_calibration(
@@ -65,6 +67,9 @@ def fill(keeper: Keeper, seen: Sightings) -> None:
     keeper.people.add("ben", "hash", "operator", 1.0, due=True)
     keeper.people.open_session("anna", 1.0, 1e12)
     keeper.people.add_token("anna", "report", "viewer", 1.0)
+    factors = keeper.people.factors(key_file)
+    secret = factors.begin("anna", 1e9)
+    factors.confirm("anna", TOTP(secret).at(10**9), 1e9)
     keeper.writer.confirmed().result(10.0)
 
 
@@ -105,12 +110,16 @@ def _schema(request: pytest.FixtureRequest) -> str:
 def test_everything_comes_back_wherever_it_goes(
     keeper: Keeper, seen: Sightings, other: str | Path, tmp_path: Path
 ) -> None:
-    fill(keeper, seen)
+    fill(keeper, seen, tmp_path / KEY_FILE)
     write_telemetry(tmp_path / "live")
     made = backups.backup(keeper.database, tmp_path / "backup", NOW, tmp_path / "live")
     assert made.made == "2026-06-21T12:00:00+00:00"
     found = backups.restore(tmp_path / "backup", other, tmp_path / "archive")
     assert (found.revision, found.size) == (HEAD, made.size)
+    # The secrets of second factors cannot be had from a backup.
+    key = (tmp_path / KEY_FILE).read_bytes().strip()
+    files = [file for file in (tmp_path / "backup").rglob("*") if file.is_file()]
+    assert not any(file.name == KEY_FILE or key in file.read_bytes() for file in files)
     restored = Database(other)
     assert all(len(rows) > 0 for rows in content(keeper.database).values())
     assert content(restored) == content(keeper.database)
@@ -162,7 +171,7 @@ class TestRefusals:
     @pytest.fixture
     def made(self, tmp_path: Path, opened: Callable[..., Keeper], seen: Sightings) -> Path:
         keeper = opened(tmp_path / "data")
-        fill(keeper, seen)
+        fill(keeper, seen, tmp_path / KEY_FILE)
         backups.backup(keeper.database, tmp_path / "backup", NOW)
         return tmp_path / "backup"
 
@@ -221,14 +230,14 @@ class TestRefusals:
         monkeypatch.setattr(backups, "_sync", full)
         with pytest.raises(StoreError, match=r"it cannot be made \(No space left on device"):
             backups.backup(Database(tmp_path / "data"), tmp_path / "second", NOW)
-        assert sorted(p.name for p in tmp_path.iterdir()) == ["backup", "data"]
+        assert sorted(p.name for p in tmp_path.iterdir()) == ["backup", "data", KEY_FILE]
 
 
 def test_hashes_are_not_for_everybody(
     tmp_path: Path, opened: Callable[..., Keeper], seen: Sightings
 ) -> None:
     keeper = opened(tmp_path / "data")
-    fill(keeper, seen)
+    fill(keeper, seen, tmp_path / KEY_FILE)
     backups.backup(keeper.database, tmp_path / "backup", NOW)
     backups.restore(tmp_path / "backup", tmp_path / "new")
     files = [p for p in tmp_path.rglob("store.sqlite*") if p.is_file()]
@@ -236,8 +245,8 @@ def test_hashes_are_not_for_everybody(
     assert [p for p in files if p.stat().st_mode & 0o007] == []
 
 
-def test_the_summary_counts(keeper: Keeper, seen: Sightings) -> None:
-    fill(keeper, seen)
+def test_the_summary_counts(keeper: Keeper, seen: Sightings, tmp_path: Path) -> None:
+    fill(keeper, seen, tmp_path / KEY_FILE)
     found = backups.summary(keeper.database)
     assert found["revision"] == HEAD
     assert found["rows"]["sighting"] == 10

@@ -19,6 +19,8 @@ app = typer.Typer(help="Look at and command a running plant.", no_args_is_help=T
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Whom = Annotated[list[str] | None, typer.Argument(help="Heliostats.", show_default=False)]
 All = Annotated[bool, typer.Option("--all", help="The whole field.")]
+#: Status of an answer that asks for the code of a second factor.
+_NEEDS_CODE = 428
 Wait = Annotated[float, typer.Option("--wait", help="Longest wait for the end, s; 0: none.")]
 
 
@@ -51,6 +53,18 @@ def _sign_in_client(context: typer.Context) -> "Client":
     from heliotrope.console.client import Client
 
     return Client("", context.obj[0])
+
+
+def _sign_in(client: "Client", name: str, password: str) -> None:
+    """Sign in; ask for a code where the account has a second factor."""
+    from heliotrope.console.stream import RemoteError
+
+    try:
+        client.sign_in(name, password)
+    except RemoteError as error:
+        if error.status != _NEEDS_CODE:
+            raise
+        client.sign_in(name, password, typer.prompt("Code of your second factor"))
 
 
 def _client(context: typer.Context) -> "Client | AtPlant":
@@ -91,7 +105,7 @@ def token(
 ) -> None:
     """Make an API token; it is printed once."""
     with _sign_in_client(context) as client:
-        client.sign_in(name, password)
+        _sign_in(client, name, password)
         made = client.ask(
             "POST",
             "tokens",
@@ -110,9 +124,44 @@ def password(
     old = typer.prompt("Password", hide_input=True)
     new = typer.prompt("New password", hide_input=True, confirmation_prompt=True)
     with _sign_in_client(context) as client:
-        client.change_password(name, old, new)
-        client.ask("DELETE", "session")
+        _sign_in(client, name, old)
+        client.change_password(old, new)
     print(f"password of {name} changed")
+
+
+@app.command()
+def factor(
+    context: typer.Context,
+    name: Annotated[str, typer.Option(help="Name of your account.")] = "engineer",
+    remove: Annotated[bool, typer.Option("--remove", help="Remove your second factor.")] = False,
+    reset: Annotated[
+        str, typer.Option(help="Remove that of another account, as an engineer with one.")
+    ] = "",
+) -> None:
+    """Set up the second factor of your account: codes of an authenticator."""
+    own = typer.prompt("Password", hide_input=True)
+    with _sign_in_client(context) as client:
+        _sign_in(client, name, own)
+        if remove or reset:
+            code = typer.prompt("Next code of your second factor")
+            path = f"accounts/{reset}/factor" if reset else "session/factor"
+            client.ask("DELETE", path, {"own_password": own, "own_code": code})
+            print(f"{reset or name} has no second factor")
+        else:
+            _set_up_factor(client, own)
+        client.ask("DELETE", "session")
+
+
+def _set_up_factor(client: "Client", own: str) -> None:
+    import segno
+
+    made = client.ask("POST", "session/factor", {"own_password": own})
+    segno.make(made["uri"]).terminal(compact=True)
+    print(f"Read it with an authenticator, or type the secret there: {made['secret']}")
+    code = typer.prompt("Code that it shows")
+    found = client.ask("PUT", "session/factor", {"code": code})
+    print("The second factor is in force. Recovery codes, shown only now, each good once:")
+    print("\n".join(found["codes"]))
 
 
 @app.command()
@@ -131,7 +180,7 @@ def account(
         raise InputError("ctl: give --disable or --reset, not both")
     own = typer.prompt("Your password", hide_input=True)
     with _sign_in_client(context) as client:
-        client.sign_in(by, own)
+        _sign_in(client, by, own)
         again = {"own_password": own}
         if reset:
             made = client.ask("POST", f"accounts/{name}/password", again)

@@ -16,9 +16,10 @@ from heliotrope.console.auth import (
     Here,
     refused,
     same_origin,
+    signed_in,
 )
-from heliotrope.console.people import ROLES, person_of
-from heliotrope.console.sign_in import checked, log_in
+from heliotrope.console.people import ROLES
+from heliotrope.console.sign_in import confirm, log_in
 from heliotrope.plant.authority import Role
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.people import Account
@@ -34,6 +35,7 @@ def _who(who: Caller) -> models.CallerState:
         expires=who.expires,
         csrf=who.csrf,
         owes=who.owes,
+        factor=who.factor,
     )
 
 
@@ -47,7 +49,10 @@ async def session(who: Anyone) -> models.CallerState:
     "/session",
     response_model=models.CallerState,
     tags=["people"],
-    responses={429: {"model": models.Problem, "description": "Too many failures"}},
+    responses={
+        428: {"model": models.Problem, "description": "The account has a second factor"},
+        429: {"model": models.Problem, "description": "Too many failures"},
+    },
 )
 async def sign_in(
     console: Here, request: Request, response: Response, given: models.LogIn
@@ -56,7 +61,9 @@ async def sign_in(
     if not same_origin(console, request):
         await console.note(SecurityEvent.ORIGIN_REFUSED, request)
         raise HTTPException(403, "this page comes from another site; sign in at the console itself")
-    account, secret, expires = await log_in(console, given.name, given.password, request)
+    account, secret, expires = await log_in(
+        console, given.name, given.password, given.code, request
+    )
     response.set_cookie(
         COOKIE,
         secret,
@@ -66,9 +73,7 @@ async def sign_in(
         samesite="strict",
         secure=console.settings.tls or console.settings.plain,
     )
-    owes = "password" if account.password_due else ""
-    who = Caller(person_of(account.name, account.role), "session", secret, expires, owes)
-    return _who(who)
+    return _who(signed_in(console, account, secret, expires))
 
 
 @router.delete("/session", status_code=204, tags=["people"])
@@ -91,7 +96,7 @@ async def own_password(
     console: Here, who: Anyone, request: Request, response: Response, given: models.OwnPassword
 ) -> None:
     """Change your own password; your sessions, including this one, and your tokens end."""
-    await _confirm(console, who, request, given.old)
+    await confirm(console, who, request, given.old)
     if given.new == given.old:
         raise HTTPException(422, "this is your password already; give another one")
     await _set_password(console, who.person.name, given.new)
@@ -104,7 +109,7 @@ async def reset_password(
     console: Here, who: Engineer, request: Request, name: Named, given: models.Confirmed
 ) -> models.GivenPassword:
     """Give a person a new password, to be changed at first use; sessions and tokens end."""
-    await _confirm(console, who, request, given.own_password)
+    await confirm(console, who, request, given.own_password)
     if name == who.person.name:
         raise HTTPException(409, f"{name}: change your own password with PUT session/password")
     if await console.ask(lambda: console.people.account(name)) is None:
@@ -127,7 +132,7 @@ async def new_account(
     console: Here, who: Engineer, request: Request, given: models.NewAccount
 ) -> models.AccountState:
     """Create an account; its password must be changed at first use."""
-    await _confirm(console, who, request, given.own_password)
+    await confirm(console, who, request, given.own_password)
     kept = await _hashed(console, given.password)
     made = await console.ask(
         lambda: console.people.add(given.name, kept, given.role, console.now(), due=True)
@@ -142,7 +147,7 @@ async def change_account(
     console: Here, who: Engineer, request: Request, name: Named, given: models.AccountChange
 ) -> models.AccountState:
     """Change the role or password of an account, or disable it; not yours."""
-    await _confirm(console, who, request, given.own_password)
+    await confirm(console, who, request, given.own_password)
     if name == who.person.name and given.password is not None:
         raise HTTPException(409, f"{name}: change your own password with PUT session/password")
     if name == who.person.name and (given.disabled or given.role not in (None, "engineer")):
@@ -178,7 +183,7 @@ async def new_token(
     console: Here, who: Anyone, request: Request, given: models.NewToken
 ) -> models.TokenState:
     """Create a token for a program; its secret is shown in this answer only."""
-    await _confirm(console, who, request, given.own_password)
+    await confirm(console, who, request, given.own_password)
     if ROLES[given.role] > who.person.role:
         await refused(console, request, who)
         raise HTTPException(403, f"token: role {given.role} is higher than your own")
@@ -198,7 +203,7 @@ async def revoke(
     console: Here, who: Anyone, request: Request, key: Named, given: models.Confirmed
 ) -> None:
     """Revoke a token: your own, or any as an engineer."""
-    await _confirm(console, who, request, given.own_password)
+    await confirm(console, who, request, given.own_password)
     found = await console.ask(lambda: console.people.tokens(_whose(who)))
     token = next((one for one in found if one.key == key), None)
     if token is None:
@@ -207,25 +212,6 @@ async def revoke(
     console.known.clear()
     what = f"{token.label} of {token.name}"
     await console.note(SecurityEvent.TOKEN_REVOKED, request, who.person.name, what)
-
-
-async def _confirm(console: Console, who: Caller, request: Request, password: str) -> None:
-    """Check that a person is there: a session, and its owner's password once more.
-
-    Raises
-    ------
-    HTTPException
-        403 for a token or a wrong password; 429 after too many failures.
-    """
-    if who.by != "session":
-        raise HTTPException(403, "a token cannot change accounts or tokens; sign in to do so")
-    try:
-        wrong = SecurityEvent.CONFIRMATION_FAILED
-        await checked(console, who.person.name, password, request, wrong)
-    except HTTPException as error:
-        if error.status_code == 401:
-            raise HTTPException(403, "your current password is wrong") from None
-        raise
 
 
 async def _hashed(console: Console, password: str) -> str:
@@ -260,5 +246,9 @@ def _whose(who: Caller) -> str:
 
 def _account(one: Account) -> models.AccountState:
     return models.AccountState(
-        name=one.name, role=one.role, disabled=one.disabled, created=one.created
+        name=one.name,
+        role=one.role,
+        disabled=one.disabled,
+        created=one.created,
+        factor=one.factor,
     )

@@ -13,6 +13,7 @@ from heliotrope import __version__
 from heliotrope.console import models
 from heliotrope.console._files import SMALL, takes_gzip
 from heliotrope.console.auth import (
+    DUES,
     FIXED,
     Anyone,
     Console,
@@ -211,7 +212,7 @@ async def live(socket: WebSocket) -> None:
         return
     await socket.accept()
     if found.owes:
-        await socket.close(4403, "change your password first")
+        await socket.close(4403, DUES[found.owes][0])
         return
     if console.stream.viewers >= console.settings.viewers:
         await socket.close(4429, f"{console.settings.viewers} viewers are connected already")

@@ -15,7 +15,7 @@ from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, Response
 from starlette.staticfiles import StaticFiles
 
 from heliotrope import __version__
-from heliotrope.console import accounts, api, commands
+from heliotrope.console import accounts, api, commands, factor
 from heliotrope.console._attempts import Attempts
 from heliotrope.console._files import KEPT, PLAIN, STATIC, Files
 from heliotrope.console.auth import FOUND, Caller, Console
@@ -38,7 +38,7 @@ ABOUT = (
     "word that the answer to the sign-in gave."
 )
 
-ROUTERS = (api.router, commands.router, accounts.router)
+ROUTERS = (api.router, commands.router, accounts.router, factor.router)
 #: Errors of a request that the answer lists, and their longest texts, characters.
 MOST_ERRORS, LONGEST_TEXT, LONGEST_WORD = 5, 200, 64
 

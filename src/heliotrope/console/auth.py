@@ -23,13 +23,13 @@ from heliotrope.console import _secrets
 from heliotrope.console._attempts import Attempts
 from heliotrope.console.emergencies import EmergencyOrders
 from heliotrope.console.live import Stream
-from heliotrope.console.people import person_of
+from heliotrope.console.people import ROLES, person_of
 from heliotrope.console.remote import RemotePeople, RemotePlant
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.security import SPAN, SecurityEvent, plain
-from heliotrope.store.people import ApiToken, Session
+from heliotrope.store.people import Account, ApiToken, Session
 
 T = TypeVar("T")
 COOKIE = "heliotrope_session"
@@ -54,12 +54,12 @@ _ALWAYS = frozenset(
     {("POST", f"{_API}/{path}") for path in ("emergency", "stow", "defocus", "commands")}
     | {(method, f"{_API}/session") for method in ("GET", "HEAD", "DELETE")}
 )
-_SAFE = "; EMERGENCY, DEFOCUS and STOW are accepted all the same"
-#: What a person may owe: the requests that settle it, and what a refusal says.
-DUES = {
-    "password": (
-        frozenset({("PUT", f"{_API}/session/password")}),
-        "change your password first: on the page /account, or by `heliotrope ctl password`" + _SAFE,
+#: What a person may owe: what to do about it, and the requests that settle it.
+DUES: dict[str, tuple[str, frozenset[tuple[str, str]]]] = {
+    "password": ("change your password first", frozenset({("PUT", f"{_API}/session/password")})),
+    "factor": (
+        "set up your second factor first",
+        frozenset({("POST", f"{_API}/session/factor"), ("PUT", f"{_API}/session/factor")}),
     ),
 }
 
@@ -154,6 +154,8 @@ class Caller:
         POSIX s; None for never.
     owes
         What the person must do before anything else, see `DUES`; "" for nothing.
+    factor
+        Whether the account has a second factor.
     """
 
     person: Person
@@ -161,6 +163,7 @@ class Caller:
     secret: str = field(repr=False)
     expires: float | None
     owes: str = ""
+    factor: bool = False
 
     @property
     def csrf(self) -> str:
@@ -245,12 +248,22 @@ async def _look_up(console: Console, by: str, secret: str) -> tuple[float, Calle
     if found is None:
         console.known.pop((by, secret), None)
         return None
-    owes = "password" if isinstance(found, Session) and found.password_due else ""
-    who = Caller(person_of(found.name, found.role), by, secret, found.expires, owes)
+    if isinstance(found, Session):
+        who = signed_in(console, found, secret, found.expires)
+    else:
+        who = Caller(person_of(found.name, found.role), by, secret, found.expires)
     if len(console.known) > MOST_KNOWN:
         console.known.clear()
     known = console.known[by, secret] = (time.monotonic(), who)
     return known
+
+
+def signed_in(console: Console, found: Account | Session, secret: str, expires: float) -> Caller:
+    """Return the caller of a session."""
+    person, least = person_of(found.name, found.role), console.settings.second_factor
+    needs_factor = bool(least) and person.role >= ROLES[least] and not found.factor
+    owes = "password" if found.password_due else "factor" if needs_factor else ""
+    return Caller(person, "session", secret, expires, owes, found.factor)
 
 
 def _is_emergency(connection: HTTPConnection) -> bool:
@@ -313,9 +326,13 @@ def settle(who: Caller, connection: HTTPConnection) -> None:
         403 for any other request.
     """
     if who.owes:
-        requests, text = DUES[who.owes]
+        text, requests = DUES[who.owes]
         if (connection.scope.get("method", "GET"), connection.scope["path"]) not in requests:
-            raise HTTPException(403, text)
+            raise HTTPException(
+                403,
+                f"{text}: on the page /account, or by `heliotrope ctl {who.owes}`; EMERGENCY, "
+                "DEFOCUS and STOW are accepted all the same",
+            )
 
 
 Anyone = Annotated[Caller, Depends(caller)]

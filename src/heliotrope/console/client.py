@@ -77,29 +77,27 @@ class Client:
         order = {"command": name, "heliostats": list(heliostats), "values": list(values)}
         return self.ask("POST", "commands", order)
 
-    def sign_in(self, name: str, password: str) -> None:
+    def sign_in(self, name: str, password: str, code: str = "") -> None:
         """Sign in; later requests are made as this person.
 
         Raises
         ------
         RemoteError
-            If name or password is wrong.
+            If name, password or code is wrong; with status 428 if a code is needed.
         """
         self._http.cookies.clear()
-        who = self.ask("POST", "session", {"name": name, "password": password})
+        who = self.ask("POST", "session", {"name": name, "password": password, "code": code})
         self._http.headers["X-CSRF-Token"] = who["csrf"]
 
-    def change_password(self, name: str, old: str, new: str) -> None:
-        """Change your own password, and sign in with the new one.
+    def change_password(self, old: str, new: str) -> None:
+        """Change your own password, which ends all sessions and tokens.
 
         Raises
         ------
         RemoteError
-            If name or password is wrong, or the new one is not accepted.
+            If the old one is wrong, or the new one is not accepted.
         """
-        self.sign_in(name, old)
         self.ask("PUT", "session/password", {"old": old, "new": new})
-        self.sign_in(name, new)
 
     async def live(self) -> AsyncIterator[LiveMessage]:
         """Yield the messages of the live stream: the whole field, then the changes.

@@ -60,11 +60,15 @@ def _type(hint: Any) -> Any:
     return Any
 
 
+Code = Annotated[str, Field(max_length=40)]
+
+
 class LogIn(Strict):
-    """Name and password."""
+    """Name and password, and the code of a second factor if the account has one."""
 
     name: Name
     password: Annotated[str, Field(min_length=1, max_length=200)]
+    code: Code = ""
 
 
 class CallerState(BaseModel):
@@ -75,13 +79,42 @@ class CallerState(BaseModel):
     by: str = Field(description='"session" or "token"')
     expires: float | None = Field(description="POSIX s")
     csrf: str = Field("", description="Send it as X-CSRF-Token with every change")
-    owes: str = Field("", description='"password": change it before anything else; "" for nothing')
+    owes: str = Field(
+        "", description='What is due before anything else: "password", "factor" or ""'
+    )
+    factor: bool = Field(False, description="Whether the account has a second factor")
 
 
 class Confirmed(Strict):
     """A change of accounts or tokens, which needs your own password again."""
 
     own_password: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class ConfirmedTwice(Confirmed):
+    """A change that needs your own password and, if you have one, a code of your second factor."""
+
+    own_code: Code = ""
+
+
+class FactorCode(Strict):
+    """A code of a second factor."""
+
+    code: Code
+
+
+class NewFactor(BaseModel):
+    """The secret of a second factor; it is shown in this answer only."""
+
+    secret: str = Field(description="Base32")
+    uri: str = Field(description="The secret as an authenticator reads it")
+    qr: str = Field(description="The same as a QR code: a data URI with SVG")
+
+
+class RecoveryCodes(BaseModel):
+    """Codes that replace one of a second factor, once each; shown in this answer only."""
+
+    codes: list[str]
 
 
 class NewAccount(Confirmed):
@@ -195,6 +228,7 @@ class AccountState(BaseModel):
     role: str
     disabled: bool
     created: float
+    factor: bool = Field(description="Whether it has a second factor")
 
 
 class TokenState(BaseModel):

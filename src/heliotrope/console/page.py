@@ -90,6 +90,9 @@ async def _page(request: Request) -> Response | None:
         with person, ui.menu():
             for title, part in _menu(who):
                 ui.menu_item(title).on("click", js_handler=f"() => heliotrope.open('{part}')")
+            ui.menu_item("Second factor").on(
+                "click", js_handler="() => location.assign('/account')"
+            )
             ui.menu_item("Sign out").on("click", js_handler="() => heliotrope.leave()")
     View("alert")
     with ui.element("main").classes("hx-main"):

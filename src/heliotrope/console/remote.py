@@ -15,6 +15,7 @@ from heliotrope.local import EMERGENCY, INTERNAL, ORDINARY, CallError, LocalConn
 from heliotrope.plant.authority import Person
 from heliotrope.plant.interface import CALLS, remade
 from heliotrope.plant.operations.security import SecurityEvent
+from heliotrope.store.factors import Used
 from heliotrope.store.people import Account, ApiToken, Expired, Session
 
 #: Time between two signs of life, s.
@@ -162,6 +163,27 @@ class RemotePeople:
     def close_session(self, secret: str) -> None:
         """End a session, if it exists."""
         self._ask("close_session", secret=secret)
+
+    def close_sessions(self, name: str) -> None:
+        """End all sessions of an account."""
+        self._ask("close_sessions", name=name)
+
+    def begin_factor(self, name: str, now: float) -> str:
+        """Return the secret of a new second factor; see `Factors.begin`."""
+        return str(self._ask("begin_factor", name=name, now=now))
+
+    def confirm_factor(self, name: str, code: str, now: float) -> tuple[str, ...]:
+        """Put a second factor in force; see `Factors.confirm`."""
+        return tuple(self._ask("confirm_factor", name=name, code=code, now=now))
+
+    def check_factor(self, name: str, code: str, now: float) -> Used | None:
+        """Use a code; see `Factors.check`."""
+        found = self._ask("check_factor", name=name, code=code, now=now)
+        return None if found is None else Used(**found)
+
+    def remove_factor(self, name: str) -> bool:
+        """Remove a second factor; see `Factors.remove`."""
+        return bool(self._ask("remove_factor", name=name))
 
     def add_token(
         self, name: str, label: str, role: str, now: float, lifetime: float | None = None

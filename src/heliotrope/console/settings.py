@@ -6,7 +6,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from heliotrope.errors import InputError
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.store.people import ROLES
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ class ConsoleSettings:
         Whether other machines may connect without TLS, behind a proxy that has it.
     proxies
         Addresses of trusted proxies: ``X-Forwarded-For`` names the caller of their requests.
+    second_factor
+        Least role that needs a second factor; "" for none.
     emergency_port
         Port that serves EMERGENCY alone; None: the next one, or a free one if that is taken.
 
@@ -55,6 +58,7 @@ class ConsoleSettings:
     page: bool = True
     plain: bool = False
     proxies: tuple[str, ...] = ()
+    second_factor: str = ""
     emergency_port: int | None = None
 
     def __post_init__(self) -> None:
@@ -66,6 +70,8 @@ class ConsoleSettings:
         for name in ("session_s", "period"):
             if not getattr(self, name) > 0.0:
                 raise InputError(f"console: {name} of {getattr(self, name)} s must be above 0")
+        if self.second_factor not in ("", *ROLES):
+            raise UnknownNameError("role", self.second_factor, ROLES)
         for proxy in self.proxies:
             _check_address(proxy)
         if not self.local and not self.tls and not self.plain:

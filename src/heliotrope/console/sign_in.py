@@ -7,23 +7,31 @@ from fastapi import HTTPException
 from starlette.requests import HTTPConnection
 
 from heliotrope.console import _secrets
-from heliotrope.console.auth import Console, address_of
+from heliotrope.console.auth import Caller, Console, address_of
 from heliotrope.console.edge import network_of
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.people import Account
 
+_WRONG_CODE = "the code is wrong or was used already; wait for the next one"
+
 
 async def log_in(
-    console: Console, name: str, password: str, connection: HTTPConnection
+    console: Console, name: str, password: str, code: str, connection: HTTPConnection
 ) -> tuple[Account, str, float]:
-    """Check a password; return account, and secret of a new session and its end, POSIX s.
+    """Check a password, and the code of a second factor; begin a session.
+
+    Returns
+    -------
+    The account, and the session's secret and end, POSIX s.
 
     Raises
     ------
     HTTPException
-        401 if name or password is wrong; 429 after too many failures.
+        401 if name, password or code is wrong; 428 if a code is needed; 429 after too many
+        failures.
     """
-    account = await checked(console, name, password, connection, SecurityEvent.SIGN_IN_FAILED)
+    failure = SecurityEvent.SIGN_IN_FAILED
+    account = await checked(console, name, password, connection, failure, code)
     now, lifetime = console.now(), console.settings.session_s
     secret = await console.ask(
         lambda: console.people.open_session(
@@ -41,14 +49,22 @@ async def _known(console: Console, name: str) -> str:
 
 
 async def checked(
-    console: Console, name: str, password: str, connection: HTTPConnection, failure: SecurityEvent
+    console: Console,
+    name: str,
+    password: str,
+    connection: HTTPConnection,
+    failure: SecurityEvent,
+    code: str | None = None,
 ) -> Account:
     """Return the account for a name and password; a wrong one is recorded as ``failure``.
+
+    An account with a second factor needs its code too, unless ``code`` is None.
 
     Raises
     ------
     HTTPException
-        401 if name or password is wrong; 429 after too many failures.
+        401 if name, password or code is wrong; 428 if a code is needed; 429 after too many
+        failures.
     """
     keys = (name, network_of(address_of(console, connection)))
     if (wait := console.attempts.wait(*keys)) > 0.0:
@@ -67,5 +83,45 @@ async def checked(
     if not good or account is None:
         await console.note(failure, connection, name if account is not None else "")
         raise HTTPException(401, "name or password is wrong")
+    if code is not None and account.factor:
+        await _use_code(console, name, code, connection, failure)
     console.attempts.good(*keys)
     return account
+
+
+async def _use_code(
+    console: Console, name: str, code: str, connection: HTTPConnection, failure: SecurityEvent
+) -> None:
+    """Use a code of a second factor; raises `HTTPException` if it is not right."""
+    if not code:
+        raise HTTPException(428, "give the code of your second factor too")
+    used = await console.ask(lambda: console.people.check_factor(name, code, console.now()))
+    if used is None:
+        await console.note(failure, connection, name, "wrong code of the second factor")
+        raise HTTPException(401, _WRONG_CODE)
+    if used.recovery:
+        left = f"a recovery code was used, {used.left} are left"
+        await console.note(SecurityEvent.FACTOR_CHANGED, connection, name, left)
+
+
+async def confirm(
+    console: Console, who: Caller, request: HTTPConnection, password: str, code: str | None = None
+) -> None:
+    """Check that a person is there: a session, and its owner's password (and code) once more.
+
+    Raises
+    ------
+    HTTPException
+        403 for a token, a wrong password or a wrong code; 428 if a code is needed; 429 after too
+        many failures.
+    """
+    if who.by != "session":
+        raise HTTPException(403, "a token cannot change accounts or tokens; sign in to do so")
+    try:
+        wrong = SecurityEvent.CONFIRMATION_FAILED
+        await checked(console, who.person.name, password, request, wrong, code)
+    except HTTPException as error:
+        if error.status_code == 401:
+            text = _WRONG_CODE if error.detail == _WRONG_CODE else "your current password is wrong"
+            raise HTTPException(403, text) from None
+        raise

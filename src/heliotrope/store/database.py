@@ -19,7 +19,7 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 from heliotrope.store.records import StoreError
 
 #: Revision of the tables that this program knows.
-HEAD = "0004"
+HEAD = "0005"
 FILE = "store.sqlite"
 #: Permissions of its files.
 MODE = 0o640

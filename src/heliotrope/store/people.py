@@ -10,21 +10,25 @@ import secrets
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Select, Table, literal, select
+from sqlalchemy import ColumnElement, Connection, FromClause, Select, Table, literal, select
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.store import _rows as rows
 from heliotrope.store import tables
 from heliotrope.store.database import Database
+from heliotrope.store.factors import Factors
 from heliotrope.store.records import StoreError
 from heliotrope.store.writer import Writer
 
 _ACCOUNT, _SESSION, _TOKEN = tables.account, tables.session, tables.api_token
-_DUE = tables.password_due
-_DUE_OF = _DUE.c.name == _ACCOUNT.c.name
-_IS_DUE = _DUE.c.name.is_not(None).label("password_due")
+_DUE, _FACTOR = tables.password_due, tables.second_factor
+_STATE = (
+    _DUE.c.name.is_not(None).label("password_due"),
+    _FACTOR.c.name.is_not(None).label("factor"),
+)
 ROLES = ("viewer", "operator", "engineer")
 
 
@@ -46,6 +50,8 @@ class Account:
         POSIX s.
     password_due
         Whether the password must be changed at its next use: somebody else has given it.
+    factor
+        Whether it has a second factor.
     """
 
     name: str
@@ -55,6 +61,7 @@ class Account:
     created: float
     changed: float
     password_due: bool = False
+    factor: bool = False
 
 
 @dataclass(frozen=True)
@@ -71,6 +78,7 @@ class Session:
     expires: float
     note: str = ""
     password_due: bool = False
+    factor: bool = False
 
 
 @dataclass(frozen=True)
@@ -249,11 +257,15 @@ class People:
 
         def work(connection: Connection) -> None:
             _need(connection, name)
-            for table in (_SESSION, _TOKEN, _DUE, _ACCOUNT):
+            for table in (_SESSION, _TOKEN, _DUE, tables.recovery_code, _FACTOR, _ACCOUNT):
                 connection.execute(table.delete().where(table.c.name == name))
             _check_engineers(connection, name)
 
         self._writer.do(work)
+
+    def factors(self, file: Path) -> Factors:
+        """Return the second factors of the accounts; ``file`` has the key of their secrets."""
+        return Factors(self._database, self._writer, file, self._entropy)
 
     # -- sessions ------------------------------------------------------------------------
 
@@ -282,8 +294,8 @@ class People:
 
     def session(self, secret: str, now: float) -> Session | None:
         """Return the session of a secret; None if there is none, or it is no longer valid."""
-        columns = (_SESSION, _ACCOUNT.c.role, _ACCOUNT.c.disabled, _IS_DUE)
-        joined = select(*columns).select_from(_SESSION.join(_ACCOUNT).outerjoin(_DUE, _DUE_OF))
+        columns = (_SESSION, _ACCOUNT.c.role, _ACCOUNT.c.disabled, *_STATE)
+        joined = select(*columns).select_from(_with_state(_SESSION.join(_ACCOUNT)))
         query = joined.where(_SESSION.c.key == _key(secret), _SESSION.c.expires > now)
         with self._database.reading() as connection:
             row = connection.execute(query).mappings().first()
@@ -431,7 +443,13 @@ def _check_role(role: str) -> None:
 
 
 def _accounts() -> Select[Any]:
-    return select(_ACCOUNT, _IS_DUE).select_from(_ACCOUNT.outerjoin(_DUE, _DUE_OF))
+    return select(_ACCOUNT, *_STATE).select_from(_with_state(_ACCOUNT))
+
+
+def _with_state(accounts: FromClause) -> FromClause:
+    """Join what `_STATE` needs to the accounts."""
+    factor = (_FACTOR.c.name == _ACCOUNT.c.name) & _FACTOR.c.confirmed
+    return accounts.outerjoin(_DUE, _DUE.c.name == _ACCOUNT.c.name).outerjoin(_FACTOR, factor)
 
 
 def _set_due(connection: Connection, name: str, *, due: bool) -> None:

@@ -397,6 +397,23 @@ password_due = Table(
     Column("name", Text, ForeignKey(account.c.name, ondelete="CASCADE"), primary_key=True),
 )
 
+#: Of `used`: the last step of time whose code was accepted. `word` is not secret, see `factors`.
+second_factor = Table(
+    "second_factor",
+    metadata,
+    Column("name", Text, ForeignKey(account.c.name, ondelete="CASCADE"), primary_key=True),
+    _text("word"),
+    _real("since", needed=True),
+    Column("confirmed", Boolean, nullable=False),
+    Column("used", BigInteger, nullable=False),
+)
+recovery_code = Table(
+    "recovery_code",
+    metadata,
+    _text("digest", key=True),
+    Column("name", Text, ForeignKey(account.c.name, ondelete="CASCADE"), nullable=False),
+)
+
 session = Table(
     "session",
     metadata,

@@ -49,6 +49,7 @@ class Shown:
     key: Path | None = None
     plain: bool = False
     proxies: tuple[str, ...] = ()
+    second_factor: str = ""
     emergency_port: int | None = None
     console: bool = True
     browser: bool = True
@@ -92,6 +93,7 @@ class Shown:
             key=self.key,
             plain=self.plain,
             proxies=self.proxies,
+            second_factor=self.second_factor,
             emergency_port=self.emergency_port,
         )
 

@@ -143,6 +143,13 @@ def run(
             rich_help_panel=_CONSOLE,
         ),
     ] = None,
+    second_factor: Annotated[
+        str,
+        typer.Option(
+            help="Role from which on people need a second factor: viewer, operator or engineer.",
+            rich_help_panel=_CONSOLE,
+        ),
+    ] = "",
     emergency_port: Annotated[
         int | None,
         typer.Option(
@@ -196,6 +203,7 @@ def run(
         key=key,
         plain=plain,
         proxies=tuple(proxy or ()),
+        second_factor=second_factor,
         emergency_port=emergency_port,
         console=not no_console,
         browser=not no_browser,

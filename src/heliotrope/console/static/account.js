@@ -1,8 +1,11 @@
-// The page of one's own account, which does without the frame: who owes a change of password sees only this one.
+// The page of one's own account, which does without the frame: who owes something sees only this one.
 (() => {
   const find = (id) => document.getElementById(id);
   const csrf = document.querySelector('meta[name="heliotrope-csrf"]').content;
-  const DUE = { password: "Somebody else knows this password. Change it before you go on." };
+  const DUE = {
+    password: "Somebody else knows this password. Change it before you go on.",
+    factor: "Your role needs a second factor. Set it up before you go on.",
+  };
 
   async function api(method, path, body) {
     const headers = { "X-CSRF-Token": csrf };
@@ -19,7 +22,8 @@
   }
 
   // Does the work of a form; what goes wrong is told in it.
-  function on(form, said, work) {
+  function on(name, work) {
+    const form = find(name), said = form.querySelector("[role=alert]");
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
       said.textContent = "";
@@ -27,13 +31,41 @@
     });
   }
 
-  on(find("password"), find("said"), async (given) => {
+  on("password", async (given) => {
     if (given.new !== given.again) throw new Error("the two new passwords differ; nothing was changed");
     await api("PUT", "session/password", { old: given.old, new: given.new });
     location.assign("/login");
   });
+  on("begin", async (given) => {
+    const made = await api("POST", "session/factor", given);
+    find("qr").src = made.qr;
+    find("secret").textContent = made.secret.match(/.{1,4}/g).join(" ");
+    find("begin").hidden = true;
+    find("confirm").hidden = false;
+    find("confirm").elements.code.focus();
+  });
+  on("confirm", async (given) => {
+    const { codes } = await api("PUT", "session/factor", given);
+    find("confirm").hidden = true;
+    find("codes").hidden = false;
+    find("codes").querySelector("pre").textContent = codes.join("\n");
+    find("due").textContent = "";
+  });
+  on("remove", async (given) => {
+    await api("DELETE", "session/factor", given);
+    await look();
+  });
   find("leave").addEventListener("click", async () => {
     try { await api("DELETE", "session"); } finally { location.assign("/login"); }
   });
-  api("GET", "session").then((who) => { find("due").textContent = DUE[who.owes] ?? ""; }, () => {});
+
+  async function look() {
+    const who = await api("GET", "session");
+    find("due").textContent = DUE[who.owes] ?? "";
+    find("password").hidden = who.owes === "factor";
+    find("factor").hidden = who.owes === "password";
+    find("begin").hidden = who.factor;
+    find("remove").hidden = !who.factor;
+  }
+  look().catch(() => {});
 })();

@@ -5,10 +5,14 @@ document.getElementById("login").addEventListener("submit", async (event) => {
   try {
     const answer = await fetch("/api/v1/session", {
       method: "POST", headers: { "Content-Type": "application/json" }, credentials: "same-origin",
-      body: JSON.stringify({ name: form.get("name"), password: form.get("password") }),
+      body: JSON.stringify({ name: form.get("name"), password: form.get("password"), code: form.get("code") }),
     });
     if (answer.ok) location.assign("/");
-    else said.textContent = (await answer.json()).detail;
+    else if (answer.status === 428) {
+      document.getElementById("code").hidden = false;
+      event.target.elements.code.focus();
+      said.textContent = (await answer.json()).detail;
+    } else said.textContent = (await answer.json()).detail;
   } catch {
     said.textContent = "the console does not answer";
   }

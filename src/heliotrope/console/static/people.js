@@ -50,6 +50,13 @@ export const people = () => open("People", async (done) => {
     button("New password", () => done(async () => {
       const given = await confirmed(`Create a new password for ${one.name}? The old password, all sessions and tokens end.`, [], "Create");
       return given ? once(`New password of ${one.name}`, (await api("POST", `${path(one.name)}/password`, given)).password) : "";
+    })),
+    one.factor && button("Remove second factor", () => done(async () => {
+      const given = await confirmed(`Remove the second factor of ${one.name}? All sessions end.`,
+        [{ name: "own_code", label: "Code of your own second factor" }], "Remove");
+      if (!given) return "";
+      await api("DELETE", `${path(one.name)}/factor`, given);
+      return `${one.name} has no second factor`;
     }))));
   const add = button("Add…", () => done(async () => {
     const given = await confirmed("New account", [{ name: "name", label: "Name" }, { name: "role", label: "Role", options: ROLES },

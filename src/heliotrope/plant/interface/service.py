@@ -35,6 +35,7 @@ from heliotrope.plant.interface.errors import kind_of
 from heliotrope.plant.interface.orders import Beat
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.security import SecurityEvent
+from heliotrope.store.factors import KEY_FILE, Factors
 from heliotrope.store.people import People
 
 T = TypeVar("T")
@@ -90,6 +91,7 @@ class PlantInterface:
 
     def __init__(self, operations: Operations, people: People, data: Path) -> None:
         self._desk, self._people = Desk(operations), people
+        self._factors = people.factors(data / KEY_FILE)
         self.folder, self.key = socket_folder(data), secrets.token_hex(32)
         self.heard, self.address = -math.inf, ""
         self._known: dict[str, tuple[float, Person]] = {}
@@ -202,7 +204,7 @@ class PlantInterface:
         if caller.person is None and name == "heartbeat":
             self.heard, self.address = time.monotonic(), _checked(Beat, given).address
             return None, b""
-        people = _people_calls(self._people)
+        people = _people_calls(self._people, self._factors)
         if caller.person is None and name in people:
             work = functools.partial(people[name], **given)
             loop = asyncio.get_running_loop()
@@ -302,7 +304,7 @@ class _LoopThread:
                 group.create_task(work())
 
 
-def _people_calls(people: People) -> dict[str, Callable[..., Any]]:
+def _people_calls(people: People, factors: Factors) -> dict[str, Callable[..., Any]]:
     """Return the calls that only a console may make, done in threads and not in the loop."""
     return {
         "people.account": people.account,
@@ -312,11 +314,16 @@ def _people_calls(people: People) -> dict[str, Callable[..., Any]]:
         "people.open_session": people.open_session,
         "people.session": people.session,
         "people.close_session": people.close_session,
+        "people.close_sessions": people.close_sessions,
         "people.add_token": people.add_token,
         "people.token": people.token,
         "people.tokens": people.tokens,
         "people.revoke_token": people.revoke_token,
         "people.forget_expired": people.forget_expired,
+        "people.begin_factor": factors.begin,
+        "people.confirm_factor": factors.confirm,
+        "people.check_factor": factors.check,
+        "people.remove_factor": factors.remove,
     }
 
 

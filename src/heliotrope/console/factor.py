@@ -1,0 +1,74 @@
+"""The HTTP API, version 1: the second factor of an account."""
+
+from fastapi import APIRouter, HTTPException, Request
+
+from heliotrope.console import models
+from heliotrope.console.api import REFUSALS, Named
+from heliotrope.console.auth import Anyone, Engineer, Here
+from heliotrope.console.sign_in import confirm
+from heliotrope.plant.operations.security import SecurityEvent
+
+router = APIRouter(prefix="/api/v1", responses=REFUSALS)
+
+
+@router.post("/session/factor", response_model=models.NewFactor, tags=["people"])
+async def begin_factor(
+    console: Here, who: Anyone, request: Request, given: models.Confirmed
+) -> models.NewFactor:
+    """Make the secret of your second factor, shown once; `PUT session/factor` puts it in force."""
+    import pyotp
+    import segno
+
+    await confirm(console, who, request, given.own_password)
+    name = who.person.name
+    secret = await console.ask(lambda: console.people.begin_factor(name, console.now()))
+    uri = pyotp.TOTP(secret).provisioning_uri(name=name, issuer_name="Heliotrope")
+    return models.NewFactor(secret=secret, uri=uri, qr=segno.make(uri).svg_data_uri(scale=5))
+
+
+@router.put("/session/factor", response_model=models.RecoveryCodes, tags=["people"])
+async def confirm_factor(
+    console: Here, who: Anyone, request: Request, given: models.FactorCode
+) -> models.RecoveryCodes:
+    """Put your second factor in force by its first code; the recovery codes are shown once."""
+    if who.by != "session":
+        raise HTTPException(403, "a token cannot change a second factor; sign in to do so")
+    name = who.person.name
+    codes = await console.ask(
+        lambda: console.people.confirm_factor(name, given.code, console.now())
+    )
+    console.known.clear()
+    await console.note(SecurityEvent.FACTOR_CHANGED, request, name, "set up")
+    return models.RecoveryCodes(codes=list(codes))
+
+
+@router.delete("/session/factor", status_code=204, tags=["people"])
+async def remove_own_factor(
+    console: Here, who: Anyone, request: Request, given: models.ConfirmedTwice
+) -> None:
+    """Remove your own second factor."""
+    await confirm(console, who, request, given.own_password, given.own_code)
+    name = who.person.name
+    if not await console.ask(lambda: console.people.remove_factor(name)):
+        raise HTTPException(404, f"{name} has no second factor")
+    console.known.clear()
+    await console.note(SecurityEvent.FACTOR_CHANGED, request, name, "removed")
+
+
+@router.delete("/accounts/{name}/factor", status_code=204, tags=["people"])
+async def remove_factor(
+    console: Here, who: Engineer, request: Request, name: Named, given: models.ConfirmedTwice
+) -> None:
+    """Remove the second factor of another person, whose sessions end; needs one of your own."""
+    if not who.factor:
+        raise HTTPException(409, f"{who.person.name}: set up your own second factor first")
+    if name == who.person.name:
+        raise HTTPException(409, f"{name}: remove your own one with DELETE session/factor")
+    await confirm(console, who, request, given.own_password, given.own_code)
+    if await console.ask(lambda: console.people.account(name)) is None:
+        raise HTTPException(404, f"there is no account {name}")
+    if not await console.ask(lambda: console.people.remove_factor(name)):
+        raise HTTPException(404, f"{name} has no second factor")
+    await console.ask(lambda: console.people.close_sessions(name))
+    console.known.clear()
+    await console.note(SecurityEvent.FACTOR_CHANGED, request, who.person.name, f"removed: {name}")

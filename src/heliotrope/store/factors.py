@@ -1,0 +1,222 @@
+"""Second factors of accounts: codes of an authenticator (TOTP, RFC 6238) and recovery codes.
+
+No secret is in the database. That of an account is derived from a key file, which no backup has,
+and from the account's name and a random word; recovery codes are kept as SHA-256.
+"""
+
+import base64
+import hashlib
+import hmac
+import os
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy import Connection, select
+
+from heliotrope.errors import InputError
+from heliotrope.store import tables
+from heliotrope.store.database import PRIVATE, Database
+from heliotrope.store.records import StoreError
+from heliotrope.store.writer import Writer
+
+#: Name of the key file in the plant's data folder.
+KEY_FILE = "second-factor.key"
+#: Recovery codes of an account.
+CODES = 8
+#: Length of a code's step, s, and steps before and after the present one that are accepted.
+STEP, NEAR = 30, 1
+_FACTOR, _RECOVERY = tables.second_factor, tables.recovery_code
+_BYTES = 32
+
+
+@dataclass(frozen=True)
+class Used:
+    """A code that was right: whether it was a recovery code, and how many of those are left."""
+
+    recovery: bool
+    left: int
+
+
+class Factors:
+    """The second factors of a store; any thread may call any method.
+
+    Parameters
+    ----------
+    database, writer
+        The keeper's.
+    file
+        Key file; it is made when the first secret is.
+    entropy
+        Returns random bytes.
+    """
+
+    def __init__(
+        self,
+        database: Database,
+        writer: Writer,
+        file: Path,
+        entropy: Callable[[int], bytes] = secrets.token_bytes,
+    ) -> None:
+        self._database, self._writer, self._file, self._entropy = database, writer, file, entropy
+
+    def begin(self, name: str, now: float) -> str:
+        """Return a new secret of an account, base32; it counts once `confirm` has seen its code.
+
+        Raises
+        ------
+        InputError
+            If the account has a second factor already, or the key file cannot be used.
+        StoreError
+            If it could not be written.
+        """
+        word = self._entropy(16).hex()
+        made = self._secret(name, word)
+
+        def work(connection: Connection) -> None:
+            found = _find(connection, name)
+            if found is not None and found.confirmed:
+                raise InputError(f"account {name}: it has a second factor; remove that one first")
+            connection.execute(_FACTOR.delete().where(_FACTOR.c.name == name))
+            row = {"name": name, "word": word, "since": now, "confirmed": False, "used": 0}
+            connection.execute(_FACTOR.insert().values(row))
+
+        self._writer.do(work)
+        return made
+
+    def confirm(self, name: str, code: str, now: float) -> tuple[str, ...]:
+        """Put the secret of `begin` in force; return the recovery codes, shown only now.
+
+        Raises
+        ------
+        InputError
+            If there is none, or the code is wrong.
+        StoreError
+            If it could not be written.
+        """
+        codes = tuple(self._recovery_code() for _ in range(CODES))
+
+        def work(connection: Connection) -> None:
+            found = _find(connection, name)
+            if found is None or found.confirmed:
+                raise InputError(f"account {name}: begin to set up a second factor first")
+            step = self._step(name, found.word, 0, code, now)
+            if step is None:
+                raise InputError("the code is wrong; check the clock of the device that made it")
+            mine = _FACTOR.update().where(_FACTOR.c.name == name)
+            connection.execute(mine.values(confirmed=True, used=step))
+            connection.execute(_RECOVERY.delete().where(_RECOVERY.c.name == name))
+            rows = [{"digest": _digest(name, one), "name": name} for one in codes]
+            connection.execute(_RECOVERY.insert(), rows)
+
+        self._writer.do(work)
+        return codes
+
+    def check(self, name: str, code: str, now: float) -> Used | None:
+        """Use a code; None if it is wrong. Each code is good once.
+
+        Raises
+        ------
+        StoreError
+            If its use could not be written.
+        """
+
+        def work(connection: Connection) -> Used | None:
+            found = _find(connection, name)
+            if found is None or not found.confirmed:
+                return None
+            mine = _RECOVERY.c.name == name
+            which = mine & (_RECOVERY.c.digest == _digest(name, code))
+            recovery = connection.execute(_RECOVERY.delete().where(which)).rowcount == 1
+            if not recovery:
+                step = self._step(name, found.word, found.used, code, now)
+                if step is None:
+                    return None
+                update = _FACTOR.update().where(_FACTOR.c.name == name)
+                connection.execute(update.values(used=step))
+            left = connection.execute(select(_RECOVERY.c.digest).where(mine)).all()
+            return Used(recovery, len(left))
+
+        return self._writer.do(work)
+
+    def remove(self, name: str) -> bool:
+        """Remove the second factor of an account; return whether there was one."""
+
+        def work(connection: Connection) -> bool:
+            connection.execute(_RECOVERY.delete().where(_RECOVERY.c.name == name))
+            return connection.execute(_FACTOR.delete().where(_FACTOR.c.name == name)).rowcount > 0
+
+        return self._writer.do(work)
+
+    # -- codes ---------------------------------------------------------------------------
+
+    def _step(self, name: str, word: str, used: int, code: str, now: float) -> int | None:
+        """Return the step of a code that is right and was not used; None if there is none."""
+        import pyotp
+
+        clean = code.replace(" ", "")
+        try:
+            totp = pyotp.TOTP(self._secret(name, word))
+        except InputError:
+            return None  # without the key file only recovery codes are left
+        present = int(now // STEP)
+        for step in range(max(used + 1, present - NEAR), present + NEAR + 1):
+            if hmac.compare_digest(totp.at(step * STEP).encode(), clean.encode()):
+                return step
+        return None
+
+    def _recovery_code(self) -> str:
+        """Return a random code of 80 bits in groups that can be read aloud."""
+        text = base64.b32encode(self._entropy(10)).decode().lower()
+        return "-".join(text[k : k + 4] for k in range(0, 16, 4))
+
+    def _secret(self, name: str, word: str) -> str:
+        """Return the secret of an account, base32."""
+        message = f"second factor\0{name}\0{word}".encode()
+        return base64.b32encode(hmac.digest(self._key(), message, "sha256")[:20]).decode()
+
+    def _key(self) -> bytes:
+        """Return the key of the file, which is made if there is none.
+
+        Raises
+        ------
+        InputError
+            If it cannot be read or made, or others may read it.
+        """
+        try:
+            if self._file.stat().st_mode & 0o077:
+                raise InputError(f"key file {self._file}: others may read it; run chmod 600 on it")
+            key = bytes.fromhex(self._file.read_text("ascii").strip())
+        except FileNotFoundError:
+            return self._make_key()
+        except (OSError, ValueError) as error:
+            raise InputError(f"key file {self._file}: it cannot be read ({error})") from None
+        if len(key) != _BYTES:
+            raise InputError(f"key file {self._file}: {len(key)} bytes; give {_BYTES}, as hex")
+        return key
+
+    def _make_key(self) -> bytes:
+        with self._database.reading() as connection:
+            if connection.execute(select(_FACTOR.c.name).where(_FACTOR.c.confirmed)).first():
+                raise InputError(
+                    f"key file {self._file}: it is missing, so no code of an authenticator can be "
+                    "checked; put it back, or sign in by recovery codes"
+                )
+        key = self._entropy(_BYTES)
+        try:
+            made = os.open(self._file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, PRIVATE)
+            with os.fdopen(made, "w") as file:
+                file.write(key.hex() + "\n")
+        except OSError as error:
+            raise StoreError(f"key file {self._file}: {error.strerror}") from None
+        return key
+
+
+def _find(connection: Connection, name: str):  # type: ignore[no-untyped-def]
+    return connection.execute(select(_FACTOR).where(_FACTOR.c.name == name)).first()
+
+
+def _digest(name: str, code: str) -> str:
+    clean = "".join(c for c in code.lower() if c.isalnum())
+    return hashlib.sha256(f"{name}\0{clean}".encode(errors="replace")).hexdigest()
