@@ -32,6 +32,12 @@ KINDS = {
     ),
 }
 
+#: Said below the table of models.
+ROLES = """`malan8`, `guo6` and `khalsa8` are written down for azimuth and elevation; another kind
+takes its own parameters of the same role. Roles are `position`, `tilts`, `biases`, `scales`,
+`non_orthogonality` and `canting`. Models, roles and parameters may be joined: `malan8+canting`,
+`tilts+biases+sag`."""
+
 
 def page() -> str:
     """Return the page's text."""
@@ -57,6 +63,7 @@ def page() -> str:
     for name, parameters in MODELS.items():
         lines.append(f"| `{name}` | {', '.join(f'`{p}`' for p in parameters)} |")
     lines.append("| `full` | all of a mechanism's but worm and pivot radius |")
+    lines += ["", ROLES]
     return "\n".join(lines) + "\n"
 
 

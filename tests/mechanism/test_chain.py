@@ -7,6 +7,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import azimuth_elevation, direction, rotation
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.parameters import MODELS, model
 from support.machines import every_kind, imperfect, random_counts
 
 KINDS = list(every_kind())
@@ -193,3 +194,45 @@ def test_guards(make, text: str) -> None:  # type: ignore[no-untyped-def]
 def test_unknown_parameter_suggests() -> None:
     with pytest.raises(UnknownNameError, match=r"did you mean.*tilt_north"):
         kinds.azimuth_elevation(ORIGIN).with_parameters({"tilt_nord": 0.1})
+
+
+def test_models_by_role_fit_every_kind() -> None:
+    for name, mechanism in every_kind().items():
+        known = mechanism.parameters
+        if len(mechanism.driven) < 2:
+            continue
+        found = model("malan8+canting", known)
+        assert len(found) == 9, name
+        assert set(found) <= set(known)
+        assert [n for n in found if n.startswith("position_")] == [
+            "position_east", "position_north", "position_up",
+        ]  # fmt: skip
+        assert sum(n.endswith("_bias") for n in found) == 2
+        assert model("khalsa8", known)[-2:] == tuple(n for n in known if n.endswith("_scale"))
+    azel = every_kind()["azimuth_elevation"].parameters
+    assert model("tilts+biases", azel) == (
+        "tilt_north", "tilt_east", "azimuth_bias", "elevation_bias",
+    )  # fmt: skip
+    assert model("malan8", azel) == MODELS["malan8"]
+    assert model("canting+sag", azel) == ("canting", "sag")
+    with pytest.raises(UnknownNameError, match="model 'malan9'"):
+        model("malan9", azel)
+    with pytest.raises(UnknownNameError, match="'jacks'"):
+        model("jacks", azel)
+
+
+def test_a_drive_called_tilt_is_no_tilt_of_the_pedestal() -> None:
+    known = every_kind()["tilt_roll"].parameters
+    assert "tilt_bias" in known
+    assert "tilt_bias" not in model("tilts", known)
+
+
+@pytest.mark.parametrize("name", [n for n, m in every_kind().items() if len(m.driven) == 2])
+def test_an_armature_with_its_drives_is_the_same_machine(name: str) -> None:
+    mechanism = imperfect(every_kind()[name])
+    made = kinds.of_armature(mechanism.armature, mechanism.drives, mechanism.position)
+    counts = random_counts(mechanism, 20)
+    one, other = mechanism.pose(counts), made.pose(counts)
+    np.testing.assert_allclose(other.normal, one.normal, atol=1e-12)
+    np.testing.assert_allclose(other.vertex, one.vertex, atol=1e-9)
+    np.testing.assert_allclose(made.armature.table, mechanism.armature.table, atol=1e-12)

@@ -55,6 +55,7 @@ from support.broker import Mosquitto, mosquitto_for
 from support.cluster_process import Line
 from support.clusters import Board, key_of
 from support.plant_bench import ScriptedCluster
+from support.six_kinds import mixed
 
 MAIN = "from heliotrope.cli import main; main()"
 PREFIX = "heliotrope/test"
@@ -521,6 +522,20 @@ def call(*words: object) -> tuple[int, str, str]:
 def test_files_are_checked_without_a_plant(folder: Path) -> None:
     done = call(folder / "plant.toml", "--clusters", folder / "links.toml", "--check")
     assert done == (0, "four ways: 8 heliostats on 4 clusters, 0 of 0 targets with a camera\n", "")
+
+
+def test_a_plant_of_four_kinds_is_built_by_the_check(folder: Path) -> None:
+    """What `--check` builds is what a run builds, with the parameters that are to be stored."""
+    kinds = ["azimuth_elevation", "tilt_roll", "target_aligned", "polar"]
+    made, homes = mixed(kinds, 2, "K"), clusters_of(design())
+    groups = {
+        name: replace(group, names=homes[group.cluster[0]]) for name, group in made.groups.items()
+    }
+    write_plant(replace(made, groups=groups, targets=(), cameras=()), folder / "mixed.toml")
+    words = ("--clusters", folder / "links.toml", "--check", "--configure")
+    code, out, err = call(folder / "mixed.toml", *words)
+    assert (code, err) == (0, "")
+    assert "8 heliostats on 4 clusters" in out
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from heliotrope.geometry import FloatArray, as_float, direction
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
+from heliotrope.mechanism.parameters import model
 from heliotrope.sun import Site
 
 #: Centres of the six groups of three, metres east and north of the tower.
@@ -111,12 +112,19 @@ def roughly_installed(nominal: Mechanism, seed: int = 0) -> Mechanism:
     """
     rng = np.random.default_rng(seed)
     sizes = {
-        "tilt_north": 10e-3, "tilt_east": 10e-3, "azimuth_bias": 5e-3, "elevation_bias": 5e-3,
-        "non_orthogonality": 2e-3, "canting": 2e-3, "position_east": 0.02, "position_north": 0.02,
-        "position_up": 0.02,
-    }  # fmt: skip
+        "tilts": 10e-3,
+        "biases": 5e-3,
+        "non_orthogonality": 2e-3,
+        "canting": 2e-3,
+        "position": 0.02,
+    }
+    known = nominal.parameters
     return nominal.with_parameters(
-        {name: rng.normal(0.0, size, nominal.shape) for name, size in sizes.items()}
+        {
+            name: rng.normal(0.0, size, nominal.shape)
+            for role, size in sizes.items()
+            for name in model(role, known)
+        }
     )
 
 

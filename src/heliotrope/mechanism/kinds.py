@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
-from heliotrope.mechanism.armature import check_axes
+from heliotrope.mechanism.armature import Armature, check_axes
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive, direct
 
@@ -311,6 +311,32 @@ def pitch_roll(
         pivot_offset=pivot_offset,
         drives=drives,
     )
+
+
+def of_armature(
+    armature: Armature, drives: Drive, position: npt.ArrayLike, *, kind: str = "two_axis"
+) -> Mechanism:
+    """Return two-axis mechanisms with given armatures: any kind, without the names of its errors.
+
+    Parameters
+    ----------
+    armature
+        Shape (...).
+    drives
+        Both drives, (..., 2).
+    position
+        ENU metres, (..., 3).
+    kind
+        Name of the kind.
+    """
+    foot = as_vectors(position, "position")
+    steps: list[tuple[str, FloatArray, npt.ArrayLike]] = [
+        ("primary", armature.axis_1, armature.origin_1 - foot),
+        ("secondary", armature.axis_2, armature.origin_2 - armature.origin_1),
+    ]
+    both = (drives[0], drives[1])
+    mirror = armature.vertex - armature.origin_2
+    return _assemble(kind, steps, (0, 1), foot, None, both, mirror, armature.normal)
 
 
 def polar(

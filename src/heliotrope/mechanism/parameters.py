@@ -281,21 +281,71 @@ MODELS: dict[str, tuple[str, ...]] = {
 }
 
 
+#: Parts that every kind of two-axis mechanism has, whatever its joints are called.
+_ROLES = ("position", "tilts", "biases", "scales", "non_orthogonality", "canting")
+#: The models that consist of roles, for kinds whose joints have other names.
+_BY_ROLE: dict[str, tuple[str, ...]] = {
+    "malan8": ("position", "tilts", "biases", "non_orthogonality"),
+    "guo6": ("tilts", "biases", "non_orthogonality", "canting"),
+    "khalsa8": ("tilts", "biases", "non_orthogonality", "canting", "scales"),
+}
+
+
 def model(name: str, known: dict[str, Parameter]) -> tuple[str, ...]:
     """Return the parameter names of model ``name`` for a mechanism with table ``known``.
+
+    Parameters
+    ----------
+    name
+        A model, a role ("position", "tilts", "biases", "scales", "non_orthogonality", "canting"),
+        a parameter, or several of them joined by "+", such as "malan8+canting". A model written
+        down for azimuth and elevation takes the parameters of the same role in other kinds.
+    known
+        Parameter table of the mechanism.
 
     Raises
     ------
     UnknownNameError
         If there is no such model, or the mechanism lacks one of its parameters.
     """
+    found: dict[str, None] = {}
+    for part in name.split("+"):
+        found |= dict.fromkeys(_part(part.strip(), known))
+    return tuple(found)
+
+
+def _part(name: str, known: dict[str, Parameter]) -> tuple[str, ...]:
     if name == "full":
         return tuple(n for n in known if "_worm_" not in n and not n.endswith("pivot_radius"))
-    if name not in MODELS:
-        raise UnknownNameError("model", name, [*MODELS, "full"])
-    for parameter in MODELS[name]:
-        if parameter not in known:
+    if name in MODELS:
+        missing = [parameter for parameter in MODELS[name] if parameter not in known]
+        if not missing:
+            return MODELS[name]
+        if name not in _BY_ROLE:
             raise UnknownNameError(
-                f"parameter (of model {name!r}) in this kind of mechanism:", parameter, known
+                f"parameter (of model {name!r}) in this kind of mechanism:", missing[0], known
             )
-    return MODELS[name]
+        return tuple(n for role in _BY_ROLE[name] for n in _role(role, known))
+    if name in _ROLES:
+        return _role(name, known)
+    if name in known:
+        return (name,)
+    raise UnknownNameError("model", name, [*MODELS, "full", *_ROLES])
+
+
+def _role(role: str, known: dict[str, Parameter]) -> tuple[str, ...]:
+    """Return the parameters with a role, in the order of the table."""
+    if role in known:
+        return (role,)
+    begins = {"position": "position_", "tilts": "tilt_"}
+    ends = {"biases": "_bias", "scales": "_scale"}
+    if role in begins:
+        # A drive that is called tilt has parameters of its own, such as tilt_bias.
+        kind = slot.MOVES_POSITION if role == "position" else slot.MOVES_JOINT
+        found = [n for n, p in known.items() if n.startswith(begins[role]) and p.code[0] == kind]
+    else:
+        end = ends.get(role, role)
+        found = [n for n, p in known.items() if n.endswith(end) and p.code[0] == slot.MOVES_DRIVE]
+    if not found:
+        raise UnknownNameError("parameters of this role in this kind of mechanism:", role, known)
+    return tuple(found)

@@ -19,7 +19,6 @@ from heliotrope.field.plant import Plant
 from heliotrope.lcu import states
 from heliotrope.links.link import running
 from heliotrope.mechanism.board_items import items_of
-from heliotrope.mechanism.parameters import MODELS
 from heliotrope.plant.assigned import rest_on
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.automatic import AutomaticSettings
@@ -36,7 +35,7 @@ from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.safety import alarms
 
 #: A calibration that removes the errors of a quick installation.
-CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model=(*MODELS["malan8"], "canting"))
+CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model="malan8+canting")
 #: Age from which a silent heliostat is not waited for at the end, s.
 SILENT = 10.0
 #: Period of reading the sensors, s.

@@ -89,6 +89,22 @@ class Audit(Protocol):
         ...
 
 
+class Forgetful:
+    """An audit that stores nothing, for plants that are only looked at."""
+
+    def begin(self, record: Record) -> None:
+        """Take a record."""
+
+    def finish(self, identity: str, result: str, at: str) -> None:
+        """Take a result."""
+
+    def confirm(self) -> None:
+        """Do nothing: nothing can go wrong."""
+
+    def close(self) -> None:
+        """Do nothing: nothing is open."""
+
+
 class JsonLines:
     """An audit in one file that only grows, line by line.
 

@@ -13,6 +13,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.links.clock import SystemClock
 from heliotrope.links.link import running
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
+from heliotrope.plant.audit import Forgetful
 from heliotrope.plant.cameras import RealCameras
 from heliotrope.plant.disk import DiskThread
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
@@ -23,6 +24,7 @@ from heliotrope.store.keeper import Keeper
 
 if TYPE_CHECKING:
     from heliotrope.cluster.program import LocalCluster
+    from heliotrope.links.link import Link
     from heliotrope.links.papers import Papers
     from heliotrope.plant.links_file import PlantLinks
 
@@ -53,7 +55,7 @@ def run_real(design: Plant, choice: RealChoice, shown: Shown) -> None:
         for name in design.names:
             design.machine(name)
     if choice.check:
-        _print_check(design, _cameras(design, choice, shown, clock))
+        _check(design, choice, outside, _cameras(design, choice, shown, clock), clock)
         for text in _papers(outside, shown).lines():
             print(text)
         return
@@ -73,7 +75,24 @@ def _papers(outside: "_Outside", shown: Shown) -> "Papers":
     return papers
 
 
-def _print_check(design: Plant, cameras: RealCameras | None) -> None:
+def _settings(choice: RealChoice) -> AssemblySettings:
+    return AssemblySettings(
+        # A heliostat that a person gives to automatic control is calibrated too.
+        work=AutomaticSettings(wanted=not choice.idle),
+        machines=MachineTables.WRITTEN if choice.configure else MachineTables.UNKNOWN,
+    )
+
+
+def _check(
+    design: Plant,
+    choice: RealChoice,
+    outside: "_Outside",
+    cameras: RealCameras | None,
+    clock: SystemClock,
+) -> None:
+    """Build the whole plant without starting it, and print what it consists of."""
+    ports = Ports(outside.all_links, clock, Forgetful(), cameras, outside.links.sensors)
+    PlantAssembly(design, ports, _settings(choice))
     seen = 0 if cameras is None else sum(cameras.sees(t.name) for t in design.targets)
     print(
         f"{design.name}: {len(design):,} heliostats on {len(clusters_of(design))} clusters, "
@@ -98,12 +117,17 @@ class _Outside:
         async with running(*parts), running(*(one.cluster for one in self.local)):
             yield
 
+    @property
+    def all_links(self) -> "dict[str, Link]":
+        """The links to all clusters, by name."""
+        return {**self.links.links, **{one.cluster.config.name: one.link for one in self.local}}
+
     def ports(
         self, design: Plant, choice: RealChoice, shown: Shown, clock: SystemClock, keeper: Keeper
     ) -> Ports:
         """Return the ports of the plant."""
         return Ports(
-            {**self.links.links, **{one.cluster.config.name: one.link for one in self.local}},
+            self.all_links,
             clock,
             KeptAudit(keeper, clock, clock.utc()),
             _cameras(design, choice, shown, clock),
@@ -141,16 +165,11 @@ def _cameras(
 
 
 async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outside) -> None:
-    settings = AssemblySettings(
-        # A heliostat that a person gives to automatic control is calibrated too.
-        work=AutomaticSettings(wanted=not choice.idle),
-        machines=MachineTables.WRITTEN if choice.configure else MachineTables.UNKNOWN,
-    )
     ending = begin(design, shown)
     with store(shown) as (keeper, folder):
         clock = SystemClock()
         ports = outside.ports(design, choice, shown, clock, keeper)
-        live = PlantAssembly(design, ports, settings)
+        live = PlantAssembly(design, ports, _settings(choice))
         if live.plant.unwatched:
             print(f"no readings for: {', '.join(live.plant.unwatched)}", flush=True)
         papers = _papers(outside, shown)

@@ -149,11 +149,6 @@ class AutomaticControl:
 
     # -- people's requests -----------------------------------------------------------------
 
-    @property
-    def model(self) -> tuple[str, ...]:
-        """Parameters that are fitted."""
-        return self.book.model
-
     def switch(self, on: bool) -> None:
         """Switch calibration on or off."""
         self._on = on

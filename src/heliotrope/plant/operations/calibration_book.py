@@ -34,8 +34,6 @@ class CalibrationBook:
         Predicted standard deviation of the normal (two-dimensional) at the aim, rad, (N,).
     measured, calibrated_at, sightings
         See `FieldFrame`.
-    model
-        Names of the parameters.
     results, quality
         The last results and the last points of the quality, oldest first.
     failed
@@ -44,10 +42,7 @@ class CalibrationBook:
 
     def __init__(self, plant: PlantController, model: str | tuple[str, ...]) -> None:
         count = len(plant.field)
-        self._plant = plant
-        group, _ = plant.design.find(plant.field.names[0])
-        known = group.mechanism.parameters
-        self.model = parameter_table.model(model, known) if isinstance(model, str) else model
+        self._plant, self._model = plant, model
         self.error = np.full(count, np.nan)
         self.measured = np.full(count, np.nan)
         self.calibrated_at = np.full(count, np.nan)
@@ -61,6 +56,13 @@ class CalibrationBook:
     def calibrated(self) -> int:
         """Number of heliostats with a calibration."""
         return len(self._plant.beliefs)
+
+    def model_of(self, name: str) -> tuple[str, ...]:
+        """Return the names of the parameters that are fitted for a heliostat's kind."""
+        if not isinstance(self._model, str):
+            return self._model
+        group, _ = self._plant.design.find(name)
+        return parameter_table.model(self._model, group.mechanism.parameters)
 
     def _believe(self, record: HeliostatCalibration) -> None:
         row = self._plant.field.place(record.heliostat)
@@ -116,9 +118,12 @@ class CalibrationBook:
         light = light if light[2] > 0.0 else np.array([0.0, 0.0, 1.0])
         spread = []
         for row, aim in zip(rows, self._aims(rows), strict=True):
-            nominal = self._plant.beliefs.nominal(field.names[row])
-            prior = np.linalg.inv(precision(nominal, self.model))[0]
-            found = expected_error(nominal, self.model, prior, light, aim)
+            nominal, model = (
+                self._plant.beliefs.nominal(field.names[row]),
+                self.model_of(field.names[row]),
+            )
+            prior = np.linalg.inv(precision(nominal, model))[0]
+            found = expected_error(nominal, model, prior, light, aim)
             spread.append(0.5 * float(found.rms[0]))
         good = np.array(spread)[np.isfinite(spread)]
         return float(np.sqrt(np.mean(good**2))) if len(good) else 0.0

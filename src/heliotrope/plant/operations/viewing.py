@@ -180,7 +180,7 @@ class Viewer:
             values = record.parameters
             sigmas = dict(zip(record.names, record.sigma.tolist(), strict=True))
         found = {}
-        for key in dict.fromkeys((*self._automatic.model, *values)):
+        for key in dict.fromkeys((*self._automatic.book.model_of(name), *values)):
             known = group.mechanism.parameter(key)
             found[key] = ParameterView(
                 float(values.get(key, 0.0)), float(sigmas.get(key, known.prior)), known.unit

@@ -10,6 +10,8 @@ motors lose steps, and the wind turns mirrors. Settings, searching and jogging n
 (`twin.boards.board`).
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -77,7 +79,7 @@ class Field:
     mechanism
         True mechanisms, batch shape (N,), each with two drives.
     machine
-        Limits and resting places, the same for all; with a standby point.
+        Limits and resting places, with a standby point: one for all, or one for each heliostat.
     believed
         Mechanisms that the controllers store; None: the true ones.
     play, miss, seed
@@ -113,7 +115,7 @@ class Field:
     def __init__(
         self,
         mechanism: Mechanism,
-        machine: Machine,
+        machine: Machine | Sequence[Machine],
         *,
         believed: Mechanism | None = None,
         play: npt.ArrayLike = 0.0,
@@ -129,11 +131,13 @@ class Field:
         count = mechanism.shape[0]
         self.mechanism = mechanism
         self.journals = Journals(mechanism if believed is None else believed, machine)
-        self._stow = np.broadcast_to(np.array(machine.stow, dtype=np.int64), (count, 2))
-        self._defocus = np.array(machine.defocus)
+        self._stow = np.zeros((count, 2), dtype=np.int64)
+        self._defocus = np.zeros((count, 2))
         self.axes = np.zeros((count, 2), dtype=AXIS)
-        for i, axis in enumerate(machine.axes):
-            _limit(self.axes[:, i], axis)
+        for one, rows in self.journals.machines():
+            self._stow[rows], self._defocus[rows] = one.stow, one.defocus
+            for i, axis in enumerate(one.axes):
+                _limit(self.axes, rows, i, axis)
         for name in ("count", "goal", "leg"):
             self.axes[name] = self._stow
         ends = np.stack([self._angles_at(self.axes[name]) for name in ("low", "high")])
@@ -159,7 +163,7 @@ class Field:
         self._path = np.zeros((count, 1, 3))
         self._length = np.zeros(count, dtype=np.int64)
         self._place = np.zeros(count, dtype=np.int64)
-        self._way, self._way_length = self._ways(machine.way)
+        self._way, self._way_length = self._all_ways()
         self._sun = np.zeros((2, 3), dtype=np.int64)
         self._sun_ms = 0
 
@@ -168,11 +172,21 @@ class Field:
 
     # -- the safe way ----------------------------------------------------------------------
 
-    def _ways(
-        self, given: tuple[tuple[float, float, float], ...]
-    ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    def _all_ways(self) -> tuple[FloatArray, npt.NDArray[np.int64]]:
         """Return the points from the ground to standby, (N, P, 3), and how many there are."""
-        origin, here, standby = self.journals.origin, self.journals.position, self.journals.standby
+        made = [(rows, *self._ways(one.way, rows)) for one, rows in self.journals.machines()]
+        out = np.zeros((len(self), max(points.shape[1] for _, points, _ in made), 3))
+        lengths = np.zeros(len(self), dtype=np.int64)
+        for rows, points, length in made:
+            out[rows, : points.shape[1]] = points
+            lengths[rows] = length
+        return out, lengths
+
+    def _ways(
+        self, given: tuple[tuple[float, float, float], ...], rows: Rows
+    ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+        books = self.journals
+        origin, here, standby = books.origin[rows], books.position[rows], books.standby[rows]
         if given:
             corners = np.broadcast_to(np.array(given), (len(here), len(given), 3))
             return pieces(np.concatenate([corners, standby[:, None]], axis=1), origin)
@@ -203,7 +217,7 @@ class Field:
     def _away(self, rows: Rows, angles: FloatArray) -> FloatArray:
         """Angles turned away by the defocus; the other way where a stop is near."""
         low, high = self._low[rows], self._high[rows]
-        one, other = angles + self._defocus, angles - self._defocus
+        one, other = angles + self._defocus[rows], angles - self._defocus[rows]
         stop = np.where(angles - low > high - angles, low, high)
         inside = (low <= other) & (other <= high)
         back = np.where(inside, other, stop)
@@ -651,11 +665,17 @@ class Field:
         return light_share(*self.stand(), sun, receiver, radius)
 
 
-def _limit(rows: npt.NDArray[np.void], axis: AxisLimits) -> None:
-    """Set the limits of an axis for all rows of dtype `AXIS`, as `lcu.stepper.Axis` does."""
+def _limit(axes: npt.NDArray[np.void], rows: Rows, index: int, axis: AxisLimits) -> None:
+    """Set the limits of an axis for rows of dtype `AXIS`, as `lcu.stepper.Axis` does."""
     # Intervals are whole microseconds.
     room = 1000 * SLOT_MS * kernels.SCALE // -(-1_000_000 // axis.rate)
-    rows["low"], rows["high"] = axis.low, axis.high
-    rows["top"] = max(1, min(axis.rate * SLOT_MS * kernels.SCALE // 1000, room))
-    rows["change"] = max(1, axis.acceleration * SLOT_MS * SLOT_MS * kernels.SCALE // 1_000_000)
-    rows["backlash"], rows["direction"] = axis.backlash, 1
+    values = {
+        "low": axis.low,
+        "high": axis.high,
+        "top": max(1, min(axis.rate * SLOT_MS * kernels.SCALE // 1000, room)),
+        "change": max(1, axis.acceleration * SLOT_MS * SLOT_MS * kernels.SCALE // 1_000_000),
+        "backlash": axis.backlash,
+        "direction": 1,
+    }
+    for name, value in values.items():
+        axes[name][rows, index] = value

@@ -2,10 +2,12 @@
 
 import struct
 from binascii import crc32
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu.journal import CODES_OF
 from heliotrope.mechanism.armature import Armature
@@ -28,12 +30,10 @@ class Journals:
     believed
         Mechanisms stored at first, (N,).
     machine
-        Limits and resting places, the same for all.
+        Limits and resting places: one for all, or one for each.
 
     Attributes
     ----------
-    machine
-        As given.
     armatures
         Tables, (N, 18).
     checksums
@@ -42,9 +42,12 @@ class Journals:
         Standby points, ENU, m, (N, 3).
     """
 
-    def __init__(self, believed: Mechanism, machine: Machine) -> None:
+    def __init__(self, believed: Mechanism, machine: Machine | Sequence[Machine]) -> None:
         count = len(believed)
-        self.machine, self._nominal = machine, believed
+        self._machines = [machine] * count if isinstance(machine, Machine) else list(machine)
+        if len(self._machines) != count:
+            raise InputError(f"field: {len(self._machines)} machine tables for {count} heliostats")
+        self._nominal = believed
         self._items: dict[int, dict[str, bytes]] = {}
         self.armatures = np.array(np.broadcast_to(believed.armature.table, (count, 18)))
         shape = (count, 2, slot.DRIVE_SLOTS)
@@ -52,8 +55,17 @@ class Journals:
         self.checksums = np.array(
             [crc32(struct.pack("<18d", *row)) for row in self.armatures], dtype=np.uint32
         )
-        standby = np.full(3, np.nan) if machine.standby is None else np.array(machine.standby)
-        self.standby = np.array(np.broadcast_to(standby, (count, 3)))
+        self.standby = np.full((count, 3), np.nan)
+        for one, rows in self.machines():
+            if one.standby is not None:
+                self.standby[rows] = one.standby
+
+    def machines(self) -> list[tuple[Machine, Rows]]:
+        """Return each machine table with the rows of its heliostats."""
+        rows: dict[Machine, list[int]] = {}
+        for row, one in enumerate(self._machines):
+            rows.setdefault(one, []).append(row)
+        return [(one, np.array(members, dtype=np.intp)) for one, members in rows.items()]
 
     @property
     def origin(self) -> FloatArray:
@@ -99,7 +111,7 @@ class Journals:
     def items(self, row: int) -> dict[str, bytes]:
         """Return the items that a controller stores."""
         if row not in self._items:
-            self._items[row] = items_of(self._nominal[row], self.machine)
+            self._items[row] = items_of(self._nominal[row], self._machines[row])
         return self._items[row]
 
     def store(self, row: int, items: dict[str, bytes]) -> None:

@@ -4,6 +4,7 @@ Each heliostat is a `twin.boards.board.Board`: the real local controller on simu
 journal, MACs and editions. Boards stand on a `TwinBus` at its baud rate.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,8 +42,8 @@ class BoardField:
         Heliostats.
     truth, believed
         True mechanisms, and those that the boards store, (N,).
-    machine
-        Limits and resting places, the same for all.
+    machines
+        Limits and resting places of each.
     seed
         Seed of flash and motors.
 
@@ -63,7 +64,7 @@ class BoardField:
         names: tuple[str, ...],
         truth: Mechanism,
         believed: Mechanism,
-        machine: Machine,
+        machines: Sequence[Machine],
         seed: int = 0,
     ) -> None:
         if len(names) > MOST:
@@ -71,7 +72,7 @@ class BoardField:
         self._clock = clock
         self.boards: list[Board] = []
         for i, name in enumerate(names):
-            items = items_of(believed[i], machine)
+            items = items_of(believed[i], machines[i])
             outfit = Outfit(name, 0, 1 + i, key_of(name), truth[i], {}, items)
             self.boards.append(Board(outfit, seed=seed + i))
 

@@ -9,7 +9,7 @@ speed) or on a `VirtualLoop` (as fast as possible).
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -22,17 +22,20 @@ from heliotrope.cluster.controller import Cluster
 from heliotrope.cluster.timekeeping import SystemTime
 from heliotrope.errors import InputError
 from heliotrope.field.example import roughly_installed
+from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Bus, running
+from heliotrope.mechanism import kinds
+from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
-from heliotrope.mechanism.parameters import MODELS
 from heliotrope.plant.aims import default_aims
 from heliotrope.plant.assigned import Assigned
-from heliotrope.plant.audit import Audit, Record
+from heliotrope.plant.audit import Audit, Forgetful
 from heliotrope.plant.disk import Disk
 from heliotrope.plant.ports import Ports
 from heliotrope.plant.settings import clusters_of
@@ -61,9 +64,7 @@ _MOST_TICKS = 20
 _SMALL, _STEPS_EVERY = 320, 5
 #: Settings of a calibration that removes the errors of a quick installation, with the deviation
 #: of a beam in this world, rad.
-CYCLE = CycleSettings(
-    shots=4, interval=2.0, least=3, model=(*MODELS["malan8"], "canting"), sigma=2e-4
-)
+CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model="malan8+canting", sigma=2e-4)
 
 
 @dataclass(frozen=True)
@@ -102,30 +103,14 @@ class WorldOptions:
             )
 
 
-class Forgetful:
-    """An audit that stores nothing, for plants that are only looked at."""
-
-    def begin(self, record: Record) -> None:
-        """Take a record."""
-
-    def finish(self, identity: str, result: str, at: str) -> None:
-        """Take a result."""
-
-    def confirm(self) -> None:
-        """Do nothing: nothing can go wrong."""
-
-    def close(self) -> None:
-        """Do nothing: nothing is open."""
-
-
 class World:
     """The simulated surroundings of a plant.
 
     Parameters
     ----------
     design
-        The plant: heliostats of one group with one machine table, each on a cluster;
-        its mechanisms count as nominal.
+        The plant: groups of any kind of mechanism with two drives and a machine table, each
+        heliostat on a cluster; its mechanisms count as nominal.
     clock
         Clock of the loop that it will run in.
     options
@@ -153,29 +138,23 @@ class World:
     Raises
     ------
     InputError
-        Several groups, a cluster whose heliostats are not consecutive, a target without a camera,
-        or a machine table that is missing or incomplete.
+        A cluster whose heliostats are not consecutive, a target without a camera, a mechanism with
+        one drive, or a machine table that is missing or incomplete.
     """
 
     def __init__(self, design: Plant, clock: Clock, options: WorldOptions | None = None) -> None:
         chosen = options or WorldOptions()
-        if len(design.groups) != 1:
-            raise InputError(
-                f"simulated plant: {len(design.groups)} groups of heliostats; the simulation "
-                "supports one group"
-            )
         self.design, self.clock, self.options = design, clock, chosen
-        (group,) = design.groups.values()
-        self.names = group.names
-        install = chosen.installed or partial(roughly_installed, seed=chosen.seed)
-        self.truth = install(group.mechanism)
-        machine = machine_of(design)
+        groups = design.groups.values()
+        self.names = design.names
+        self.truth = together([_installed(g, chosen, i) for i, g in enumerate(groups)])
+        believed, machines = together([g.calibrated for g in groups]), machines_of(design)
         self.field: Field | BoardField = (
-            BoardField(clock, self.names, self.truth, group.calibrated, machine, chosen.seed)
+            BoardField(clock, self.names, self.truth, believed, machines, chosen.seed)
             if chosen.boards
-            else Field(self.truth, machine, believed=group.calibrated)
+            else Field(self.truth, machines, believed=believed)
         )
-        self._sizes = np.stack([group.width, group.height], axis=-1)
+        self._sizes = np.concatenate([np.stack([g.width, g.height], axis=-1) for g in groups])
         self._sun: tuple[float, FloatArray] | None = None
         self.beats = 0
         self._parts: list[Any] = []
@@ -310,23 +289,41 @@ class World:
             turns.cancel()
 
 
-def machine_of(design: Plant) -> Machine:
-    """Return the machine table of a design's heliostats, which must all have the same.
+def _installed(group: Heliostats, options: WorldOptions, number: int) -> Mechanism:
+    """Return the true mechanisms of a group; each group draws errors of its own."""
+    if len(group.mechanism.driven) != 2:
+        raise InputError(
+            f"simulated plant: mechanisms of kind {group.mechanism.kind} have "
+            f"{len(group.mechanism.driven)} drive; the simulation needs two"
+        )
+    install = options.installed or partial(roughly_installed, seed=options.seed + number)
+    return install(group.mechanism)
+
+
+def together(parts: Sequence[Mechanism]) -> Mechanism:
+    """Return arrays of mechanisms as one array; several kinds become armatures with drives."""
+    if len(parts) == 1:
+        return parts[0]
+    return kinds.of_armature(
+        Armature(np.concatenate([part.armature.table for part in parts])),
+        Drive(np.concatenate([part.drives.table for part in parts])),
+        np.concatenate([part.position for part in parts]),
+    )
+
+
+def machines_of(design: Plant) -> list[Machine]:
+    """Return the machine table of each heliostat of a design.
 
     Raises
     ------
     InputError
-        No machine table, different ones, or one without a standby point.
+        No machine table, or one without a standby point.
     """
-    machines = {design.machine(name) for name in design.names}
-    if len(machines) != 1:
-        raise InputError(
-            f"simulated plant: {len(machines)} different machines in the plant file; the "
-            "simulation needs heliostats with equal limits and resting places"
-        )
-    (machine,) = machines
-    if machine.standby is None:
-        raise InputError(
-            "simulated plant: no standby point; give standby_m in the machine table of the group"
-        )
-    return machine
+    machines = [design.machine(name) for name in design.names]
+    for name, machine in zip(design.names, machines, strict=True):
+        if machine.standby is None:
+            raise InputError(
+                f"simulated plant: heliostat {name} has no standby point; give standby_m in the "
+                "machine table of its group"
+            )
+    return machines
