@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from heliotrope.files.disk import DiskBusyError, DiskThread, Then, Work
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual, sleep_until
 from heliotrope.links.messages import Command, Emergency, Lease, Stage
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.assigned import AssignedFile
 from heliotrope.plant.audit import read
-from heliotrope.plant.disk import DiskBusyError, DiskThread, Then, Work
 from heliotrope.plant.lockouts import Lockout
 from heliotrope.safety import Act
 from support.midsummer import DayClock

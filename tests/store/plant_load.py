@@ -8,11 +8,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from heliotrope.field.layouts import malan_plant
+from heliotrope.files.disk import DiskThread
 from heliotrope.links.clock import SystemClock, VirtualClock
 from heliotrope.links.messages import Stage
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.disk import DiskThread
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.store.keeper import Keeper

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from heliotrope.field.plant import Plant
+from heliotrope.files.disk import Disk
 from heliotrope.geometry import FloatArray
 from heliotrope.links.clock import Clock
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
 from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.audit import Audit
-from heliotrope.plant.disk import Disk
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.settings import CycleSettings

@@ -5,6 +5,7 @@
 - `json`, `xml`: documents whose values know their place in the file.
 - `documents`: TOML files of our own formats, checked against pydantic models. Its names stay
   there, because pydantic is slow to load.
+- `disk`: work that waits for a disk, outside an event loop.
 - `archives`: members of a ZIP and arrays of NumPy, measured before they are expanded.
 - `cells`: tables (CSV, Parquet) cell by cell, and times in ISO 8601.
 

@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import FormatError, HeliotropeError, InputError
+from heliotrope.files.disk import Work
 from heliotrope.geometry import FloatArray, as_vectors
 from heliotrope.lcu.config import FAR
-from heliotrope.plant.disk import Work
 
 #: Points of one kind (AIM, STANDBY) by name of the heliostat, ENU, m.
 Places = dict[str, tuple[float, ...]]

@@ -26,6 +26,7 @@ from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.plant import Plant
 from heliotrope.field.volumes import Volume
+from heliotrope.files.disk import AtOnce, Disk, Work
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages as wire
 from heliotrope.lcu import states
@@ -51,7 +52,6 @@ from heliotrope.plant.authority import Authority, Grant, Person, Role
 from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
-from heliotrope.plant.disk import AtOnce, Disk, Work
 from heliotrope.plant.doubts import Doubts
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
 from heliotrope.plant.field_state import FieldState

@@ -8,6 +8,7 @@ from functools import partial
 from itertools import islice
 
 from heliotrope.errors import InputError
+from heliotrope.files.disk import Disk, DiskBusyError, Work
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.link import SendOutcome
 from heliotrope.links.messages import Command, Emergency, Parameters, Progress, Stage
@@ -15,7 +16,6 @@ from heliotrope.plant.assigned import AssignedError
 from heliotrope.plant.audit import Audit, AuditError, Record
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.clusters import ClusterEnd, Clusters
-from heliotrope.plant.disk import Disk, DiskBusyError, Work
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act
 

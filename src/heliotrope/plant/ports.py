@@ -11,12 +11,12 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from heliotrope.field.target import Target
+from heliotrope.files.disk import Disk
 from heliotrope.geometry import FloatArray
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Link
 from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.audit import Audit
-from heliotrope.plant.disk import Disk
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.sensors import Readings
 from heliotrope.plant.visits.photographs import Shot

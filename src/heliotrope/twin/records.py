@@ -7,10 +7,10 @@ from contextvars import Context
 from dataclasses import replace
 
 from heliotrope.errors import InputError
+from heliotrope.files.disk import Then, Work
 from heliotrope.links.clock import Clock
 from heliotrope.plant.assigned import Places
 from heliotrope.plant.audit import STOPPED, AuditError, Record
-from heliotrope.plant.disk import Then, Work
 
 
 class RecordsDisk:
@@ -75,7 +75,7 @@ class RecordsDisk:
 
 
 class DiskQueue:
-    """The work that waits for a disk in virtual time; a `plant.disk.Disk`.
+    """The work that waits for a disk in virtual time; a `files.disk.Disk`.
 
     Parameters
     ----------

@@ -20,10 +20,10 @@ import numpy as np
 
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.field.plant import Plant
+from heliotrope.files.disk import DiskBusyError, DiskThread
 from heliotrope.geometry import as_float
 from heliotrope.lcu import states
 from heliotrope.plant.assembly import PlantAssembly
-from heliotrope.plant.disk import DiskBusyError, DiskThread
 from heliotrope.plant.interface import ConsoleProcess, PlantInterface
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from heliotrope.cli.run._shared import Shown, at_work, begin, one_error, store
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
+from heliotrope.files.disk import DiskThread
 from heliotrope.links.clock import SystemClock
 from heliotrope.links.link import running
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
 from heliotrope.plant.audit import Forgetful
 from heliotrope.plant.cameras import RealCameras
-from heliotrope.plant.disk import DiskThread
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.ports import Ports

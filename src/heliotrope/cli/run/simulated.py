@@ -6,9 +6,9 @@ from datetime import datetime
 
 from heliotrope.cli.run._shared import Shown, at_work, begin, one_error, store
 from heliotrope.field.plant import Plant
+from heliotrope.files.disk import DiskThread
 from heliotrope.links.clock import SystemClock, VirtualClock
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
-from heliotrope.plant.disk import DiskThread
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.twin.live import CYCLE, PacedLoop, World, WorldOptions

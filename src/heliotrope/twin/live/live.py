@@ -24,6 +24,7 @@ from heliotrope.errors import InputError
 from heliotrope.field.example import roughly_installed
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
+from heliotrope.files.disk import Disk
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.links.clock import Clock
@@ -36,7 +37,6 @@ from heliotrope.mechanism.machine import Machine
 from heliotrope.plant.aims import default_aims
 from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.audit import Audit, Forgetful
-from heliotrope.plant.disk import Disk
 from heliotrope.plant.ports import Ports
 from heliotrope.plant.settings import clusters_of
 from heliotrope.plant.visits.settings import CycleSettings

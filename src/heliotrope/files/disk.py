@@ -66,7 +66,7 @@ class DiskThread:
     def __init__(self, most: int = MOST) -> None:
         self._most = most
         self._waiting: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="plant disk", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="disk", daemon=True)
         self._thread.start()
 
     def do(self, work: Work, then: Then) -> None:
