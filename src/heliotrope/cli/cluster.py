@@ -59,6 +59,7 @@ async def _run(installation: "Installation", every: float) -> None:
     from heliotrope.cluster.memory import Kept
     from heliotrope.cluster.program import line_of, time_of
     from heliotrope.cluster.serial_bus import SerialBus
+    from heliotrope.files.disk import DiskThread
     from heliotrope.links.clock import SystemClock
     from heliotrope.links.link import running
     from heliotrope.links.papers import Papers
@@ -69,13 +70,14 @@ async def _run(installation: "Installation", every: float) -> None:
     link, time = _link(installation, clock, papers), time_of(installation, clock)
     if installation.key_file is not None:
         papers.renew("key file", [installation.key_file], installation.take_keys)
+    kept = Kept(installation.state, disk=DiskThread())
     cluster = Cluster(
         installation.config,
         bus,
         link,
         clock,
         time,
-        Kept(installation.state),
+        kept,
         line_of(installation.emergency_line),
     )
     ending = asyncio.Event()
@@ -89,6 +91,7 @@ async def _run(installation: "Installation", every: float) -> None:
 
     async with running(bus, link, time), running(cluster), papers.watched(tell):
         await _log(cluster, ending, every)
+    kept.close()
     print(f"{installation.config.name}: ended, DEFOCUS sent", flush=True)
 
 

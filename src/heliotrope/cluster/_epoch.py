@@ -35,6 +35,8 @@ class Epoch:
         self._kept, self._exchange, self._reports = kept, exchange, reports
         self._of_time = present.usable
         self._duplicates = 0
+        self._storing = False
+        self._next: int | None = None  # stored, and not in use yet
         exchange.begin_epoch(kept.start(int(present.gps_s) if self._of_time else 0))
 
     def taken(self) -> None:
@@ -46,20 +48,36 @@ class Epoch:
         self._duplicates += 1
 
     def second(self) -> None:
-        """Begin an epoch if the local controllers are out of step."""
+        """Begin an epoch if the local controllers are out of step, or one that is stored."""
         if self._duplicates >= _OUT_OF_STEP:
             self._begin(0)
+        self._use()
 
     def time_known(self, present: Time) -> None:
         """Begin an epoch derived from the time, as soon as the time is known."""
         if not self._of_time:
             self._begin(int(present.gps_s))
-            self._of_time = True
+        self._use()
 
     def _begin(self, at_least: int) -> None:
-        self._duplicates = 0
-        try:
-            self._exchange.begin_epoch(self._kept.start(at_least))
+        """Have an epoch stored; until it is, the present one goes on."""
+        if self._storing or self._next is not None:
+            return
+        self._storing, self._duplicates = True, 0
+
+        def told(epoch: int, error: Exception | None) -> None:
+            self._storing = False
+            if error is not None:
+                self._reports.alarm(alarms.STATE_UNWRITABLE.raised(problem=error))
+                return
+            self._next = epoch
+            self._of_time = self._of_time or at_least > 0
             self._reports.clear(alarms.STATE_UNWRITABLE.ended())
-        except OSError as error:
-            self._reports.alarm(alarms.STATE_UNWRITABLE.raised(problem=error))
+
+        self._kept.begin(at_least, told)
+
+    def _use(self) -> None:
+        """Begin the stored epoch: only before SESSION, which tells it to the local controllers."""
+        if self._next is not None:
+            self._exchange.begin_epoch(self._next)
+            self._next = None

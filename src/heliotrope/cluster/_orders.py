@@ -293,9 +293,12 @@ class Orders:
             if step.name != "SET_ADDRESS" and not await self._knows_edition(job):
                 return self._again(job, "no answer to QUERY_STORED before it expired")
             try:
-                head, key = (*head, self._kept.next_edition(job.edition)), node.member.key
+                edition = self._kept.next_edition(job.edition)
             except OSError as error:
                 return self._again(job, f"the edition cannot be kept: {error.strerror}")
+            if edition is None:
+                return self._again(job, "the cluster's disk has not stored the edition yet")
+            head, key = (*head, edition), node.member.key
         if step.name == "SET_ADDRESS":
             return await self._give_address(job, head, key)
         slow = bool(key) or step.name in _STORED

@@ -1,17 +1,25 @@
 """State of a cluster that outlasts a restart: its epoch, and the editions it has used.
 
 Both only rise. The file is written beside the old one and renamed, so that a power cut leaves
-the old file or the new one. Editions are reserved in blocks: the edition on disk is never below
-one that was used.
+the old file or the new one. Editions are reserved in blocks, before they are needed: the edition on
+disk is never below one that was used.
+
+Nothing waits for the disk but what must not be used before it is on it: a new epoch, and an edition
+beyond those reserved.
 """
 
 import json
 import os
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from heliotrope.errors import FormatError
+from heliotrope.files.disk import AtOnce, Disk
 
 _BLOCK = 64
+#: The next block is reserved when fewer editions than this are left.
+_AHEAD = 16
 _LARGEST = 0xFFFFFFFF
 
 
@@ -24,6 +32,8 @@ class Kept:
         The file; None: nothing is stored, for simulation.
     epoch, edition
         Last values used, if there is no file.
+    disk
+        Writes the file once the cluster runs; None: at once.
 
     Attributes
     ----------
@@ -36,50 +46,91 @@ class Kept:
         If the file has other content.
     """
 
-    def __init__(self, path: Path | None, epoch: int = 0, edition: int = 0) -> None:
-        self._path = path
+    def __init__(
+        self, path: Path | None, epoch: int = 0, edition: int = 0, disk: Disk | None = None
+    ) -> None:
+        self._path, self._disk = path, disk or AtOnce()
         self.epoch, self._edition = epoch, edition
         if path is not None and path.exists():
             self.epoch, self._edition = _read(path)
         self._reserved = self._edition
+        #: What was last given to the disk: no later writing may take it back.
+        self._given = (self.epoch, self._reserved)
+        self._reserving = False
+        self._problem: Exception | None = None
 
     def start(self, at_least: int) -> int:
         """Return the epoch of a new run, above all earlier ones and not below ``at_least``.
+
+        It waits for the disk, and reserves editions in the same write.
 
         Raises
         ------
         OSError
             If it cannot be stored.
         """
-        epoch = max(self.epoch + 1, at_least) & _LARGEST
-        self._write(epoch, self._reserved)
-        self.epoch = epoch
+        epoch = self._above(at_least)
+        self._write(epoch, self._edition + _BLOCK)
+        self.epoch, self._reserved = epoch, self._edition + _BLOCK
         return epoch
 
-    def next_edition(self, above: int = 0) -> int:
-        """Return an edition that was never used, above another one.
+    def begin(self, at_least: int, then: Callable[[int, Exception | None], None]) -> None:
+        """Store an epoch as in `start`; call ``then`` with it and None, or an error, when done."""
+        epoch = self._above(at_least)
+
+        def told(error: Exception | None) -> None:
+            if error is None:
+                self.epoch = epoch
+            then(epoch, error)
+
+        self._disk.do(partial(self._write, epoch, 0), told)
+
+    def next_edition(self, above: int = 0) -> int | None:
+        """Return an edition that was never used, above another one; None: it is being stored.
 
         Raises
         ------
         OSError
-            If it cannot be stored; it is then not used either.
+            If it could not be stored; it is then not used either, and tried again.
         """
         edition = max(self._edition, above) + 1
+        if edition + _AHEAD > self._reserved and not self._reserving:
+            self._reserve(edition + _BLOCK)
         if edition > self._reserved:
-            self._write(self.epoch, edition + _BLOCK)
-            self._reserved = edition + _BLOCK
+            problem, self._problem = self._problem, None
+            if problem is not None:
+                raise problem
+            return None
         self._edition = edition
         return edition
 
+    def close(self) -> None:
+        """End the disk, which may still write for a moment."""
+        self._disk.close()
+
+    def _above(self, at_least: int) -> int:
+        return max(self.epoch + 1, at_least) & _LARGEST
+
+    def _reserve(self, reserved: int) -> None:
+        def told(error: Exception | None) -> None:
+            self._reserving, self._problem = False, error
+            if error is None:
+                self._reserved = max(self._reserved, reserved)
+
+        self._reserving = True
+        self._disk.do(partial(self._write, 0, reserved), told)
+
     def _write(self, epoch: int, reserved: int) -> None:
-        if self._path is None:
-            return
-        beside = self._path.with_name(self._path.name + ".new")
-        with beside.open("w", encoding="utf-8") as file:
-            json.dump({"epoch": epoch, "edition": reserved}, file)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(self._path)
+        """Write both numbers, neither below what was written before; one piece at a time."""
+        epoch, reserved = max(epoch, self._given[0]), max(reserved, self._given[1])
+        if self._path is not None:
+            beside = self._path.with_name(self._path.name + ".new")
+            with beside.open("w", encoding="utf-8") as file:
+                json.dump({"epoch": epoch, "edition": reserved}, file)
+                file.flush()
+                os.fsync(file.fileno())
+            beside.replace(self._path)
+        self._given = (epoch, reserved)
 
 
 def _read(path: Path) -> tuple[int, int]:

@@ -17,6 +17,7 @@ from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.serial_bus import SerialBus
 from heliotrope.cluster.timekeeping import SystemTime, TimeKeeper
 from heliotrope.errors import FormatError
+from heliotrope.files.disk import DiskThread
 from heliotrope.links.clock import Clock
 from heliotrope.links.in_process import memory_pair
 from heliotrope.links.link import Link
@@ -102,7 +103,7 @@ class LocalCluster:
             far,
             clock,
             time,
-            Kept(installation.state),
+            Kept(installation.state, disk=DiskThread()),
             line_of(installation.emergency_line),
         )
         self.parts: tuple[Any, ...] = (near, far, bus, time)
