@@ -1,7 +1,9 @@
 """The hash chains: whatever is altered, removed or added is named."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -113,6 +115,7 @@ def test_an_old_store_is_linked_when_it_is_migrated(tmp_path: Path) -> None:
     for sql in (
         "DROP TABLE event_link",
         "DROP TABLE audit_link",
+        *(f"DROP TABLE {name}" for name in reversed(old_store.LATER)),
         "UPDATE alembic_version SET version_num = '0002'",
     ):
         keeper.do(lambda c, sql=sql: c.execute(text(sql)))
@@ -143,3 +146,44 @@ def test_from_the_command_line(tmp_path: Path) -> None:
     wrong = run.invoke(app, ["store", "verify", str(tmp_path), "--head", "nonsense"])
     assert isinstance(wrong.exception, InputError)
     keeper.close()
+
+
+def test_exported_heads_show_a_chain_that_was_made_anew(tmp_path: Path) -> None:
+    keeper, out = Keeper(tmp_path / "data", inline=True), tmp_path / "out"
+    out.mkdir()
+    file, at = out / chain.HEADS, datetime(2026, 6, 21, tzinfo=UTC)
+    fill(keeper)
+    chain.write_heads(out, verified(keeper), at)
+    keeper.record_event(Event(300.0, "test", "later"))
+    chain.write_heads(out, verified(keeper), at)
+    assert file.stat().st_mode & 0o777 == 0o600
+    # Three different heads: that of the audit has not changed. Syslog's lines hold them too.
+    assert len(chain.read_heads(file)) == 3
+    keeper.close()
+    command = ["store", "verify", str(tmp_path / "data"), "--head", str(file)]
+    said = CliRunner().invoke(app, command)
+    assert said.exit_code == 0, said.exception
+    assert "3 of 3 exported heads fit" in said.output
+    again = Keeper(tmp_path / "data", inline=True)
+    again.forget_events(104.0)
+    again.close()
+    assert "3 of 3 exported heads fit" in CliRunner().invoke(app, command).output
+    shutil.copytree(tmp_path / "data", tmp_path / "later")
+    again = Keeper(tmp_path / "later", inline=True)
+    again.forget_events(300.0)
+    again.close()
+    later = [tmp_path / "later" if str(each).endswith("data") else each for each in command]
+    assert "2 of 3 exported heads fit" in CliRunner().invoke(app, list(map(str, later))).output
+    again = Keeper(tmp_path / "data", inline=True)
+    for name in ("event", "event_link"):
+        again.do(lambda c, name=name: c.execute(text(f"DELETE FROM {name} WHERE number = 6")))
+    again.close()
+    renewed = Keeper(tmp_path / "data", inline=True)
+    renewed.record_event(Event(1.0, "test", "in its place"))
+    renewed.close()
+    found = CliRunner().invoke(app, command)
+    assert isinstance(found.exception, StoreError)
+    assert "link 6 has another digest" in str(found.exception)
+    (out / "empty").touch()
+    with pytest.raises(InputError, match="holds no head"):
+        chain.read_heads(out / "empty")

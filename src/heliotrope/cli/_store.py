@@ -132,18 +132,27 @@ def verify(
     place: Place,
     head: Annotated[
         list[str] | None,
-        typer.Option(help="What `store head` printed before; may be given several times."),
+        typer.Option(
+            help="File of exported heads (heads, or a log of syslog), or what `store head` printed "
+            "before; may be given several times."
+        ),
     ] = None,
 ) -> None:
     """Check that no event and no record of the audit was altered or removed."""
     from heliotrope.store import chain
     from heliotrope.store.database import Database
 
-    known = [chain.Head.read(word) for text in head or () for word in text.split()]
+    files = [Path(text) for text in head or () if Path(text).is_file()]
+    typed = [text for text in head or () if not Path(text).is_file()]
+    known = [chain.Head.read(word) for text in typed for word in text.split()]
+    exported = [found for file in files for found in chain.read_heads(file)]
     with Database(place) as database:
         database.require()
         with database.reading() as connection:
-            found = chain.verify(connection, known)
+            kept = chain.still_kept(connection, exported)
+            found = chain.verify(connection, [*known, *kept])
+    if exported:
+        print(f"{len(kept)} of {len(exported)} exported heads fit; the others are of old events")
     print(f"{place}: every record fits; {' '.join(map(str, found))}")
 
 

@@ -211,6 +211,26 @@ RENEWAL = AlarmKind(
     "Correct the file: it is read again every two seconds. A restart with it as it is fails.",
     over="the {subject} was read again and is in force",
 )
+SYSLOG = AlarmKind(
+    "syslog",
+    _PLANT,
+    Severity.WARNING,
+    "Security events and alarms cannot be sent on to the receiver of syslog, or some were lost.",
+    "security events and alarms are not sent on: {problem}",
+    "They are in the store; up to 10,000 wait for the receiver, and those beyond are lost to it.",
+    "Check the receiver, its certificate and the network between.",
+    over="security events and alarms are sent on again; {count} were lost since the start",
+)
+HEADS = AlarmKind(
+    "heads",
+    _PLANT,
+    Severity.WARNING,
+    "The heads of the hash chains cannot be exported.",
+    "the heads of the records' chains are not exported: {problem}",
+    "The records are kept; it is tried again at the next interval.",
+    "Check the folder given by --heads, and the store.",
+    over="the heads of the records' chains are exported again",
+)
 RECORD_REFUSED = AlarmKind(
     "record_refused",
     _PLANT,

@@ -12,8 +12,12 @@ heads (`heads`) go to another machine, and `verify` compares them.
 import hashlib
 import json
 import math
+import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection, RowMapping, func, select
@@ -148,6 +152,57 @@ def forget_events(connection: Connection, before: float) -> None:
         connection.info.pop(EVENT, None)
     connection.execute(links.delete().where(links.c.number < end))
     connection.execute(_EVENT.delete().where(e.number < end))
+
+
+# -- heads on other machines ---------------------------------------------------------------
+
+#: File of exported heads: a line for each export, the time and both heads.
+HEADS = "heads"
+
+
+def write_heads(folder: Path, found: Iterable[Head], at: datetime) -> None:
+    """Add heads to the file `HEADS` of a folder; they are on the disk when this returns.
+
+    Raises
+    ------
+    StoreError
+        If they cannot be written.
+    """
+    line = f"{at.isoformat(timespec='seconds')} {' '.join(map(str, found))}\n"
+    path = folder / HEADS
+    try:
+        handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+        try:
+            os.write(handle, line.encode())
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def read_heads(path: Path) -> list[Head]:
+    """Return the heads in a file: lines of `write_heads`, or text that holds heads anywhere.
+
+    Raises
+    ------
+    InputError
+        If there is none in it, or it cannot be read.
+    """
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    found = [Head.read(each) for each in re.findall(r"\b(?:event|audit):\d+:[0-9a-f]{64}\b", text)]
+    if not found:
+        raise InputError(f"{path}: holds no head; give a file that --heads or syslog wrote")
+    return list(dict.fromkeys(found))
+
+
+def still_kept(connection: Connection, noted: Iterable[Head]) -> list[Head]:
+    """Return the heads whose events are still kept; old events leave, those of the audit never."""
+    first = connection.scalar(select(func.min(_LINKS[EVENT].c.number))) or 0
+    return [head for head in noted if head.chain == AUDIT or head.number >= first]
 
 
 # -- checking ----------------------------------------------------------------------------

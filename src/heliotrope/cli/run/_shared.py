@@ -12,12 +12,13 @@ import sys
 import tempfile
 import webbrowser
 from collections.abc import AsyncIterator, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from heliotrope.cli.run._evidence import Evidence, leaving
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.field.plant import Plant
 from heliotrope.files.disk import DiskBusyError, DiskThread
@@ -57,6 +58,7 @@ class Shown:
     database: str | None = None
     minutes: float | None = None
     every: float = EVERY
+    evidence: Evidence = field(default_factory=Evidence)
 
     def __post_init__(self) -> None:
         for name, value in (("minutes", self.minutes), ("every", self.every)):
@@ -379,6 +381,7 @@ async def at_work(
         async with (
             archive(live, shown),
             live.running(),
+            leaving(live, keeper, shown.evidence),
             interface(live, keeper, shown, folder, password, lines),
         ):
             await watch(live, shown, ending, lines, speed=speed)

@@ -177,6 +177,33 @@ def run(
             rich_help_panel=_KEPT,
         ),
     ] = None,
+    syslog: Annotated[
+        str | None,
+        typer.Option(
+            help="Send security events and alarms on: tls://host, tcp://host or udp://host.",
+            rich_help_panel=_KEPT,
+        ),
+    ] = None,
+    syslog_authority: Annotated[
+        Path | None,
+        typer.Option(
+            help="PEM file of the authority of that host; default: the system's.",
+            rich_help_panel=_KEPT,
+        ),
+    ] = None,
+    heads: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder, best of another machine, for the heads of the records' hash chains.",
+            rich_help_panel=_KEPT,
+        ),
+    ] = None,
+    heads_every: Annotated[
+        float,
+        typer.Option(
+            help="Hours between heads, in that folder and to syslog.", rich_help_panel=_KEPT
+        ),
+    ] = 1.0,
 ) -> None:
     """Run a plant: it tracks, photographs, learns and corrects; by default in simulation.
 
@@ -184,6 +211,7 @@ def run(
     heliostat after another, and every calibration is pushed to its local controller. The console
     shows it all. Ctrl-C stows the field and ends. With --clusters the heliostats are real.
     """
+    from heliotrope.cli.run._evidence import Evidence
     from heliotrope.cli.run._shared import Shown
     from heliotrope.errors import InputError
 
@@ -211,6 +239,7 @@ def run(
         database=database,
         minutes=minutes,
         every=every,
+        evidence=Evidence(syslog, syslog_authority, heads, heads_every),
     )
     if clusters is None:
         if configure or check:

@@ -1,7 +1,7 @@
 """Alarms, events and packets of a plant at work, for people."""
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -45,6 +45,8 @@ class Logbook:
     ----------
     refused
         Number of unreadable messages of each cluster.
+    forward
+        Takes each alarm that begins or ends; None: nobody.
     """
 
     def __init__(
@@ -63,6 +65,7 @@ class Logbook:
         self._links: dict[str, Link] = {}
         self._statuses: dict[str, ClusterStatus] = {}
         self.refused: dict[str, int] = {}
+        self.forward: Callable[[Alarm], None] | None = None
         #: The last record that was refused while its alarm stands, and the store's count of such.
         self._refused, self._refused_count = "", 0
 
@@ -111,6 +114,8 @@ class Logbook:
         if new or (known is not None and known.active != alarm.active):
             over = "" if alarm.active else " (over)"
             self.event("alarm", alarm.subject, f"{alarm.condition}: {alarm.text}{over}")
+            if self.forward is not None:
+                self.forward(alarm)
             if self._records is not None:
                 self._keep(
                     self._records.record_alarm,
@@ -150,7 +155,7 @@ class Logbook:
         problem, kind = lost or self._records.problem, alarms.RECORDS
         if problem:
             self.take_alarm(kind.raised(problem=problem))
-        elif self._stands(kind):
+        elif self.stands(kind):
             self.take_alarm(kind.ended())
         count = self._records.refused_count
         if count > self._refused_count:
@@ -160,7 +165,8 @@ class Logbook:
             self._refused, reason = "", self._refused
             self.take_alarm(alarms.RECORD_REFUSED.ended(problem=reason))
 
-    def _stands(self, kind: alarms.AlarmKind) -> bool:
+    def stands(self, kind: alarms.AlarmKind) -> bool:
+        """Whether an alarm about the plant as a whole is active."""
         known = self._alarms.get((kind.name, ""))
         return known is not None and known.active
 

@@ -1,0 +1,124 @@
+"""Evidence of a plant at work leaves its machine: security events, alarms, heads of the chains."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from heliotrope.errors import HeliotropeError, InputError
+from heliotrope.plant.assembly import PlantAssembly
+from heliotrope.plant.operations.security import SecurityEvent
+from heliotrope.plant.syslog import Receiver, Syslog
+from heliotrope.safety import alarms
+from heliotrope.store import chain
+from heliotrope.store.keeper import Keeper
+
+#: Default time between exports of the heads, hours, and the shortest and longest.
+HOURS, _LEAST, _MOST = 1.0, 0.01, 168.0
+#: Time between looks at the sender, s.
+_LOOKED = 2.0
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Options of what leaves the machine.
+
+    Attributes
+    ----------
+    syslog, authority
+        URL of the receiver of security events and alarms, and the PEM file of its authority.
+    heads, hours
+        Folder to which the heads of the chains are written, and the time between, hours.
+
+    Raises
+    ------
+    InputError
+        A URL, a folder or a time that cannot be used.
+    """
+
+    syslog: str | None = None
+    authority: Path | None = None
+    heads: Path | None = None
+    hours: float = HOURS
+
+    def __post_init__(self) -> None:
+        if self.authority is not None and self.syslog is None:
+            raise InputError("run: --syslog-authority belongs to --syslog tls://host")
+        _ = self.receiver
+        if self.heads is not None and not self.heads.is_dir():
+            raise InputError(f"run: --heads {self.heads}: there is no such folder; make it")
+        if not _LEAST <= self.hours <= _MOST:
+            raise InputError(f"run: --heads-every {self.hours:g} h; give {_LEAST:g} to {_MOST:g}")
+
+    @property
+    def receiver(self) -> Receiver | None:
+        """The receiver of syslog, if there is one."""
+        return None if self.syslog is None else Receiver.read(self.syslog, self.authority)
+
+
+@contextlib.asynccontextmanager
+async def leaving(live: PlantAssembly, keeper: Keeper, chosen: Evidence) -> AsyncIterator[None]:
+    """Send on security events and alarms, and export heads, during a block."""
+    receiver, sender = chosen.receiver, None
+    async with asyncio.TaskGroup() as group:
+        tasks = []
+        if receiver is not None:
+            sender = Syslog(receiver, lambda: live.clock.utc().timestamp())
+            live.logbook.forward, live.operations.security.forward = sender.alarm, sender.note
+            tasks.append(group.create_task(_watch(live, sender)))
+        if sender is not None or chosen.heads is not None:
+            tasks.append(group.create_task(_export(live, keeper, chosen)))
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+            if tasks and (sender is not None or chosen.heads is not None):
+                await export(live, keeper, chosen.heads)
+            if sender is not None:
+                await asyncio.to_thread(sender.close)
+
+
+async def _watch(live: PlantAssembly, sender: Syslog) -> None:
+    """Raise and end the alarm about messages that do not reach the receiver."""
+    kind, stands, lost = alarms.SYSLOG, False, 0
+    while True:
+        await asyncio.sleep(_LOOKED)
+        problem, more = sender.problem, sender.lost - lost
+        lost += more
+        if more:
+            problem = f"{more} messages were lost; {problem or f'{sender.receiver} is too slow'}"
+        if problem and (more or not stands):
+            live.logbook.take_alarm(kind.raised(problem=problem))
+        elif stands and not problem:
+            live.logbook.take_alarm(kind.ended(count=lost))
+        stands = bool(problem)
+
+
+async def _export(live: PlantAssembly, keeper: Keeper, chosen: Evidence) -> None:
+    while True:
+        await export(live, keeper, chosen.heads)
+        await asyncio.sleep(3600.0 * chosen.hours)
+
+
+async def export(live: PlantAssembly, keeper: Keeper, folder: Path | None) -> None:
+    """Write the heads of the chains to a folder, if one is given, and note them as events."""
+    now, kind = live.clock.utc(), alarms.HEADS
+
+    def write() -> tuple[chain.Head, ...]:
+        with keeper.database.reading() as connection:
+            found = chain.heads(connection)
+        if folder is not None:
+            chain.write_heads(folder, found, now)
+        return found
+
+    try:
+        found = await asyncio.to_thread(write)
+    except HeliotropeError as error:
+        live.logbook.take_alarm(kind.raised(problem=error))
+        return
+    if live.logbook.stands(kind):
+        live.logbook.take_alarm(kind.ended())
+    for head in found:
+        live.operations.security.note(SecurityEvent.CHAIN_HEAD, detail=str(head))
