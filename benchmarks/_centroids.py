@@ -6,43 +6,39 @@ Neither gives a covariance or reports a failure; `heliotrope.imaging.spots.spot`
 import numpy as np
 
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.spots.background import Background
 from heliotrope.imaging.targets.rectify import Rectified
 
 
-def threshold_centroid(
-    picture: Rectified, background: Background, low: float = 0.2, high: float = 0.985
-) -> FloatArray | None:
-    r"""Return the intensity-weighted centroid between two thresholds, m in the face's plane, (2,).
+def marker_threshold(values: FloatArray) -> float:
+    """Return Malan's T1, (5.2): pixels below it are his black markers.
 
-    Our reading of Malan, §5.6, (5.2)-(5.4); the text of the thesis was not available, and
-    the constants are ours. The empty target is subtracted, d = v - b, and
+    T1 = darkest + 0.2 · lightest, over the pixels of the cropped target.
+    """
+    return float(values.min() + 0.2 * values.max())
 
-    .. math:: w = d \text{ where } t_{low} < d \text{ and } v < t_{high}, \text{ else } 0,
-              \qquad t_{low} = \bar d + low (d_{max} - \bar d)
 
-    .. math:: c = Σ w p / Σ w
+def malan_centroid(picture: Rectified) -> FloatArray | None:
+    """Return Malan's centroid, (5.3)-(5.4), m in the face's plane, (2,).
 
-    over the places p of the target.
+    T2 = (mean + lowest) / 2; pixels below it become black, and the centroid is the centre of mass
+    of what is left, weighted by brightness. The threshold lies below the mean, so the lit paint
+    beside the beam keeps its weight and draws the centroid towards the target's middle.
 
     Parameters
     ----------
-    picture, background
-        A face, and the same without beams.
-    low
-        Lower threshold between the mean and the greatest difference.
-    high
-        Pixels above this share of the full scale count as clipped and are left out.
+    picture
+        The rectified face. Its paint stands for his picture cropped to the target.
 
     Returns
     -------
-    None if no pixel lies between the thresholds.
+    None if the picture is black.
     """
-    difference = np.where(picture.paint, picture.values - background.values, 0.0)
-    mean = float(difference[picture.paint].mean()) if picture.paint.any() else 0.0
-    threshold = mean + low * (float(difference.max()) - mean)
-    weight = np.where((difference > threshold) & (picture.values < high), difference, 0.0)
-    return _mean_place(picture, weight)
+    paint = picture.values[picture.paint]
+    if not paint.size:
+        return None
+    threshold = 0.5 * (float(paint.mean()) + float(paint.min()))
+    kept = picture.paint & (picture.values >= threshold)
+    return _mean_place(picture, np.where(kept, picture.values, 0.0))
 
 
 def moments_centroid(picture: Rectified) -> FloatArray | None:

@@ -1,4 +1,4 @@
-"""Redraw figures 3.5 and 4.6 to 4.9 of Malan's thesis: ``python malan_figures.py FOLDER``.
+"""Redraw figures 4.6 to 4.9 of Malan's thesis: ``python malan_figures.py FOLDER``.
 
 Figures 4.6 to 4.9 show the path of a heliostat's beam on the plane of the aim over a day with a
 single error of one unit: the pedestal leans, an encoder's zero is off, the axes are not
@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from heliotrope import sun
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import direct
-from heliotrope.optics import beam_sigma, image_offsets, intercept_circle
+from heliotrope.optics import image_offsets
 
 SITE = sun.Site(-33.93, 18.87, 120.0)
 AIM = np.array([0.0, 0.0, 13.0])
@@ -97,31 +97,11 @@ def paths(number: str) -> Figure:
     return figure
 
 
-def intercept() -> Figure:
-    """Return figure 3.5: intercept ratio against tracking error for some slant ranges."""
-    figure, axes = _figure(1, 1, (6.0, 4.0))
-    ax = axes[0, 0]
-    tracking = np.linspace(0.0, 10e-3, 200)
-    for slant, colour in ((50, "#0072b2"), (100, "#009e73"), (150, "#e69f00"), (200, "#d55e00")):
-        sigma = beam_sigma(slant, tracking=tracking, slope=1e-3)
-        ax.plot(
-            1e3 * tracking, 100 * intercept_circle(1.5, sigma), color=colour, label=f"{slant} m"
-        )
-    ax.set_title("Figure 3.5: intercept of a receiver 3 m across")
-    ax.set_xlabel("tracking error of the normal (standard deviation), mrad")
-    ax.set_ylabel("intercept, %")
-    ax.set_xlim(0, 10)
-    ax.set_ylim(0, 101)
-    ax.grid(alpha=0.3)
-    ax.legend(title="slant range", frameon=False)
-    return figure
-
-
 def main(folder: str | Path) -> list[Path]:
     """Write the figures into a folder; return their paths."""
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
-    made = {"3.5": intercept(), **{number: paths(number) for number in FIGURES}}
+    made = {number: paths(number) for number in FIGURES}
     written = []
     for number, figure in made.items():
         path = place / f"figure-{number.replace('.', '-')}.png"

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from benchmarks._centroids import moments_centroid, threshold_centroid
+from benchmarks._centroids import malan_centroid, marker_threshold, moments_centroid
 
 from heliotrope.field.target import Target
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.photograph import read_crop
-from heliotrope.imaging.spots.background import from_frame
 from heliotrope.imaging.targets.rectify import Rectified, from_crop
 
 TARGET = Target(
@@ -15,21 +14,44 @@ TARGET = Target(
 )
 
 
-def _picture(beams: list[tuple[float, float, float]], slope: float = 0.0) -> Rectified:
+def _picture(
+    beams: list[tuple[float, float, float]], slope: float = 0.0, light: float = 80.0
+) -> Rectified:
     """Gaussian beams (right, up, height) of 0.6 m on light that grows to the right."""
     y, x = np.mgrid[255:-1:-1, 0:256] * (8.0 / 256) - 4.0 + 4.0 / 256
-    light = 80.0 + slope * x
+    shine = light + slope * x
     for right, up, height in beams:
-        light = light + height * np.exp(-((x - right) ** 2 + (y - up) ** 2) / (2 * 0.6**2))
-    noise = np.random.default_rng(1).normal(0.0, 0.5, light.shape)
-    pixels = np.clip(np.round(light + noise), 0, 255).astype(np.uint8)
+        shine = shine + height * np.exp(-((x - right) ** 2 + (y - up) ** 2) / (2 * 0.6**2))
+    noise = np.random.default_rng(1).normal(0.0, 0.5, shine.shape)
+    pixels = np.clip(np.round(shine + noise), 0, 255).astype(np.uint8)
     return from_crop(Frame(pixels), TARGET)
 
 
-def test_both_find_a_lone_round_beam() -> None:
+def _grey(values: list[list[int]]) -> Rectified:
+    return from_crop(Frame(np.kron(np.array(values), np.ones((64, 64))).astype(np.uint8)), TARGET)
+
+
+def test_malans_thresholds_are_as_printed() -> None:
+    """(5.2): T1 = darkest + 0.2 · lightest; (5.3): T2 = (mean + lowest) / 2; (5.4)."""
+    picture = _grey([[200, 40, 40, 40], [40, 40, 40, 40], [40, 40, 40, 40], [40, 40, 40, 140]])
+    assert marker_threshold(picture.values) == pytest.approx((40 + 0.2 * 200) / 255)
+    # The mean is 56.25, so T2 = 48.1: the two bright squares remain, at ∓3 and ±3 m.
+    found = malan_centroid(picture)
+    assert found == pytest.approx([3 * (140 - 200) / 340, 3 * (200 - 140) / 340], abs=0.02)
+
+
+def test_both_find_a_lone_round_beam_on_a_dark_target() -> None:
+    picture = _picture([(0.7, -0.4, 150.0)], light=0.0)
+    assert malan_centroid(picture) == pytest.approx([0.7, -0.4], abs=0.02)
+    assert moments_centroid(picture) == pytest.approx([0.7, -0.4], abs=0.02)
+
+
+def test_lit_paint_draws_malans_centroid_to_the_middle() -> None:
     picture = _picture([(0.7, -0.4, 100.0)])
-    assert threshold_centroid(picture, from_frame(picture)) == pytest.approx([0.7, -0.4], abs=0.01)
-    assert moments_centroid(picture) == pytest.approx([0.7, -0.4], abs=0.01)
+    found = malan_centroid(picture)
+    assert found is not None
+    assert np.linalg.norm(found - [0.7, -0.4]) > 0.2
+    assert np.linalg.norm(found) < np.linalg.norm([0.7, -0.4])
 
 
 def test_uneven_light_moves_the_moments_and_not_the_default() -> None:
@@ -44,7 +66,7 @@ def test_uneven_light_moves_the_moments_and_not_the_default() -> None:
 
 def test_a_second_beam_moves_the_thresholds_and_not_the_default() -> None:
     picture = _picture([(-1.8, 0.0, 100.0), (2.0, 1.0, 60.0)])
-    found = threshold_centroid(picture, from_frame(picture))
+    found = malan_centroid(picture)
     assert found is not None
     assert np.linalg.norm(found - [-1.8, 0.0]) > 0.5
     frame = Frame(np.round(picture.values * 255.0).astype(np.uint8))
@@ -54,8 +76,6 @@ def test_a_second_beam_moves_the_thresholds_and_not_the_default() -> None:
 
 
 def test_nothing_bright_is_nothing() -> None:
-    frame = Frame(np.full((256, 256), 255, dtype=np.uint8))
-    picture = from_crop(frame, TARGET)
-    assert threshold_centroid(picture, from_frame(picture)) is None
     black = from_crop(Frame(np.zeros((256, 256), dtype=np.uint8)), TARGET)
     assert moments_centroid(black) is None
+    assert malan_centroid(black) is None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import InputError
-from heliotrope.optics import beam_sigma, intercept_circle, intercept_rectangle
+from heliotrope.optics import beam_sigma, intercept_circle, intercept_disks, intercept_rectangle
 
 DRAWS = 200_000
 
@@ -38,6 +38,27 @@ def test_centred_circle_is_rayleigh() -> None:
     )
 
 
+def test_malans_disks_give_his_printed_values() -> None:
+    """Malan §3.2.2: 92.2 % at 0.75 mrad, "around ten per cent" lost at 1 mrad."""
+    found = intercept_disks([0.0, 0.75e-3, 1e-3], slope=1.5e-3, sun_angle=9.3e-3)
+    assert found[0] == 1.0
+    assert found[1] == pytest.approx(0.922, abs=5e-4)
+    assert found[2] == pytest.approx(0.90, abs=5e-3)
+    # Beyond two radii nothing is common.
+    assert intercept_disks(13e-3, slope=1.5e-3, sun_angle=9.3e-3) == 0.0
+
+
+def test_malans_disks_are_the_overlap_of_two_disks() -> None:
+    rng = np.random.default_rng(33)
+    x, y = rng.uniform(-1.0, 1.0, (2, DRAWS))
+    inside = x**2 + y**2 <= 1.0
+    slope, sun_angle, tracking = 1e-3, 9.3e-3, 4e-3
+    apart = tracking / (0.5 * sun_angle + slope)
+    common = ((x - apart) ** 2 + y**2 <= 1.0)[inside].mean()
+    found = intercept_disks(tracking, slope=slope, sun_angle=sun_angle)
+    assert found == pytest.approx(common, abs=4 * 0.5 / np.sqrt(inside.sum()))
+
+
 def test_limits_and_quadrature() -> None:
     assert intercept_circle(1.0, 1e-6) == pytest.approx(1.0)
     assert intercept_circle(1.0, 1e6) == pytest.approx(0.0, abs=1e-9)
@@ -52,6 +73,8 @@ def test_limits_and_quadrature() -> None:
         (lambda: beam_sigma(0.0), "slant: 0 m must be above 0"),
         (lambda: beam_sigma(10.0, tracking=-1e-3), "tracking: -0.001 rad must be 0 or more"),
         (lambda: intercept_circle(-1.0, 1.0), "radius"),
+        (lambda: intercept_disks(-1e-3), "tracking: -0.001 rad must be 0 or more"),
+        (lambda: intercept_disks(1e-3, sun_angle=0.0), "0 rad must be above 0"),
         (lambda: intercept_circle(1.0, 1.0, right=np.inf), "infinite"),
         (lambda: intercept_rectangle(np.ones(2), np.ones(3), 1.0), "do not broadcast"),
     ],

@@ -42,7 +42,7 @@ from heliotrope.optics.glare import (
     safe_distance,
     safe_range,
 )
-from heliotrope.optics.intercept import intercept_circle, intercept_rectangle
+from heliotrope.optics.intercept import intercept_circle, intercept_disks, intercept_rectangle
 from heliotrope.optics.keep_out import (
     Entries,
     Sweep,
@@ -102,6 +102,7 @@ __all__ = [
     "ground_way",
     "image_offsets",
     "intercept_circle",
+    "intercept_disks",
     "intercept_rectangle",
     "mean_concentration",
     "predict_flux",

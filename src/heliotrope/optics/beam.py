@@ -58,7 +58,7 @@ def beam_sigma(
     Notes
     -----
     The mirror is taken as focused on the aperture, so its size adds nothing, and its
-    astigmatism away from normal incidence is left out. Malan (3.2), reconstructed.
+    astigmatism away from normal incidence is left out. Malan's beam is another: `intercept_disks`.
     """
     d = checked("slant", slant, "m", positive=True)
     t = checked("tracking", tracking, "rad")

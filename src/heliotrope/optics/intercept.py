@@ -1,13 +1,17 @@
 r"""Intercept: the share of a heliostat's beam that falls into the receiver's aperture.
 
-The beam is Gaussian, with the standard deviation σ of `beam_sigma` on the plane of the aperture.
-A centred circle of radius R takes up
+Two models:
 
-$$1 - \exp\left(-\frac{R^2}{2 σ^2}\right).$$
+- `intercept_circle` and `intercept_rectangle`, ours: the beam is Gaussian, with the standard
+  deviation σ of `beam_sigma` on the plane of the aperture. A centred circle of radius R takes up
+  $1 - \exp(-R^2 / 2 σ^2)$. Every σ is a standard deviation *per axis*; the two-dimensional RMS is
+  √2 times as large.
+- `intercept_disks`, Malan's (3.2)-(3.3): the beam is a disk of even strength, and the aperture the
+  same disk about the aim.
 
-Source: Malan (3.3), reconstructed: his text was not at hand, and the relation follows from the
-Gaussian itself. Every σ is a standard deviation *per axis*; the two-dimensional RMS is √2 times as
-large.
+Use the Gaussian: a ray trace (`examples/malan_intercept.py`) agrees with it to 0.7 percentage
+points. In the aperture that (3.2) prints, an error of 1 mrad costs 0.4 points by the ray trace and
+10.3 by the disks: a beam of even strength loses at the rim at once, and a real beam is weak there.
 """
 
 import numpy as np
@@ -15,7 +19,7 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, common_shape
-from heliotrope.optics.beam import checked
+from heliotrope.optics.beam import SUN_RADIUS, checked
 
 # Nodes of the integral over a circle, and how many σ of the beam it covers: what it leaves
 # out is 2e-17.
@@ -53,7 +57,7 @@ def intercept_circle(
 
     Notes
     -----
-    A centred circular beam gives 1 − exp(−R²/2σ²), Malan (3.3), reconstructed; an offset one
+    A centred circular beam gives 1 − exp(−R²/2σ²); an offset one
     the distribution of Rice, which is the non-central χ² with two degrees of freedom. All
     are computed by one Gauss-Legendre integral: within 1e-10 up to R = 200 σ for elliptical
     beams, and for circular ones within 1e-11 of SciPy's ``chndtr``, which ends at R = 10⁵ σ.
@@ -69,6 +73,48 @@ def intercept_circle(
     s_up = checked("sigma_up", sigma_up, "m", positive=True)
     common_shape(radius=r, sigma=s, sigma_up=s_up, right=x, up=y)
     return _chords(r, s, s_up, x, y)
+
+
+def intercept_disks(
+    tracking: npt.ArrayLike,
+    *,
+    slope: npt.ArrayLike = 0.0,
+    sun_angle: npt.ArrayLike = 2.0 * SUN_RADIUS,
+) -> FloatArray:
+    r"""Return Malan's intercept ratio, normalised for slant, 0 to 1, (...).
+
+    Two equal disks, R = 2 d q in radius with q = θ_s / 2 + σ_slope and D = 2 d θ_t apart,
+    overlap by
+
+    $$\frac{2}{\pi}\left(\arccos x - x \sqrt{1 - x^2}\right), \qquad
+    x = \frac{D}{2 R} = \frac{θ_t}{2 q}.$$
+
+    Parameters
+    ----------
+    tracking
+        θ_t, tracking error of the normal as an offset, rad, (...).
+    slope
+        Mean slope error of the mirror's surface, rad, (...).
+    sun_angle
+        θ_s, the angle that the sun's disk subtends, rad, (...).
+
+    Raises
+    ------
+    InputError
+        If a value is negative or not finite, the disks have no size, or shapes do not broadcast.
+
+    Notes
+    -----
+    Malan (3.2)-(3.3) as printed: 92.2 % at 0.75 mrad and 89.7 % at 1 mrad with his 9.3 mrad and
+    1.5 mrad. For a perfect mirror his R is d θ_s, which his text calls the diameter of the smallest
+    image; its radius is half of it.
+    """
+    t = checked("tracking", tracking, "rad")
+    q = checked("sun_angle", sun_angle, "rad") / 2.0 + checked("slope", slope, "rad")
+    common_shape(tracking=t, q=q)
+    checked("sun_angle / 2 + slope", q, "rad", positive=True)
+    x = np.minimum(t / (2.0 * q), 1.0)
+    return as_float(2.0 / np.pi * (np.arccos(x) - x * np.sqrt(1.0 - x * x)))
 
 
 def intercept_rectangle(
