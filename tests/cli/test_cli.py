@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from heliotrope.calibration.sighting_table import write_sightings
 from heliotrope.calibration.sightings import join, sightings
 from heliotrope.cli import main
 from heliotrope.field.example import prototype
+from heliotrope.field.formats import open_plant
 from heliotrope.field.formats.plant_file import read_plant, write_plant
 from heliotrope.geometry import azimuth_elevation, reflect
 from heliotrope.mechanism.tracking import track
@@ -185,6 +187,68 @@ def test_track_reads_heliok(call: Any) -> None:
     )
     angles = np.degrees(found["branches"][0]["angles_rad"])
     np.testing.assert_allclose(angles, [-36.8761, 40.6415], rtol=0, atol=2e-3)
+
+
+HELIOK = Path(__file__).parents[1] / "files" / "heliok-scene.xml"
+
+
+def test_track_takes_aim_and_sun_of_a_heliok_file(call: Any) -> None:
+    found = json.loads(call("track", HELIOK, "--heliostat", "HeliostatA", "--json"))
+    assert found["sun_from"] == "file"
+    assert found["aim"] == [0.0, 0.0, 20.0]
+    angles = np.degrees(found["branches"][0]["angles_rad"])
+    np.testing.assert_allclose(angles, [-36.8761, 40.6415], rtol=0, atol=2e-3)
+    timed = call(
+        "track", HELIOK, "--heliostat", "HeliostatA", "--time", "2026-06-21T10:00Z", "--json"
+    )
+    assert json.loads(timed)["sun_from"] == "time"
+
+
+def test_track_traces_the_iteration_of_both_branches(call: Any) -> None:
+    words = ("track", HELIOK, "--heliostat", "HeliostatA", "--trace")
+    steps = json.loads(call(*words, "--json"))["steps"]
+    assert {step["branch"] for step in steps} == {0, 1}
+    for branch in (0, 1):
+        misses = [step["miss_m"] for step in steps if step["branch"] == branch]
+        # "A sub-millimeter accuracy" after two iterations, a thousandth of the miss each.
+        assert misses[0] > 0.01
+        assert misses[1] < 1e-3
+        assert all(b < 0.01 * a for a, b in pairwise(misses))
+    assert "Grigoriev's iteration" in call(*words)
+    with pytest.raises(AssertionError, match="--trace prints one moment"):
+        call(*words, "--local")
+
+
+def test_track_aims_at_a_point_fixed_to_the_mirror(call: Any) -> None:
+    mechanism = open_plant(HELIOK).heliostat("HeliostatA")
+    zero, there = mechanism.pose([0.0, 0.0]), mechanism.pose([0.3, 0.7])
+    # A point on the mirror's own normal is met where the mirror looks at the sun.
+    aim, light = zero.vertex + 2.0 * zero.normal, there.normal
+    words = [
+        "--aim",
+        ",".join(map(str, aim)),
+        "--sun",
+        ",".join(map(str, light)),
+        "--local",
+        "--json",
+    ]
+    found = json.loads(call("track", HELIOK, "--heliostat", "HeliostatA", *words))
+    best = found["branches"][found["best"]]
+    assert best["reachable"]
+    np.testing.assert_allclose(best["normal"], light, rtol=0, atol=1e-9)
+
+
+def test_view_writes_a_page_and_a_model(call: Any, tmp_path: Path) -> None:
+    words = ("--heliostat", "HeliostatA", "--time", "2026-06-21T12:00Z", "--every", "1h")
+    said = call("view", HELIOK, tmp_path / "day.html", *words)
+    assert "poses reach the aim" in said
+    page = (tmp_path / "day.html").read_text(encoding="utf-8")
+    assert "armature and mirror through a day" in page
+    assert "<script src=" not in page, "the page stands by itself"
+    call("view", HELIOK, tmp_path / "day.glb", *words)
+    assert (tmp_path / "day.glb").read_bytes().startswith(b"glTF")
+    with pytest.raises(AssertionError, match=r"ends in \.html or \.glb"):
+        call("view", HELIOK, tmp_path / "day.obj", *words)
 
 
 def test_track_reads_paint(call: Any) -> None:

@@ -28,6 +28,7 @@ from heliotrope.cli.run.command import GroupedCommand, run
 from heliotrope.cli.simulate import simulate
 from heliotrope.cli.sun import sun
 from heliotrope.cli.track import track
+from heliotrope.cli.view import view
 from heliotrope.errors import HeliotropeError
 
 app = typer.Typer(
@@ -60,6 +61,7 @@ field_app.command()(layout)
 
 app.command()(sun)
 app.command()(track)
+app.command()(view)
 app.command()(parameters)
 app.add_typer(field_app, name="field")
 app.add_typer(camera_app, name="camera")

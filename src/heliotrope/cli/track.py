@@ -17,8 +17,10 @@ from heliotrope.cli._track_guo import track_by_guo
 from heliotrope.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from heliotrope.field.plant import Plant
-    from heliotrope.mechanism.tracking import Tracking
+    from heliotrope.mechanism.tracking import TraceStep, Tracking
 
 
 def track(
@@ -26,10 +28,15 @@ def track(
     heliostat: Annotated[str, typer.Option(help="Name of the heliostat.")],
     aim: Annotated[
         str | None,
-        typer.Option(help="Aim east,north,up in metres; default the first target."),
+        typer.Option(
+            help="Aim east,north,up in metres; default the heliostat's own, or the first target."
+        ),
     ] = None,
     target: Annotated[str | None, typer.Option(help="Aim at the centre of this target.")] = None,
-    time: Annotated[str, typer.Option(help="ISO 8601 with a zone, or now.")] = "now",
+    time: Annotated[
+        str | None,
+        typer.Option(help="ISO 8601 with a zone, or now; default the file's <Sun>, or now."),
+    ] = None,
     sun: Annotated[
         str | None, typer.Option(help="Vector to the sun east,north,up, instead of that at TIME.")
     ] = None,
@@ -43,6 +50,13 @@ def track(
         Literal["armature", "guo"],
         typer.Option(help="armature: any mechanism; guo: the closed form for azimuth-elevation."),
     ] = "armature",
+    local: Annotated[
+        bool,
+        typer.Option(help="The aim is fixed to the mirror: its place at zero joint angles."),
+    ] = False,
+    trace: Annotated[
+        bool, typer.Option(help="Print each iteration of both branches: angles and miss.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Print normal, joint angles and drive counts of both branches, or of a day."""
@@ -58,27 +72,31 @@ def track(
 
         plant = apply_to_plant(plant, read_json(calibration))
     mechanism = plant.heliostat(heliostat)
-    goal = np.array(_aim(plant, aim, target))
-    moment = parse_time(time)
-    if every is not None and law == "guo":
-        raise InputError("--law guo prints one moment; leave out --every, or track by the armature")
+    goal = np.array(aim_of(plant, heliostat, aim, target))
+    moment = parse_time(time or "now")
+    _check(every, law, local, trace)
     if every is not None:
         times = solar.daylight(moment.date(), plant.site, every=parse_duration(every))
-        result = tracking.track(mechanism, solar.vector(times, plant.site), goal)
+        result = tracking.track(mechanism, solar.vector(times, plant.site), goal, local=local)
         _day(heliostat, [t.isoformat() for t in times], result, mechanism.joints, as_json)
         return
+    own = _sun_of(field) if sun is None and time is None else None
     if sun is not None:
         vector = normalize(parse_point(sun, "sun"), "sun")
     else:
-        vector = solar.vector(moment, plant.site)
+        vector = solar.vector(moment, plant.site) if own is None else own
     if law == "guo":
         track_by_guo(heliostat, mechanism, vector, goal, moment, as_json)
         return
-    result = tracking.track(mechanism, vector, goal)
+    if trace:
+        _trace(heliostat, tracking.trace(mechanism, vector, goal), as_json)
+        return
+    result = tracking.track(mechanism, vector, goal, local=local)
     joints = [mechanism.joints[j] for j in mechanism.driven]
     document = {
         "heliostat": heliostat,
         "time": moment,
+        "sun_from": "file" if own is not None else "option" if sun is not None else "time",
         "sun_vector": vector,
         "sun_elevation_deg": float(np.degrees(np.arcsin(vector[2]))),
         "aim": goal,
@@ -92,16 +110,70 @@ def track(
     _print_branches(document, heliostat)
 
 
-def _aim(plant: "Plant", aim: str | None, target: str | None) -> Any:
+def _check(every: str | None, law: str, local: bool, trace: bool) -> None:
+    """Refuse options that do not fit together."""
+    if law == "guo" and (every is not None or local or trace):
+        raise InputError(
+            "--law guo prints one moment of global aiming; leave out --every, --local and --trace, "
+            "or track by the armature"
+        )
+    if trace and (every is not None or local):
+        raise InputError("--trace prints one moment of global aiming; leave out --every, --local")
+
+
+def _sun_of(field: Path) -> "np.ndarray | None":
+    """Return the sun of a HelioK file, (3,); None for other files and where it gives none."""
+    if field.suffix.lower() != ".xml":
+        return None
+    from heliotrope.field.formats import heliok
+
+    document = heliok.read(field)
+    has = any(True for world in document.root.elements("World") for _ in world.elements("Sun"))
+    return heliok.sun(document) if has else None
+
+
+def aim_of(plant: "Plant", heliostat: str, aim: str | None, target: str | None) -> Any:
+    """Return the aim that options name, else the heliostat's own, else the first target, (3,)."""
+    import numpy as np
+
     if aim is not None and target is not None:
         raise InputError("give --aim or --target, not both")
     if aim is not None:
         return parse_point(aim, "aim")
     if target is not None:
         return plant.target(target).center
+    group, row = plant.find(heliostat)
+    if group.aim is not None and np.isfinite(group.aim[row]).all():
+        return group.aim[row]
     if not plant.targets:
         raise InputError("this plant has no target; give --aim east,north,up in metres")
     return plant.targets[0].center
+
+
+def _trace(heliostat: str, steps: "tuple[TraceStep, ...]", as_json: bool) -> None:
+    """Print the table of iterations, as HelioK's debug output has it."""
+    import numpy as np
+
+    if as_json:
+        rows = [
+            {"branch": s.branch, "iteration": s.iteration, "angles_rad": s.angles, "miss_m": s.miss}
+            for s in steps
+        ]
+        print_json({"heliostat": heliostat, "steps": rows})
+        return
+    print_table(
+        ["branch", "iteration", "angles", "miss"],
+        [
+            [
+                str(step.branch),
+                str(step.iteration),
+                "  ".join(f"{np.degrees(angle):.6f}°" for angle in step.angles),
+                f"{1e3 * step.miss:.3g} mm",
+            ]
+            for step in steps
+        ],
+        title=f"{heliostat}: Grigoriev's iteration, stops left aside",
+    )
 
 
 def _branch(result: "Tracking", b: int) -> dict[str, Any]:
@@ -145,10 +217,9 @@ def _print_branches(document: dict[str, Any], heliostat: str) -> None:
                 branch["text"],
             ]
         )
-    print(
-        f"{heliostat} at {document['time'].isoformat()}, sun at "
-        f"{document['sun_elevation_deg']:.2f}° of elevation"
-    )
+    when = "" if document["sun_from"] != "time" else f" at {document['time'].isoformat()}"
+    whose = "the file's sun" if document["sun_from"] == "file" else "sun"
+    print(f"{heliostat}{when}, {whose} at {document['sun_elevation_deg']:.2f}° of elevation")
     names = "joints " + " and ".join(document["joints"])
     print_table(["branch", "azimuth", "elevation", names, "counts", "residual", ""], rows)
     print("* the one to take")

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
-from heliotrope.geometry import FloatArray, as_float, as_vectors
+from heliotrope.geometry import FloatArray, as_float, as_vectors, reflect
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive, direct
@@ -207,6 +207,80 @@ def track(
     return Tracking(
         **{name: array.reshape((*shape, *array.shape[1:])) for name, array in vars(result).items()}
     )
+
+
+@dataclass(frozen=True)
+class TraceStep:
+    """A step of the fixed point (Grigoriev et al. 2021, "Global aiming").
+
+    Attributes
+    ----------
+    iteration
+        From 1.
+    branch
+        0 or 1.
+    angles
+        Joint angles, rad, (D,).
+    miss
+        Lateral distance of the reflected ray from the aim point with these angles, m.
+    """
+
+    iteration: int
+    branch: int
+    angles: FloatArray
+    miss: float
+
+
+def trace(
+    mechanism: Mechanism | Armature,
+    sun: npt.ArrayLike,
+    aim: npt.ArrayLike,
+    *,
+    drives: Drive | None = None,
+    tolerance: float = 1e-9,
+    most: int = 50,
+) -> tuple[TraceStep, ...]:
+    """Return how both branches of one heliostat converge on an aim, without Newton and stops.
+
+    A branch ends when it misses by less than the tolerance, or gains nothing more.
+
+    Parameters
+    ----------
+    mechanism, sun, aim, drives
+        As for `track`, of batch shape ().
+    tolerance
+        Miss at which a branch ends, m.
+    most
+        Largest number of iterations.
+
+    Raises
+    ------
+    InputError
+        As `track`, or more than one heliostat.
+    """
+    armature, table = _tables(mechanism, drives)
+    if armature.shape or np.ndim(sun) != 1 or np.ndim(aim) != 1:
+        raise InputError("trace: give one heliostat, one sun and one aim")
+    s, p = as_vectors(sun, "sun"), as_vectors(aim, "aim")
+    free = direct().table
+    free_drives = Drive(table).replace(
+        min_angle=free[slot.MIN_ANGLE], max_angle=free[slot.MAX_ANGLE]
+    )
+    steps: list[TraceStep] = []
+    for branch in (0, 1):
+        before = np.inf
+        for k in range(1, most + 1):
+            # A tolerance that no step reaches, so that each step is made.
+            found = track(
+                armature, s, p, drives=free_drives, tolerance=1e-300, max_iterations=k, newton=False
+            )
+            normal, vertex = found.normal[branch], found.vertex[branch]
+            miss = float(np.linalg.norm(np.cross(p - vertex, reflect(s, normal))))
+            steps.append(TraceStep(k, branch, found.angles[branch], miss))
+            if miss < tolerance or miss > 0.999 * before:
+                break
+            before = miss
+    return tuple(steps)
 
 
 def _tables(mechanism: Mechanism | Armature, drives: Drive | None) -> tuple[Armature, FloatArray]:
