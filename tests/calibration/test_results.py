@@ -21,6 +21,7 @@ from heliotrope.field.example import prototype
 from heliotrope.field.formats import measurements, paint
 from heliotrope.field.formats.plant_file import read_plant
 from heliotrope.field.plant import Plant
+from heliotrope.mechanism import direct, kinds
 from support.data import juelich
 
 NAMES = tuple(f"H{i}" for i in range(6))
@@ -131,6 +132,40 @@ def test_the_simplest_model_that_explains_is_chosen() -> None:
     assert "full" in known
     with pytest.raises(InputError, match="name the model instead of auto"):
         models.compare_models(nominal, seen.take(range(3)))
+
+
+@pytest.mark.parametrize("axes", [("elevation",), ("azimuth", "elevation")])
+def test_auto_offers_the_worm_of_every_drive_with_a_known_ratio(axes: tuple[str, ...]) -> None:
+    drives = [direct(worm_ratio=30.0 if j in axes else 0.0) for j in ("azimuth", "elevation")]
+    mechanism = kinds.azimuth_elevation(np.zeros((1, 3)), drives=(drives[0], drives[1]))
+    known = models.candidate_models(mechanism)
+    for joint in ("azimuth", "elevation"):
+        assert (f"malan8+{joint}_worm" in known) == (joint in axes)
+    assert ("malan8+worm" in known) == (len(axes) == 2)
+    wanted = {f"{j}_worm_{part}" for j in axes for part in ("cos", "sin")}
+    assert {p for p in known["full+worm"] if "_worm_" in p} == wanted
+    assert "full+worm" not in models.candidate_models(field(1))
+
+
+def test_auto_finds_malans_worm() -> None:
+    """Malan §6.4: a worm of 30:1 on the elevation; 1.35 mrad of it are planted."""
+    drives = (direct(), direct(min_angle=-0.1, max_angle=1.7, worm_ratio=30.0))
+    nominal = kinds.azimuth_elevation(field(4).position, pivot_height=2.0, drives=drives)
+    worm = {"elevation_worm_cos": 1.03e-3, "elevation_worm_sin": 0.87e-3}
+    seen, _ = measured(nominal, 9, days=12, known=worm)
+    offered = models.candidate_models(nominal)
+    trials = {name: offered[name] for name in ("guo6", "guo6+sag", "guo6+elevation_worm")}
+    chosen = models.choose_model(models.compare_models(nominal, seen, trials))
+    assert chosen.name == "guo6+elevation_worm"
+    training = evaluation.split(seen, "random", 0.7)
+    names = tuple("ABCD")
+    left = {
+        name: assess(names, learning.learn(nominal, seen, trials[name], used=training)).beam.rms
+        for name in ("guo6", chosen.name)
+    }
+    # The beam is off by twice the normal; 0.2 mrad of each axis are the noise of a spot.
+    assert left["guo6"] > 1e-3
+    assert left[chosen.name] < 0.4e-3
 
 
 def test_neighbourhoods_are_held_out_whole(learnt: learning.Learned) -> None:

@@ -80,6 +80,9 @@ def candidate_models(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
             if all(p in known and p not in found[name] for p in extra[1]):
                 found[label] = found[name] + extra[1]
     found["full"] = parameter_table.model("full", known)
+    worms = tuple(name for names in _worms(mechanism).values() for name in names)
+    if worms:
+        found["full+worm"] = found["full"] + worms
     return dict(sorted(found.items(), key=lambda item: len(item[1])))
 
 
@@ -88,12 +91,22 @@ def _extras(mechanism: Mechanism) -> list[tuple[str, tuple[str, ...]]]:
     extras = [("sag", ("sag",)), ("position", parameter_table.MODELS["malan8"][:3])]
     extras.append(("radii", tuple(f"{j}_pivot_radius" for j in joints)))
     extras.append(("scales", tuple(f"{j}_scale" for j in joints)))
-    ratio = mechanism.drives.table[..., SLOTS["worm_ratio"]]
-    if bool(np.all(ratio != 0.0)):
-        extras.append(
-            ("worm", tuple(f"{j}_worm_{part}" for j in joints for part in ("cos", "sin")))
-        )
+    worms = _worms(mechanism)
+    extras += [(f"{joint}_worm", names) for joint, names in worms.items()]
+    if len(worms) > 1:
+        extras.append(("worm", tuple(name for names in worms.values() for name in names)))
     return extras
+
+
+def _worms(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
+    """Return the periodic error's parameters by joint, for each drive whose ratio is known."""
+    ratio = mechanism.drives.table[..., SLOTS["worm_ratio"]].reshape(-1, len(mechanism.driven))
+    joints = [mechanism.joints[k] for k in mechanism.driven]
+    return {
+        joint: (f"{joint}_worm_cos", f"{joint}_worm_sin")
+        for joint, known in zip(joints, (ratio != 0.0).all(axis=0), strict=True)
+        if known
+    }
 
 
 def compare_models(
