@@ -133,7 +133,9 @@ def test_a_plant_runs_and_is_defocused() -> None:
     assert result["heliostats"] == 32 * result["clusters"] == 640
     assert [row["work"] for row in result["rows"]] == [
         "a second of operation",
+        "of it: the checks",
         "the same, two keep-out volumes",
+        "of it: the checks",
         "order to all links",
         "all answers to it",
     ]
