@@ -100,7 +100,7 @@ def test_exchanged_addresses_are_named_and_neither_is_moved_or_written(
     run_virtual(main)
 
 
-def test_both_of_an_exchanged_pair_are_defocused_until_that_is_seen(tmp_path: Path) -> None:
+def test_both_of_an_exchanged_pair_are_stowed_until_that_is_seen(tmp_path: Path) -> None:
     async def main(clock: VirtualClock) -> None:
         bench = Bench(clock, tmp_path)
         correct(bench)
@@ -113,7 +113,7 @@ def test_both_of_an_exchanged_pair_are_defocused_until_that_is_seen(tmp_path: Pa
                 return [m.name for m in cluster.of(Emergency) if name in m.heliostats]
 
             plant.aim(OPERATOR, token, plant.default_aims())
-            cluster.set(states.DEFOCUSED, *PAIR)
+            cluster.set(states.DEFOCUSED, "P5B")
             cluster.set(states.TRACKING, "P5A")
             await bench.wait(2.0)
             assert not sent(cluster, Emergency)
@@ -124,17 +124,42 @@ def test_both_of_an_exchanged_pair_are_defocused_until_that_is_seen(tmp_path: Pa
             await bench.until(lambda: bool(sent(cluster, Emergency)), 3.0)
             await bench.wait(30.0)
             assert len(orders_to("P5A")) >= 3, "it is repeated while it is not seen"
-            assert set(orders_to("P5A")) == {"DEFOCUS"}
+            assert set(orders_to("P5A")) == {"STOW"}
+            assert set(orders_to("P5B")) == {"STOW"}, "its defocus may be about the other mirror"
             assert "P5B" not in {n for m in cluster.commands("REFOCUS") for n in m.heliostats}
             assert waits.finished
             cluster.deaf.clear()
             assert state[row] == states.TRACKING
-            await bench.until(lambda: bool(state[row] == states.DEFOCUSED), 70.0)
+            await bench.until(lambda: bool(state[row] == states.STOWED), 70.0)
             await bench.wait(15.0)
             count = len(orders_to("P5A"))
             await bench.wait(80.0)
             assert len(orders_to("P5A")) == count, "nothing is repeated once it is seen"
             assert named(bench) == set(PAIR)
+
+    run_virtual(main)
+
+
+def test_an_emergency_is_proven_for_an_exchanged_pair_at_stow_only(tmp_path: Path) -> None:
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path)
+        correct(bench)
+        cluster = exchange(bench)
+        async with running(bench):
+            plant = bench.plant
+            await bench.wait(2.0)
+            assert named(bench) == set(PAIR)
+            cluster.set(states.DEFOCUSED)
+            for other in bench.clusters.values():
+                other.set(states.DEFOCUSED)
+            order = plant.raise_emergency("Vera")
+            await bench.wait(5.0)
+            report = order.report(plant.now())
+            assert set(report.not_done) == set(PAIR)
+            assert "so only stow proves that it is off" in report.unknown[0]
+            await bench.until(lambda: not order.report(plant.now()).not_done, 60.0)
+            assert {cluster.rows["state"][cluster.names.index(n)] for n in PAIR} == {states.STOWED}
+            assert not order.report(plant.now()).unknown
 
     run_virtual(main)
 

@@ -231,7 +231,7 @@ class PlantController:
             self._ways,
             self.beams.drives,
             self.settings.repeat,
-            self._identities.off,
+            self._identities,
         )
 
     # -- running ---------------------------------------------------------------------------

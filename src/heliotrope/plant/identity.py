@@ -19,8 +19,9 @@ from heliotrope.plant import refusals
 from heliotrope.plant.field_state import FieldState
 from heliotrope.safety import Act, Alarm, alarms
 
-#: States in which a heliostat is off, or on its way there.
-_OFF = (states.STOWED, states.STOWING, states.DEFOCUSED)
+#: States in which a heliostat is safe whoever's board it has, or on its way there. DEFOCUSED is not
+#: among them: a defocus is relative to goals, which may belong to the other mirror.
+_OFF = (states.STOWED, states.STOWING)
 _AT_STOW = 1 << meanings.FLAGS.index("AT_STOW")
 
 
@@ -143,7 +144,7 @@ class Identities:
         going = field.among(_OFF, now) | (field.rows["flags"] & _AT_STOW != 0)
         needed = field.live(now) & ~going
         return {
-            name: (Act.DEFOCUS, f"{name}: {text}")
+            name: (Act.STOW, f"{name}: {text}")
             for name, text in self.strange.items()
             if needed[field.index[name]]
         }

@@ -124,8 +124,9 @@ IDENTITY = AlarmKind(
     Severity.ALARM,
     "A local controller reports the armature of another heliostat, or another one reports its own.",
     "{subject}: {problem}",
-    "It is defocused, and neither moved nor written; DEFOCUS and STOW still go to its address.",
-    "Stow both; then correct their addresses, or write the parameters of the mirror that is there.",
+    "It is sent to stow, and neither moved nor written; DEFOCUS and STOW still go to its address.",
+    "See that both stand at stow; then correct their addresses, or write the parameters of the "
+    "mirror that is there.",
     over="{subject}: its own parameters answer again",
 )
 SECOND_PLANT = AlarmKind(

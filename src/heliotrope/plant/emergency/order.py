@@ -115,10 +115,20 @@ class EmergencyOrder:
         heard: npt.NDArray[np.float64],
         drives: Drive,
         now: float,
+        strange: Mask,
     ) -> None:
-        """Take the state of heliostats (K,): rows of `NODE`, when they were true, and drives."""
-        fresh = heard >= self.at
-        fulfilled = fresh & carried_out(self.act, rows, drives, heard >= self.at + LEAVING)
+        """Take the state of heliostats (K,): rows of `NODE`, when they were true, and drives.
+
+        ``strange`` ones are not what their address says. They are done at stow only: the goals of
+        their defocus may belong to another mirror.
+        """
+        settled = heard >= self.at + LEAVING
+        fulfilled = np.where(
+            strange,
+            carried_out(Act.STOW, rows, drives, settled),
+            carried_out(self.act, rows, drives, settled),
+        )
+        fulfilled &= heard >= self.at
         ready = tuple(names[i] for i in np.flatnonzero(fulfilled))
         if ready:
             self.take_stage(ready, Stage.DONE, now)

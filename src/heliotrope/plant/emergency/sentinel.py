@@ -6,7 +6,7 @@ acknowledged, and a person's order is withdrawn.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from heliotrope.plant.emergency.order import (
 )
 from heliotrope.plant.emergency.table import TableWatch
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.identity import Identities
 from heliotrope.plant.joining import JoinQueue
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
@@ -51,8 +52,8 @@ class Sentinel:
         Of the heliostats, (N, 2), for the proof.
     repeat
         Pause between two repetitions of an order, s.
-    astray
-        Returns the heliostats that must leave, beside those of the table, at a time.
+    identities
+        Heliostats that are not what their address says: they must leave, and are done at stow only.
 
     Attributes
     ----------
@@ -74,14 +75,14 @@ class Sentinel:
         ways: BeamWatch,
         drives: Drive,
         repeat: float,
-        astray: Callable[[float], Mapping[str, tuple[Act, str]]],
+        identities: Identities,
     ) -> None:
         self.order: EmergencyOrder | None = None
         self.on = False
         self._called = False
         self._clock, self.table, self._field = clock, table, field
         self._orders, self._joining, self._ways = orders, joining, ways
-        self._drives, self._repeat, self._astray = drives, repeat, astray
+        self._drives, self._repeat, self._identities = drives, repeat, identities
         #: The strongest act that each cluster was sent as a whole, while it holds.
         self._acts: dict[str, Act] = {}
         self._sent_off: dict[str, float] = {}
@@ -135,7 +136,7 @@ class Sentinel:
         A heliostat that has just been sent off has the time to show it.
         """
         self._sent_off = {n: at for n, at in self._sent_off.items() if now - at < OFF_SHOWS}
-        wanted = {**self._astray(now), **self.table.off()}
+        wanted = {**self.table.off(), **self._identities.off(now)}
         self._tries = {name: tried for name, tried in self._tries.items() if name in wanted}
         order = self.order if self.on else None
         sent: dict[Act, dict[str, str]] = {}
@@ -221,7 +222,10 @@ class Sentinel:
             if progress.stage is Stage.DONE:
                 flags = self._field.rows["flags"]
                 good = (flags & COUNTS_UNKNOWN == 0) & ~switched_off(flags)
-                heliostats = tuple(n for n in heliostats if good[self._field.index[n]])
+                strange = self._identities.strange
+                heliostats = tuple(
+                    n for n in heliostats if good[self._field.index[n]] and n not in strange
+                )
             self.order.take_stage(heliostats, progress.stage, self._clock.monotonic())
 
     def take_rows(self, cluster: str, now: float) -> None:
@@ -239,6 +243,7 @@ class Sentinel:
                 self._field.heard[index],
                 Drive(self._drives.table[index]),
                 now,
+                np.array([self._field.names[r] in self._identities.strange for r in rows]),
             )
         for row in rows:
             name = self._field.names[row]
@@ -249,6 +254,8 @@ class Sentinel:
                     f"{name}: its drives are switched off at the mirror, so it is not proven to be "
                     "off; it was not at stow"
                 )
+            elif not order.is_done(name) and (text := self._identities.strange.get(name)):
+                order.unknown[name] = f"{name}: {text}, so only stow proves that it is off"
             else:
                 order.unknown.pop(name, None)
 
