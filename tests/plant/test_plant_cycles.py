@@ -27,6 +27,7 @@ from heliotrope.plant.visits.calibration_cycle import (
     Shot,
 )
 from heliotrope.plant.visits.visit import Visit
+from heliotrope.safety import alarms
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 NAME = "P2A"
@@ -209,9 +210,63 @@ def test_what_has_not_earned_it_is_not_pushed(
     assert not bench.cluster_of(NAME).of(Parameters)
 
 
+def sent_to_the_receiver(bench: Bench, token: int) -> None:
+    """As if the aim on the receiver had been given before the visit."""
+    plant, row = bench.plant, bench.plant.field.place(NAME)
+    before = plant.aims[row].copy()
+    plant.aims[row] = plant.default_aims((NAME,))[NAME]
+    try:
+        plant.command(ENGINEER, token, "REFOCUS", (NAME,))
+    finally:
+        plant.aims[row] = before
+
+
+def test_one_whose_verification_was_broken_off_moves_when_the_old_parameters_are_back(
+    tmp_path: Path,
+) -> None:
+    async def scene(bench: Bench, whole: CalibrationCycle, eye: Eye, token: int) -> None:
+        plant, cluster = bench.plant, bench.cluster_of(NAME)
+        await whole.run(ENGINEER, token, NAME, "target")
+        old = dict(cluster.stored[NAME])
+        eye.error = {"azimuth_bias": 9e-3}
+        begin = eye.count
+        eye.during = lambda: (
+            plant.release_authority(ENGINEER, token) if eye.count >= begin + 6 else None
+        )
+        with pytest.raises(RefusedError, match="nobody has it"):
+            await whole.run(ENGINEER, token, NAME, "target")
+        assert cluster.stored[NAME] != old
+        again = plant.take_authority(ENGINEER).token
+        cluster.set(states.IDLE, NAME)
+        for _ in range(40):
+            await bench.wait(1.0)
+            plant.authority.keep(ENGINEER, again)
+            for name in ("TRACK", "REFOCUS"):
+                with pytest.raises(RefusedError, match=f"{name} P2A.*parameters that differ"):
+                    plant.command(ENGINEER, again, name, (NAME,))
+        assert cluster.stored[NAME] != old, "its beam is out: they are written at stow"
+        told = [a for a in plant.alarms if a.condition == alarms.PARAMETERS_DIFFER.name]
+        assert told[-1].subject == NAME
+        assert "No motion but DEFOCUS and STOW is accepted" in told[-1].text
+        plant.stow("Vera", (NAME,))
+        for _ in range(70):
+            await bench.wait(1.0)
+            plant.authority.keep(ENGINEER, again)
+        assert cluster.stored[NAME] == old
+        assert state_of(bench) == states.STOWED
+        cluster.set(states.IDLE, NAME)
+        await bench.wait(2.0)
+        plant.aim(ENGINEER, again, plant.default_aims((NAME,)))
+        plant.command(ENGINEER, again, "TRACK", (NAME,))
+
+    settings = CycleSettings(shots=5, interval=5.0, least=2, left=1.0)
+    cycle(tmp_path, scene, settings, azimuth_bias=1e-3)
+
+
 @pytest.mark.parametrize("why", ["another light", "cloud", "authority"])
 def test_a_large_change_that_no_photograph_confirms_is_withdrawn(tmp_path: Path, why: str) -> None:
     results: list[CycleResult] = []
+    refused: list[str] = []
 
     async def scene(bench: Bench, whole: CalibrationCycle, eye: Eye, token: int) -> None:
         plant, cluster = bench.plant, bench.cluster_of(NAME)
@@ -226,6 +281,12 @@ def test_a_large_change_that_no_photograph_confirms_is_withdrawn(tmp_path: Path,
             if eye.count < begin + 6:
                 return
             assert plant.wanted.items[NAME] != old
+            if state_of(bench) == states.TRACKING and plant.authority.token == token:
+                with pytest.raises(RefusedError, match=r"AIM P2A.*has yet to verify"):
+                    plant.aim(ENGINEER, token, plant.default_aims((NAME,)))
+                with pytest.raises(RefusedError, match=r"REFOCUS P2A.*has yet to verify"):
+                    sent_to_the_receiver(bench, token)
+                refused.append(why)
             eye.error = {"azimuth_bias": -9e-3} if why == "another light" else eye.error
             eye.reasons = ("cloud",) if why == "cloud" else ()
             if why == "authority":
@@ -246,6 +307,7 @@ def test_a_large_change_that_no_photograph_confirms_is_withdrawn(tmp_path: Path,
 
     settings = CycleSettings(shots=5, interval=5.0, least=2, left=1.0)
     cycle(tmp_path, scene, settings, azimuth_bias=1e-3)
+    assert refused
     for result in results:
         assert result.outcome is CalibrationOutcome.NOT_VERIFIED
         assert result.record is None

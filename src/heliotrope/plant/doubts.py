@@ -1,13 +1,14 @@
-"""Heliostats whose step counts are in doubt, and the confirmations that they are right.
+"""Heliostats whose step counts or parameters are in doubt, and what confirms that they are right.
 
 A power cut in motion may leave the step counts of a local controller wrong by up to 1,000 steps,
 which it reports as COUNTS_DOUBTFUL until ZERO. Its beam may then stand beside its place without
 any other sign. Such a heliostat is named, and kept off the receiver until a photograph on a target
 or a person has confirmed its place. A confirmation holds for one boot: it says nothing of the next
-cut.
+cut. One that stores new parameters which a calibration has yet to verify stays off in the same way.
 """
 
-from collections.abc import Callable, Iterable
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -50,6 +51,8 @@ class Doubts:
         self._receivers = np.array([each.center for each in design.receivers]).reshape(-1, 3)
         self._targets = np.array([each.center for each in design.targets]).reshape(-1, 3)
         self._reach = np.array([np.hypot(each.width, each.height) for each in design.targets])
+        #: Rows whose new parameters are being verified.
+        self._unverified: set[int] = set()
         #: Boots of each local controller when its place was confirmed, -1 before.
         self._confirmed = np.full(len(field), -1, dtype=np.int64)
         self.standing: Mask = np.zeros(len(field), dtype=np.bool_)
@@ -72,6 +75,16 @@ class Doubts:
         self._confirmed[row] = int(self._field.rows["boots"][row]) if boots is None else boots
         self._judge([row])
 
+    @contextlib.contextmanager
+    def unverified(self, heliostat: str) -> Iterator[None]:
+        """Keep a heliostat off the receiver while its new parameters are being verified."""
+        row = self._field.place(heliostat)
+        self._unverified.add(row)
+        try:
+            yield
+        finally:
+            self._unverified.discard(row)
+
     def _judge(self, rows: list[int]) -> None:
         found = self._field.rows[rows]
         doubtful = found["flags"] & (_DOUBTFUL | _UNKNOWN) == _DOUBTFUL
@@ -86,11 +99,13 @@ class Doubts:
         """Return which heliostats may not join their aims, or points (K, 3), and why."""
         names = tuple(heliostats)
         rows = [self._field.place(name) for name in names]
-        if not self.standing[rows].any():
+        unverified = np.isin(rows, list(self._unverified))
+        doubted = self.standing[rows] | unverified
+        if not doubted.any():
             return {}
         on_target = self._on_target(self._aims[rows] if points is None else points)
-        wrong = self.standing[rows] & ~on_target
-        return {names[i]: refusals.COUNTS_DOUBTFUL.text for i in np.flatnonzero(wrong)}
+        why = {True: refusals.NOT_VERIFIED.text, False: refusals.COUNTS_DOUBTFUL.text}
+        return {names[i]: why[bool(unverified[i])] for i in np.flatnonzero(doubted & ~on_target)}
 
     def _on_target(self, points: FloatArray) -> Mask:
         """Return which points (K, 3) are at a target, and nearer to it than to a receiver."""

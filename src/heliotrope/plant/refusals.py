@@ -149,6 +149,12 @@ COUNTS_DOUBTFUL = Refusal(
     "its step counts may be wrong since a power cut in motion, and nobody has confirmed them",
     "Look where its mirror stands, then acknowledge the alarm `counts_doubtful`; or calibrate it.",
 )
+NOT_VERIFIED = Refusal(
+    "not verified",
+    "A heliostat is sent to the receiver while a calibration verifies its new parameters.",
+    "a calibration has yet to verify its new parameters by a photograph",
+    "Wait until the visit has ended; DEFOCUS, STOW and LOCK end it at once.",
+)
 PARAMETERS_NOT_HERE = Refusal(
     "parameters not here",
     "Parameters that change a pose are given where the beam would move or is not proven free.",

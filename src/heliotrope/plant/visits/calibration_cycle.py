@@ -223,7 +223,8 @@ class CalibrationCycle:
         found = self._fit(name, every)
         pushed: tuple[str, ...] = ()
         if not found.problem:
-            found, pushed = await self._try(visit, found, every, taken, tell)
+            with self._plant.doubts.unverified(name):
+                found, pushed = await self._try(visit, found, every, taken, tell)
         if found.problem and (not old or found.outcome is CalibrationOutcome.NOT_VERIFIED):
             # No earlier sighting supports these, or a later photograph contradicts them: drop them.
             text = f"unchanged: {found.problem}"
