@@ -19,7 +19,7 @@ from heliotrope.console.auth import (
     signed_in,
 )
 from heliotrope.console.people import ROLES
-from heliotrope.console.sign_in import confirm, log_in
+from heliotrope.console.sign_in import confirm, log_in, set_cookie
 from heliotrope.plant.authority import Role
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.people import Account
@@ -64,15 +64,7 @@ async def sign_in(
     account, secret, expires = await log_in(
         console, given.name, given.password, given.code, request
     )
-    response.set_cookie(
-        COOKIE,
-        secret,
-        max_age=int(console.settings.session_s),
-        path="/",
-        httponly=True,
-        samesite="strict",
-        secure=console.settings.tls or console.settings.plain,
-    )
+    set_cookie(console, response, secret)
     return _who(signed_in(console, account, secret, expires))
 
 
@@ -112,8 +104,7 @@ async def reset_password(
     await confirm(console, who, request, given.own_password)
     if name == who.person.name:
         raise HTTPException(409, f"{name}: change your own password with PUT session/password")
-    if await console.ask(lambda: console.people.account(name)) is None:
-        raise HTTPException(404, f"there is no account {name}")
+    await _find(console, name, password=True)
     password = _secrets.new_password()
     await _set_password(console, name, password, due=True)
     await console.note(SecurityEvent.PASSWORD_RESET, request, who.person.name, name)
@@ -152,8 +143,7 @@ async def change_account(
         raise HTTPException(409, f"{name}: change your own password with PUT session/password")
     if name == who.person.name and (given.disabled or given.role not in (None, "engineer")):
         raise HTTPException(409, f"{name}: you cannot change your own role; ask another engineer")
-    if await console.ask(lambda: console.people.account(name)) is None:
-        raise HTTPException(404, f"there is no account {name}")
+    await _find(console, name, password=given.password is not None)
     kept = await _hashed(console, given.password) if given.password is not None else None
     made = await console.ask(
         lambda: console.people.change(
@@ -212,6 +202,15 @@ async def revoke(
     console.known.clear()
     what = f"{token.label} of {token.name}"
     await console.note(SecurityEvent.TOKEN_REVOKED, request, who.person.name, what)
+
+
+async def _find(console: Console, name: str, *, password: bool) -> None:
+    """Check that there is an account, and that it may have a password if that is to be changed."""
+    found = await console.ask(lambda: console.people.account(name))
+    if found is None:
+        raise HTTPException(404, f"there is no account {name}")
+    if password and found.by_proxy:
+        raise HTTPException(409, f"{name} signs in by the proxy, and has no password here")
 
 
 async def _hashed(console: Console, password: str) -> str:

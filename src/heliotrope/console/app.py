@@ -11,14 +11,15 @@ from collections.abc import AsyncIterator, Callable
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, Response
+from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.staticfiles import StaticFiles
 
 from heliotrope import __version__
 from heliotrope.console import accounts, api, commands, factor
 from heliotrope.console._attempts import Attempts
 from heliotrope.console._files import KEPT, PLAIN, STATIC, Files
-from heliotrope.console.auth import FOUND, Caller, Console
+from heliotrope.console.auth import FOUND, Caller, Console, introduced
+from heliotrope.console.by_proxy import ByProxy
 from heliotrope.console.edge import Edge
 from heliotrope.console.emergencies import EmergencyOrders
 from heliotrope.console.guard import Guard
@@ -26,6 +27,7 @@ from heliotrope.console.live import Stream
 from heliotrope.console.remote import RemotePeople, RemotePlant
 from heliotrope.console.routes import Routes
 from heliotrope.console.settings import ConsoleSettings
+from heliotrope.console.sign_in import enter, set_cookie
 from heliotrope.errors import HeliotropeError, UnknownNameError
 from heliotrope.local import AwayError
 from heliotrope.plant.audit import AuditError
@@ -58,6 +60,8 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
     people, stream = RemotePeople(plant), Stream(plant, chosen.period)
     attempts = Attempts(time.monotonic, chosen.proxies)
     console = Console(plant, people, chosen, stream, attempts, EmergencyOrders())
+    if chosen.people_by_proxy is not None:
+        console.by_proxy = ByProxy.read(chosen.people_by_proxy)
 
     @contextlib.asynccontextmanager
     async def alive(app: FastAPI) -> AsyncIterator[None]:
@@ -142,7 +146,12 @@ def _pages(app: FastAPI) -> None:
         app.mount(place, StaticFiles(directory=STATIC), name=place)
 
     @app.get("/login", include_in_schema=False)
-    async def login() -> Response:
+    async def login(request: Request) -> Response:
+        console: Console = request.scope["heliotrope"]
+        if (found := introduced(console, request)) is not None:
+            answer = RedirectResponse("/", 303)
+            set_cookie(console, answer, await enter(console, found, request))
+            return answer
         return FileResponse(STATIC / "login.html", media_type="text/html; charset=utf-8")
 
     plain = {

@@ -21,6 +21,7 @@ from starlette.requests import HTTPConnection
 
 from heliotrope.console import _secrets
 from heliotrope.console._attempts import Attempts
+from heliotrope.console.by_proxy import ByProxy, Introduced
 from heliotrope.console.emergencies import EmergencyOrders
 from heliotrope.console.live import Stream
 from heliotrope.console.people import ROLES, person_of
@@ -76,6 +77,9 @@ class Console:
     emergencies: EmergencyOrders
     #: Concurrent password checks: each takes 50 ms of a core and 64 MiB.
     hashing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
+
+    #: How a trusted proxy names people; None: it does not.
+    by_proxy: ByProxy | None = None
 
     #: Port of the way for EMERGENCY alone; 0: none.
     emergency_port: int = 0
@@ -156,6 +160,8 @@ class Caller:
         What the person must do before anything else, see `DUES`; "" for nothing.
     factor
         Whether the account has a second factor.
+    by_proxy
+        Whether a trusted proxy has signed that person in.
     """
 
     person: Person
@@ -164,6 +170,7 @@ class Caller:
     expires: float | None
     owes: str = ""
     factor: bool = False
+    by_proxy: bool = False
 
     @property
     def csrf(self) -> str:
@@ -220,7 +227,27 @@ async def find_caller(console: Console, connection: HTTPConnection) -> Caller | 
         if known is None:
             return None
     who = known[1]
+    if not _is_emergency(connection) and not _as_introduced(console, connection, who):
+        return None
     return who if who.expires is None or who.expires > console.now() else None
+
+
+def introduced(console: Console, connection: HTTPConnection) -> Introduced | None:
+    """Return the person whom a trusted proxy names; None if there is no proxy, or nobody."""
+    address = connection.client.host if connection.client else ""
+    if console.by_proxy is None or address not in console.settings.proxies:
+        return None
+    return console.by_proxy.introduced(connection.headers)
+
+
+def _as_introduced(console: Console, connection: HTTPConnection, who: Caller) -> bool:
+    """Whether a session is that of the person whom the proxy names now, with that role."""
+    if who.by != "session":
+        return True
+    found = introduced(console, connection)
+    if found is None:
+        return not who.by_proxy
+    return who.by_proxy and (found.name, found.role) == (who.person.name, who.person.role.title)
 
 
 def secret_of(connection: HTTPConnection) -> tuple[str, str] | None:
@@ -261,9 +288,10 @@ async def _look_up(console: Console, by: str, secret: str) -> tuple[float, Calle
 def signed_in(console: Console, found: Account | Session, secret: str, expires: float) -> Caller:
     """Return the caller of a session."""
     person, least = person_of(found.name, found.role), console.settings.second_factor
-    needs_factor = bool(least) and person.role >= ROLES[least] and not found.factor
+    has_one = found.factor or found.by_proxy  # theirs is the proxy's business
+    needs_factor = bool(least) and person.role >= ROLES[least] and not has_one
     owes = "password" if found.password_due else "factor" if needs_factor else ""
-    return Caller(person, "session", secret, expires, owes, found.factor)
+    return Caller(person, "session", secret, expires, owes, found.factor, found.by_proxy)
 
 
 def _is_emergency(connection: HTTPConnection) -> bool:

@@ -9,6 +9,8 @@ from typing import Any
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.store.people import ROLES
 
+_FILES = ("certificate", "key", "people_by_proxy")
+
 
 @dataclass(frozen=True)
 class ConsoleSettings:
@@ -35,6 +37,8 @@ class ConsoleSettings:
         Whether other machines may connect without TLS, behind a proxy that has it.
     proxies
         Addresses of trusted proxies: ``X-Forwarded-For`` names the caller of their requests.
+    people_by_proxy
+        File that says how a trusted proxy names people, see `by_proxy`; None: it does not.
     second_factor
         Least role that needs a second factor; "" for none.
     emergency_port
@@ -58,6 +62,7 @@ class ConsoleSettings:
     page: bool = True
     plain: bool = False
     proxies: tuple[str, ...] = ()
+    people_by_proxy: Path | None = None
     second_factor: str = ""
     emergency_port: int | None = None
 
@@ -72,6 +77,10 @@ class ConsoleSettings:
                 raise InputError(f"console: {name} of {getattr(self, name)} s must be above 0")
         if self.second_factor not in ("", *ROLES):
             raise UnknownNameError("role", self.second_factor, ROLES)
+        if self.people_by_proxy is not None and not self.proxies:
+            raise InputError(
+                "console: --people-by-proxy believes the addresses of --proxy only; give them"
+            )
         for proxy in self.proxies:
             _check_address(proxy)
         if not self.local and not self.tls and not self.plain:
@@ -84,14 +93,14 @@ class ConsoleSettings:
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> "ConsoleSettings":
         """Return the settings of `given`."""
-        files = {name: Path(given[name]) for name in ("certificate", "key") if given[name]}
+        files = {name: Path(given[name]) for name in _FILES if given[name]}
         tuples = {name: tuple(given[name]) for name in ("names", "proxies")}
         return cls(**{**given, **tuples, **files})
 
     @property
     def given(self) -> dict[str, Any]:
         """The settings as JSON values, for the console's process."""
-        files = {name: str(getattr(self, name) or "") or None for name in ("certificate", "key")}
+        files = {name: str(getattr(self, name) or "") or None for name in _FILES}
         lists = {"names": list(self.names), "proxies": list(self.proxies)}
         return {**asdict(self), **lists, **files}
 

@@ -5,12 +5,14 @@ import math
 
 from fastapi import HTTPException
 from starlette.requests import HTTPConnection
+from starlette.responses import Response
 
 from heliotrope.console import _secrets
-from heliotrope.console.auth import Caller, Console, address_of
+from heliotrope.console.auth import COOKIE, Caller, Console, address_of
+from heliotrope.console.by_proxy import Introduced, check_account
 from heliotrope.console.edge import network_of
 from heliotrope.plant.operations.security import SecurityEvent
-from heliotrope.store.people import Account
+from heliotrope.store.people import BY_PROXY, Account
 
 _WRONG_CODE = "the code is wrong or was used already; wait for the next one"
 
@@ -40,6 +42,46 @@ async def log_in(
     )
     await console.note(SecurityEvent.SIGNED_IN, connection, name)
     return account, secret, now + lifetime
+
+
+async def enter(console: Console, found: Introduced, connection: HTTPConnection) -> str:
+    """Return the secret of a new session of somebody whom a trusted proxy has signed in.
+
+    Raises
+    ------
+    HTTPException
+        403 if they may not enter.
+    HeliotropeError
+        If the account cannot be made or changed.
+    """
+    name, role, people, now = found.name, found.role, console.people, console.now()
+    account = await console.ask(lambda: people.account(name))
+    check_account(found, account)
+    if account is None:
+        await console.ask(lambda: people.add(name, BY_PROXY, role, now))
+        detail = f"{name}, {role}, as the proxy says"
+        await console.note(SecurityEvent.ACCOUNT_MADE, connection, name, detail)
+    elif account.role != role:
+        await console.ask(lambda: people.change(name, now, role=role))
+        detail = f"{name}, role {role}, as the proxy says"
+        await console.note(SecurityEvent.ACCOUNT_CHANGED, connection, name, detail)
+    lifetime, address = console.settings.session_s, address_of(console, connection)
+    secret = await console.ask(lambda: people.open_session(name, now, lifetime, address))
+    await console.note(SecurityEvent.SIGNED_IN, connection, name, "by the proxy")
+    return secret
+
+
+def set_cookie(console: Console, response: Response, secret: str) -> None:
+    """Give a browser its session."""
+    response.set_cookie(
+        COOKIE,
+        secret,
+        max_age=int(console.settings.session_s),
+        path="/",
+        httponly=True,
+        samesite="strict",
+        secure=console.settings.tls or console.settings.plain,
+    )
 
 
 async def _known(console: Console, name: str) -> str:
@@ -117,6 +159,12 @@ async def confirm(
     """
     if who.by != "session":
         raise HTTPException(403, "a token cannot change accounts or tokens; sign in to do so")
+    if who.by_proxy:
+        raise HTTPException(
+            403,
+            f"{who.person.name} has no password here, which this needs once more; ask an engineer "
+            "whose account has one",
+        )
     try:
         wrong = SecurityEvent.CONFIRMATION_FAILED
         await checked(console, who.person.name, password, request, wrong, code)

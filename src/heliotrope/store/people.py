@@ -25,9 +25,12 @@ from heliotrope.store.writer import Writer
 
 _ACCOUNT, _SESSION, _TOKEN = tables.account, tables.session, tables.api_token
 _DUE, _FACTOR = tables.password_due, tables.second_factor
+#: In the place of a password's hash: a trusted proxy signs that person in.
+BY_PROXY = "by the proxy"
 _STATE = (
     _DUE.c.name.is_not(None).label("password_due"),
     _FACTOR.c.name.is_not(None).label("factor"),
+    (_ACCOUNT.c.password_hash == BY_PROXY).label("by_proxy"),
 )
 ROLES = ("viewer", "operator", "engineer")
 
@@ -52,6 +55,8 @@ class Account:
         Whether the password must be changed at its next use: somebody else has given it.
     factor
         Whether it has a second factor.
+    by_proxy
+        Whether it has no password, and a trusted proxy signs that person in.
     """
 
     name: str
@@ -62,6 +67,7 @@ class Account:
     changed: float
     password_due: bool = False
     factor: bool = False
+    by_proxy: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,6 +85,7 @@ class Session:
     note: str = ""
     password_due: bool = False
     factor: bool = False
+    by_proxy: bool = False
 
 
 @dataclass(frozen=True)

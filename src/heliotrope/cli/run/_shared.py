@@ -50,6 +50,7 @@ class Shown:
     key: Path | None = None
     plain: bool = False
     proxies: tuple[str, ...] = ()
+    people_by_proxy: Path | None = None
     second_factor: str = ""
     emergency_port: int | None = None
     console: bool = True
@@ -95,6 +96,7 @@ class Shown:
             key=self.key,
             plain=self.plain,
             proxies=self.proxies,
+            people_by_proxy=self.people_by_proxy,
             second_factor=self.second_factor,
             emergency_port=self.emergency_port,
         )
@@ -122,6 +124,10 @@ def check_console(shown: Shown) -> None:
     for module in _OF_CONSOLE:
         if importlib.util.find_spec(module) is None:
             raise _missing(ImportError(name=module))
+    if shown.people_by_proxy is not None:
+        from heliotrope.console.by_proxy import ByProxy
+
+        ByProxy.read(shown.people_by_proxy)
     # The plant makes the first account; loading this takes longer than a lease lasts.
     import heliotrope.console.people  # noqa: F401 - only loaded
 

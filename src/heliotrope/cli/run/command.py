@@ -143,6 +143,13 @@ def run(
             rich_help_panel=_CONSOLE,
         ),
     ] = None,
+    people_by_proxy: Annotated[
+        Path | None,
+        typer.Option(
+            help="File that says how --proxy names people whom it has signed in.",
+            rich_help_panel=_CONSOLE,
+        ),
+    ] = None,
     second_factor: Annotated[
         str,
         typer.Option(
@@ -231,6 +238,7 @@ def run(
         key=key,
         plain=plain,
         proxies=tuple(proxy or ()),
+        people_by_proxy=people_by_proxy,
         second_factor=second_factor,
         emergency_port=emergency_port,
         console=not no_console,

@@ -1,0 +1,167 @@
+"""People whom a trusted proxy signs in: who is believed, with which role, and who is not."""
+
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from heliotrope.console.by_proxy import ByProxy
+from heliotrope.console.settings import ConsoleSettings
+from heliotrope.errors import FormatError, InputError
+from support.live_console import LiveConsole
+
+DEPLOY = Path(__file__).parents[2] / "docs" / "how-to" / "deploy.md"
+WORD = "0123456789abcdef" * 4
+PAGE = DEPLOY.read_text("utf-8")
+FILE = re.findall(r'```toml\n(format = "heliotrope-proxy".*?)```', PAGE, re.S)[0]
+HEADERS = {"X-Heliotrope-Person": "ada", "X-Heliotrope-Groups": "staff, solar-operators",
+           "X-Heliotrope-Secret": WORD}  # fmt: skip
+
+
+def written(folder: Path, text: str = FILE, word: str = WORD, mode: int = 0o600) -> Path:
+    secret, file = folder / "proxy.secret", folder / "people.toml"
+    secret.write_text(word + "\n")
+    secret.chmod(mode)
+    file.write_text(text)
+    return file
+
+
+@pytest.fixture
+def behind(console: LiveConsole, tmp_path: Path) -> Iterator[httpx.Client]:
+    """Requests as they come through the proxy, for somebody whom it has signed in."""
+    here = console.server.app.state.console
+    before = here.settings
+    file = written(tmp_path)
+    settings = ConsoleSettings(
+        port=0, page=False, proxies=("127.0.0.1",), people_by_proxy=file, second_factor="viewer"
+    )
+
+    def put(chosen: ConsoleSettings, by_proxy: ByProxy | None) -> None:
+        here.settings, here.by_proxy = chosen, by_proxy
+        here.known.clear()
+
+    console.call(lambda: put(settings, ByProxy.read(file)))
+    with httpx.Client(base_url=console.address, trust_env=False, headers=HEADERS) as client:
+        yield client
+    console.call(lambda: put(before, None))
+    for account in console.keeper.people.accounts():
+        if account.by_proxy:
+            console.keeper.people.remove(account.name)
+    console.calm()
+
+
+def test_the_person_enters_with_the_role_of_the_groups(
+    console: LiveConsole, behind: httpx.Client
+) -> None:
+    answer = behind.get("login")
+    assert (answer.status_code, answer.headers["location"]) == (303, "/")
+    who = behind.get("api/v1/session").json()
+    assert (who["name"], who["role"], who["owes"]) == ("ada", "operator", "")
+    account = console.keeper.people.account("ada")
+    assert account is not None
+    assert account.by_proxy
+    # Nobody signs in to it with a password, and it changes no accounts.
+    guess = behind.post("api/v1/session", json={"name": "ada", "password": account.password_hash})
+    assert guess.status_code == 401
+    csrf = {"X-CSRF-Token": who["csrf"]}
+    token = {"label": "x", "role": "viewer", "own_password": "anything"}
+    refused = behind.post("api/v1/tokens", json=token, headers=csrf)
+    assert refused.status_code == 403
+    assert "no password here" in refused.json()["detail"]
+
+
+def test_a_session_ends_when_the_proxy_says_another_thing(behind: httpx.Client) -> None:
+    behind.get("login")
+    csrf = {"X-CSRF-Token": behind.get("api/v1/session").json()["csrf"]}
+    for other in (
+        {"X-Heliotrope-Person": "grace"},
+        {"X-Heliotrope-Groups": "solar-guests"},
+        {"X-Heliotrope-Groups": "staff"},
+        {"X-Heliotrope-Secret": "0" * 64},
+        {"X-Heliotrope-Person": ""},
+    ):
+        assert behind.get("api/v1/session", headers=other).status_code == 401, other
+        order = behind.post("api/v1/emergency", json={"reason": "x"}, headers={**csrf, **other})
+        assert order.status_code == 200, other  # a safe order never waits for the proxy
+    behind.get("login", headers={"X-Heliotrope-Groups": "solar-engineers"})
+    engineer = {"X-Heliotrope-Groups": "solar-engineers"}
+    assert behind.get("api/v1/session", headers=engineer).json()["role"] == "engineer"
+
+
+@pytest.mark.parametrize(
+    ("headers", "text"),
+    [
+        ({"X-Heliotrope-Person": "engineer"}, "has a password here"),
+        ({"X-Heliotrope-Groups": "staff"}, "none of your groups has a role"),
+    ],
+)
+def test_who_stays_out(behind: httpx.Client, headers: dict[str, str], text: str) -> None:
+    answer = behind.get("login", headers=headers)
+    assert answer.status_code == 403
+    assert text in answer.json()["detail"]
+    assert "set-cookie" not in answer.headers
+
+
+def test_without_the_secret_it_is_a_stranger(behind: httpx.Client) -> None:
+    for secret in ("", WORD[:-1], "0" * 64):
+        answer = behind.get("login", headers={"X-Heliotrope-Secret": secret})
+        assert answer.status_code == 200  # the page to sign in
+        assert "set-cookie" not in answer.headers
+
+
+def test_other_addresses_are_not_believed(console: LiveConsole, behind: httpx.Client) -> None:
+    here = console.server.app.state.console
+    settings = here.settings
+    others = ConsoleSettings(port=0, page=False, proxies=("192.0.2.1",))
+    console.call(lambda: setattr(here, "settings", others))
+    assert "set-cookie" not in behind.get("login").headers
+    console.call(lambda: setattr(here, "settings", settings))
+    assert "set-cookie" in behind.get("login").headers
+
+
+def test_a_disabled_account_stays_out(console: LiveConsole, behind: httpx.Client) -> None:
+    behind.get("login")
+    console.keeper.people.change("ada", 1.0, disabled=True)
+    assert "is disabled" in behind.get("login").json()["detail"]
+
+
+def test_the_example_of_nginx_sets_each_header(tmp_path: Path) -> None:
+    found = ByProxy.read(written(tmp_path))
+    (block,) = re.findall(r"```text\n(server \{.*?)```", PAGE, re.S)
+    (plant,) = re.findall(r"location / \{(.*?)\n    \}", block, re.S)
+    given: dict[str, str] = dict(re.findall(r"proxy_set_header (\S+) (\S+);", plant))
+    assert given[found.person] == "$person"
+    assert given[found.groups] == "$groups"
+    assert given[found.secret] == "SECRET"
+    assert given["X-Forwarded-For"] == "$proxy_add_x_forwarded_for"
+    for variable in ("$person", "$groups"):
+        assert f"auth_request_set {variable} $upstream_http_x_auth_request_" in plant
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"text": FILE.replace("heliotrope-proxy", "other")}, "format is 'other'"),
+        ({"text": FILE.replace('"viewer"', '"boss"')}, "roles.solar-guests"),
+        ({"text": FILE.replace("X-Heliotrope-Person", "X Person")}, "person"),
+        ({"text": FILE.replace("groups =", "group =")}, "'groups' is missing"),
+        ({"word": "short"}, "at least 32 letters"),
+        ({"mode": 0o644}, "others may read it"),
+    ],
+)
+def test_files_that_are_refused(tmp_path: Path, change: dict[str, Any], text: str) -> None:
+    with pytest.raises(FormatError, match=text):
+        ByProxy.read(written(tmp_path, **change))
+
+
+def test_it_needs_the_address_of_the_proxy(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    assert tomllib.loads(FILE)["version"] == 1
+    with pytest.raises(InputError, match="addresses of --proxy only"):
+        ConsoleSettings(people_by_proxy=file)
+    given = ConsoleSettings(people_by_proxy=file, proxies=("::1",))
+    assert ConsoleSettings.of(given.given) == given
