@@ -11,9 +11,10 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from heliotrope.console import bodies, buckets, routes
+from heliotrope.console import bodies, routes
 from heliotrope.console.edge import network_of
 from heliotrope.errors import InputError
+from heliotrope.local import Buckets
 from support.live_console import PASSWORD, LiveConsole
 
 Ask = Callable[..., httpx.Response]
@@ -166,7 +167,7 @@ def test_strangers_are_counted_and_known_callers_are_not(
     console: LiveConsole, ask: Ask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Requests of a stranger end at a limit; those of people at the same address do not."""
-    slow = buckets.Buckets(0.5, 10.0, time.monotonic)
+    slow = Buckets(0.5, 10.0, time.monotonic)
     monkeypatch.setattr(console.server.app.state.edge, "_stranger", slow)
     assert ask("viewer", "GET", "summary").status_code == 200
     with httpx.Client(trust_env=False) as client:
@@ -182,7 +183,7 @@ def test_strangers_are_counted_and_known_callers_are_not(
 
 def test_a_bucket() -> None:
     times = [0.0]
-    bucket = buckets.Buckets(2.0, 3.0, lambda: times[-1], largest=2)
+    bucket = Buckets(2.0, 3.0, lambda: times[-1], largest=2)
     assert [bucket.take("a") for _ in range(4)] == [0.0, 0.0, 0.0, 0.5]
     assert bucket.take("b") == 0.0
     times.append(0.5)

@@ -11,7 +11,7 @@ from fastapi import HTTPException
 from starlette.requests import HTTPConnection
 
 from heliotrope.console.auth import Caller, Console, address_of, find_caller, secret_of
-from heliotrope.console.buckets import Buckets
+from heliotrope.local import Buckets
 
 #: Requests of strangers: from one address, and from all; 1/s, and at once.
 STRANGER, STRANGERS = (50.0, 200.0), (300.0, 600.0)

@@ -7,6 +7,7 @@ may make them. It needs the standard library only, so a command in an emergency 
 Begin with `frames`.
 """
 
+from heliotrope.local.buckets import Buckets
 from heliotrope.local.client import AwayError, CallError, LocalConnection, ask_once
 from heliotrope.local.frames import INTERNAL, Frame, FrameError, pack
 from heliotrope.local.server import LocalLimits, LocalServer
@@ -17,6 +18,7 @@ __all__ = [
     "INTERNAL",
     "ORDINARY",
     "AwayError",
+    "Buckets",
     "CallError",
     "Frame",
     "FrameError",
