@@ -32,6 +32,7 @@ from heliotrope.errors import HeliotropeError, UnknownNameError
 from heliotrope.local import AwayError
 from heliotrope.plant.audit import AuditError
 from heliotrope.plant.authority import RefusedError, Role
+from heliotrope.plant.interface import BusyError
 from heliotrope.store.records import StoreError
 
 ABOUT = (
@@ -88,6 +89,7 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
         app.include_router(router)
     for kind, status in (
         (HeliotropeError, 422),
+        (BusyError, 429),
         (UnknownNameError, 404),
         (RefusedError, 409),
         (AuditError, 503),
@@ -110,7 +112,8 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
 def _problem(status: int) -> Callable[[Request, Exception], Response]:
     def answer(request: Request, error: Exception) -> Response:
         del request
-        return JSONResponse({"detail": str(error)}, status)
+        headers = {"Retry-After": "1"} if status == 429 else None
+        return JSONResponse({"detail": str(error)}, status, headers)
 
     return answer
 

@@ -6,6 +6,7 @@ own; only the call itself runs in the plant's loop. `calls` is the table of the 
 `ConsoleProcess` runs the console beside the plant and starts it again.
 """
 
+from heliotrope.plant.interface.admission import BusyError
 from heliotrope.plant.interface.calls import CALLS, Call
 from heliotrope.plant.interface.console_process import ConsoleProcess
 from heliotrope.plant.interface.encoding import frame_of, frame_parts, plain
@@ -14,6 +15,7 @@ from heliotrope.plant.interface.service import PlantInterface
 
 __all__ = [
     "CALLS",
+    "BusyError",
     "Call",
     "ConsoleProcess",
     "PlantInterface",

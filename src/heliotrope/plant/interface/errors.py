@@ -3,11 +3,13 @@
 from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.local import CallError
 from heliotrope.plant.audit import AuditError
+from heliotrope.plant.interface.admission import BusyError
 from heliotrope.plant.refusals import RefusedError
 from heliotrope.store.records import StoreError
 
 #: By kind; a class comes before those that it derives from.
 _CLASSES: dict[str, type[HeliotropeError]] = {
+    "busy": BusyError,
     "unknown": UnknownNameError,
     "input": InputError,
     "refused": RefusedError,

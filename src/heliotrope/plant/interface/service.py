@@ -28,6 +28,7 @@ from heliotrope.local import EMERGENCY, ORDINARY, Frame, LocalLimits, LocalServe
 from heliotrope.local.sockets import make_folder
 from heliotrope.plant import refusals
 from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.interface.admission import Admission
 from heliotrope.plant.interface.calls import CALLS, Call, WithBlob
 from heliotrope.plant.interface.desk import Desk
 from heliotrope.plant.interface.encoding import plain
@@ -83,6 +84,8 @@ class PlantInterface:
         Folder of the sockets.
     key
         Proves a console; made at each start.
+    admission
+        How many ordinary orders are admitted.
     heard
         When a console last gave a sign of life, monotonic time of the machine, s.
     address
@@ -96,6 +99,7 @@ class PlantInterface:
         self.heard, self.address = -math.inf, ""
         self._known: dict[str, tuple[float, Person]] = {}
         self._noted = -math.inf
+        self.admission = Admission()
         #: Threads that wait for the store; those that hang take no place from others.
         self._threads = ThreadPoolExecutor(4, "plant people")
         self._plant: asyncio.AbstractEventLoop | None = None
@@ -218,6 +222,7 @@ class PlantInterface:
             raise refusals.ROLE_TOO_LOW.error(
                 what=name, person=person.name, role=person.role.title, needed=call.role.title
             )
+        self.admission.admit(name, person)
         value = await turns.do(call, self._desk, person, arguments, frame.blob)
         if call.then is not None:
             value = await self._wait_in_plant(call.then(self._desk, person, value))
