@@ -279,6 +279,31 @@ def bare(name: str, heliostats: list[int], lens: LedCamera) -> FlightData:
     return FlightData(name, (), lens, stand, rows, np.zeros((count, 2)), shapes, seen=(seen,))
 
 
+@pytest.mark.parametrize(
+    ("lines", "text"),
+    [
+        (("", ":"), "its photographs show no reflection of the lamp"),
+        (("a.jpg: blur: 3 px", "none of its 1 photographs can be used"), "a.jpg: blur: 3 px"),
+        (
+            ("a.jpg: outline: none", "b.jpg: blur: 3 px", "c.jpg: blur: 4 px"),
+            "b.jpg: blur: 3 px (and 1 more for the same reason)",
+        ),
+    ],
+)
+def test_the_cause_of_a_failed_flight_is_named(lines: tuple[str, ...], text: str) -> None:
+    assert campaign._cause(lines) == text
+
+
+def test_no_flight_gives_a_reflection(monkeypatch) -> None:
+    def fails(*_: object) -> None:
+        raise InputError("no mirror was found")
+
+    monkeypatch.setattr(campaign, "_together", fails)
+    flights = [bare("", [0], camera()), bare("b", [1], camera())]
+    with pytest.raises(InputError, match="no flight of 2 gives a reflection; the first: no mirror"):
+        campaign.evaluate_campaign(flights)
+
+
 def test_flights_that_share_heliostats_go_together(monkeypatch) -> None:
     lens, other = camera(), camera(900, 700)
     poses = [

@@ -5,6 +5,7 @@ position the images hardly tell the two apart (`heliotrope.airborne.evaluate.bun
 flights that share heliostats go through one adjustment, in groups that fit into memory.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -108,13 +109,24 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
             else:
                 problems[k] = (*problems[k], "no reflection on any mirror in its photographs")
     if all(one is None for one in found):
-        first = next(
-            (f"{f.name}: {line[-1]}" for f, line in zip(flights, problems, strict=True) if line),
-            "there is no flight",
-        )
+        if not flights:
+            raise InputError("there is no flight to evaluate")
+        first = f"{flights[0].name}: {_cause(problems[0])}".removeprefix(": ")
         raise InputError(f"no flight of {len(flights)} gives a reflection; the first: {first}")
     offset, covariance = common_offset(done, (priors or Priors()).offset)
     return Campaign(tuple(found), tuple(problems), offset, covariance, len(done))
+
+
+def _cause(lines: Sequence[str]) -> str:
+    """Return why a flight failed: the reason of most of its lines, with an example."""
+    given = [line for line in lines if line.strip(" :")]
+    if not given:
+        return "its photographs show no reflection of the lamp"
+    # A line of a photograph is "name: kind: reason".
+    kinds = Counter(line.partition(": ")[2].partition(":")[0] or line for line in given)
+    kind, count = kinds.most_common(1)[0]
+    line = next(one for one in given if kind in one)
+    return line if count == 1 else f"{line} (and {count - 1} more for the same reason)"
 
 
 def flight_groups(flights: Sequence[FlightData], usable: Sequence[int]) -> list[list[int]]:

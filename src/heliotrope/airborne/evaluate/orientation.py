@@ -45,9 +45,9 @@ FEWEST = 5
 _OFF_CENTRE = 0.25
 # A facet is canted off if its mean differs this many standard errors, and this much (rad).
 _CANTED_SIGMA, _CANTED = 4.0, 0.5e-3
-# p below which the differences are reported as not normal. HelioPoint uses 0.05, which one good
-# mirror in ten would fail in one of its two components.
-_NORMAL = 1e-3
+# p below which the differences are reported as not normal: HelioPoint's threshold. One good mirror
+# in ten fails it in one of its two components.
+_NORMAL = 0.05
 
 
 @dataclass(frozen=True)
@@ -486,7 +486,10 @@ def _warnings(o: Orientation, shape: MirrorShape, xy: FloatArray) -> list[str]:
             )
     for name, p in zip(("rotX", "rotY"), o.normality, strict=True):
         if p < _NORMAL:
-            lines.append(f"the differences in {name} are not normally distributed (p = {p:.1e})")
+            lines.append(
+                f"the differences in {name} are not normally distributed (p = {p:.1e}); take its "
+                "standard deviation as an order of magnitude"
+            )
     return lines
 
 
