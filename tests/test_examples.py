@@ -1,9 +1,11 @@
 """The example scripts run and their pictures are pictures."""
 
 import importlib.util
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 from matplotlib.image import imread
 
@@ -20,12 +22,30 @@ def _load(name: str) -> ModuleType:
 
 
 def test_malan_figures(tmp_path: Path) -> None:
-    paths = _load("malan_figures").main(tmp_path)
-    assert [p.name for p in paths] == [f"figure-{n}.png" for n in ("4-6", "4-7", "4-8", "4-9")]
-    for path in paths:
-        picture = imread(path)
-        assert picture.shape[0] > 300
-        assert picture[..., :3].std() > 0.02
+    malan = _load("malan_figures")
+    written = malan.main(tmp_path)
+    assert [p.name for p in written] == [f"figure-4-{n}.png" for n in (6, 7, 8, 9)]
+    assert all(imread(path)[..., :3].std() > 0.02 for path in written)
+    for number, pairs in {"4.6": ("AB", "CD"), "4.7": ("AB", "CD"), "4.8": ("AB",)}.items():
+        found = malan.paths(number)
+        for place in malan.PLACES:
+            for one, other in pairs:
+                # Errors of opposite sign give opposite paths, to first order.
+                a, b = found[place, one], found[place, other]
+                np.testing.assert_allclose(a.right, -b.right, rtol=0, atol=0.01)
+                np.testing.assert_allclose(a.up, -b.up, rtol=0, atol=0.01)
+                assert 0.5 < a.rms < 2.0
+    # In the south a lean to the north lowers the image, and one to the east moves it right.
+    tilt = malan.paths("4.6")
+    assert (tilt["south", "A"].up < -1.0).all()
+    assert (tilt["south", "D"].right > 0.4).all()
+    # A normal raised by 1 mrad raises the beam by 2 cos(incidence) mrad at noon.
+    bias = malan.paths("4.7")["south", "A"]
+    assert bias.up.max() == pytest.approx(2.0, abs=0.05)
+    # One set of errors moves the image differently in every season, by centimetres at 40 m.
+    seasons = [p.rms for p in malan.paths("4.9").values()]
+    assert len(seasons) == 3
+    assert min(abs(a - b) for a, b in pairwise(seasons)) > 0.5
 
 
 def test_guo_figures(tmp_path: Path) -> None:
@@ -67,8 +87,17 @@ def test_malan_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_malan_sizing(capsys: pytest.CaptureFixture[str]) -> None:
+    """Malan §3.2 and §3.5, as printed."""
     found = _load("malan_sizing").main()
-    # The thesis: 5 MWe from about 10,000 heliostats of 5 m².
-    assert found["heliostats"] == pytest.approx(10_000, rel=0.05)
-    assert found["normal_rate"] == pytest.approx(36.46e-6, rel=1e-3)
-    assert "sidereal day" in capsys.readouterr().out
+    assert found["lower"] == pytest.approx(5_534, abs=0.5)
+    assert found["upper"] == pytest.approx(15_314, abs=0.5)
+    assert found["ratio"] == pytest.approx(10_098, abs=0.5)
+    assert found["area"] == 50_000
+    assert found["heliostats"] == 10_000
+    assert found["field"] == 100_000
+    assert found["interval"] == pytest.approx(13.75, abs=0.005)
+    assert found["whole_seconds"] == 13
+    assert found["bits"] == pytest.approx(1.3e6)
+    assert found["clusters"] == 313
+    assert found["sector"] == 1_536
+    assert "control interval" in capsys.readouterr().out
