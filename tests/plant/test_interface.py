@@ -236,6 +236,9 @@ def test_what_a_token_may_see_and_order(plant: LiveConsole, tokens: dict[str, st
     with pytest.raises(CallError, match="needs operator"):
         ask_once(folder / EMERGENCY, viewer, "stow", {"heliostats": [plant.live.names[0]]})
     name = plant.live.names[0]
+    plant.until(
+        lambda: [e for e in plant.live.operations.events() if "stow on this machine" in e.text]
+    )
     ticket = ask_once(folder / EMERGENCY, operator, "defocus", {"heliostats": [name]})
     assert (ticket["command"], ticket["heliostats"]) == ("DEFOCUS", 1)
     with pytest.raises(CallError, match="no call"):

@@ -10,6 +10,7 @@ from typer.testing import CliRunner, Result
 
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.cli._store import app
+from heliotrope.store.database import HEAD
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry
 
@@ -34,7 +35,7 @@ def data(tmp_path: Path, opened: Callable[..., Keeper], seen: Sightings) -> Path
 def test_info(data: Path) -> None:
     done = run("info", data, "--json")
     found = json.loads(done.stdout)
-    assert (found["rows"]["sighting"], found["revision"]) == (10, "0003")
+    assert (found["rows"]["sighting"], found["revision"]) == (10, HEAD)
     assert found["first_sighting"].startswith("2027-01-1")
     assert "sighting" in run("info", data).stdout
 
@@ -43,8 +44,8 @@ def test_backup_and_restore(data: Path, tmp_path: Path) -> None:
     done = run("backup", data, "--to", tmp_path / "b")
     assert done.exit_code == 0
     assert "made" in done.stdout
-    done = run("restore", tmp_path / "b", tmp_path / "new", "--json")
-    assert json.loads(done.stdout)["revision"] == "0003"
+    done = run("restore", tmp_path / "b", tmp_path / "new", "--unsigned", "--json")
+    assert json.loads(done.stdout)["revision"] == HEAD
     assert json.loads(run("info", tmp_path / "new", "--json").stdout)["rows"]["sighting"] == 10
     found = run("query", tmp_path / "new", "SELECT count(*) AS n FROM telemetry", "--json")
     assert json.loads(found.stdout) == [{"n": 3}]

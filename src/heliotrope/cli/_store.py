@@ -11,6 +11,8 @@ app = typer.Typer(
     help="Look at, back up, restore and export the store of a plant.", no_args_is_help=True
 )
 
+#: Ending of an audit in a file, as the library's `JsonLines` writes it.
+_LINES = ".jsonl"
 Place = Annotated[
     str, typer.Argument(help="Data folder of a plant, or postgresql://user@host/name.")
 ]
@@ -56,15 +58,20 @@ def backup(
     without_telemetry: Annotated[
         bool, typer.Option("--without-telemetry", help="Leave the telemetry out.")
     ] = False,
+    sign: Annotated[
+        Path | None, typer.Option(help="Private key that `store key` made: signs the backup.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make a backup; the plant may keep running."""
     from heliotrope.store import backup as backups
     from heliotrope.store.database import Database
+    from heliotrope.store.signing import SigningKey
 
+    key = None if sign is None else SigningKey(sign)
     with Database(place) as database:
         archive = None if without_telemetry else telemetry or _telemetry(database)
-        made = backups.backup(database, to, parse_time("now"), archive)
+        made = backups.backup(database, to, parse_time("now"), archive, key=key)
     _tell(made, "made", as_json)
 
 
@@ -73,15 +80,38 @@ def restore(
     backup: Annotated[Path, typer.Argument(help="Folder of a backup.")],
     place: Place,
     telemetry: TelemetryOption = None,
+    key: Annotated[
+        Path | None, typer.Option(help="Public key (FILE.pub) that must have signed the backup.")
+    ] = None,
+    unsigned: Annotated[
+        bool, typer.Option("--unsigned", help="Restore it whoever made it; no key is asked for.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Check a backup and restore it into an empty place."""
+    from heliotrope.errors import InputError
     from heliotrope.store import backup as backups
     from heliotrope.store.database import Database
+    from heliotrope.store.signing import PublicKey
 
+    if (key is None) != unsigned:
+        raise InputError(
+            "store restore: give --key FILE.pub, or --unsigned to restore what nobody has signed"
+        )
+    signed_by = None if key is None else PublicKey(key)
     file = Database(place).file
     archive = telemetry or (file.with_name(backups.TELEMETRY) if file is not None else None)
-    _tell(backups.restore(backup, place, archive), "restored", as_json)
+    _tell(backups.restore(backup, place, archive, signed_by=signed_by), "restored", as_json)
+
+
+@app.command()
+def key(
+    file: Annotated[Path, typer.Argument(help="File to make; the public key becomes FILE.pub.")],
+) -> None:
+    """Make the key that signs backups: the private one stays here, the public one checks."""
+    from heliotrope.store.signing import make_key
+
+    print(f"{file}: private key; {make_key(file)}: give it to those who restore")
 
 
 @app.command()
@@ -118,6 +148,11 @@ def migrate(place: Place) -> None:
 @app.command()
 def head(place: Place) -> None:
     """Print the heads of the chains of events and audit: note them on another machine."""
+    if place.endswith(_LINES):
+        from heliotrope.plant import audit
+
+        print(audit.verify(place))
+        return
     from heliotrope.store import chain
     from heliotrope.store.database import Database
 
@@ -141,11 +176,18 @@ def verify(
     """Check that no event and no record of the audit was altered or removed."""
     from heliotrope.store import chain
     from heliotrope.store.database import Database
+    from heliotrope.store.digests import Head
 
     files = [Path(text) for text in head or () if Path(text).is_file()]
     typed = [text for text in head or () if not Path(text).is_file()]
-    known = [chain.Head.read(word) for text in typed for word in text.split()]
+    known = [Head.read(word) for text in typed for word in text.split()]
     exported = [found for file in files for found in chain.read_heads(file)]
+    if place.endswith(_LINES):
+        from heliotrope.plant import audit
+
+        last = audit.verify(place, [*known, *exported])
+        print(f"{place}: every record fits; {last}")
+        return
     with Database(place) as database:
         database.require()
         with database.reading() as connection:

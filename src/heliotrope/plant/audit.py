@@ -16,14 +16,17 @@ without a result is ended at the next start.
 """
 
 import fcntl
+import hashlib
 import json
 import os
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Protocol
 
 from heliotrope.errors import FormatError, HeliotropeError, InputError
+from heliotrope.store.digests import AUDIT, GENESIS, Head, digest_of
 
 #: A disk with less free space than this (bytes) counts as full: no record may end half-way.
 LEAST_FREE = 1 << 20
@@ -108,6 +111,9 @@ class Forgetful:
 class JsonLines:
     """An audit in one file that only grows, line by line.
 
+    The lines are a hash chain: each has the digest of its content and of the line before; see
+    `verify`. Lines of earlier programs have none; the first digest covers them all.
+
     Parameters
     ----------
     path
@@ -126,7 +132,7 @@ class JsonLines:
     def __init__(self, path: str | Path, started: datetime) -> None:
         self.path = Path(path)
         try:
-            self._file = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o640)
+            self._file = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o600)
         except OSError as error:
             raise AuditError(f"audit {self.path}: {error.strerror}; give a writable file") from None
         try:
@@ -146,6 +152,8 @@ class JsonLines:
         #: not continue it.
         self.torn = torn
         self._torn = not _ends_with_newline(self._file)
+        #: Digest of the last line; None: to be read from the file.
+        self._digest: str | None = None
         for identity in sorted(self._open):
             self.finish(identity, STOPPED, started.isoformat())
 
@@ -207,6 +215,12 @@ class JsonLines:
         os.close(self._file)
 
     def _append(self, fields: dict[str, Any]) -> None:
+        if self._digest is None:
+            self._digest = _last_digest(self.path.read_bytes())
+        digest = digest_of(self._digest, [fields])
+        # It may be written although its sync fails: then the file says which one is the last.
+        self._digest = None
+        fields = {**fields, "digest": digest}
         line = json.dumps(fields, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
         data = (b"\n" if self._torn else b"") + line.encode() + b"\n"
         try:
@@ -219,6 +233,7 @@ class JsonLines:
         self._torn = written != len(data)
         if self._torn:
             raise AuditError(f"audit {self.path}: only {written} of {len(data)} bytes written")
+        self._digest = digest
 
 
 def _ends_with_newline(file: int) -> bool:
@@ -243,6 +258,7 @@ def read(path: str | Path) -> tuple[list[Record], int]:
         try:
             fields = json.loads(line)
             event, identity = fields.pop("event"), fields["identity"]
+            fields.pop("digest", None)
         except (ValueError, KeyError, AttributeError, TypeError):
             torn += 1
             continue
@@ -274,3 +290,68 @@ def _repeats(known: Record, event: str, fields: dict[str, Any]) -> bool:
         return bool(known.result == fields["result"])
     names = ("who", "what", "at")
     return all(str(getattr(known, name)) == fields.get(name) for name in names)
+
+
+# -- the chain -----------------------------------------------------------------------------
+
+
+def _fields(line: bytes) -> dict[str, Any] | None:
+    """Return the fields of a line, None if it was torn by a loss of power."""
+    try:
+        found = json.loads(line)
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _before(data: bytes) -> str:
+    """Return the digest before the first line that has one: of all lines without."""
+    older = data.rstrip(b"\n")
+    return hashlib.sha256(older).hexdigest() if older else GENESIS
+
+
+def _last_digest(data: bytes) -> str:
+    """Return the digest of the last whole line that has one, whether or not the chain fits."""
+    for line in reversed(data.split(b"\n")):
+        fields = _fields(line)
+        if fields is not None and isinstance(fields.get("digest"), str):
+            return str(fields["digest"])
+    return _before(data)
+
+
+def verify(path: str | Path, known: Iterable[Head] = ()) -> Head:
+    """Check the hash chain of an audit's file, and that known heads are in it; return its head.
+
+    Raises
+    ------
+    FormatError
+        If a line does not fit, or a head is not in the chain; the text names the first.
+    """
+    data, place = Path(path).read_bytes(), 0
+    digests: list[str] = []
+    last = GENESIS
+    for number, line in enumerate(data.split(b"\n"), 1):
+        fields = _fields(line)
+        digest = None if fields is None else fields.pop("digest", None)
+        if digest is None:
+            if digests and fields is not None:
+                raise FormatError(
+                    path, "it has no digest: it was altered or added", f"line {number}"
+                )
+        else:
+            if not digests:
+                last = _before(data[:place])
+            last = digest_of(last, [fields])
+            if last != digest:
+                who = (fields or {}).get("identity", "")
+                raise FormatError(
+                    path,
+                    f"record {who} does not fit: it was altered, or lines before it were",
+                    f"line {number}",
+                )
+            digests.append(last)
+        place += len(line) + 1
+    for head in known:
+        if head.chain != AUDIT or (head.number and digests[head.number - 1 :][:1] != [head.digest]):
+            raise FormatError(path, f"head {head} is not in it: records were removed or made anew")
+    return Head(AUDIT, len(digests), last)

@@ -1,8 +1,9 @@
 """Backup and restore: one consistent state of everything, taken while the plant runs.
 
 A backup is a folder: ``store.sqlite`` (of a store in PostgreSQL too, so each kind can be restored
-into the other), the telemetry if wanted, and ``manifest.json`` with the checksum of every file. It
-is there whole or not at all. A restore needs an empty place: nothing is ever overwritten.
+into the other), the telemetry if wanted, and ``manifest.json`` with the checksum of every file;
+``manifest.sig`` is the manifest's signature, if a key was given. It is there whole or not at all. A
+restore needs an empty place: nothing is ever overwritten.
 """
 
 import hashlib
@@ -24,10 +25,11 @@ from sqlalchemy.exc import SQLAlchemyError
 from heliotrope import __version__
 from heliotrope.errors import FormatError
 from heliotrope.store import tables
-from heliotrope.store.database import FILE, HEAD, MODE, Database, cause, make_private
+from heliotrope.store.database import FILE, HEAD, PRIVATE, Database, cause, make_private
 from heliotrope.store.records import StoreError
+from heliotrope.store.signing import PublicKey, SigningKey
 
-MANIFEST = "manifest.json"
+MANIFEST, SIGNATURE = "manifest.json", "manifest.sig"
 TELEMETRY = "telemetry"
 _ROWS = 5000
 
@@ -43,7 +45,12 @@ class Backup:
 
 
 def backup(
-    database: Database, folder: str | Path, now: datetime, telemetry: str | Path | None = None
+    database: Database,
+    folder: str | Path,
+    now: datetime,
+    telemetry: str | Path | None = None,
+    *,
+    key: SigningKey | None = None,
 ) -> Backup:
     """Make a backup.
 
@@ -57,6 +64,8 @@ def backup(
         Time for the manifest.
     telemetry
         Folder of the archive to include.
+    key
+        Signs it; None: it is not signed.
 
     Raises
     ------
@@ -86,8 +95,12 @@ def backup(
             "made": now.isoformat(),
             "files": files,
         }
-        (beside / MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+        text = json.dumps(manifest, indent=1).encode()
+        (beside / MANIFEST).write_bytes(text)
+        if key is not None:
+            (beside / SIGNATURE).write_bytes(key.sign(text))
         for path in _files(beside):
+            path.chmod(PRIVATE)
             _sync(path)
         beside.rename(final)
         _sync(final.parent)
@@ -99,22 +112,33 @@ def backup(
     return Backup(final, HEAD, now.isoformat(), size)
 
 
-def check(folder: str | Path) -> Backup:
-    """Return a backup after comparing every file with its checksum.
+def check(folder: str | Path, *, signed_by: PublicKey | None = None) -> Backup:
+    """Return a backup after comparing every file with its checksum, and with a signature.
+
+    Parameters
+    ----------
+    folder
+        Folder of the backup.
+    signed_by
+        The key that must have signed it; None: it may be unsigned.
 
     Raises
     ------
     FormatError
-        If it is not a backup, or a file is missing or altered.
+        If it is not a backup, it is not signed by that key, or a file is missing, altered or added.
     """
     place = Path(folder)
     path = place / MANIFEST
     try:
-        manifest: Any = json.loads(path.read_text(encoding="utf-8"))
-        files, revision, made = manifest["files"], manifest["revision"], manifest["made"]
-        wanted = dict(files.items())
+        data = path.read_bytes()
     except OSError as error:
         raise FormatError(path, f"{error.strerror}; give the folder of a backup") from None
+    if signed_by is not None:
+        _check_signature(place, data, signed_by)
+    try:
+        manifest: Any = json.loads(data)
+        files, revision, made = manifest["files"], manifest["revision"], manifest["made"]
+        wanted = dict(files.items())
     except (ValueError, KeyError, TypeError, AttributeError):
         raise FormatError(path, "this is not the manifest of a backup") from None
     if FILE not in wanted:
@@ -129,10 +153,31 @@ def check(folder: str | Path) -> Backup:
         if checksum(file) != sum_:
             raise FormatError(file, "its checksum differs; use another backup")
         size += file.stat().st_size
+    for file in _files(place):
+        if str(file.relative_to(place)) not in {*wanted, MANIFEST, SIGNATURE}:
+            raise FormatError(
+                file, "the manifest does not name it; remove it, or use another backup"
+            )
     return Backup(place, revision, made, size)
 
 
-def restore(folder: str | Path, place: str | Path, telemetry: str | Path | None = None) -> Backup:
+def _check_signature(place: Path, manifest: bytes, key: PublicKey) -> None:
+    path = place / SIGNATURE
+    if not path.is_file():
+        raise FormatError(path, "it is not signed; use a signed backup")
+    if not key.signed(manifest, path.read_bytes()):
+        raise FormatError(
+            path, f"its signature is not of the key {key.path}, or the manifest was altered"
+        )
+
+
+def restore(
+    folder: str | Path,
+    place: str | Path,
+    telemetry: str | Path | None = None,
+    *,
+    signed_by: PublicKey | None = None,
+) -> Backup:
     """Restore a backup into an empty place.
 
     Parameters
@@ -143,19 +188,21 @@ def restore(folder: str | Path, place: str | Path, telemetry: str | Path | None 
         As in `Database`; there must be no store yet.
     telemetry
         Destination of its telemetry, if it has any; None: left out.
+    signed_by
+        As in `check`.
 
     Raises
     ------
     FormatError
-        If the backup is damaged.
+        If the backup is damaged, or not signed by that key.
     StoreError
         If there is a store already, another process holds it, or it cannot be written.
     """
-    found = check(folder)
+    found = check(folder, signed_by=signed_by)
     database = Database(place)
     try:
         if database.file is not None:
-            database.file.parent.mkdir(parents=True, exist_ok=True)
+            make_private(database.file.parent)
         database.lock()
         if database.revision():
             raise StoreError(
@@ -169,7 +216,7 @@ def restore(folder: str | Path, place: str | Path, telemetry: str | Path | None 
             beside = database.file.with_name(f".{database.file.name}.{os.getpid()}.part")
             try:
                 shutil.copyfile(found.folder / FILE, beside)
-                beside.chmod(MODE)
+                beside.chmod(PRIVATE)
                 _sync(beside)
                 beside.rename(database.file)
                 _sync(database.file.parent)
@@ -270,7 +317,7 @@ def _copy_file(source: Path, target: Path) -> None:
         closing(sqlite3.connect(target)) as new,
     ):
         old.backup(new)
-    target.chmod(MODE)
+    target.chmod(PRIVATE)
     _close_log(target)
     with closing(sqlite3.connect(target)) as new:
         (state,) = new.execute("PRAGMA quick_check(1)").fetchone()
@@ -315,7 +362,7 @@ def _copy_telemetry(source: Path, target: Path) -> None:
         for path in sorted(source.glob("????-??-??/*.*")):
             copy = target / path.parent.name / path.name
             if path.suffix in (".parquet", ".part") and not copy.exists():
-                copy.parent.mkdir(exist_ok=True)
+                copy.parent.mkdir(mode=0o700, exist_ok=True)
                 try:
                     shutil.copyfile(path, copy)
                 except FileNotFoundError:

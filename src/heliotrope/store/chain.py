@@ -9,13 +9,10 @@ Whoever can write the database can make all digests anew, or remove the newest r
 heads (`heads`) go to another machine, and `verify` compares them.
 """
 
-import hashlib
-import json
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -26,49 +23,14 @@ from heliotrope.errors import InputError
 from heliotrope.safety import Severity
 from heliotrope.store import _rows as rows
 from heliotrope.store import tables
+from heliotrope.store.digests import AUDIT, EVENT, GENESIS, Head, digest_of
 from heliotrope.store.records import AuditEntry, StoreError
 
-#: Digest before the first record.
-GENESIS = "0" * 64
-EVENT, AUDIT = "event", "audit"
 ACCEPTED, RESULT = "accepted", "result"
 #: Row of the table ``about`` with the digest before the oldest event that is kept.
 ANCHOR = "event_anchor"
 _EVENT, _AUDIT = tables.event, tables.audit
 _LINKS = {EVENT: tables.event_link, AUDIT: tables.audit_link}
-
-
-@dataclass(frozen=True)
-class Head:
-    """Number and digest of the last link of a chain, `EVENT` or `AUDIT`."""
-
-    chain: str
-    number: int
-    digest: str
-
-    def __str__(self) -> str:
-        return f"{self.chain}:{self.number}:{self.digest}"
-
-    @classmethod
-    def read(cls, text: str) -> "Head":
-        """Return a head from its text.
-
-        Raises
-        ------
-        InputError
-            If it is none.
-        """
-        chain, _, rest = text.partition(":")
-        number, _, digest = rest.partition(":")
-        if chain not in (EVENT, AUDIT) or not number.isdigit() or len(digest) != len(GENESIS):
-            raise InputError(f"head {text!r}: give one as `heliotrope store head` prints it")
-        return cls(chain, int(number), digest)
-
-
-def digest_of(before: str, content: Sequence[Any]) -> str:
-    """Return the digest of a record, from the digest before it and its content."""
-    text = json.dumps(content, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
-    return hashlib.sha256(f"{before}\n{text}".encode(errors="surrogatepass")).hexdigest()
 
 
 def _event(row: Mapping[str, Any] | RowMapping) -> list[Any]:

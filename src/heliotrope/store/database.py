@@ -7,6 +7,7 @@ log into the file.
 
 import fcntl
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,9 +22,7 @@ from heliotrope.store.records import StoreError
 #: Revision of the tables that this program knows.
 HEAD = "0005"
 FILE = "store.sqlite"
-#: Permissions of its files.
-MODE = 0o640
-#: Mode of the folders that the store makes, and of telemetry: for its user alone.
+#: Modes of the folders and files of a plant: for its user alone.
 _PRIVATE_FOLDER, PRIVATE = 0o700, 0o600
 #: Key of PostgreSQL's advisory lock; the second number stands for the schema.
 _LOCK = 0x48454C49
@@ -135,7 +134,7 @@ class Database:
             return
         path = self.file.with_name(self.file.name + ".lock")
         try:
-            self._lock = os.open(path, os.O_RDWR | os.O_CREAT, MODE)
+            self._lock = os.open(path, os.O_RDWR | os.O_CREAT, PRIVATE)
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self.close()
@@ -228,7 +227,7 @@ class Database:
             if self.file is not None:
                 # It holds password hashes, so only its owner may read it; its log gets the same
                 # permissions.
-                os.close(os.open(self.file, os.O_RDWR | os.O_CREAT, MODE))
+                os.close(os.open(self.file, os.O_RDWR | os.O_CREAT, PRIVATE))
             with self._writer.connect() as connection:
                 config.attributes["connection"] = connection
                 with connection.begin():
@@ -313,3 +312,24 @@ def make_private(folder: Path) -> None:
     for place in reversed(missing):
         place.mkdir(mode=_PRIVATE_FOLDER, exist_ok=True)
     folder.mkdir(exist_ok=True)
+
+
+#: What a plant makes in its data folder, beside the store.
+_MADE = ("telemetry", "targets", "interface", "first-password")
+
+
+def tighten(folder: Path) -> None:
+    """Take a data folder of an earlier program, and what plants made in it, from other users.
+
+    Files that a plant did not make are left alone, and so is a folder that is shared by its nature.
+    """
+    there = folder.stat()
+    if there.st_mode & stat.S_ISVTX or there.st_uid != os.geteuid():
+        return
+    folder.chmod(_PRIVATE_FOLDER)
+    made = [*folder.glob(f"{FILE}*"), *(folder / name for name in _MADE)]
+    inside = [path for top in made if top.is_dir() for path in top.rglob("*")]
+    for path in [*made, *inside]:
+        if path.is_symlink() or not path.exists() or path.is_socket():
+            continue
+        path.chmod(_PRIVATE_FOLDER if path.is_dir() else PRIVATE)

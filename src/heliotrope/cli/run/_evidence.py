@@ -12,6 +12,7 @@ from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.syslog import Receiver, Syslog
 from heliotrope.safety import alarms
 from heliotrope.store import chain
+from heliotrope.store.digests import Head
 from heliotrope.store.keeper import Keeper
 
 #: Default time between exports of the heads, hours, and the shortest and longest.
@@ -106,7 +107,7 @@ async def export(live: PlantAssembly, keeper: Keeper, folder: Path | None) -> No
     """Write the heads of the chains to a folder, if one is given, and note them as events."""
     now, kind = live.clock.utc(), alarms.HEADS
 
-    def write() -> tuple[chain.Head, ...]:
+    def write() -> tuple[Head, ...]:
         with keeper.database.reading() as connection:
             found = chain.heads(connection)
         if folder is not None:

@@ -26,6 +26,7 @@ from heliotrope.geometry import as_float
 from heliotrope.lcu import states
 from heliotrope.plant.assembly import PlantAssembly
 from heliotrope.plant.interface import ConsoleProcess, PlantInterface
+from heliotrope.store.database import make_private, tighten
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry
 
@@ -170,16 +171,21 @@ def ending_at_signals() -> asyncio.Event:
 def store(shown: Shown) -> Iterator[tuple[Keeper, Path]]:
     """Open the store: a database, or a folder; yield it, and the folder of the plant.
 
-    Without ``--data`` the folder of the plant is deleted afterwards.
+    Without ``--data`` the folder of the plant is deleted afterwards. Whatever is made meanwhile,
+    by the console's process too, belongs to this user alone.
     """
+    mask = os.umask(0o077)
     folder = shown.data or Path(tempfile.mkdtemp(prefix="heliotrope-"))
     try:
         keeper = Keeper(shown.database or folder)
         try:
+            make_private(folder)
+            tighten(folder)
             yield keeper, folder
         finally:
             keeper.close()
     finally:
+        os.umask(mask)
         if shown.data is None:
             shutil.rmtree(folder, ignore_errors=True)
 

@@ -165,9 +165,13 @@ class PlantInterface:
             return LocalCaller(person)
         if time.monotonic() - self._noted >= _NOTED:
             self._noted = time.monotonic()
-            note, kind = self._desk.operations.security.note, SecurityEvent.TOKEN_REFUSED
-            self.in_plant(lambda: note(kind, detail="by a caller on this machine"))
+            self._note(SecurityEvent.TOKEN_REFUSED, "", "by a caller on this machine")
         return None
+
+    def _note(self, kind: SecurityEvent, who: str, detail: str) -> None:
+        """Record a security event; the log bounds their number."""
+        note = self._desk.operations.security.note
+        self.in_plant(lambda: note(kind, who, detail=detail))
 
     async def _person(self, token: str) -> Person | None:
         """Return the person of a token; one known lately also if the store cannot say."""
@@ -219,6 +223,8 @@ class PlantInterface:
         arguments = _checked(call.arguments, given)
         person = caller.person or _on_behalf(frame.head.get("for"))
         if person.role < call.role:
+            if caller.person is not None:  # a console has noted it, with the caller's address
+                self._note(SecurityEvent.ORDER_REFUSED, person.name, f"{name} on this machine")
             raise refusals.ROLE_TOO_LOW.error(
                 what=name, person=person.name, role=person.role.title, needed=call.role.title
             )

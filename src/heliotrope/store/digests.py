@@ -1,0 +1,46 @@
+"""Digests of hash chains and their heads; they need no database."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from heliotrope.errors import InputError
+
+#: Digest before the first record.
+GENESIS = "0" * 64
+EVENT, AUDIT = "event", "audit"
+
+
+@dataclass(frozen=True)
+class Head:
+    """Number and digest of the last link of a chain, `EVENT` or `AUDIT`."""
+
+    chain: str
+    number: int
+    digest: str
+
+    def __str__(self) -> str:
+        return f"{self.chain}:{self.number}:{self.digest}"
+
+    @classmethod
+    def read(cls, text: str) -> "Head":
+        """Return a head from its text.
+
+        Raises
+        ------
+        InputError
+            If it is none.
+        """
+        chain, _, rest = text.partition(":")
+        number, _, digest = rest.partition(":")
+        if chain not in (EVENT, AUDIT) or not number.isdigit() or len(digest) != len(GENESIS):
+            raise InputError(f"head {text!r}: give one as `heliotrope store head` prints it")
+        return cls(chain, int(number), digest)
+
+
+def digest_of(before: str, content: Sequence[Any]) -> str:
+    """Return the digest of a record, from the digest before it and its content."""
+    text = json.dumps(content, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
+    return hashlib.sha256(f"{before}\n{text}".encode(errors="surrogatepass")).hexdigest()
