@@ -11,11 +11,19 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism.board_items import checksums
 from heliotrope.plant.visits import CalibrationCycle, CycleResult, CycleSettings
 from heliotrope.plant.visits.photographs import Shot
+from heliotrope.plant.visits.settings import Centring
 from support.whole_plant import ENGINEER, WholePlant
 
 NAME = "H1"
 #: A light that is not the heliostat's beam, 3 m from the middle of the target.
 FALSE = np.array([2.1, 0.0, 42.1])
+
+#: A target on which a beam can be moved by more than the tolerance of its place.
+WIDE = Target(
+    "white",
+    np.array([(4.0, 0.0, 44.0), (-4.0, 0.0, 44.0), (-4.0, 0.0, 36.0), (4.0, 0.0, 36.0)]),
+    np.array([0.0, 0.0, 40.0]),
+)
 
 
 class Liar:
@@ -62,3 +70,34 @@ def test_the_same_false_light_on_a_first_visit_changes_nothing(tmp_path: Path, l
     assert result.outcome is CalibrationOutcome.NOT_VERIFIED, result.text
     assert "the old parameters are back" in result.text
     assert result.record is None
+
+
+class Still:
+    """A camera that sees one light that stands near the middle of the target, and no beam."""
+
+    def __init__(self, whole: WholePlant) -> None:
+        self._whole = whole
+
+    async def photograph(self, target: Target, heliostat: str) -> Shot:
+        shot = await self._whole.photograph(target, heliostat)
+        return Shot(np.asarray(target.point(np.array([0.5, 0.3]))), shot.at, 1e-4)
+
+
+def test_light_that_no_photograph_shows_to_move_is_not_kept(tmp_path: Path) -> None:
+    """Where the light was found, each photograph agrees with it, whatever light it is."""
+    results: list[CycleResult] = []
+
+    async def main(clock: VirtualClock) -> None:
+        whole = WholePlant(clock, tmp_path, clusters=1, target=WIDE)
+        async with whole.alive():
+            plant, token = whole.plant, whole.token
+            assert await plant.command(ENGINEER, token, "APPROACH").end(400.0)
+            settings = CycleSettings(interval=5.0)
+            cycle = CalibrationCycle(plant, Still(whole), settings, Centring(looks=1))
+            results.append(await cycle.run(ENGINEER, token, NAME, "white"))
+            assert plant.beliefs.seen(NAME) is None
+
+    run_virtual(main, 1)
+    (result,) = results
+    assert result.outcome is CalibrationOutcome.NO_PHOTOGRAPH, result.text
+    assert "the light did not move with the aim" in result.rejected[-1]

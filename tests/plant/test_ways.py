@@ -35,8 +35,10 @@ from heliotrope.plant.ways import Ways
 from heliotrope.safety import Act
 from heliotrope.sun import broadcast_values, vector
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.boards.outfit import Outfit, own_items
+from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, Outfit, outfits, own_items
 from heliotrope.twin.field.field import Field
+from heliotrope.twin.world.scene import TARGETS, scene_of
+from heliotrope.twin.world.simulation import design_of
 from support.live import LiveOptions, LivePlant
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
@@ -652,3 +654,26 @@ def test_automatic_control_raises_those_with_a_free_way_and_names_the_others() -
 
     run_virtual(main, start=NOON)
     assert not lit
+
+
+def test_the_way_to_an_aim_is_that_of_the_branch_on_which_the_mirror_stands() -> None:
+    """A mirror without known stops reaches an aim in two poses; it takes the nearer one."""
+    fits = outfits(4, 5)
+    scene = scene_of(("visits",), 5, 180.0, 4)
+    design = design_of(fits, {"C1": [each.name for each in fits]}, scene)
+    check, rows = BeamCheck(design, design.names), np.arange(4)
+    sun = vector(scene.start.timestamp(), scene.site)
+    stow = np.tile(np.array(MACHINE.stow, dtype=float), (4, 1))
+    found = check.poses(rows, np.tile(RECEIVER, (4, 1)), sun, stow)
+    here = np.asarray(found.chosen(found.counts))
+    aims = np.tile(TARGETS[0].center, (4, 1))
+    turned: list[float] = []
+
+    def motion(some: npt.NDArray[np.intp], begin: FloatArray, end: FloatArray) -> FloatArray:
+        turned.append(float(np.abs(end - begin).max()))
+        table = check.drives.table[some][:, None]
+        angles: FloatArray = Drive(table).angles(np.stack([begin, end], axis=1))
+        return angles
+
+    assert check.on_the_way(rows, here, aims, sun, motion) == {}
+    assert 0.0 < turned[0] < 20_000

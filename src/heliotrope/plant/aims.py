@@ -269,7 +269,7 @@ class BeamCheck:
             Returns the angles that the axes pass between counts; see `Ways.motion`.
         """
         found: dict[str, str] = {}
-        solved = self.poses(rows, aims, sun)
+        solved = self.poses(rows, aims, sun, counts)
         status = solved.chosen(solved.status)
         for i in np.flatnonzero(status != TrackingStatus.OK):
             found[self.names[rows[i]]] = (

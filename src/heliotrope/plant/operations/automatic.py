@@ -312,7 +312,18 @@ class AutomaticControl:
         self._raising.lose(self._losses.look(self._raising.wanted))
         if not self._why_idle():
             resting = self._losses.settling() | self.service.rows()
+            self._start_again(self._raising.stuck(self._visiting(), resting))
             await self._raising.step(self._token, self._visiting, resting)
+
+    def _start_again(self, rows: npt.NDArray[np.intp]) -> None:
+        """Send heliostats to stow that cannot go on from where they are; they are raised again."""
+        if len(rows):
+            names = tuple(self._plant.field.names[row] for row in rows)
+            self._losses.ordered(rows)
+            self._plant.stow(AUTOMATIC.name, names)
+            text = "cannot go on from where it is: it goes to stow, and is raised again"
+            for name in names:
+                self._log.event("plant", name, text)
 
     def _visiting(self) -> frozenset[str]:
         if self._calibrating is None:
@@ -322,7 +333,7 @@ class AutomaticControl:
     def _ready(self) -> npt.NDArray[np.bool_]:
         """Return which heliostats may be calibrated now, (N,)."""
         ready = self._plant.field.among(_READY, self._plant.now()) & self._raising.wanted
-        ready &= ~self.service.rows()
+        ready &= ~self.service.rows() & self._raising.able()
         ready[[self._plant.field.place(name) for name in self._visiting()]] = False
         return ready
 

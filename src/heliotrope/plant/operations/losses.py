@@ -70,11 +70,13 @@ class Losses:
         """Return which of the wanted heliostats (N,) were lost since the last look, (N,)."""
         field, now = self._plant.field, self._plant.now()
         live, up = field.live(now), field.among(_UP, now)
-        lost = live & ~up & self._up
+        # Only an order locks a heliostat: a person's, or a visit's that writes parameters.
+        held = field.among((states.LOCKED,), now)
+        lost = live & ~up & ~held & self._up
         lost |= ~self._seen & field.among(_LEAVING, now)
         lost &= wanted
-        # A heliostat that is not heard keeps what was seen of it last.
-        self._up = np.where(live, up, self._up)
+        # A heliostat that is not heard, or is locked, keeps what was seen of it last.
+        self._up = np.where(live & ~held, up, self._up)
         self._seen |= live
         self._lost_at[lost] = now
         together = int((self.settling() & wanted).sum())

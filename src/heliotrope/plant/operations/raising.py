@@ -2,11 +2,12 @@
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.plant.authority import Person
 from heliotrope.plant.beam_watch import BeamError
@@ -17,6 +18,9 @@ from heliotrope.safety import alarms
 
 #: Time before a heliostat whose beam has no clear way is tried again, s.
 _BLOCKED = 300.0
+#: Time after which a heliostat that can only go on from stow is sent there, s.
+_HALTED = 10.0
+_READY = 1 << meanings.FLAGS.index("READY")
 
 Rows = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
@@ -66,6 +70,7 @@ class Raising:
         self._by_people: Mask = np.zeros(count, dtype=np.bool_)
         self._busy_until = np.full(count, -math.inf)
         self._told_in = np.full(count, -1, dtype=np.int16)
+        self._halted_at = np.full(count, math.inf)
         self._blocked: set[str] = set()
         self._joins: list[Ticket] = []  # some of their heliostats still wait for their turn
         self._aims = plant.default_aims() if plant.design.receivers else {}
@@ -107,6 +112,30 @@ class Raising:
             room = np.minimum(room, np.linalg.norm(points - middle, axis=-1) - reach)
         # The beam is off by twice as much as the normal; that error is two-dimensional.
         return np.asarray(math.sqrt(2.0) * clearance * slant < room)
+
+    def stuck(self, visiting: Collection[str], resting: Mask) -> Rows:
+        """Return the rows of wanted heliostats that only the way from stow brings on.
+
+        A heliostat that has not come to standby by that way since it booted, or since it was at
+        stow, refuses to track; one that stores other parameters than the wanted ones may not move,
+        and they are written at stow. Those that recover by themselves are given a while.
+        """
+        plant, now = self._plant, self._plant.now()
+        field = plant.field
+        halted = self.wanted & ~resting & field.among((states.IDLE, states.DEFOCUSED), now)
+        halted &= ~self.able()
+        halted[[field.place(name) for name in visiting]] = False
+        self._halted_at = np.where(halted, np.minimum(self._halted_at, now), math.inf)
+        found = now - self._halted_at >= _HALTED
+        self._halted_at[found] = math.inf
+        return np.flatnonzero(found)
+
+    def able(self) -> Mask:
+        """Return which heliostats can track from standby, as far as they tell, (N,)."""
+        field = self._plant.field
+        found: Mask = field.rows["flags"] & _READY != 0
+        found[[field.place(name) for name in self._plant.wanted.missing]] = False
+        return found
 
     async def step(self, token: int, visiting: Callable[[], frozenset[str]], resting: Mask) -> None:
         """Give the commands that may be given now.

@@ -169,18 +169,21 @@ class Centred:
         """Take the photographs of the beam that was found; end at once if it is another's."""
         plant, settings = visit.plant, self._settings
         aim, room = light.aim, room_of(visit, self._centring)
+        stood = moved = False  # whether light was seen that did not move with the aim, and that did
         for k in range(settings.shots + _SPARE):
             tell(f"photograph {k + 1}")
             due = plant.now() + settings.interval
             shot = await photographed(self._camera, visit)
             astray = self._astray(visit.target, shot, aim, light)
             good = not astray and not shot.reasons
+            stood |= bool(astray)
+            moved |= good and bool(np.linalg.norm(aim - light.aim) > _SAME)
             if good:
                 taken.used.append((shot, await visit.counts_at(shot.at)))
             else:
                 taken.rejected.append(f"photograph {k + 1}: {astray or '; '.join(shot.reasons)}")
             if len(taken.used) >= settings.shots or (astray and not taken.used):
-                return
+                break
             # A photograph that failed off the middle may succeed in the middle.
             corner = np.array(CORNERS[k % len(CORNERS)]) * (room if good else 0.0)
             goal = np.asarray(light.aim + corner @ visit.target.axes)
@@ -188,6 +191,10 @@ class Centred:
             aim = goal
             while plant.now() < due:
                 await visit.look()
+        if stood and not moved and taken.used:
+            # Any light agrees with the place where it was found.
+            taken.used.clear()
+            taken.rejected.append("the light did not move with the aim in any photograph")
 
     def _astray(self, target: Target, shot: Shot, aim: FloatArray, light: "_Light") -> str:
         """Return why light is not the beam found first, "" if it is: a beam moves with its aim."""

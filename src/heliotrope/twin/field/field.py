@@ -232,6 +232,11 @@ class Field:
         kernels.still_rows(axes, queued, out)
         return out
 
+    def ready(self, rows: Rows) -> Bools:
+        """Whether heliostats have come to standby by the safe way, (M,)."""
+        found: Bools = self._ready[rows]
+        return found
+
     def at_stow(self, rows: Rows | None = None) -> Bools:
         """Whether each heliostat stands at stow, (N,), or (M,) for some rows."""
         count, stow = self.axes["count"], self._stow

@@ -30,8 +30,8 @@ _NAMES = {number: name for name, number in messages.NUMBER_OF.items()}
 _STATUS = np.dtype(
     [(f"f{i}", f"<{code}") for i, code in enumerate(messages.codes_of(_NUMBERS["STATUS"]))]
 )
-#: Bits of `lcu.names.FLAGS`: sun fresh, clock set, configured; at stow.
-_SUN_FRESH, _SOUND, _AT_STOW = 1 << 1, 0b1100, 1 << 5
+#: Bits of `lcu.names.FLAGS`: sun fresh; clock set, configured; ready; at stow.
+_SUN_FRESH, _SOUND, _READY, _AT_STOW = 1 << 1, 0b1100, 1 << 4, 1 << 5
 _NEVER = 0xFFFFFFFF
 #: Size of a keyed message's head, and the place of the edition in it.
 _KEY_HEAD = struct.calcsize("<" + messages.HEADS[messages.KEY][0])
@@ -200,6 +200,7 @@ class FieldBus:
             fresh = left > 0
             made["f0"] = np.maximum(state, 0)
             made["f1"] = _SOUND + _SUN_FRESH * fresh + _AT_STOW * (state == states.STOWED)
+            made["f1"] += (_READY * field.ready(self._all)).astype(np.uint32)
             made["f2"] = field.fault[self._all]
             made["f4"] = np.where(fresh, LEASE_MS - left, _NEVER)
             made["f5"], made["f6"], made["f8"] = 24_000, 25, 1

@@ -1,0 +1,79 @@
+"""Which heliostats automatic control counts as lost, and which it sends to stow to start again."""
+
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import numpy as np
+
+from heliotrope.lcu import names as meanings
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.operations import Logbook
+from heliotrope.plant.operations.losses import Losses
+from heliotrope.plant.operations.raising import Raising
+from support.plant_bench import ENGINEER, Bench, running
+
+NAME, OTHER = "P1A", "P2A"
+READY = 1 << meanings.FLAGS.index("READY")
+
+
+def play(folder: Path, scene: Callable[[Bench], Awaitable[None]]) -> None:
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, folder)
+        for cluster in bench.clusters.values():
+            cluster.set(states.IDLE)
+            cluster.rows["flags"] = READY
+        async with running(bench):
+            await bench.wait(2.0)
+            await scene(bench)
+
+    run_virtual(main)
+
+
+def test_a_mirror_that_a_visit_locks_is_not_lost(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        wanted = np.ones(len(plant.field), dtype=np.bool_)
+        losses = Losses(plant, Logbook(bench.clock), 0, None, lambda: None)
+        assert not losses.look(wanted).any()
+        for state in (states.LOCKED, states.IDLE, states.LOCKED):
+            bench.cluster_of(NAME).set(state, NAME)
+            await bench.wait(2.0)
+            assert not losses.look(wanted).any()
+            assert not losses.reason
+        bench.cluster_of(NAME).set(states.DEFOCUSED, NAME)
+        await bench.wait(2.0)
+        lost = losses.look(wanted)
+        assert np.flatnonzero(lost).tolist() == [plant.field.place(NAME)]
+        assert losses.reason
+
+    play(tmp_path, scene)
+
+
+def test_only_what_cannot_go_on_is_sent_to_stow(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, none = bench.plant, np.zeros(len(bench.plant.field), dtype=np.bool_)
+        raising = Raising(
+            plant, Logbook(bench.clock), ENGINEER, most=2, patience=60.0, clearance=0.0, wanted=True
+        )
+
+        async def stuck(visiting: tuple[str, ...] = ()) -> list[str]:
+            raising.stuck(visiting, none)
+            await bench.wait(11.0)
+            return [plant.field.names[row] for row in raising.stuck(visiting, none)]
+
+        assert await stuck() == []
+        row = bench.cluster_of(NAME).names.index(NAME)
+        bench.cluster_of(NAME).rows["flags"][row] = 0
+        await bench.wait(2.0)
+        assert await stuck((NAME,)) == []  # its visit sees to it
+        assert await stuck() == [NAME]
+        plant.wanted.missing[OTHER] = ("armature",)
+        assert sorted(await stuck()) == sorted([NAME, OTHER])
+        raising.want([NAME], wanted=False)
+        assert await stuck() == [OTHER]
+        bench.cluster_of(OTHER).set(states.STOWED, OTHER)
+        await bench.wait(2.0)
+        assert await stuck() == []
+
+    play(tmp_path, scene)
