@@ -16,6 +16,8 @@ from heliotrope.plant.identity import Identities
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.parameters import ParameterSync
 from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.visits.photographs import Centred, seen
+from heliotrope.plant.visits.verification import Verification
 from heliotrope.safety import JoinLimiter
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 
@@ -117,6 +119,25 @@ def differing_moves(patch: pytest.MonkeyPatch) -> None:
     """Boards that store other parameters than the wanted ones are moved, and are not corrected."""
     patch.setattr(ParameterSync, "differing", lambda self, heliostats: {})
     patch.setattr(ParameterSync, "_push", lambda self, *given: None)
+
+
+def unverified(patch: pytest.MonkeyPatch) -> None:
+    """New parameters are taken without the photograph that confirms them."""
+
+    async def confirmed(*_: Any) -> str:
+        return ""
+
+    patch.setattr(Verification, "problem", confirmed)
+
+
+def any_light(patch: pytest.MonkeyPatch) -> None:
+    """Light on the target counts as the heliostat's beam, whether it moves with the aim or not."""
+
+    def own(self: Any, target: Any, shot: Any, *_: Any) -> str:
+        dark = seen(target, shot) is None and not shot.reasons
+        return "no light on the target" if dark else ""
+
+    patch.setattr(Centred, "_astray", own)
 
 
 #: Invariants that may find it, name, defect, faults to draw from, pause between them, and the seed

@@ -382,6 +382,10 @@ DEFECTS = (
            ("line_drop",), 60.0, worlds=("calm", "parameters")),
     Defect((4,), "a cluster obeys two plants", _two_plants_obeyed, ("plant_twice",), 20.0,
            worlds=("twice", "calm"), first=3),
+    Defect((12,), "new parameters are not verified", plant_defects.unverified, faults=(),
+           first=9, worlds=("visits",)),
+    Defect((12, 16), "any light on a target is the heliostat's", plant_defects.any_light, faults=(),
+           first=2, worlds=("visits",)),
     *(Defect(numbers, name, defect, only, pause, first=first)
       for numbers, name, defect, only, pause, first in plant_defects.ROWS),
 )  # fmt: skip

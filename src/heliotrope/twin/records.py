@@ -145,6 +145,7 @@ class SimulatedAudit:
 
     def __init__(self, disk: RecordsDisk, started: str) -> None:
         self._disk = disk
+        self._lost = False
         for identity, record in list(disk.records.items()):
             if not record.result:
                 self.finish(identity, STOPPED, started)
@@ -159,7 +160,7 @@ class SimulatedAudit:
         InputError
             If the identity has been used before.
         """
-        self._disk.check()
+        self._check()
         if record.identity in self._disk.records:
             raise InputError(f"audit: record {record.identity} exists; identities are unique")
         self._disk.records[record.identity] = record
@@ -174,7 +175,7 @@ class SimulatedAudit:
         InputError
             If the record was not begun, or already has a result.
         """
-        self._disk.check()
+        self._check()
         known = self._disk.records.get(identity)
         if known is None or known.result:
             raise InputError(f"audit: no record {identity} waits for a result")
@@ -188,6 +189,15 @@ class SimulatedAudit:
         AuditError
             If the disk is full.
         """
+        self._check()
+
+    def lose(self) -> None:
+        """Take nothing more: the plant's program has ended, wherever it was."""
+        self._lost = True
+
+    def _check(self) -> None:
+        if self._lost:
+            raise AuditError("audit: the simulated program has ended")
         self._disk.check()
 
     def close(self) -> None:

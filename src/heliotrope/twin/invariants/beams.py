@@ -35,6 +35,10 @@ DONE_WITHIN = 5.0
 NEAR_STOW = 5000
 #: Mirrors that leave within this time leave together, s; orders this old explain it.
 TOGETHER = 10.0
+#: Longest time from sending an order to join to its execution, s: its life, and late on the bus.
+UNDER_WAY = 5.0
+#: A status waits up to a second, and may be in transit for another, s.
+TOLD_WITHIN = 2.2
 #: Half angle of the largest search of the simulated persons, rad.
 _SEARCH = 8e-3
 #: States in which a beam is sent to a point.
@@ -272,7 +276,10 @@ class BeamObserver:
                 f"{states.STATES[state]} {now - self._lost_at:.1f} s after a loss that took every "
                 "mirror off, without a person's command since"
             )
-            good = mirror.resumed_at >= self._lost_at
+            # An order that left before the plant could know of the loss cannot be called back.
+            unknowing = mirror.called_at <= self._lost_at + TOLD_WITHIN
+            late = unknowing and now - mirror.called_at <= UNDER_WAY
+            good = late or mirror.resumed_at >= self._lost_at
             self._check(14, good, now, mirror.name, saw)
 
     def _placed(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:

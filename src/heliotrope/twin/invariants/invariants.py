@@ -1,4 +1,4 @@
-"""The fifteen safety invariants, and an independent observer of the first eleven.
+"""The sixteen safety invariants, and an independent observer of the first eleven.
 
 The observer sees the frames on the bus, the actions of each board, and the messages to and from the
 plant. It keeps its own accounts in true time and trusts no report: the age of a sun counts from
@@ -71,6 +71,7 @@ TITLES = {
     13: "no state is exempt",
     14: "only a person resumes the field",
     15: "a proof counts only what is known",
+    16: "work that is possible is done, and what is shown is true",
 }
 
 #: Local lease, and how late a board may notice its end, s.

@@ -12,9 +12,10 @@ from collections.abc import Sequence
 from itertools import islice
 
 from heliotrope.lcu import states
-from heliotrope.links.messages import Command, Emergency, Message, Parameters
+from heliotrope.links.messages import Command, Emergency, Lease, Message, Parameters
 from heliotrope.plant.authority import OPERATOR_COMMANDS, Person, Role
 from heliotrope.plant.controller import JOINING, PlantController
+from heliotrope.plant.operations.automatic import AUTOMATIC
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.tickets import Ticket
 from heliotrope.twin.invariants.invariants import InvariantError, Observer, Violation
@@ -41,6 +42,8 @@ _OFF = (
     states.UNCONFIGURED,
 )
 _OWN = ("plant", "safety table")
+#: Ends of the names under which automatic control commands.
+_UNTOLD = (AUTOMATIC.name, "out of service")
 
 
 class PlantObserver:
@@ -56,6 +59,8 @@ class PlantObserver:
         Settings of the plant.
     clusters
         Observers of its clusters.
+    automatic
+        Whether automatic control works beside the persons.
 
     Attributes
     ----------
@@ -71,11 +76,13 @@ class PlantObserver:
         disk: RecordsDisk,
         settings: PlantSettings,
         clusters: Sequence[Observer],
+        *,
+        automatic: bool = False,
     ) -> None:
         self.checks: Counter[int] = Counter()
         self.old: dict[int, float] = {}
         self._start, self._disk, self._settings = start, disk, settings
-        self._clusters = clusters
+        self._clusters, self._automatic = clusters, automatic
         self._accounts = {a.name: a for each in clusters for a in each.accounts}
         self._holder: tuple[Person, int, float] | None = None
         self._accepted: Counter[tuple[str, str]] = Counter()
@@ -135,7 +142,8 @@ class PlantObserver:
             good &= person.role >= before[0].role if seized else person == before[0]
         if before is None or seized:
             good &= token != 0 and token not in self.old and (before is None or token != before[1])
-            self._noted(person.name, "AUTHORITY", now)
+            if person != AUTOMATIC:
+                self._noted(person.name, "AUTHORITY", now)
             self._end(now)
         self.check(4, good, now, saw)
         self._holder = (person, token, now)
@@ -149,6 +157,30 @@ class PlantObserver:
         """Note that it was released."""
         self._noted(person.name, "AUTHORITY", now)
         self._end(now)
+
+    def gave_way(self, now: float) -> None:
+        """Note that automatic control gives its authority to a person."""
+        if self._by_itself():
+            self._end(now)
+
+    def _by_itself(self) -> bool:
+        return self._holder is not None and self._holder[0] == AUTOMATIC
+
+    def _leased(self, token: int, now: float) -> None:
+        """Follow the authority of automatic control, which no person tells of.
+
+        It may only have what nobody holds.
+        """
+        holder = self._live(now)
+        if holder is not None and holder[1] == token:
+            if self._by_itself():
+                self.kept(now)
+        elif token == 0:
+            self.gave_way(now)
+        elif token not in self.old:
+            if self._by_itself():
+                self._end(now)
+            self.granted(AUTOMATIC, token, now, seized=False)
 
     def until(self, token: int, until: float) -> float:
         """Return when an order with a token becomes void."""
@@ -216,6 +248,8 @@ class PlantObserver:
 
     def posted(self, members: int, message: Message, now: float) -> None:
         """Judge a message before it goes to a cluster with a number of heliostats."""
+        if self._automatic and isinstance(message, Lease | Command | Parameters):
+            self._leased(message.token, now)
         if not isinstance(message, Command | Parameters | Emergency):
             return
         identity = message.identity.rpartition(".")[0]
@@ -263,6 +297,10 @@ class PlantObserver:
     def look(self, plant: PlantController | None, now: float) -> None:
         """Judge everything that must have happened by now; None: the plant does not run."""
         self.hangs(now, on=self._hangs, stands=self._stands)
+        if self._by_itself() and plant is not None:
+            grant, held = plant.authority.grant, self._holder
+            if grant is not None and held is not None and grant.token == held[1]:
+                self.kept(now)
         self._live(now)
         self._count(now)
         self._boards(now)
@@ -278,6 +316,8 @@ class PlantObserver:
         """Check that each record belongs to one command, and that no command has two."""
         records = self._disk.records
         for record in islice(records.values(), self._looked, None):
+            if self._automatic and record.who.endswith(_UNTOLD):
+                continue  # it tells nobody; `posted` wants a record of all that it sends
             if record.who in _OWN:
                 if record.identity not in self._sent:
                     self._own[record.identity] = now

@@ -78,6 +78,8 @@ class Operator:
         Whether nobody is on duty.
     waits
         Whether the plant's program is frozen, so that nobody can do anything.
+    commands
+        Whether they hold the authority; else it is left to automatic control.
     counts
         Number of actions of each kind.
     refusal
@@ -98,6 +100,7 @@ class Operator:
     ) -> None:
         self.plant: PlantController | None = None
         self.away = self.waits = False
+        self.commands = True
         self.counts: Counter[str] = Counter()
         self.refusal = ""
         self._clock, self._observer, self._flux = clock, observer, flux
@@ -126,13 +129,17 @@ class Operator:
             if plant is not None and not (self.away or self.waits):
                 if self._flux is not None:
                     plant.put(FLUX_READING, self._flux())
-                if plant.authority.grant is None:
-                    self._take(plant, self._chance.choice([OPERATOR, ENGINEER]))
-                token = self._tokens.get(self._duty.name, 0)
-                with contextlib.suppress(RefusedError):
-                    plant.authority.keep(self._duty, token)
-                    self._observer.kept(self._clock.monotonic())
+                if self.commands:
+                    self._renews(plant)
             await sleep_until(self._clock, due)
+
+    def _renews(self, plant: PlantController) -> None:
+        if plant.authority.grant is None:
+            self._take(plant, self._chance.choice([OPERATOR, ENGINEER]))
+        token = self._tokens.get(self._duty.name, 0)
+        with contextlib.suppress(RefusedError):
+            plant.authority.keep(self._duty, token)
+            self._observer.kept(self._clock.monotonic())
 
     def _take(self, plant: PlantController, person: Person) -> None:
         try:

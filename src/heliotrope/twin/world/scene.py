@@ -3,13 +3,15 @@
 import math
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
+from heliotrope.field.target import Target
 from heliotrope.sun import Site, vector
 from heliotrope.twin.boards.outfit import KEEP_OUT, KEEP_OUT_RADIUS, RECEIVER, STANDBY, Ball
+from heliotrope.twin.world.worlds import works
 
 #: The sun is at least this high at the beginning and at the end of a drawn scene, rad.
 _LOWEST = math.radians(8.0)
@@ -29,22 +31,37 @@ class Scene:
         East and north of each heliostat, m; (): `outfits` draws them.
     keep_outs
         Balls that no beam may enter; the first is the one that persons aim at.
+    targets
+        Calibration targets.
     """
 
     site: Site
     start: datetime
     places: tuple[tuple[float, float], ...] = ()
     keep_outs: tuple[Ball, ...] = ((KEEP_OUT, KEEP_OUT_RADIUS),)
+    targets: tuple[Target, ...] = ()
 
 
+def _square(name: str, middle: tuple[float, float, float], side: float) -> Target:
+    """Return a target that faces the field in the north."""
+    (east, north, up), half = middle, 0.5 * side
+    corners = [(east + a * half, north, up + b * half) for a, b in _CORNERS]
+    return Target(name, np.array(corners), np.array(middle))
+
+
+#: Corners of a square as seen from its front: left and right are those of a reader in the north.
+_CORNERS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
+#: Targets for visits, below the receiver and away from the usual keep-out volume.
+TARGETS = (_square("left", (2.0, 0.0, 33.0), 7.0), _square("right", (14.0, 0.0, 27.0), 7.0))
 #: The usual scene; its volume lies away from all natural ways.
 USUAL = Scene(Site(37.4, -6.0, 100.0, name="simulation"), datetime(2026, 6, 21, 9, tzinfo=UTC))
 
 
 def scene_of(worlds: Sequence[str], seed: int, seconds: float, heliostats: int) -> Scene:
     """Return the scene of a run: drawn in the world "place", else the usual one."""
+    targets = TARGETS if works(worlds) else ()
     if "place" not in worlds:
-        return USUAL
+        return replace(USUAL, targets=targets)
     chance = random.Random(f"place {seed}")
     site, start = _when(chance, seconds)
     places: list[tuple[float, float]] = []
@@ -55,7 +72,7 @@ def scene_of(worlds: Sequence[str], seed: int, seconds: float, heliostats: int) 
         if apart and _beside(place) > _BESIDE:
             places.append(place)
     balls = tuple(_ball(chance, places) for _ in range(chance.randint(1, 3)))
-    return Scene(site, start, tuple(places), balls)
+    return Scene(site, start, tuple(places), balls, targets)
 
 
 def _beside(place: tuple[float, float]) -> float:

@@ -7,6 +7,7 @@ ready callbacks. The same seed gives the same run, so one command replays a brok
 """
 
 import asyncio
+import contextlib
 import random
 import traceback
 from collections import Counter
@@ -40,10 +41,12 @@ from heliotrope.twin.boards.outfit import (
     mechanisms,
     outfits,
 )
+from heliotrope.twin.cameras import FieldSnapshot, mirrors_of
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.sensors import SensorObserver
+from heliotrope.twin.invariants.visits import VisitObserver
 from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.damage import Damage
@@ -52,9 +55,11 @@ from heliotrope.twin.world.instruments import READINGS, Instruments
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
 from heliotrope.twin.world.scene import Scene, scene_of
+from heliotrope.twin.world.shift import Shift
 from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
 from heliotrope.twin.world.twice import SecondPlant
-from heliotrope.twin.world.worlds import Habits, PodErrors, checked, knows_boards, stored_by
+from heliotrope.twin.world.work import Work
+from heliotrope.twin.world.worlds import Habits, PodErrors, checked, knows_boards, stored_by, works
 
 #: Longest interval between two looks at the boards, and between two judgements of everything, s.
 LOOK, JUDGE = 0.2, 0.5
@@ -82,7 +87,7 @@ def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], scene:
     homes
         Names of the heliostats of each cluster.
     scene
-        Site and keep-out volumes.
+        Site, targets and keep-out volumes.
     """
     home = {name: cluster for cluster, names in homes.items() for name in names}
     names = tuple(each.name for each in fits)
@@ -95,7 +100,14 @@ def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], scene:
     )
     balls = tuple(Sphere(f"house {i}", *ball) for i, ball in enumerate(scene.keep_outs, 1))
     groups = {"all": group}
-    return Plant("simulation", scene.site, groups, receivers=(receiver,), keep_outs=balls)
+    return Plant(
+        "simulation",
+        scene.site,
+        groups,
+        targets=scene.targets,
+        receivers=(receiver,),
+        keep_outs=balls,
+    )
 
 
 def wanted_of(fits: Sequence[Outfit]) -> Wanted:
@@ -234,6 +246,15 @@ class RunResult:
         return self.problem
 
 
+@dataclass(frozen=True)
+class Working:
+    """Automatic control of a run, the persons beside it, and the observer of its visits."""
+
+    control: Work
+    shift: Shift
+    observer: VisitObserver
+
+
 class Simulation:
     """One run; use `run`.
 
@@ -283,12 +304,15 @@ class Simulation:
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
         self._design, self._homes = design_of(fits, homes, scene), homes
         # The boards' wanted items and assigned points survive the plant's program.
+        self._fits = fits
         self._wanted = wanted_of(fits) if knows_boards(plan.worlds) else Wanted()
         self._assigned = AssignedDisk()
         self._assigned.keep({"STANDBY": {each.name: STANDBY for each in fits}})
         self.disk = RecordsDisk()
         observers = [pod.observer for pod in self.pods]
-        self.observer = PlantObserver(self.begin, self.disk, SETTINGS, observers)
+        self.observer = PlantObserver(
+            self.begin, self.disk, SETTINGS, observers, automatic=works(plan.worlds)
+        )
         self.operator = Operator(
             self._clock,
             plan.seed,
@@ -300,6 +324,8 @@ class Simulation:
             scene.keep_outs[0][0],
             None if self._measured else self._flux,
         )
+        self._exits = contextlib.ExitStack()
+        self._work = self._new_work() if works(plan.worlds) else None
         self._tour: Tour | None = None
         if TOUR in plan.worlds:
             self._tour = Tour(self.operator, self.observer, self.boards, self._clock, plan.seed)
@@ -308,6 +334,20 @@ class Simulation:
         self._program: list[asyncio.Task[None]] = []
         for pod in self.pods:
             pod.plant = self.observer
+
+    def _new_work(self) -> "Working":
+        """Return automatic control with its persons and its observer."""
+        plan, clock = self.plan, self._clock
+        boards = {board.outfit.name: board for board in self.boards}
+        sight = FieldSnapshot(clock, mirrors_of(boards), lambda: self.sun(clock.monotonic()))
+        work = Work(plan.seed, sight, self._exits)
+        shift = Shift(
+            work, self.operator, self.observer, self.beams, tuple(boards), clock, plan.seed, 90.0
+        )
+        observer = VisitObserver(
+            self.begin, self.boards, self._scene.targets, followed=work.centred
+        )
+        return Working(work, shift, observer)
 
     def _board(self, outfit: Outfit) -> Board:
         chance = self._chance
@@ -354,6 +394,11 @@ class Simulation:
         board = self.boards[fault.target]
         return next(pod for pod in self.pods if board in pod.boards)
 
+    @property
+    def visits(self) -> VisitObserver | None:
+        """Observer of visits to targets; None: there are none."""
+        return None if self._work is None else self._work.observer
+
     # -- the plant -------------------------------------------------------------------------
 
     def start_plant(self, group: asyncio.TaskGroup) -> None:
@@ -365,7 +410,10 @@ class Simulation:
             pod.ear = PlantEar(pod, self.observer, self.beams)
             pod.tap = TappedLink(link, self._clock, pod.ear)
             links[pod.name] = pod.tap
-        audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
+        audit = self._audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
+        if self._work is not None:
+            self._wanted = wanted_of(self._fits)  # the store knows better; see `Work.begins`
+            self._work.control.opens()
         context = context_of(_PLANT)
         plant = self.plant = PlantController(
             self._design,
@@ -383,10 +431,10 @@ class Simulation:
         )
         self.operator.begins(plant)
         self.instruments.plant = plant
-        self._program = [
-            group.create_task(each, context=context)
-            for each in (*(link.run() for link in links.values()), plant.run())
-        ]
+        parts = [*(link.run() for link in links.values()), plant.run()]
+        if self._work is not None:
+            parts.append(self._work.control.begins(plant).run())
+        self._program = [group.create_task(each, context=context) for each in parts]
 
     def _second_plant(self, fits: Sequence[Outfit]) -> SecondPlant:
         return SecondPlant(
@@ -412,11 +460,18 @@ class Simulation:
             self._second.turn(group, on=on)
 
     def _alarmed(self, alarm: Alarm) -> None:
+        if self._work is not None:
+            self._work.control.take_alarm(alarm)
         self.beams.alarmed(alarm, self._clock.monotonic())
         self.readings.alarmed(alarm)
 
     def crash_plant(self, now: float) -> None:
         """Kill the plant's program wherever it is; the network tells the clusters."""
+        if self._work is not None:
+            self._work.control.ends()
+            self._work.observer.ended()
+        if self.plant is not None:
+            self._audit.lose()
         for task in self._program:
             task.cancel()
         self._program, self.plant = [], None
@@ -458,7 +513,9 @@ class Simulation:
             Within an exception group, if an invariant is broken.
         """
         damage = Damage(self, self.plan.drawn)
-        async with asyncio.TaskGroup() as group:
+        async with contextlib.AsyncExitStack() as stack:
+            stack.enter_context(self._exits)
+            group = await stack.enter_async_context(asyncio.TaskGroup())
             for pod in self.pods:
                 pod.start(group)
             self.start_plant(group)
@@ -480,6 +537,8 @@ class Simulation:
                 task.cancel()
 
     async def _persons(self) -> None:
+        if self._work is not None:
+            await self._work.shift.work()
         await (self.operator if self._tour is None else self._tour).work()
 
     async def _turn(self, damage: Damage, group: asyncio.TaskGroup) -> None:
@@ -500,6 +559,8 @@ class Simulation:
                 self.observer.look(self.plant, now)
                 carried = {pod.name for pod in self.pods if pod.carried(now)}
                 self.beams.look(self.plant, carried, now)
+                if self._work is not None:
+                    self._work.observer.look(self.plant, self.sun(now), now)
                 if self._measured:
                     runs = self.plant is not None and not self.operator.waits
                     self.readings.look(carried, now, runs=runs)
@@ -529,6 +590,8 @@ def run(plan: RunPlan) -> RunResult:
         (pod.observer.checks for pod in simulation.pods),
         simulation.observer.checks + simulation.beams.checks + simulation.readings.checks,
     )
+    if (extra := simulation.visits) is not None:
+        outcome.checks += extra.checks
     outcome.faults = simulation.faults
     outcome.counts = sum((pod.counts for pod in simulation.pods), simulation.operator.counts)
     outcome.states = sum((pod.observer.entered for pod in simulation.pods), Counter())

@@ -26,13 +26,19 @@ WORLDS = {
     "tour": "nothing fails, and each heliostat is led through all commands, which must be done",
     "calibrations": "persons and beliefs change parameters, rightly or wrongly",
     "twice": "a second plant with the same keys runs for a while, on the same lines",
+    "visits": "automatic control raises and calibrates the field, by photographs that may lie",
 }
+#: Worlds with automatic control.
+WORKING = ("visits",)
+#: Faults in a run with automatic control come this many times more seldom: a visit takes a minute.
+_SELDOM = 4.0
 #: Name that lets each run draw its worlds: see `mixed`.
 ANY = "any"
 #: Worlds that hold, of which `mixed` chooses.
 MIX = (
     "calm", "swarm", "held", "frozen", "disk", "place", "sensors", "parameters", "calibrations",
     "twice",
+    "visits",
 )  # fmt: skip
 
 
@@ -53,7 +59,9 @@ def mixed(seed: int) -> tuple[str, ...]:
     """Return worlds of `MIX` drawn from a seed: none, some or all of them."""
     chance = random.Random(f"worlds {seed}")
     share = chance.choice([0.0, 0.2, 0.5, 0.8])
-    return tuple(name for name in MIX if chance.random() < share)
+    found = [name for name in MIX if chance.random() < share]
+    # Automatic control of a second plant is not judged.
+    return tuple(name for name in found if name != "twice" or "visits" not in found)
 
 
 @dataclass(frozen=True)
@@ -106,14 +114,21 @@ def weights_of(worlds: Sequence[str], seed: int, weights: Mapping[str, float]) -
 
 def pause_of(worlds: Sequence[str], seed: int, pause: float) -> float:
     """Return the mean time between two faults of a run, s."""
+    if works(worlds):
+        pause *= _SELDOM
     if "swarm" not in worlds:
         return pause
     return pause * random.Random(f"pause {seed}").choice([0.5, 1.0, 3.0, 10.0])
 
 
+def works(worlds: Sequence[str]) -> bool:
+    """Whether automatic control runs in a run."""
+    return not set(worlds).isdisjoint(WORKING)
+
+
 def knows_boards(worlds: Sequence[str]) -> bool:
     """Whether the plant of a run knows what every board should store, as a real one does."""
-    return not {"parameters", "calibrations"}.isdisjoint(worlds)
+    return works(worlds) or not {"parameters", "calibrations"}.isdisjoint(worlds)
 
 
 def stored_by(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:

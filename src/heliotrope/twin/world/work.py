@@ -1,0 +1,127 @@
+"""Automatic control in a run: raising, visits to targets, and the memory of both.
+
+The worlds "visits" and "day" run the whole plant, not its controller alone: `Operations` with
+automatic control and calibration visits. The store outlives the plant's program, as a disk does.
+"""
+
+import contextlib
+import random
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.links.clock import Clock
+from heliotrope.mechanism.board_items import items_of
+from heliotrope.plant.assembly import CYCLE
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations import AutomaticSettings, Logbook, Operations
+from heliotrope.plant.operations.views import CalibrationEntry, Planned
+from heliotrope.plant.visits import CalibrationCycle, Centring, CycleSettings
+from heliotrope.safety import Alarm
+from heliotrope.store.keeper import Keeper
+from heliotrope.twin.boards.outfit import MACHINE
+from heliotrope.twin.cameras import FieldSnapshot
+from heliotrope.twin.world.photographs import LyingCamera
+
+#: With this few mirrors, the loss of two may be the loss of all; orders are given again soon.
+SETTINGS = AutomaticSettings(rate=1.0, losses=1, patience=20.0)
+#: A visit that fits into a run of some minutes.
+VISIT = CycleSettings(shots=3, interval=2.0, arrival=60.0, least=3, model=CYCLE.model)
+#: A search that stays near its target.
+SEARCH = Centring(most=8)
+#: Share of the photographs with which lies begin.
+LIES = 0.2
+
+
+class _Rounds:
+    """The schedule of a short run: whichever ready heliostat has waited longest."""
+
+    def __init__(self, names: Sequence[str], clock: Clock) -> None:
+        self._names, self._clock = names, clock
+        self._last = dict.fromkeys(names, -1)
+        self._count = 0
+
+    def next(self, target: str, ready: npt.NDArray[np.bool_]) -> Planned | None:
+        able = [name for name, free in zip(self._names, ready, strict=True) if free]
+        if not able:
+            return None
+        name = min(able, key=lambda each: self._last[each])
+        self._count += 1
+        self._last[name] = self._count
+        return Planned(name, target, self._clock.utc().timestamp(), 0.0, "in turn")
+
+    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[Planned]:
+        del ready, limit
+        return ()
+
+    def done(self, entry: CalibrationEntry) -> None:
+        """Nothing to do: the next is next."""
+
+
+class Work:
+    """Automatic control of a run, made anew whenever the plant's program starts.
+
+    Parameters
+    ----------
+    seed
+        Seed of the camera, and of the kind of visits.
+    sight
+        True mirrors and sun.
+    exits
+        Closes the store at the end of the run.
+
+    Attributes
+    ----------
+    centred
+        Whether visits search for the beam and follow it; else they photograph what is there.
+    camera
+        Camera of the targets.
+    operations, logbook
+        Of the plant's program; None while it does not run.
+    """
+
+    def __init__(self, seed: int, sight: FieldSnapshot, exits: contextlib.ExitStack) -> None:
+        self.centred = random.Random(f"visits {seed}").random() < 0.5
+        self.camera = LyingCamera(sight, seed, LIES)
+        self._clock = sight.clock
+        folder = exits.enter_context(tempfile.TemporaryDirectory())
+        self._records = Keeper(Path(folder) / "records.sqlite", inline=True)
+        exits.callback(self._records.close)
+        self.operations: Operations | None = None
+        self.logbook: Logbook | None = None
+
+    def opens(self) -> Logbook:
+        """Return the logbook of a new program."""
+        self.logbook = Logbook(self._clock, self._records)
+        return self.logbook
+
+    def begins(self, plant: PlantController) -> Operations:
+        """Return the operations of a new program; local controllers should store what it knows."""
+        assert self.logbook is not None
+        centring = SEARCH if self.centred else None
+        cycle = CalibrationCycle(plant, self.camera, VISIT, centring)
+        self.operations = Operations(
+            plant,
+            self.logbook,
+            cycle,
+            scheduler=_Rounds(plant.field.names, self._clock),
+            records=self._records,
+            settings=SETTINGS,
+        )
+        for name in plant.field.names:
+            plant.wanted.set(name, items_of(plant.beliefs.present(name)[0], MACHINE))
+        return self.operations
+
+    def take_alarm(self, alarm: Alarm) -> None:
+        """Take an alarm of the plant."""
+        if self.logbook is not None:
+            self.logbook.take_alarm(alarm)
+
+    def ends(self) -> None:
+        """Note that the program ends, wherever it is."""
+        if self.operations is not None:
+            self.operations.automatic.stop()
+        self.operations = self.logbook = None
