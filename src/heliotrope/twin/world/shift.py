@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import random
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from heliotrope.links.clock import Clock
 from heliotrope.plant.authority import RefusedError
@@ -16,6 +17,7 @@ from heliotrope.plant.operations import Operations
 from heliotrope.safety import Act
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.invariants.visits import VisitObserver
 from heliotrope.twin.world.operator import ENGINEER, VIEWER, Operator
 from heliotrope.twin.world.work import Work
 
@@ -158,3 +160,12 @@ class Shift:
         self._operator.raises(operations.plant, VIEWER, Act.DEFOCUS)
         operations.automatic.want(self._names, wanted=False)
         await asyncio.sleep(self._chance.uniform(2.0, _EMERGENCY))
+
+
+@dataclass(frozen=True)
+class Working:
+    """Automatic control of a run, the persons beside it, and the observer of its visits."""
+
+    control: Work
+    shift: Shift
+    observer: VisitObserver

@@ -55,7 +55,7 @@ from heliotrope.twin.world.instruments import READINGS, Instruments
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
 from heliotrope.twin.world.scene import Scene, scene_of
-from heliotrope.twin.world.shift import Shift
+from heliotrope.twin.world.shift import Shift, Working
 from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
 from heliotrope.twin.world.twice import SecondPlant
 from heliotrope.twin.world.work import Work
@@ -246,15 +246,6 @@ class RunResult:
         return self.problem
 
 
-@dataclass(frozen=True)
-class Working:
-    """Automatic control of a run, the persons beside it, and the observer of its visits."""
-
-    control: Work
-    shift: Shift
-    observer: VisitObserver
-
-
 class Simulation:
     """One run; use `run`.
 
@@ -335,7 +326,7 @@ class Simulation:
         for pod in self.pods:
             pod.plant = self.observer
 
-    def _new_work(self) -> "Working":
+    def _new_work(self) -> Working:
         """Return automatic control with its persons and its observer."""
         plan, clock = self.plan, self._clock
         boards = {board.outfit.name: board for board in self.boards}
