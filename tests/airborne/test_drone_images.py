@@ -261,6 +261,37 @@ def test_rtk_scatter_is_found(case: Case) -> None:
     assert (check.sigma < 1.6 * expected).all()
     assert (check.sigma > 0.5 * (told - true).std(axis=0, ddof=1)).all()
     assert check.covariance.shape == (3, 3)
+    # The case has an RTK of 8 mm a component.
+    assert (check.rtk_range[0] < (told - true).std(axis=0, ddof=1)).all()
+    assert (check.rtk_range[1] > (told - true).std(axis=0, ddof=1)).all()
+
+
+def test_an_rtk_without_errors_is_told_from_photogrammetry(case: Case) -> None:
+    """Of 0.1 mm and the noise of the photographs only the photographs' remains."""
+    noise = np.random.default_rng(3).normal(0.0, 1e-4, (len(case.photos), 3))
+    exact = [
+        replace(photo, position=np.asarray(taken.position) + extra)
+        for photo, taken, extra in zip(case.photos, case.flown.taken, noise, strict=True)
+    ]
+    check, _ = rtk.check_rtk(
+        exact, case.seen, case.flown.camera, case.stand, Priors(position=0.001)
+    )
+    assert (check.sigma > 1e-3).all(), "what was printed before, as if it were RTK's"
+    assert (check.rtk_range[0] <= 1e-4).all()
+    assert (check.rtk < 0.5 * check.sigma).all()
+
+
+def test_the_share_of_rtk_is_found_and_its_interval_holds() -> None:
+    rng = np.random.default_rng(4)
+    held = 0
+    for true in (0.0, 0.002, 0.008):
+        for _ in range(40):
+            sigma = rng.uniform(0.002, 0.006, (60, 3))
+            gap = 0.01 + rng.normal(0.0, true, (60, 3)) + rng.normal(0.0, sigma)
+            found, (low, high) = rtk.share_of_rtk(gap, sigma)
+            assert (np.abs(found - true) < 0.0035).all()
+            held += int(((low <= true) & (true <= high)).sum())
+    assert held >= 0.92 * 360
 
 
 # -- pieces ----------------------------------------------------------------------------

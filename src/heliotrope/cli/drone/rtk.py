@@ -58,18 +58,21 @@ def rtk(
                 "common_offset_m": check.mean,
                 "common_offset_sigma_m": check.mean_sigma,
                 "sigma_m": check.sigma,
+                "rtk_sigma_m": check.rtk,
+                "rtk_sigma_95_m": check.rtk_range,
                 "covariance_m2": check.covariance,
                 "photogrammetry_sigma_m": check.photogrammetry,
             }
         )
         return
-    columns = (check.mean, check.mean_sigma, check.sigma, check.photogrammetry)
+    columns = (check.mean, check.mean_sigma, check.sigma, check.photogrammetry, check.rtk)
+    low, high = 1e3 * check.rtk_range
     rows = [
-        [axis, *(f"{1e3 * column[k]:.1f}" for column in columns)]
+        [axis, *(f"{1e3 * column[k]:.1f}" for column in columns), f"{low[k]:.1f} to {high[k]:.1f}"]
         for k, axis in enumerate(("east", "north", "up"))
     ]
     print_table(
-        ["axis", "common offset", "± of it", "σ of one", "σ of photogrammetry"],
+        ["axis", "common offset", "± of it", "σ of both", "of photogrammetry", "of RTK", "95 %"],
         rows,
         f"RTK less photogrammetry, {len(check.names)} photographs, mm",
     )
@@ -77,4 +80,4 @@ def rtk(
         [axis, *(f"{1e6 * v:.1f}" for v in row)]
         for axis, row in zip(("east", "north", "up"), check.covariance, strict=True)
     ]
-    print_table(["mm²", "east", "north", "up"], body, "Covariance of one position")
+    print_table(["mm²", "east", "north", "up"], body, "Covariance of one difference")
