@@ -1,0 +1,99 @@
+"""Run `heliotrope` with gauges in the plant: ``gauges.py FILE COUNT run …``, for `attack.py`.
+
+Each 50 ms a line is added to the file: the time, the longest wait of the plant's loop since the
+line before, the longest time since a cluster's last lease, and the time since which every one of
+the ``COUNT`` simulated local controllers has heard DEFOCUS; POSIX s and s.
+"""
+
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heliotrope.cli import main
+from heliotrope.plant.clusters import ClusterEnd
+from heliotrope.twin.field.field_bus import FieldBus
+from heliotrope.twin.live.loop import PacedLoop
+
+#: Time between two looks at the loop, and between two lines, s.
+_LOOK, _LINE = 0.02, 0.05
+
+
+class Gauges:
+    """What is noted, by the plant's loop and by a thread of its own."""
+
+    def __init__(self, file: Path, count: int) -> None:
+        self._file, self._heard = file, np.zeros(count)
+        self._leases: dict[str, float] = {}
+        self._gap = 0.0
+        self.loop: PacedLoop | None = None
+
+    def lease(self, cluster: str) -> None:
+        """Note a lease for a cluster."""
+        now = time.monotonic()
+        self._gap = max(self._gap, now - self._leases.get(cluster, now))
+        self._leases[cluster] = now
+
+    def heard(self, command: str, rows: range) -> None:
+        """Note that local controllers have heard a command."""
+        if command == "DEFOCUS":
+            self._heard[rows.start : rows.stop] = time.time()
+
+    def run(self) -> None:
+        """Write lines for ever."""
+        with self._file.open("w", encoding="ascii", buffering=1) as out:
+            while True:
+                lag, until = 0.0, time.monotonic() + _LINE
+                while time.monotonic() < until:
+                    lag = max(lag, self._look())
+                    time.sleep(_LOOK)
+                now, self._gap, gap = time.monotonic(), 0.0, self._gap
+                gap = max([gap, *(now - at for at in self._leases.values())])
+                out.write(f"{time.time()} {lag} {gap} {self._heard.min()}\n")
+
+    def _look(self) -> float:
+        """Return how long the plant's loop takes to do something, s."""
+        done, begun = threading.Event(), time.perf_counter()
+        if self.loop is None or self.loop.is_closed():
+            return 0.0
+        try:
+            self.loop.call_soon_threadsafe(done.set)
+        except RuntimeError:  # it was closed meanwhile
+            return 0.0
+        done.wait(60.0)
+        return time.perf_counter() - begun
+
+
+def attach(gauges: Gauges) -> None:
+    """Let the classes of the plant tell the gauges."""
+    make, keep, tell = PacedLoop.__init__, ClusterEnd.keep, FieldBus._tell  # noqa: SLF001
+
+    def made(self: PacedLoop, *given: Any, **named: Any) -> None:
+        make(self, *given, **named)
+        gauges.loop = self
+
+    async def kept(self: ClusterEnd, lease: Callable[[], Any], *given: Any) -> None:
+        def noted() -> Any:
+            gauges.lease(self.name)
+            return lease()
+
+        await keep(self, noted, *given)
+
+    def told(self: FieldBus, name: str, rows: range) -> None:
+        gauges.heard(name, rows)
+        tell(self, name, rows)
+
+    PacedLoop.__init__ = made  # type: ignore[method-assign]
+    ClusterEnd.keep = kept  # type: ignore[method-assign]
+    FieldBus._tell = told  # type: ignore[method-assign]  # noqa: SLF001
+    threading.Thread(target=gauges.run, daemon=True).start()
+
+
+if __name__ == "__main__":
+    attach(Gauges(Path(sys.argv[1]), int(sys.argv[2])))
+    sys.argv[1:3] = []
+    sys.exit(main())

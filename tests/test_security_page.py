@@ -1,0 +1,55 @@
+"""The page about security names tests and attacks that there are."""
+
+import ast
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "explanation" / "security.md").read_text(encoding="utf-8")
+
+
+def rows(title: str) -> list[list[str]]:
+    """Return the cells of the table of a chapter, without its head."""
+    chapter = PAGE.split(f"\n## {title}\n")[1].split("\n## ")[0]
+    lines = [line for line in chapter.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+def test_each_test_that_is_named_exists() -> None:
+    named = set(re.findall(r"`(tests/[\w/]+\.py)`", PAGE))
+    assert len(named) > 20
+    assert not [name for name in sorted(named) if not (ROOT / name).is_file()]
+
+
+def test_each_threat_has_a_safeguard_and_a_test() -> None:
+    threats = rows("Threats")
+    assert len(threats) >= 11
+    for threat, safeguard, proof in threats:
+        assert threat, safeguard
+        assert safeguard, threat
+        assert re.search(r"`tests/[\w/]+\.py`", proof), threat
+
+
+def test_each_attack_that_is_named_exists() -> None:
+    """The attacks are read, not run: a run takes minutes."""
+    tree = ast.parse((ROOT / "scripts" / "attacks.py").read_text(encoding="utf-8"))
+    table = next(
+        node.value
+        for node in tree.body
+        if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == "ATTACKS"
+    )
+    known = {
+        node.id.replace("_", "-")
+        for node in ast.walk(table)  # type: ignore[arg-type]
+        if isinstance(node, ast.Name)
+    }
+    assert len(known) >= 25
+    named = {word for _, _, proof in rows("Threats") for word in re.findall(r"\*([\w-]+)\*", proof)}
+    assert named
+    assert named <= known, named - known
+
+
+def test_the_seven_requirements_are_answered() -> None:
+    found = rows("IEC 62443-3-3")
+    assert [row[0].split()[0] for row in found] == [f"FR{k}" for k in range(1, 8)]
+    assert all(len(row) == 3 and all(row) for row in found)
