@@ -85,7 +85,8 @@ def resumes_by_itself(patch: pytest.MonkeyPatch) -> None:
         take(self, end, status, now)
         names = [n for n in end.members if self.field.of(n, now).state == "DEFOCUSED"]
         if names and not self.emergency_on and not self.waiting:
-            ticket = Ticket("by itself", "REFOCUS", names, self.clock, 60.0)
+            run = self._orders._prefix
+            ticket = Ticket(f"{run}-by itself", "REFOCUS", names, self.clock, 60.0)
             self._join(ticket, "REFOCUS", (), names, self.authority.token)
 
     def quiet(self: Any, number: int, *rest: Any) -> None:
