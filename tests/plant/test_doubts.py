@@ -1,6 +1,9 @@
 """Step counts in doubt keep a heliostat off the receiver until its place is confirmed."""
 
+import math
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +12,11 @@ from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.field_state import Mask
+from heliotrope.plant.operations.calibrating import Calibrating
+from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.safety import alarms
-from support.plant_bench import OPERATOR, VIEWER, Bench, running
+from support.plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
 
 DOUBTFUL = 1 << meanings.FLAGS.index("COUNTS_DOUBTFUL")
 UNKNOWN = 1 << meanings.FLAGS.index("COUNTS_UNKNOWN")
@@ -107,5 +113,96 @@ def test_one_that_loses_its_power_while_it_waits_to_join_is_not_sent(tmp_path: P
             plant.doubts.look(cluster.name)
             await bench.wait(2.0)
             assert not cluster.commands("TRACK")
+
+    run_virtual(main)
+
+
+@dataclass
+class Chosen:
+    """A heliostat that is due."""
+
+    heliostat: str
+
+
+class Chooser:
+    """A schedule that has all heliostats but some due, in the order of the field."""
+
+    def __init__(self, bench: Bench, *rest: str) -> None:
+        self.names, self.rest = bench.plant.field.names, rest
+        self.entries: list[CalibrationEntry] = []
+
+    def next(self, target: str, ready: Mask) -> Chosen | None:
+        del target
+        due = [n for n, able in zip(self.names, ready, strict=True) if able and n not in self.rest]
+        return Chosen(due[0]) if due else None
+
+    def done(self, entry: CalibrationEntry) -> None:
+        self.entries.append(entry)
+
+
+class Refusing:
+    """A visit that is refused at once."""
+
+    async def run(self, person: object, token: int, heliostat: str, *rest: object) -> None:
+        del person, token, rest
+        raise RefusedError(f"{heliostat}: not now")
+
+
+@pytest.mark.parametrize(
+    ("doubted", "first"),
+    [((), "P1A"), (("P5A",), "P5A"), (("P3B", "P5A"), "P3B"), (("P2A",), "P1A")],
+    ids=["nobody", "one", "two", "one_that_is_not_due"],
+)
+def test_heliostats_in_doubt_are_visited_before_others(
+    tmp_path: Path, doubted: tuple[str, ...], first: str
+) -> None:
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path)
+        for name in doubted:
+            reports(bench, name, DOUBTFUL, 1)
+        async with running(bench):
+            plant = bench.plant
+            assert plant.field.names[0] == "P1A"
+            chooser = Chooser(bench, "P2A")
+            book = SimpleNamespace(error=np.zeros(len(plant.field)), conclude=lambda entry: None)
+            silent = SimpleNamespace(event=lambda *_: None, keep=lambda *_: None)
+            unknown = SimpleNamespace(now=lambda row: math.nan)
+            calibrating = Calibrating(
+                plant,
+                silent,
+                Refusing(),
+                chooser,
+                book,
+                silent,
+                unknown,  # type: ignore[arg-type]
+            )
+            ready = np.ones(len(plant.field), dtype=np.bool_)
+            assert await calibrating.visit("target", ready, ENGINEER, 1) == first
+            assert [entry.heliostat for entry in chooser.entries] == [first]
+            # Not if it is on its way elsewhere, or held.
+            for name in doubted:
+                ready[plant.field.place(name)] = False
+            assert await calibrating.visit("target", ready, ENGINEER, 1) not in doubted
+
+    run_virtual(main)
+
+
+def test_a_plant_that_restarts_asks_again_for_what_was_confirmed(tmp_path: Path) -> None:
+    async def main(clock: VirtualClock) -> None:
+        for start in ("first", "second"):
+            (tmp_path / start).mkdir()
+            bench = Bench(clock, tmp_path / start)
+            reports(bench, "P5A", DOUBTFUL, 3)
+            async with running(bench):
+                token = await bench.commanded()
+                assert named(bench) == {"P5A"}
+                plant = bench.plant
+                plant.aim(OPERATOR, token, plant.default_aims(("P5A",)))
+                bench.cluster_of("P5A").set(states.IDLE, "P5A")
+                await bench.wait(2.0)
+                with pytest.raises(RefusedError, match=r"TRACK P5A.*step counts may be wrong"):
+                    plant.command(OPERATOR, token, "TRACK", ("P5A",))
+                plant.acknowledge(OPERATOR, "counts_doubtful", "P5A")
+                plant.command(OPERATOR, token, "TRACK", ("P5A",))
 
     run_virtual(main)

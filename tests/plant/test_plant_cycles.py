@@ -14,6 +14,7 @@ import pytest
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.target import Target
+from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Parameters
@@ -405,3 +406,48 @@ def test_who_is_cancelled_ends_as_cancelled_whatever_happens_on_the_way_home() -
             await task
 
     run_virtual(main)
+
+
+def doubtful(bench: Bench, boots: int) -> None:
+    """Let the board report that its step counts are in doubt."""
+    cluster = bench.cluster_of(NAME)
+    row = cluster.names.index(NAME)
+    cluster.rows["flags"][row] = 1 << meanings.FLAGS.index("COUNTS_DOUBTFUL")
+    cluster.rows["boots"][row] = boots
+
+
+@pytest.mark.parametrize("seen", ["the beam", "nothing", "a power cut"])
+def test_a_photograph_confirms_step_counts_in_doubt(tmp_path: Path, seen: str) -> None:
+    async def scene(bench: Bench, whole: CalibrationCycle, eye: Eye, token: int) -> None:
+        plant, row = bench.plant, bench.plant.field.place(NAME)
+        doubtful(bench, 4)
+        await bench.wait(2.0)
+        assert plant.doubts.standing[row]
+        if seen == "nothing":
+            eye.reasons = ("cloud",)
+        elif seen == "a power cut":
+            # It shows in no state; the photographs say nothing of the counts after it.
+            eye.during = lambda: doubtful(bench, 5)
+        await whole.run(ENGINEER, token, NAME, "target")
+        await bench.wait(2.0)
+        assert plant.doubts.standing[row] == (seen != "the beam")
+        if seen == "the beam":
+            doubtful(bench, 5)
+            await bench.wait(2.0)
+            assert plant.doubts.standing[row], "the next cut ends the confirmation"
+
+    cycle(tmp_path, scene)
+
+
+def test_a_beam_that_is_beside_its_place_confirms_nothing(tmp_path: Path) -> None:
+    """Six milliradians off, and too few sightings for a fit that could explain them."""
+
+    async def scene(bench: Bench, whole: CalibrationCycle, eye: Eye, token: int) -> None:
+        del eye
+        doubtful(bench, 4)
+        await whole.run(ENGINEER, token, NAME, "target")
+        await bench.wait(2.0)
+        assert bench.plant.doubts.standing[bench.plant.field.place(NAME)]
+
+    given = CycleSettings(shots=1, interval=5.0, least=5)
+    cycle(tmp_path, scene, given, azimuth_bias=3e-3)
