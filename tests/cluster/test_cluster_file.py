@@ -175,6 +175,28 @@ def test_a_heliostat_that_cannot_be_is_refused() -> None:
         ClusterConfig("C", SITE, tuple(Member(f"H{n}", n) for n in range(1, 34)))
 
 
+@pytest.mark.parametrize(
+    ("rate", "text"),
+    [
+        (1199, "input should be greater than or equal to 1200"),
+        (1200, ""),
+        (4_000_000, ""),
+        (4_000_001, "input should be less than or equal to 4000000"),
+    ],
+)
+def test_the_bus_has_a_rate_that_its_port_can_have(folder: Path, rate: int, text: str) -> None:
+    path = changed(folder, "baud_rate = 115200", f"baud_rate = {rate}")
+    if text:
+        with pytest.raises(FormatError, match=f"bus.baud_rate: {rate}: {text}"):
+            read_cluster(path)
+    else:
+        assert read_cluster(path).bus.baud_rate == rate
+
+
+def test_the_bus_has_its_usual_rate_if_none_is_given(folder: Path) -> None:
+    assert read_cluster(changed(folder, "baud_rate = 115200\n", "")).bus.baud_rate == 115200
+
+
 # -- epoch and editions ----------------------------------------------------------------
 
 

@@ -15,7 +15,17 @@ from heliotrope.cluster.memory import Kept
 from heliotrope.lcu import messages, states, wire
 from heliotrope.lcu.controller import SWITCH
 from heliotrope.lcu.journal import CODES_OF
-from heliotrope.links.messages import Answer, Ask, Command, Parameters, Progress, Stage
+from heliotrope.links.link import SendOutcome
+from heliotrope.links.messages import (
+    Answer,
+    Ask,
+    ClusterStatus,
+    Command,
+    Parameters,
+    Progress,
+    Stage,
+    decode,
+)
 from heliotrope.twin.boards.bus import TwinBus
 from support.clusters import AIM, TOKEN, Board, Field, SlotBus, config_of, run
 from support.lcu_machines import heliostat, items_of_heliostat
@@ -692,3 +702,48 @@ def test_a_defocus_that_leaves_the_axes_where_they_are_is_never_done() -> None:
         assert stages == [Stage.FAILED]
 
     run(main, "IDLE")
+
+
+def test_heliostats_that_do_not_obey_leave_the_bus_to_the_others() -> None:
+    """Twelve that are silent are asked again each second, for a third of it at most."""
+
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        emergencies = field.cluster._work._emergencies
+        serve, spent = emergencies.serve, list[float]()
+
+        async def timed() -> None:
+            begin = field.clock.monotonic()
+            await serve()
+            spent.append(field.clock.monotonic() - begin)
+
+        emergencies.serve = timed  # type: ignore[method-assign]
+        for board in field.boards[1:]:
+            board.on = False
+        await field.emergency("off", "STOW")
+        await asyncio.sleep(15.0)
+        # The first rounds are as long as the order's budget; then one more answer fits in.
+        assert 0.25 < max(spent[4:]) < 0.3 + 2 * field.config.answer
+        assert field.plant.status().cycle_s < 1.0
+
+    run(main, count=13)
+
+
+def test_a_status_is_not_delivered_later_than_the_next_one_is_due() -> None:
+    async def main(field: Field) -> None:
+        send, left = field.link.send, list[float]()
+
+        async def spy(
+            data: bytes, *, expires: float | None = None, hold: bool = False
+        ) -> SendOutcome:
+            if isinstance(decode(data), ClusterStatus):
+                assert expires is not None
+                left.append(expires - field.clock.monotonic())
+            return await send(data, expires=expires, hold=hold)
+
+        field.link.send = spy  # type: ignore[method-assign]
+        await asyncio.sleep(3.5)
+        assert len(left) >= 3
+        assert max(left) <= 1.0
+
+    run(main)

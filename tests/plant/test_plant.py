@@ -332,6 +332,26 @@ def test_aims_are_spread_and_beams_are_checked(tmp_path: Path) -> None:
     assert sent == {(-0.3, 0.0, 16.5), (0.3, 0.0, 16.5)}
 
 
+def test_of_those_that_join_each_is_proven_by_its_own_way(tmp_path: Path) -> None:
+    """One has no aim, another shines through the walkway, the third past it."""
+    walkway = Sphere("walkway", (0.0, -12.0, 8.0), 1.0)
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path, volumes=[walkway])
+        async with running(bench):
+            plant, names = bench.plant, ("P1A", "P5A", "P5B")
+            bench.cluster_of("P5A").set(states.IDLE)
+            for name, aim in (("P5A", (0.0, 0.0, 16.5)), ("P5B", (20.0, 0.0, 16.5))):
+                plant.aims[plant.field.place(name)] = aim
+            await bench.wait(2.0)
+            wrong = plant._ways.joining("TRACK", (), names)
+            alone = plant._ways.joining("TRACK", (), names[1:])
+            assert "its aim is not known here" in wrong.pop("P1A")
+            assert wrong == alone
+
+    run_virtual(main)
+
+
 def test_whose_beam_would_sweep_through_a_volume_does_not_join(tmp_path: Path) -> None:
     walkway = Sphere("walkway", (0.0, -12.0, 8.0), 1.0)
     design = prototype()

@@ -1,15 +1,20 @@
 """Parts of the plant by themselves: audit, items, tickets, joining, aims, table of the field."""
 
+import functools
+import itertools
 import json
 import struct
 from collections import deque
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from zlib import crc32
 
 import numpy as np
 import pytest
 
+from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.field.example import prototype
 from heliotrope.lcu import drives, states
@@ -30,6 +35,11 @@ from heliotrope.plant.audit import STOPPED, AuditError, JsonLines, Record, read
 from heliotrope.plant.authority import Authority, Person, RefusedError, Role
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoiningJob, JoinQueue
+from heliotrope.plant.operations.keeping import Keeping
+from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.operations.views import CalibrationEntry
+from heliotrope.plant.schedule.choice import Assignment
+from heliotrope.plant.schedule.plant_schedule import STEPS, PlantSchedule
 from heliotrope.plant.settings import clusters_of
 from heliotrope.plant.tickets import Ticket
 from support.lcu_machines import STANDBY, STOW, heliostat, items_of_heliostat
@@ -344,3 +354,78 @@ def test_rows_are_put_by_their_names_and_strangers_left_out() -> None:
     rows["heard_ms"][1] = 0
     field.take("K", status(3, ("B", "A", "C")), 13.0)
     assert field.of("B", 13.0).state == "FAULT"
+
+
+class _Kept:
+    """Records of which sightings may be lost."""
+
+    problem = ""
+
+    def record_visit(self, visit: object) -> None:
+        del visit
+
+
+@pytest.mark.parametrize(
+    ("identities", "lost"), [([4, 0], "the disk is full"), ([4, 5], ""), (None, "")]
+)
+def test_a_visit_that_is_kept_says_so_only_if_its_sightings_are_kept_too(
+    identities: list[int] | None, lost: str
+) -> None:
+    seen = None if identities is None else SimpleNamespace(identities=np.array(identities))
+    beliefs = SimpleNamespace(seen=lambda name: seen)
+    keeping = Keeping(("A",), beliefs, _Kept())  # type: ignore[arg-type]
+    keeping.lost = "the disk is full"
+    nan = float("nan")
+    outcome = CalibrationOutcome.CALIBRATED
+    entry = CalibrationEntry(0.0, "A", "T", outcome, *[nan] * 6, 2, 2, "calibrated", 1)
+    keeping.keep(entry, 0.0, 1e-3)
+    assert keeping.lost == lost
+
+
+class _Endless:
+    """A scheduler that always finds another visit, and counts those that it was asked for."""
+
+    def __init__(self, names: int) -> None:
+        self.asked, self.plans, self._names = 0, 0, names
+        self.running: dict[str, object] = {}
+
+    def upcoming(self, *_: object) -> Iterator[Assignment]:
+        self.plans += 1
+        for i in itertools.count():
+            self.asked += 1
+            at = 1e9 + i
+            yield Assignment(
+                f"H{i % self._names}", "T", at, at + 1.0, 2e-3, 1e-3, 1e-3, 1.0, False, ""
+            )
+
+    def learn(self, *_: object) -> None:
+        pass
+
+
+def test_a_plan_is_made_when_it_is_as_long_as_it_is_shown() -> None:
+    found = _Endless(50)
+    plant = SimpleNamespace(
+        now=lambda: 100.0,
+        clock=VirtualClock(lambda: 0.0, AT),
+        beliefs=SimpleNamespace(subscribe=lambda learn: None),
+    )
+    schedule = PlantSchedule(plant, found)  # type: ignore[arg-type]
+    schedule._states = lambda ready: None  # type: ignore[assignment,method-assign]
+    ready = np.ones(50, dtype=np.bool_)
+    for _ in range(4):
+        schedule.plan(ready, 2 * STEPS)
+    # Two calls made it, and for `REPLAN` it is only shown.
+    assert (found.asked, found.plans) == (2 * STEPS, 1)
+
+
+def test_standby_points_given_by_a_person_are_an_event() -> None:
+    told = []
+    given = Ticket("t", "STANDBY", ["A", "B"], VirtualClock(lambda: 0.0, AT), 60.0)
+    operations = SimpleNamespace(
+        plant=SimpleNamespace(standby=lambda *_: given),
+        logbook=SimpleNamespace(event=lambda *event: told.append(event)),
+    )
+    operations._told = functools.partial(Operations._told, operations)
+    olga = Person("Olga", Role.OPERATOR)
+    assert Operations.standby(operations, olga, 1, {}) is given  # type: ignore[arg-type]
+    assert told == [("command", "Olga", "STANDBY A, B")]
