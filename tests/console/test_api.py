@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import logging
 import re
+import shutil
 import ssl
 import subprocess
 import threading
@@ -25,6 +26,7 @@ from heliotrope.plant import audit
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import StoreError
 from support.live_console import GATE, PASSWORD, LiveConsole, serving
+from support.papers import certificate as renewed
 
 Ask = Callable[..., httpx.Response]
 ORDER = ("", "viewer", "operator", "engineer")
@@ -544,6 +546,20 @@ def test_tls_by_file(console: LiveConsole, tmp_path: Path) -> None:
             assert "max-age" in answer.headers["strict-transport-security"]
         with pytest.raises(httpx.HTTPError):
             httpx.get(f"http{address[5:]}api/v1/health", trust_env=False)
+        # Renewed in its place: taken without a restart, and the one before is gone.
+        for new, old in zip(renewed(tmp_path, 90.0), (certificate, key), strict=True):
+            shutil.copy(new, old)
+        trusting = ssl.create_default_context(cafile=certificate)
+        until, status = time.monotonic() + 60.0, 0
+        while status != 200:
+            assert time.monotonic() < until, "the renewed certificate is not served"
+            time.sleep(0.2)
+            with contextlib.suppress(httpx.ConnectError):
+                status = httpx.get(
+                    f"{address}api/v1/health", verify=trusting, trust_env=False
+                ).status_code
+        with pytest.raises(httpx.ConnectError):
+            httpx.get(f"{address}api/v1/health", verify=known, trust_env=False)
     finally:
         console.console_wait(second.__aexit__(None, None, None))
 

@@ -12,7 +12,6 @@ import errno
 import logging
 import resource
 import socket
-import ssl
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -25,6 +24,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from heliotrope.console.auth import FOUND
+from heliotrope.links.tls import TlsSource, context_of
 
 logger = logging.getLogger("heliotrope.console")
 #: Descriptors asked of the system, and those kept for files, the plant and the store.
@@ -192,9 +192,7 @@ class Listener:
     def __len__(self) -> int:
         return len(self._known) + len(self._strangers)
 
-    async def run(
-        self, protocol: Callable[[], asyncio.Protocol], tls: ssl.SSLContext | None
-    ) -> None:
+    async def run(self, protocol: Callable[[], asyncio.Protocol], tls: TlsSource) -> None:
         """Accept connections until cancelled."""
         loop, (line,) = asyncio.get_running_loop(), self.sockets
         async with asyncio.TaskGroup() as group:
@@ -229,7 +227,7 @@ class Listener:
         loop: asyncio.AbstractEventLoop,
         group: asyncio.TaskGroup,
         protocol: Protocols,
-        tls: ssl.SSLContext | None,
+        tls: TlsSource,
     ) -> bool:
         """Accept what waits; return whether the system had the means."""
         for _ in range(_BURST):
@@ -257,13 +255,13 @@ class Listener:
         loop: asyncio.AbstractEventLoop,
         found: Connection,
         protocol: Protocols,
-        tls: ssl.SSLContext | None,
+        tls: TlsSource,
     ) -> None:
         """Shake hands with a new connection."""
         limit = 10.0 * self.limits.handshake if tls is not None else None  # `look` is earlier
         try:
             made, _ = await loop.connect_accepted_socket(
-                protocol, found.line, ssl=tls, ssl_handshake_timeout=limit
+                protocol, found.line, ssl=context_of(tls), ssl_handshake_timeout=limit
             )
         except OSError:
             return

@@ -2,8 +2,10 @@
 
 import asyncio
 import contextlib
+import logging
 import socket
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import uvicorn
 
@@ -22,6 +24,12 @@ from heliotrope.console.remote import RemotePlant
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.console.urgent import LIMITS, EmergencyWay
 from heliotrope.errors import InputError
+from heliotrope.links.clock import SystemClock
+from heliotrope.links.papers import Papers
+from heliotrope.links.tls import RenewedTls, server_tls
+from heliotrope.safety import Alarm
+
+_LOG = logging.getLogger(__name__)
 
 
 class _Server(uvicorn.Server):
@@ -37,13 +45,23 @@ class _Server(uvicorn.Server):
         The application, whose listeners it serves.
     listen
         Opens them.
+    papers
+        The certificate, if there is one: it is taken again when its files are renewed.
     """
 
     def __init__(
-        self, config: uvicorn.Config, doors: Doors, listen: Callable[[], list[Listener]]
+        self,
+        config: uvicorn.Config,
+        doors: Doors,
+        listen: Callable[[], list[Listener]],
+        papers: tuple[Path, Path] | None,
     ) -> None:
         super().__init__(config)
         self._doors, self._listen = doors, listen
+        self._papers, self._tls = Papers(SystemClock()), None
+        if papers is not None:
+            self._tls = RenewedTls(lambda: server_tls(*papers))
+            self._papers.renew("certificate of the console", papers, self._tls.renew)
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -72,14 +90,18 @@ class _Server(uvicorn.Server):
             )
             return made
 
-        async with asyncio.TaskGroup() as group:
+        async with self._papers.watched(_tell), asyncio.TaskGroup() as group:
             works = [
-                group.create_task(one.run(protocol, config.ssl)) for one in self._doors.listeners
+                group.create_task(one.run(protocol, self._tls)) for one in self._doors.listeners
             ]
             self.started = True
             await super().main_loop()
             for work in works:
                 work.cancel()
+
+
+def _tell(alarm: Alarm) -> None:
+    _LOG.warning("console: %s", alarm.text)
 
 
 class ConsoleServer:
@@ -116,7 +138,7 @@ class ConsoleServer:
         # This reads modules and certificates from the disk, which no loop may wait for.
         config.load()
         limit()
-        self._server = _Server(config, self._doors, self._listen)
+        self._server = _Server(config, self._doors, self._listen, chosen.papers)
 
     def _listen(self) -> list[Listener]:
         left = raise_descriptors() - RESERVE

@@ -105,6 +105,13 @@ class ConsoleSettings:
         return {**asdict(self), **lists, **files}
 
     @property
+    def papers(self) -> tuple[Path, Path] | None:
+        """The certificate and its key, None without TLS."""
+        if self.certificate is None or self.key is None:
+            return None
+        return self.certificate, self.key
+
+    @property
     def tls(self) -> bool:
         """Whether the console itself speaks TLS."""
         return self.certificate is not None
