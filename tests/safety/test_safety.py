@@ -65,6 +65,7 @@ TRIPS = {
         Scope.HELIOSTAT,
         "in a keep-out volume or headin",
     ),
+    "beam_unsent": (1.0, 0.0, Act.DEFOCUS, Scope.HELIOSTAT, "on a receiver, and nobody sent it"),
     "pointing_disagrees": (5e-3, 0.0, Act.DEFOCUS, Scope.HELIOSTAT, r"beam 0.286° beside its aim"),
     "pointing_disagrees_many": (120.0, 0.0, Act.DEFOCUS, Scope.FIELD, "counts of 120 heliostats"),
     "cluster_time_differs": (5.0, 0.0, Act.DEFOCUS, Scope.CLUSTER, "differs from the .* by 5 s"),

@@ -347,15 +347,31 @@ class BeamCheck:
 
         For the arguments see `moving`. It is the middle of a beam that counts; see `_MIDDLE`.
         """
-        if not (len(rows) and self.solids):
-            return {}
-        armature = Armature(self.armature.table[rows])
-        entered = sweep(armature, path, sun, _MIDDLE, self.solids, reach=FAR).entered
+        entered = self._on_receivers(rows, path, sun)
         return {
             self.names[rows[i]]: f"the beam crosses {self.solids[int(entered[i].argmax())].name} "
             f"{when}; try again when the sun has moved on"
             for i in np.flatnonzero(entered.any(axis=-1))
         }
+
+    def lights(
+        self, rows: npt.NDArray[np.intp], angles: FloatArray, sun: FloatArray
+    ) -> npt.NDArray[np.bool_]:
+        """Return which beams are on a receiver, (K,), with the axes at angles (K, 2).
+
+        For ``sun`` see `problems`; it is the middle of a beam that counts.
+        """
+        still = np.repeat(angles[:, None], 2, axis=1)
+        return np.asarray(self._on_receivers(rows, still, sun).any(axis=-1))
+
+    def _on_receivers(
+        self, rows: npt.NDArray[np.intp], path: FloatArray, sun: FloatArray
+    ) -> npt.NDArray[np.bool_]:
+        """Return whose middles of beams cross each of R receivers on a path, (K, R)."""
+        if not (len(rows) and self.solids and sun[..., 2].max() > 0.0):
+            return np.zeros((len(rows), len(self.solids)), dtype=np.bool_)
+        armature = Armature(self.armature.table[rows])
+        return sweep(armature, path, sun, _MIDDLE, self.solids, reach=FAR).entered
 
     def inside(self, row: int, poses: FloatArray, sun: FloatArray) -> npt.NDArray[np.bool_]:
         """Return in which poses, angles of the axes (K, 2), the beam of a heliostat is in a volume.

@@ -1,4 +1,7 @@
-"""Beams stay out of keep-out volumes: commands are proven before they are sent, beams watched."""
+"""Beams stay out of keep-out volumes: commands are proven before they are sent, beams watched.
+
+The watch over beams that light a receiver unsent is `unsent`.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -16,13 +19,14 @@ from heliotrope.plant.assigned import Points
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.leaving import way_out
 from heliotrope.plant.refusals import BEAM_REFUSED, RefusedError
+from heliotrope.plant.unsent import TURNS, UnsentBeams
 from heliotrope.plant.ways import Ways
 from heliotrope.safety import Act, Reading
 
 Rows = npt.NDArray[np.intp]
 
-#: Pause between two looks at the beams, s; a heliostat that stands still is seen every third time.
-LOOK_PERIOD, TURNS = 1.0, 3
+#: Pause between two looks at the beams, s.
+LOOK_PERIOD = 1.0
 #: A heliostat moves if its counts and goals differ by more steps than this.
 _MOVES = 200
 #: States whose motions were commanded: the whole way is looked at. Of every other state the present
@@ -80,6 +84,8 @@ class BeamWatch:
     ----------
     points
         As given.
+    unsent
+        Watch over beams on a receiver that were not sent there.
     """
 
     def __init__(
@@ -93,6 +99,7 @@ class BeamWatch:
         self._check, self._field, self.points, self._sun = check, field, points, sun
         self._machines = machines
         self._ways = Ways(check, machines)
+        self.unsent = UnsentBeams(check, field, sun, machines)
         self._seen: frozenset[str] = frozenset()
         self._turn = 0
         self._at = -np.inf
@@ -259,26 +266,31 @@ class BeamWatch:
     # -- the watch -------------------------------------------------------------------------
 
     @property
-    def watches(self) -> bool:
-        """Whether there are keep-out volumes to watch."""
-        return bool(self._check.volumes)
+    def watched(self) -> frozenset[str]:
+        """Names of the readings: of keep-out volumes and of receivers, where there are any."""
+        found = {"keep_out_predicted": self._check.volumes, "beam_unsent": self._check.solids}
+        return frozenset(name for name, places in found.items() if places)
 
     def readings(self, now: float) -> dict[tuple[str, str], Reading]:
-        """Return 1 for each heliostat whose beam is in a volume or heading for one, 0 for others.
+        """Return 1 for each heliostat whose beam is where it may not be, 0 for others.
 
-        The beams are looked at once a second; between two looks the last one counts.
+        That is in a volume or heading for one, or on a receiver unsent. The beams are looked at
+        once a second; between two looks the last one counts.
         """
-        if not self.watches:
-            return {}
         if now - self._at >= LOOK_PERIOD:
             self._at = now
-            self._look(now)
-        found = {("keep_out_predicted", name): Reading(1.0, now) for name in self._seen}
-        found["keep_out_predicted", ""] = Reading(0.0, now)
-        return found
+            if self._check.volumes:
+                self._look(now)
+            if self.unsent.watches:
+                self.unsent.look(now)
+        seen = {"keep_out_predicted": self._seen, "beam_unsent": self.unsent.seen}
+        found = {(what, ""): Reading(0.0, now) for what in self.watched}
+        return found | {
+            (what, name): Reading(1.0, now) for what in self.watched for name in seen[what]
+        }
 
     def way_out(self, name: str, *, again: bool) -> Act:
-        """Return the order, DEFOCUS or STOW, that takes a heliostat out of a volume soonest.
+        """Return the order, DEFOCUS or STOW, that takes a beam out of a volume or off a receiver.
 
         Parameters
         ----------
@@ -289,7 +301,8 @@ class BeamWatch:
         """
         row = self._field.place(name)
         if name not in self._seen:
-            return Act.DEFOCUS
+            lit = name in self.unsent.seen
+            return self.unsent.way_out(name, again=again) if lit else Act.DEFOCUS
         node = self._field.rows[row]
         ends = self._field.goals(np.array([row]))[0]
         stands = not (np.abs(ends - self._field.posed[row]) > _MOVES).any()

@@ -291,6 +291,13 @@ def _mirrors() -> tuple[Condition, ...]:
             " point.",
         ),
         Condition(
+            "beam_unsent", _PLANT, "beam_unsent", "yes/no",
+            "beam on a receiver that was not sent there",
+            "its beam is on a receiver, and nobody sent it there", 0.5, 0.4, _DEFOCUS, _HELIOSTAT,
+            _SERIOUS, 30.0, then_stow=10.0, delay=5.0, release="the beam is off the receiver",
+            remedy="If it stays, inspect the heliostat; to hold it, lock it at stow.",
+        ),
+        Condition(
             "pointing_disagrees", _PLANT, "pointing_error", "rad",
             "angle between its beam, by its step counts, and its aim",
             "its step counts send its beam {value} beside its aim", 3e-3, 2e-3, _DEFOCUS,

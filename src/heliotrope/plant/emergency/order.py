@@ -2,8 +2,10 @@
 
 A heliostat has acknowledged the order when its local controller says so, or when a state heard
 after the order shows it. A heliostat is done by its state *and* by its axes: its beam is off the
-receiver when the axes are within `NEAR` of the goals of the defocus, whatever the state is called.
-A heliostat with unknown step counts is never done: the report says where its beam was last.
+receiver when the axes are within `NEAR` of the goals of the defocus, whatever the state is called,
+and the beam, by step counts and believed mechanism, is on no receiver: a mirror at standby may turn
+its beam onto one. A heliostat with unknown step counts is never done: the report says where its
+beam was last.
 """
 
 from dataclasses import replace
@@ -116,11 +118,13 @@ class EmergencyOrder:
         drives: Drive,
         now: float,
         strange: Mask,
+        lit: Mask,
     ) -> None:
         """Take the state of heliostats (K,): rows of `NODE`, when they were true, and drives.
 
         ``strange`` ones are not what their address says. They are done at stow only: the goals of
-        their defocus may belong to another mirror.
+        their defocus may belong to another mirror. Where a beam is still on a receiver (``lit``),
+        nothing is done.
         """
         settled = heard >= self.at + LEAVING
         fulfilled = np.where(
@@ -128,7 +132,7 @@ class EmergencyOrder:
             carried_out(Act.STOW, rows, drives, settled),
             carried_out(self.act, rows, drives, settled),
         )
-        fulfilled &= heard >= self.at
+        fulfilled &= (heard >= self.at) & ~lit
         ready = tuple(names[i] for i in np.flatnonzero(fulfilled))
         if ready:
             self.take_stage(ready, Stage.DONE, now)

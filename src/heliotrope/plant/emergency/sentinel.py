@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
@@ -22,7 +23,7 @@ from heliotrope.plant.emergency.order import (
     switched_off,
 )
 from heliotrope.plant.emergency.table import TableWatch
-from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.field_state import FieldState, Mask
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.joining import JoinQueue
 from heliotrope.plant.orders import PlantOrders
@@ -217,16 +218,24 @@ class Sentinel:
     def take_progress(
         self, ticket: Ticket, heliostats: tuple[str, ...], progress: Progress
     ) -> None:
-        """Take a cluster's report on a ticket, if it is the order's ticket."""
-        if self.order is not None and ticket is self.order.ticket:
-            if progress.stage is Stage.DONE:
-                flags = self._field.rows["flags"]
-                good = (flags & COUNTS_UNKNOWN == 0) & ~switched_off(flags)
-                strange = self._identities.strange
-                heliostats = tuple(
-                    n for n in heliostats if good[self._field.index[n]] and n not in strange
-                )
-            self.order.take_stage(heliostats, progress.stage, self._clock.monotonic())
+        """Take a cluster's report on a ticket, if it is the order's ticket.
+
+        Where a plant has receivers, a cluster's word that a DEFOCUS is done only acknowledges it:
+        the beam is off by the step counts of the next status, which show where it went.
+        """
+        order = self.order
+        if order is None or ticket is not order.ticket:
+            return
+        stage = progress.stage
+        if stage is Stage.DONE:
+            flags, strange = self._field.rows["flags"], self._identities.strange
+            good = (flags & COUNTS_UNKNOWN == 0) & ~switched_off(flags)
+            heliostats = tuple(
+                n for n in heliostats if good[self._field.index[n]] and n not in strange
+            )
+            if order.act is Act.DEFOCUS and self._ways.unsent.watches:
+                stage = Stage.ACKNOWLEDGED
+        order.take_stage(heliostats, stage, self._clock.monotonic())
 
     def take_rows(self, cluster: str, now: float) -> None:
         """Update the proof of the order from a cluster's new status."""
@@ -244,6 +253,7 @@ class Sentinel:
                 Drive(self._drives.table[index]),
                 now,
                 np.array([self._field.names[r] in self._identities.strange for r in rows]),
+                self._lit(index),
             )
         for row in rows:
             name = self._field.names[row]
@@ -258,6 +268,14 @@ class Sentinel:
                 order.unknown[name] = f"{name}: {text}, so only stow proves that it is off"
             else:
                 order.unknown.pop(name, None)
+
+    def _lit(self, rows: npt.NDArray[np.intp]) -> Mask:
+        """Return which heliostats (K,) are not proven to be off: their beams are on a receiver.
+
+        At stow nothing can take a beam elsewhere, so it counts as off.
+        """
+        stowed = self._field.rows["state"][rows] == states.STOWED
+        return np.asarray(self._ways.unsent.lit(rows) & ~stowed)
 
     def barred(self, heliostats: Iterable[str]) -> dict[str, str]:
         """Return which heliostats may not join their aims, and why."""

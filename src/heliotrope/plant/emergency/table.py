@@ -85,7 +85,7 @@ class PlantReadings:
         self._beams, self._agreement, self._sun = beams, agreement, sun
         self._sun_at = -math.inf
         self._elevation = -0.5 * np.pi
-        self.names = OWN_READINGS | ({"keep_out_predicted"} if beams.watches else set())
+        self.names = OWN_READINGS | beams.watched
 
     def take(
         self, proof: Proof | None, *, called: bool, now: float
