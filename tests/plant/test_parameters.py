@@ -175,3 +175,38 @@ def test_stored_items_give_the_pose_that_they_were_made_of() -> None:
     counts = np.array([12_345.0, -2_345.0])
     made = type(before.drives)(drives).angles(counts)
     assert made == pytest.approx(after.drives.angles(counts), abs=1e-6)
+
+
+def test_nothing_moves_before_its_parameters_have_been_compared(tmp_path: Path) -> None:
+    """Not where the answer is lost either; where nothing is wanted, nothing is asked."""
+
+    async def scene(bench: Bench, token: int) -> None:
+        plant, cluster = bench.plant, bench.cluster_of(NAME)
+        text = "P1A: its stored parameters have not been compared with the wanted ones"
+        with pytest.raises(RefusedError, match=text):
+            plant.command(ENGINEER, token, "APPROACH", (NAME,))
+        assert plant.command(ENGINEER, token, "APPROACH", (NAME, OTHER)).blocked.keys() == {NAME}
+        assert plant.command(ENGINEER, token, "LOCK", (NAME,))
+        cluster.deaf.clear()
+        for _ in range(35):
+            await bench.wait(1.0)
+            plant.authority.keep(ENGINEER, token)
+        assert not plant.command(ENGINEER, token, "APPROACH", (NAME, OTHER)).blocked
+        # A cluster that connects again may have other boards.
+        plant._greet(plant._clusters.ends[cluster.name])
+        with pytest.raises(RefusedError, match=text):
+            plant.command(ENGINEER, token, "IDLE", (NAME,))
+
+    made: list[Bench] = []
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path, wanted=Wanted({NAME: items(NAME)}))
+        made.append(bench)
+        cluster = bench.cluster_of(NAME)
+        cluster.stored[NAME] = items(NAME)
+        cluster.deaf.add(NAME)
+        async with running(bench):
+            await scene(bench, await bench.commanded(ENGINEER))
+
+    run_virtual(main)
+    assert made[0].cluster_of(OTHER).commands("APPROACH")

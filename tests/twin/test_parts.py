@@ -5,24 +5,29 @@ import math
 import random
 from contextvars import copy_context
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from heliotrope.errors import FormatError, InputError
 from heliotrope.lcu import ticks, wire
 from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of, run_virtual
 from heliotrope.links.link import LinkClosedError, SendOutcome
-from heliotrope.plant.audit import AuditError
+from heliotrope.plant.audit import AuditError, Record
 from heliotrope.sun import vector
+from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.bus import BusFaults, TwinBus
 from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime, TickCounter
 from heliotrope.twin.boards.flash import NorFlash, PowerCutError
 from heliotrope.twin.boards.motors import MotorAxis
 from heliotrope.twin.boards.outfit import RECEIVER, outfits
+from heliotrope.twin.invariants.invariants import InvariantError
+from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.runs import RunAccount
 from heliotrope.twin.records import RecordsDisk
 from heliotrope.twin.world.scene import USUAL, scene_of
-from heliotrope.twin.world.simulation import RunPlan
+from heliotrope.twin.world.simulation import SETTINGS, RunPlan
 from heliotrope.twin.world.soak import run_many
 
 
@@ -196,6 +201,64 @@ def test_a_frozen_program_stands_still_and_catches_up() -> None:
     run_virtual(main)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_program_that_is_killed_while_frozen_does_nothing_more(seed: int) -> None:
+    """Its tasks end, and neither timers nor messages that came meanwhile let them go on."""
+    did: list[str] = []
+
+    async def main(clock: VirtualClock) -> None:
+        loop, rings = asyncio.get_running_loop(), asyncio.Event()
+        assert isinstance(loop, VirtualLoop)
+
+        async def wait(what: str) -> None:
+            await (rings.wait() if what == "message" else asyncio.sleep(1.0))
+            did.append(what)
+
+        async def program() -> None:
+            async with asyncio.TaskGroup() as group:
+                for what in ("message", "timer") * 3:
+                    group.create_task(wait(what))
+
+        task = loop.create_task(program(), context=context_of("one"))
+        await asyncio.sleep(0.5)
+        loop.freeze("one")
+        rings.set()
+        await asyncio.sleep(5.0)
+        task.cancel()
+        loop.kill("one")
+        async with asyncio.timeout(10.0):
+            await asyncio.gather(task, return_exceptions=True)
+        assert task.cancelled()
+
+    run_virtual(main, seed)
+    assert not did
+
+
+def test_imperfections_are_counted_once() -> None:
+    fit = outfits(1, seed=4)[0]
+    same = fit.with_causes(fit.causes)
+    np.testing.assert_allclose(same.armature.table, fit.mechanism.armature.table, atol=1e-12)
+    assert any(abs(value) > 1e-3 for value in fit.causes.values())
+
+
+def test_a_record_of_a_command_that_was_given_up_belongs_to_nothing_and_says_so() -> None:
+    plant = SimpleNamespace(
+        field=SimpleNamespace(live=lambda now: np.zeros(0, dtype=bool)), emergency=None
+    )
+    for result, good in (("PARAMETERS: 1 failed (H1: not sent: too late)", True), ("done", False)):
+        disk = RecordsDisk()
+        observer = PlantObserver(0.0, disk, SETTINGS, [])
+        record = Record("x-1", "plant", "plant", "PARAMETERS", "", result=result)
+        observer.look(plant, 0.0)  # type: ignore[arg-type]
+        disk.records["x-1"] = record
+        observer.look(plant, 1.0)  # type: ignore[arg-type]
+        if good:
+            observer.look(plant, 4.0)  # type: ignore[arg-type]
+        else:
+            with pytest.raises(InvariantError, match="record x-1 belongs to nothing"):
+                observer.look(plant, 4.0)  # type: ignore[arg-type]
+
+
 def test_a_slow_disk_works_in_order_and_loses_what_waits() -> None:
     async def main(clock: VirtualClock) -> None:
         disk, done = RecordsDisk(), []
@@ -227,7 +290,7 @@ def test_a_slow_disk_works_in_order_and_loses_what_waits() -> None:
 
 
 def test_a_drawn_scene_has_sun_and_free_mirrors() -> None:
-    assert scene_of(("calm",), 3, 60.0, 4) is USUAL
+    assert scene_of(("calm",), 3, 60.0, 4) == USUAL
     for seed in range(30):
         scene = scene_of(("place",), seed, 600.0, 6)
         assert scene == scene_of(("place",), seed, 600.0, 6)
@@ -236,6 +299,14 @@ def test_a_drawn_scene_has_sun_and_free_mirrors() -> None:
         for middle, radius in scene.keep_outs:
             assert math.dist(middle, RECEIVER) > radius + 5.0
             assert all(math.dist(middle, (*place, 2.0)) > radius + 5.0 for place in scene.places)
+        # Nothing can take a beam elsewhere at stow.
+        fits = outfits(6, seed, scene.places)
+        for at in (0.0, 250.0, 600.0):
+            sun = vector(scene.start.timestamp() + at, scene.site)
+            for fit in fits:
+                board = Board(fit)
+                assert board.miss(sun, RECEIVER) > 6.0
+                assert all(board.miss(sun, ball) > radius for ball, radius in scene.keep_outs)
 
 
 def test_the_run_that_is_obeyed_is_the_only_one_while_its_leases_come() -> None:

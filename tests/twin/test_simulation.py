@@ -68,6 +68,21 @@ def test_what_was_found_once_stays_mended(seed: int, seconds: float) -> None:
     assert outcome.good, f"{outcome.text}; {outcome.command}"
 
 
+@pytest.mark.parametrize(
+    ("seed", "seconds", "worlds"),
+    [
+        (200046, 22.0, "place"),
+        (200254, 35.0, "swarm frozen disk place sensors parameters calibrations"),
+        (200095, 28.0, "calm held frozen sensors parameters calibrations"),
+        (200184, 75.0, "swarm held frozen disk place sensors parameters calibrations"),
+    ],
+)
+def test_what_any_world_found_once_stays_mended(seed: int, seconds: float, worlds: str) -> None:
+    """An approach over the receiver; a scene; parameters not compared; a proof of DEFOCUS."""
+    outcome = run(RunPlan(seed, seconds, 4, pause=12.0, worlds=tuple(worlds.split())))
+    assert outcome.good, f"{outcome.text}; {outcome.command}"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("block", range(10))
 def test_no_invariant_is_broken_for_long(block: int) -> None:

@@ -325,6 +325,20 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         """Let a program go on: everything that has become due runs at once, in any order."""
         self._ready.extend(self._ready.held.pop(program, ()))
 
+    def kill(self, program: str) -> None:
+        """End a program that is frozen where it stands; its owner has cancelled its tasks.
+
+        What it was kept from doing is not done: no task takes another step, no timer wakes one.
+        """
+        for handle in self._ready.held.get(program, ()):
+            # Group and tasks of the program must still learn that they end.
+            owner = getattr(handle._callback, "__self__", None)  # type: ignore[attr-defined] # noqa: SLF001
+            if isinstance(owner, asyncio.Task):
+                owner.cancel()
+            elif not isinstance(owner, asyncio.TaskGroup):
+                handle.cancel()
+        self.thaw(program)
+
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Callable[..., Any], *args: Any
     ) -> asyncio.Future[Any]:

@@ -144,7 +144,10 @@ class ParameterSync:
             self._due[heliostat] = -math.inf
 
     def differing(self, heliostats: Sequence[str]) -> dict[str, str]:
-        """Return which heliostats may not move, because their parameters differ, and why."""
+        """Return which heliostats may not move, because their parameters differ, and why.
+
+        Those that have not been compared since their cluster connected may differ.
+        """
         found = {}
         for name in heliostats:
             ticket = self._tickets.get(name)
@@ -152,6 +155,8 @@ class ParameterSync:
             if items or (ticket is not None and not ticket.finished):
                 listed = ", ".join(items) or "being written"
                 found[name] = refusals.PARAMETERS_DIFFER.text.format(items=listed)
+            elif name in self._due:
+                found[name] = refusals.NOT_COMPARED.text
         return found
 
     def check(self, heliostat: str, items: Mapping[str, bytes]) -> None:

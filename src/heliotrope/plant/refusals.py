@@ -131,6 +131,14 @@ PARAMETERS_DIFFER = Refusal(
     "Stow the heliostat: the wanted ones are written there. Lock it at stow if the text names more "
     "than armature, biases, location and defocus.",
 )
+NOT_COMPARED = Refusal(
+    "not compared",
+    "A motion is given to a heliostat whose stored parameters have not been compared with the "
+    "wanted ones since its cluster connected.",
+    "its stored parameters have not been compared with the wanted ones yet",
+    "Wait some seconds; an answer that is lost is asked for again after 30 s. If it stays, see to "
+    "its cluster or its supply. DEFOCUS and STOW are still sent.",
+)
 OTHER_PARAMETERS = Refusal(
     "other parameters",
     "A heliostat is moved, unlocked or written, and its address answers as another heliostat.",

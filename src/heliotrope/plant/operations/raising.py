@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
+from heliotrope.plant import refusals
 from heliotrope.plant.authority import Person
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
@@ -16,6 +17,8 @@ from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import alarms
 
+#: Refusals that end by themselves within seconds: the heliostat is tried again at the next turn.
+_SOON = (refusals.NOT_HEARD.text, refusals.NOT_COMPARED.text)
 #: Time before a heliostat whose beam has no clear way is tried again, s.
 _BLOCKED = 300.0
 #: Time after which a heliostat that can only go on from stow is sent there, s.
@@ -192,7 +195,7 @@ class Raising:
             try:
                 ticket = give(names)
             except BeamError as error:
-                refusals = error.refusals
+                wrong = error.refusals
             else:
                 told = [self._plant.field.place(name) for name in names]
                 # They get no further command until their state changes or patience ends.
@@ -200,13 +203,15 @@ class Raising:
                 self._told_in[told] = state
                 self._block(ticket.blocked, state)
                 return names, ticket
-            self._block(refusals, state)
-            names = tuple(name for name in names if name not in refusals)
+            self._block(wrong, state)
+            names = tuple(name for name in names if name not in wrong)
         return None
 
-    def _block(self, refusals: Mapping[str, str], state: int) -> None:
+    def _block(self, wrong: Mapping[str, str], state: int) -> None:
         """Leave heliostats where they are until the sun has moved on."""
-        for name, text in refusals.items():
+        for name, text in wrong.items():
+            if text in _SOON:
+                continue
             row = self._plant.field.place(name)
             self._busy_until[row], self._told_in[row] = self._plant.now() + _BLOCKED, state
             self._blocked.add(name)

@@ -4,7 +4,7 @@ import hashlib
 import math
 import random
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,6 +62,10 @@ class Outfit:
     mechanism: Mechanism
     causes: dict[str, float]
     items: dict[str, bytes]
+
+    def with_causes(self, causes: Mapping[str, float]) -> Mechanism:
+        """Return its mechanism with other imperfections (rad, by parameter) in place of its own."""
+        return _perfect(self.mechanism.position).with_parameters(causes)
 
     @property
     def stow(self) -> tuple[int, int]:
@@ -125,6 +129,23 @@ def _perfect(places: npt.ArrayLike) -> Mechanism:
     return kinds.azimuth_elevation(
         places, pivot_height=2.0, pivot_offset=0.2, drives=(rotary(**gear), rotary(**gear))
     )
+
+
+def stow_beams(
+    places: Sequence[tuple[float, float]], suns: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return vertices (N, 1, 3) and directions (N, S, 3) of the beams at stow.
+
+    Parameters
+    ----------
+    places
+        East and north of N heliostats without imperfections, m.
+    suns
+        Unit vectors, (S, 3).
+    """
+    pose = _perfect([(*place, 0.0) for place in places]).pose(np.tile(STOW, (len(places), 1)))
+    normal = pose.normal[:, None]
+    return pose.vertex[:, None], 2.0 * (normal @ suns.T).swapaxes(1, 2) * normal - suns
 
 
 def mechanisms(fits: Sequence[Outfit]) -> Mechanism:

@@ -350,7 +350,10 @@ class PlantObserver:
         for identity, at in list(self._own.items()):
             if now - max(at, self._hung_at) > RECORD_WITHIN:
                 del self._own[identity]
-                self.check(11, False, now, f"record {identity} belongs to nothing that was sent")
+                # A command that waited too long for the disk is given up; its record says so.
+                given_up = "not sent" in self._disk.records[identity].result
+                saw = f"record {identity} belongs to nothing that was sent, and does not say so"
+                self.check(11, given_up, now, saw)
 
     def _boards(self, now: float) -> None:
         """Note the mirrors that join, by the boards themselves."""

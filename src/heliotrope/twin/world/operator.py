@@ -355,7 +355,7 @@ class Operator:
         chance, name = self._chance, self._safe(plant)
         fit = self._fits[name]
         slight = {k: v + chance.gauss(0.0, 3e-4) for k, v in fit.causes.items()}
-        near = fit.mechanism.with_parameters(slight)
+        near = fit.with_causes(slight)
         what = chance.choice(["right", "slight", "belief", "belief", "another", "much", "machine"])
         self.counts[f"calibration {what}"] += 1
         if what == "belief":
@@ -367,7 +367,7 @@ class Operator:
         elif what in ("another", "much"):
             wrong = {k: v + chance.choice([-1.0, 1.0]) * 0.02 for k, v in fit.causes.items()}
             other = self._fits[chance.choice([n for n in self._names if n != name] or [name])]
-            source = other.mechanism if what == "another" else fit.mechanism.with_parameters(wrong)
+            source = other.mechanism if what == "another" else fit.with_causes(wrong)
             if other is not fit or what == "much":
                 self.push(plant, name, {"armature": items_of(source)["armature"]})
         else:

@@ -152,7 +152,9 @@ class Pod:
         self.observer.runs.forget()
         self.link = None
         self.line.drop()
-        self.freeze(on=False)
+        loop = asyncio.get_running_loop()
+        if self.freezes and isinstance(loop, VirtualLoop):
+            loop.kill(self.name)
 
     def freeze(self, *, on: bool) -> None:
         """Freeze the program, or let it go on."""

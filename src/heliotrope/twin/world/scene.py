@@ -9,14 +9,28 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 
 from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
 from heliotrope.sun import Site, vector
-from heliotrope.twin.boards.outfit import KEEP_OUT, KEEP_OUT_RADIUS, RECEIVER, STANDBY, Ball
+from heliotrope.twin.boards.outfit import (
+    KEEP_OUT,
+    KEEP_OUT_RADIUS,
+    RECEIVER,
+    STANDBY,
+    Ball,
+    stow_beams,
+)
+from heliotrope.twin.invariants.invariants import OFF
 from heliotrope.twin.world.worlds import works
 
 #: The sun is at least this high at the beginning and at the end of a drawn scene, rad.
 _LOWEST = math.radians(8.0)
 #: Nearest two heliostats, and nearest that a beam at rest passes the receiver, m.
 _APART, _BESIDE = 6.0, 8.0
+#: A beam at stow passes receiver and volumes by this much more than their radius, m: nothing can
+#: take it elsewhere, and persons change the stow position a little.
+_ROOM = 10.0
+#: The sun is looked at this often, s.
+_OFTEN = 60.0
 
 
 @dataclass(frozen=True)
@@ -64,15 +78,26 @@ def scene_of(worlds: Sequence[str], seed: int, seconds: float, heliostats: int) 
         return replace(USUAL, targets=targets)
     chance = random.Random(f"place {seed}")
     site, start = _when(chance, seconds)
+    times = np.linspace(0.0, seconds, 2 + int(seconds / _OFTEN))
+    suns = np.stack([vector(start.timestamp() + float(at), site) for at in times])
     places: list[tuple[float, float]] = []
     while len(places) < heliostats:
         bearing, away = chance.uniform(-math.pi, math.pi), chance.uniform(40.0, 150.0)
         place = (away * math.sin(bearing), away * math.cos(bearing))
         apart = all(math.dist(place, other) > _APART for other in places)
-        if apart and _beside(place) > _BESIDE:
+        off = _clear_at_stow([place], suns, (RECEIVER, OFF))
+        if apart and off and _beside(place) > _BESIDE:
             places.append(place)
-    balls = tuple(_ball(chance, places) for _ in range(chance.randint(1, 3)))
+    balls = tuple(_ball(chance, places, suns) for _ in range(chance.randint(1, 3)))
     return Scene(site, start, tuple(places), balls, targets)
+
+
+def _clear_at_stow(places: Sequence[tuple[float, float]], suns: FloatArray, ball: Ball) -> bool:
+    """Whether no beam at stow comes near a ball; ``suns`` are (S, 3)."""
+    (middle, radius), (vertex, way) = ball, stow_beams(places, suns)
+    along = ((np.array(middle) - vertex) * way).sum(axis=-1, keepdims=True)
+    miss = np.linalg.norm(np.array(middle) - vertex - np.maximum(along, 0.0) * way, axis=-1)
+    return bool((miss > radius + _ROOM).all())
 
 
 def _beside(place: tuple[float, float]) -> float:
@@ -94,8 +119,8 @@ def _when(chance: random.Random, seconds: float) -> tuple[Site, datetime]:
             return site, start
 
 
-def _ball(chance: random.Random, places: Sequence[tuple[float, float]]) -> Ball:
-    """Return a ball across a natural way of beams, clear of the mirrors and of the receiver."""
+def _ball(chance: random.Random, places: Sequence[tuple[float, float]], suns: FloatArray) -> Ball:
+    """Return a ball across a natural way of beams, clear of mirrors, receiver and beams at stow."""
     while True:
         radius = chance.uniform(1.0, 5.0)
         east, north = chance.choice(list(places))
@@ -112,5 +137,6 @@ def _ball(chance: random.Random, places: Sequence[tuple[float, float]]) -> Ball:
                 chance.uniform(-30.0, 30.0), chance.uniform(-30.0, 30.0), chance.uniform(5.0, 60.0)
             )  # fmt: skip
         clear = math.dist(middle, RECEIVER) > radius + 6.0
-        if clear and all(math.dist(middle, (*p, 2.0)) > radius + 8.0 for p in places):
+        clear &= all(math.dist(middle, (*p, 2.0)) > radius + 8.0 for p in places)
+        if clear and _clear_at_stow(places, suns, (middle, radius)):
             return middle, radius

@@ -466,7 +466,8 @@ class Simulation:
         for task in self._program:
             task.cancel()
         self._program, self.plant = [], None
-        self._frozen(on=False)
+        self.operator.waits = False
+        self._loop.kill(_PLANT)
         self.disk.lose()
         self.operator.begins(None)
         self.instruments.plant = None

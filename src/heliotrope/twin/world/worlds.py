@@ -157,7 +157,7 @@ def wrong_items(fit: Outfit, fits: Sequence[Outfit], chance: random.Random) -> d
     size = chance.choice([1e-3, 5e-3, 30e-3])
     if what == "armature":
         causes = {k: v + chance.gauss(0.0, size) for k, v in fit.causes.items()}
-        return {"armature": items_of(fit.mechanism.with_parameters(causes))["armature"]}
+        return {"armature": items_of(fit.with_causes(causes))["armature"]}
     if what == "biases":
         return {"biases": packed("biases", (chance.gauss(0.0, size), chance.gauss(0.0, size)))}
     return narrow_limits()
