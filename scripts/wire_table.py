@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from heliotrope.lcu import journal, messages, packet12, wire
+from heliotrope.lcu import journal, messages, wire
 
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "wire.md"
 WHO = {
@@ -20,7 +20,7 @@ GROUPS = {
 }  # fmt: skip
 FRAME = f"""# The wire, version 2
 
-This page is made from the tables in the program (`scripts/wire_table.py`); the code is `heliotrope.lcu.wire`, `messages`, `packet12` (offered as `heliotrope.links.packet12`) and `journal`.
+This page is made from the tables in the program (`scripts/wire_table.py`); the code is `heliotrope.lcu.wire`, `messages` and `journal`.
 
 ## A frame
 
@@ -71,8 +71,7 @@ def page() -> str:
     )
     lines.append(
         f"Payloads from the authority begin with `{names}` (`{plain}`), with a key "
-        f"`{keyed_names}` (`{keyed}`); the table leaves this head out. The 12-byte packet's types "
-        "stand in the last column."
+        f"`{keyed_names}` (`{keyed}`); the table leaves this head out."
     )
     said = meanings()
     for number, name, who, codes, fields in messages.MESSAGES:
@@ -80,43 +79,20 @@ def page() -> str:
             row[0] for row in messages.MESSAGES if row[0] & 0xF0 == number & 0xF0
         ):
             lines += ["", f"### {GROUPS[number & 0xF0]}", ""]
-            lines += ["| type | name | from | payload | meaning | 12 bytes |"]
-            lines += ["|---|---|---|---|---|---|"]
+            lines += ["| type | name | from | payload | meaning |"]
+            lines += ["|---|---|---|---|---|"]
         payload = f"`{codes}`: {fields.replace(' ', ', ')}" if codes else ""
-        lines.append(
-            f"| 0x{number:02X} | `{name}` | {WHO[who]} | {payload} | {said[number]} "
-            f"| {packet_types(name)} |"
-        )
+        lines.append(f"| 0x{number:02X} | `{name}` | {WHO[who]} | {payload} | {said[number]} |")
     lines += ["", "## Results in ACK", "", "| number | meaning |", "|---|---|"]
     lines += [f"| {number} | {text} |" for number, text in enumerate(messages.RESULTS)]
     lines += ["", "## Stored items", "", "| item | name | `struct` codes |", "|---|---|---|"]
     lines += [f"| {n} | `{name}` | `{codes}` |" for n, (name, codes) in enumerate(journal.ITEMS, 1)]
-    lines += ["", "## The 12-byte packet", "", PACKET, "", "## Damaged frames", "", DAMAGE]
+    lines += ["", "## Damaged frames", "", DAMAGE]
     return "\n".join(lines) + "\n"
 
 
-def packet_types(name: str) -> str:
-    """Return the types of the 12-byte packets that hold a message."""
-    if name in packet12.KINDS:
-        return f"0x{packet12.SEARCH_OR_DIAGNOSE:02X}"
-    row = packet12.ROW_OF_NAME.get(name)
-    if row is None:
-        return ""
-    types = [part[0] for part in row[1]]
-    return f"0x{types[0]:02X}" + (f" to 0x{types[-1]:02X}" if len(types) > 1 else "")
-
-
-PACKET = (
-    "Address (high, low), type, eight bytes of data, sum of the eleven bytes modulo 256. Of this, "
-    "the length, the 16-bit address, a type byte, 0xD8 for target search and motion detection, "
-    "data and a checksum are Malan's; the rest is ours, because the thesis's Table D.1 was not at "
-    "hand: compare it with the firmware of a board that was built to the thesis. Packets are "
-    f"separated by {packet12.GAP_CHARACTERS} characters of silence. They carry no head and no MAC, "
-    "so they can store nothing."
-)
-
 #: Measured by ``python -m benchmarks frames``.
-DAMAGE = """Ten million frames of all types were damaged at random in five ways and read (`python -m benchmarks frames`), and ten million 12-byte packets separated by silence, the best case for them. A false accept is a frame that comes out and was never sent.
+DAMAGE = """Ten million frames of all types were damaged at random in five ways and read (`python -m benchmarks frames`), and ten million packets with the length and the one-byte sum of Malan's thesis, separated by silence, the best case for them. A false accept is a frame that comes out and was never sent.
 
 | damage | frames | false accepts | packets | false accepts |
 |---|---|---|---|---|

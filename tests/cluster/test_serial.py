@@ -174,20 +174,6 @@ def test_the_codec_says_what_an_answer_is(line: Line) -> None:
     real(main)
 
 
-def test_a_gap_ends_an_answer_where_nothing_else_does(line: Line) -> None:
-    line.answer = lambda _: [bytes(range(12))]
-    settings = BusSettings(gap=0.05, gap_ends=True)
-
-    async def main() -> None:
-        bus = bus_of(line, settings)
-        async with running(bus):
-            await bus.opened()
-            # The answer comes long before its timeout, which the test's own limit holds.
-            assert await bus.transact(bytes(12), 1000.0) == bytes(range(12))
-
-    real(main)
-
-
 def test_transactions_do_not_mix_and_the_urgent_goes_first(line: Line) -> None:
     spoken: list[bytes] = []
 

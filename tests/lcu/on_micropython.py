@@ -24,8 +24,6 @@ from lcu import journal, ticks  # noqa: E402
 memory[2] = gc.mem_alloc()
 from nor import CutError, Nor  # noqa: E402
 
-from lcu import packet12  # noqa: E402
-
 with open("/vectors.json") as file:  # noqa: PTH123
     given = json.load(file)
 raws = [unhexlify(raw_hex) for raw_hex in given["frames"]]
@@ -119,24 +117,6 @@ def judged(vectors, key):
     return out
 
 
-def packets(vectors):
-    out = []
-    for address, name, values, tag in vectors:
-        joiner = packet12.Joiner()
-        made = packet12.to_packets(address, name, tuple([real(value) for value in values]), tag)
-        got = [joiner.feed(packet) for packet in made][-1]
-        out.append([hexlify(b"".join(made)).decode(), got[0], got[1], [plain(v) for v in got[2]]])
-    return out
-
-
-def split(vectors):
-    splitter = packet12.Splitter(1042)
-    out = []
-    for tick, data in vectors:
-        out += [hexlify(packet).decode() for packet in splitter.feed(tick, unhexlify(data))]
-    return out
-
-
 def tick_sums(vectors):
     """As CPython, and as this machine's own functions."""
     out = []
@@ -210,8 +190,6 @@ def main():
         "counts": counts(given["stream"]),
         "refusals": refusals(given["refusals"]),
         "judged": judged(given["judged"], key),
-        "packets": packets(given["packets"]),
-        "split": split(given["split"]),
         "ticks": tick_sums(given["ticks"]),
         "deadline": deadline(*given["deadline"]),
         "keep": keep(given["keep"]),

@@ -19,14 +19,14 @@ from typing import Any, NoReturn
 
 import pytest
 
-from heliotrope.lcu import journal, messages, packet12, ticks, wire
+from heliotrope.lcu import journal, messages, ticks, wire
 from lcu.nor import Nor
-from lcu.test_wire import KEY, codes, example, frame_of, sha256, traffic
+from lcu.test_wire import KEY, example, frame_of, sha256, traffic
 
 HERE = Path(__file__).parent
 CORE = HERE.parents[1] / "src" / "heliotrope" / "lcu"
 FILES = sorted(CORE.glob("*.py"))
-COMPARED = ("__init__", "journal", "messages", "packet12", "ticks", "wire")
+COMPARED = ("__init__", "journal", "messages", "ticks", "wire")
 PACKAGE = "@micropython/micropython-webassembly-pyscript"
 OLDEST, NEWEST = "1.25.0", "1.27.0"
 NOW = 1_480_000_000
@@ -121,8 +121,6 @@ def vectors() -> dict[str, Any]:
         "stream": stream.hex(),
         "refusals": refusals(),
         "judged": gate_traffic(),
-        "packets": packet_messages(rng),
-        "split": line(rng),
         "ticks": [
             [rng.randrange(1 << 30), rng.randrange(-(1 << 29), 1 << 29), rng.randrange(1 << 30)]
             for _ in range(500)
@@ -174,27 +172,6 @@ def gate_traffic() -> list[list[Any]]:
         if turn % 11 == 4:
             raws.append(raws[0])
         out += [[raw.hex(), tick, NOW] for raw in raws]
-    return out
-
-
-def packet_messages(rng: random.Random) -> list[list[Any]]:
-    out = []
-    for name, _ in packet12.PARTS:
-        number = messages.NUMBER_OF[name]
-        values = wire.unpack(number, example(name, rng))
-        assert values is not None
-        bare = values[len(codes(name)) - len(messages.ROW_OF[number][3]) :]
-        out.append([rng.randrange(65536), name, [plain(v) for v in bare], rng.randrange(256)])
-    return out
-
-
-def line(rng: random.Random) -> list[list[Any]]:
-    out, tick = [], (1 << 30) - 100_000
-    for _ in range(60):
-        packet = packet12.build(rng.randrange(32), rng.randrange(256), rng.randbytes(8))
-        packet = packet[: rng.choice((12, 12, 12, 7))]
-        out.append([tick, packet.hex()])
-        tick = ticks.add(tick, len(packet) * 1042 + rng.choice((4000, 4000, 1000)))
     return out
 
 
@@ -285,25 +262,6 @@ def test_the_gate_judges_alike(given: dict[str, Any], answers: dict[str, Any]) -
         messages.EXPIRED,
         messages.DUPLICATE,
     }
-
-
-def test_packets_are_alike(given: dict[str, Any], answers: dict[str, Any]) -> None:
-    for (address, name, values, tag), got in zip(given["packets"], answers["packets"], strict=True):
-        real = tuple(
-            struct.unpack("<d", bytes.fromhex(v[1:]))[0] if isinstance(v, str) else v
-            for v in values
-        )
-        made = packet12.to_packets(address, name, real, tag)
-        assert got == [b"".join(made).hex(), address, name, values]
-
-
-def test_packets_are_split_alike(given: dict[str, Any], answers: dict[str, Any]) -> None:
-    splitter, expected = packet12.Splitter(1042), []
-    for tick, data in given["split"]:
-        expected += [packet.hex() for packet in splitter.feed(tick, bytes.fromhex(data))]
-    assert answers["split"] == expected
-    assert splitter.good > 10
-    assert splitter.bad > 5
 
 
 def test_ticks_are_alike(given: dict[str, Any], answers: dict[str, Any]) -> None:

@@ -48,9 +48,6 @@ class BusSettings:
         Bits per second; a character has ten.
     gap
         Silence before a frame, in s; None: 3.5 characters, at least 1.75 ms, as on Modbus.
-    gap_ends
-        A gap ends an answer: for the thesis's 12-byte packets. Needs a port without a network in
-        between, because a network adds gaps of its own.
     echo
         The adapter hears its own frames.
     first_pause, longest_pause
@@ -66,7 +63,6 @@ class BusSettings:
 
     baud_rate: int = 115200
     gap: float | None = None
-    gap_ends: bool = False
     echo: bool = False
     first_pause: float = 0.2
     longest_pause: float = 2.0
@@ -130,12 +126,6 @@ class BusStatistics:
 def ends_in_zero(data: bytes) -> bool:
     """Return whether bytes hold a whole frame of the wire: something, then a zero."""
     return data.endswith(b"\0") and bool(data.strip(b"\0"))
-
-
-def _never(data: bytes) -> bool:
-    """Return False: the gap ends the answer."""
-    del data
-    return False
 
 
 class _Port(asyncio.Protocol):
@@ -342,7 +332,7 @@ class SerialBus:
             As in `transmit`.
         complete
             Returns whether the bytes received so far are the whole answer; None: that of the wire,
-            `ends_in_zero`, unless gaps end an answer.
+            `ends_in_zero`.
 
         Returns
         -------
@@ -360,7 +350,7 @@ class SerialBus:
         if not timeout > 0.0:
             raise InputError(f"bus {self._url}: a timeout of {timeout} s; it must be above 0")
         if complete is None:
-            complete = _never if self._settings.gap_ends else ends_in_zero
+            complete = ends_in_zero
         async with self._turns.turn(urgent=urgent):
             port, _ = await self._put(frame, expires)
             if port is None:
@@ -409,14 +399,11 @@ class SerialBus:
         return False
 
     async def _hear(self, port: _Port, end: float, complete: Callable[[bytes], bool]) -> bytes:
-        """Return the bytes received until they are complete, until a gap, or until ``end``."""
+        """Return the bytes received until they are complete, or until ``end``."""
         while True:
             answer = bytes(port.data)
-            until = end
-            if answer and self._settings.gap_ends:
-                until = min(end, port.last_at + self._settings.quiet)
-            over = port.lost.is_set() or port.spoilt or self._clock.monotonic() >= until
+            over = port.lost.is_set() or port.spoilt or self._clock.monotonic() >= end
             if over or (answer and complete(answer)):
                 port.data.clear()
                 return answer
-            await port.hear(until)
+            await port.hear(end)

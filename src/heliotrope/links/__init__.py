@@ -6,15 +6,13 @@ one implementation, over a `Carrier`: in the same process (`memory_pair`), TCP (
 seals each message in an envelope that proves its age without a common clock.
 
 `encode` and `decode` turn messages (`Lease`, `Command`, `ClusterStatus`, …) into bytes and back.
-A `TappedLink` shows the messages of any link to a listener. `packet12` reads and writes the 12-byte
-packets of Malan's thesis, for local controllers that understand no other.
+A `TappedLink` shows the messages of any link to a listener.
 
 `Clock` measures every limit; `run_virtual` runs a program in virtual time.
 
 Begin with `Link` and `memory_pair`.
 """
 
-from heliotrope.lcu import packet12
 from heliotrope.links.addresses import url_parts
 from heliotrope.links.clock import (
     Clock,
@@ -115,7 +113,6 @@ __all__ = [
     "gps_week",
     "leap_seconds",
     "memory_pair",
-    "packet12",
     "received",
     "run_virtual",
     "running",
