@@ -94,7 +94,8 @@ def _raised(plant: LiveConsole) -> None:
     plant.call(lambda: here.switch_calibration(who, on=False))
     plant.call(lambda: here.resume(who))
     plant.call(lambda: here.give_back(who))
-    plant.until(lambda: here.plant.field.among(UP, here.plant.now()).all(), 120.0)
+    plant.until(lambda: not here.calibration().running, 240.0)
+    plant.until(lambda: here.plant.field.among(UP, here.plant.now()).all(), 240.0)
 
 
 @pytest.fixture
