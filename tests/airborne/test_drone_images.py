@@ -466,7 +466,7 @@ def test_evaluate_command(case: Case, tmp_path) -> None:
     checked = run("rtk", case.folder, *common, "--survey-mm", 1)
     assert checked.exit_code == 0, checked.output
     assert "16 photographs, mm" in checked.stdout
-    assert "Covariance of one position" in checked.stdout
+    assert "Covariance of one difference" in checked.stdout
 
 
 def test_simulate_command(tmp_path) -> None:

@@ -264,8 +264,7 @@ class PlantController:
     def _greet(self, end: ClusterEnd) -> None:
         """Repeat orders to a cluster that has connected, and compare its parameters."""
         self._sentinel.greet(end.name)
-        for name in end.members:
-            self._sync.compare(name)
+        self._sync.greet(end.members)
 
     def _take(self, end: ClusterEnd, message: object, now: float) -> None:
         match message:

@@ -135,6 +135,8 @@ class ParameterSync:
         self._barred = barred
         #: Heliostats to be compared, each with its time, monotonic s.
         self._due = dict.fromkeys(wanted.items, -math.inf)
+        #: Those not compared since their cluster connected: any board may answer there.
+        self._strange = set(self._due)
         self._tickets: dict[str, Ticket] = {}
         self._tried: dict[str, float] = {}
 
@@ -142,6 +144,12 @@ class ParameterSync:
         """Compare a heliostat as soon as possible."""
         if heliostat in self._wanted.items:
             self._due[heliostat] = -math.inf
+
+    def greet(self, heliostats: Sequence[str]) -> None:
+        """Compare the heliostats of a cluster that has connected, before they may move."""
+        for name in heliostats:
+            self.compare(name)
+        self._strange.update(name for name in heliostats if name in self._wanted.items)
 
     def differing(self, heliostats: Sequence[str]) -> dict[str, str]:
         """Return which heliostats may not move, because their parameters differ, and why.
@@ -155,7 +163,7 @@ class ParameterSync:
             if items or (ticket is not None and not ticket.finished):
                 listed = ", ".join(items) or "being written"
                 found[name] = refusals.PARAMETERS_DIFFER.text.format(items=listed)
-            elif name in self._due:
+            elif name in self._strange:
                 found[name] = refusals.NOT_COMPARED.text
         return found
 
@@ -225,6 +233,7 @@ class ParameterSync:
             problem = answer.data.get("error", "nothing is stored")
             raise refusals.NO_ANSWER.error(heliostat=heliostat, problem=problem)
         sums = checksums(items)
+        self._strange.discard(heliostat)
         self._wanted.compare(heliostat, sums)
         return sums
 
@@ -251,6 +260,7 @@ class ParameterSync:
             if not items:
                 return
             self._due.pop(name, None)
+            self._strange.discard(name)
             differing = self._wanted.compare(name, checksums(items))
             if differing:
                 self._tell(alarms.PARAMETERS_DIFFER.raised(name, items=", ".join(differing)))
