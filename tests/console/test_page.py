@@ -67,7 +67,7 @@ def test_first_start(field: LiveConsole, browser: Any, tmp_path: Path) -> None:
         page.fill("[name=password]", password)
         page.click("button")
         page.wait_for_url("**/account")
-        assert "Change it before you go on" in page.inner_text("#due")
+        page.wait_for_selector("#due:has-text('Change it before you go on')")
         page.fill("[name=old]", password)
         for name in ("new", "again"):
             page.fill(f"[name={name}]", "a password of my own")

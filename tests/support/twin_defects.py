@@ -362,8 +362,10 @@ DEFECTS = (
            faults=tuple(Fault("line_cut", at, 9.0, 0, 0.5) for at in (80.0, 120.0, 150.0)),
            worlds=("calm",)),
     Defect((13,), "a mirror stays where it was after a boot", _stays_after_boot,
-           faults=tuple(Fault("power_cut", 150.0, 2.0, i, 0.5) for i in range(3)), seconds=220.0,
-           worlds=("calm",)),
+           # The plant sends off a beam that nobody sent, so it must not reach the boards.
+           faults=tuple(Fault(kind, at, long, i, 0.5) for i in range(3) for kind, at, long in
+                        (("power_cut", 150.0, 2.0), ("bus_unplugged", 151.0, 60.0))),
+           seconds=220.0, worlds=("calm",)),
     Defect((1,), "SEARCHING goes on without a sun", _search_without_sun,
            faults=tuple(Fault("cluster_crash", at, 12.0, i, 0.5)
                         for at in (70.0, 100.0, 130.0, 160.0, 190.0, 220.0) for i in range(3)),

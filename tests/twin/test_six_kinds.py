@@ -16,7 +16,8 @@ from support.live import LiveOptions, LivePlant
 from support.six_kinds import BUILDERS, mixed
 
 MRAD = 1e-3
-START = datetime(2026, 1, 10, 10, 0, tzinfo=UTC)
+#: Then every heliostat of these layouts has a way past the receiver.
+START = datetime(2026, 1, 10, 7, 0, tzinfo=UTC)
 SIX = [kind for kind in BUILDERS if kind != "two_jacks"]
 
 

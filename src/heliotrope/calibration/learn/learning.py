@@ -144,7 +144,7 @@ class Learned:
         with threadpool_limits(1, "blas"):
             order = np.argsort(rows, kind="stable")
             each, first = np.unique(rows[order], return_index=True)
-            for i, part in zip(each, np.split(order, first[1:]), strict=True):
+            for i, part in zip(each, np.split(order, first)[1:], strict=True):
                 # In parts, because memory grows with sightings × times × parameters.
                 for some in np.array_split(part, 1 + len(part) // 500):
                     label = self.regimes(int(i), when[some])
