@@ -449,3 +449,32 @@ def test_unknown_step_counts_are_never_done(act: Act, seen: bool, tmp_path: Path
         assert "unknown" not in report.text
 
     play(tmp_path, scene)
+
+
+def test_a_safe_order_repeated_at_once_joins_the_one_under_way(tmp_path: Path) -> None:
+    """A program that stows as fast as it is answered does not fill the buses."""
+
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        token = await bench.commanded(OPERATOR)
+        first = plant.stow("Olga", ("P3B",))
+        assert all(plant.stow("Olga", ("P3B",)) is first for _ in range(100))
+        # Another person, another order, other heliostats, and anything ordered in between count.
+        for other in (
+            plant.stow("Oskar", ("P3B",)),
+            plant.defocus("Olga", ("P3B",)),
+            plant.stow("Olga", ("P3A", "P3B")),
+        ):
+            assert other is not first
+        last = plant.stow("Olga", ("P3B",))
+        assert last is not first
+        plant.command(OPERATOR, token, "LOCK", ("P1A",))
+        again = plant.stow("Olga", ("P3B",))
+        assert again is not last
+        await bench.wait(0.3)
+        assert plant.stow("Olga", ("P3B",)) is not again
+        await bench.wait(0.3)
+
+    bench = play(tmp_path, scene)
+    sent = [heliostats for name, heliostats in orders(bench, "pod-3") if name == "STOW"]
+    assert len(sent) == 6

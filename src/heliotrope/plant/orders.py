@@ -96,6 +96,8 @@ class PlantOrders:
         Last time that the audit confirmed that it can write, monotonic s.
     problem
         Why it cannot write, "" if it can.
+    latest
+        Ticket of the last command; None before the first.
     """
 
     def __init__(
@@ -112,6 +114,7 @@ class PlantOrders:
         self._prefix, self._lifetime, self._patience = prefix, lifetime, patience
         self._number = self._messages = 0
         self._open: dict[str, Ticket] = {}
+        self.latest: Ticket | None = None
         self._under: dict[str, _Under] = {}
         self._recording: dict[str, _Recording] = {}
         self._owed: deque[Work] = deque()
@@ -171,7 +174,7 @@ class PlantOrders:
             self._owed.append(lambda: self._audit.begin(entry))
         else:
             self._record(ticket, entry, store)
-        self._open[identity] = ticket
+        self._open[identity] = self.latest = ticket
         return ticket
 
     def _record(self, ticket: Ticket, entry: Record, store: tuple[Work, Work] | None) -> None:
