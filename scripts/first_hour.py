@@ -100,7 +100,8 @@ def main() -> None:
     plant = Plant("--heliostats", str(given.heliostats), "--speed", str(given.speed))
     try:
         address = plant.told(r"console: (\S+)")
-        password = plant.told(r"password (\S+)")
+        # A terminal would be shown it; a pipe is told the file.
+        password = Path(plant.told(r"password in (\S+)")).read_text("utf-8").strip()
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS)
             page = browser.new_page(viewport=WIDE)
