@@ -23,16 +23,24 @@ if TYPE_CHECKING:
     from heliotrope.mechanism.tracking import TraceStep, Tracking
 
 
+FieldArgument = Annotated[
+    Path, typer.Argument(help="Plant file (TOML), HelioK XML or PAINT folder.")
+]
+HeliostatOption = Annotated[str, typer.Option(help="Name of the heliostat.")]
+AimOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Aim east,north,up in metres; default the heliostat's own, or the first target."
+    ),
+]
+TargetOption = Annotated[str | None, typer.Option(help="Aim at the centre of this target.")]
+
+
 def track(
-    field: Annotated[Path, typer.Argument(help="Plant file (TOML), HelioK XML or PAINT folder.")],
-    heliostat: Annotated[str, typer.Option(help="Name of the heliostat.")],
-    aim: Annotated[
-        str | None,
-        typer.Option(
-            help="Aim east,north,up in metres; default the heliostat's own, or the first target."
-        ),
-    ] = None,
-    target: Annotated[str | None, typer.Option(help="Aim at the centre of this target.")] = None,
+    field: FieldArgument,
+    heliostat: HeliostatOption,
+    aim: AimOption = None,
+    target: TargetOption = None,
     time: Annotated[
         str | None,
         typer.Option(help="ISO 8601 with a zone, or now; default the file's <Sun>, or now."),

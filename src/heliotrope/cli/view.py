@@ -6,7 +6,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from heliotrope.cli._common import open_plant, parse_duration, parse_time
-from heliotrope.cli.track import aim_of
+from heliotrope.cli.track import (
+    AimOption,
+    FieldArgument,
+    HeliostatOption,
+    TargetOption,
+    aim_of,
+)
 from heliotrope.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,16 +27,11 @@ _RAY = 2.0
 
 
 def view(
-    field: Annotated[Path, typer.Argument(help="Plant file (TOML), HelioK XML or PAINT folder.")],
+    field: FieldArgument,
     out: Annotated[Path, typer.Argument(help="File to write: .html, or .glb for Blender.")],
-    heliostat: Annotated[str, typer.Option(help="Name of the heliostat.")],
-    aim: Annotated[
-        str | None,
-        typer.Option(
-            help="Aim east,north,up in metres; default the heliostat's own, or the first target."
-        ),
-    ] = None,
-    target: Annotated[str | None, typer.Option(help="Aim at the centre of this target.")] = None,
+    heliostat: HeliostatOption,
+    aim: AimOption = None,
+    target: TargetOption = None,
     time: Annotated[str, typer.Option(help="A moment of the day, ISO 8601 with a zone.")] = "now",
     every: Annotated[str, typer.Option(help="Time between two poses: 5min, 30s.")] = "10min",
 ) -> None:
