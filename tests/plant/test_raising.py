@@ -1,5 +1,6 @@
 """Which heliostats automatic control counts as lost, and which it sends to stow to start again."""
 
+import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -75,5 +76,30 @@ def test_only_what_cannot_go_on_is_sent_to_stow(tmp_path: Path) -> None:
         bench.cluster_of(OTHER).set(states.STOWED, OTHER)
         await bench.wait(2.0)
         assert await stuck() == []
+
+    play(tmp_path, scene)
+
+
+def test_who_is_stowed_while_its_aim_is_on_its_way_is_not_sent_to_the_receiver(
+    tmp_path: Path,
+) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, none = bench.plant, np.zeros(len(bench.plant.field), dtype=np.bool_)
+        raising = Raising(
+            plant, Logbook(bench.clock), ENGINEER, most=2, patience=60.0, clearance=0.0, wanted=True
+        )
+        raising.want([n for n in plant.field.names if n not in (NAME, OTHER)], wanted=False)
+        token = await bench.commanded(ENGINEER)
+        bench.cluster_of(NAME).deaf.add(NAME)  # its aim is not answered: the turn waits for it
+        step = asyncio.create_task(raising.step(token, frozenset, none))
+        await bench.wait(1.0)
+        plant.stow("a person", [OTHER])
+        raising.want([OTHER], wanted=False)
+        await step
+        await bench.wait(5.0)
+        sent = [
+            n for c in bench.clusters.values() for m in c.commands("TRACK") for n in m.heliostats
+        ]
+        assert OTHER not in sent
 
     play(tmp_path, scene)

@@ -180,9 +180,9 @@ class Raising:
             return
         names, ticket = given
         await ticket.end(10.0)
-        # A visit may have begun meanwhile: its aim must not be undone.
-        away = visiting() | ticket.refusals.keys()
-        done = tuple(name for name in names if name not in away)
+        # Meanwhile a visit may have begun, whose aim must stay, or a person may have stowed one.
+        away, place = visiting() | ticket.refusals.keys(), plant.field.place
+        done = tuple(name for name in names if name not in away and self.wanted[place(name)])
         if done:
             self._joins.append(plant.command(self._person, token, "TRACK", done))
 
