@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from heliotrope.airborne.evaluate.sightings import _by_turn, _turned_back, fit_together
+from heliotrope.airborne.evaluate.sightings import fit_together
 from heliotrope.airborne.mirror import orientation
 from heliotrope.calibration import sightings as kinds
+from heliotrope.calibration.fit.common import derivative_by_turn, turned_back
 from heliotrope.calibration.fit.estimator import FieldFit, fit
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.errors import InputError
@@ -115,10 +116,10 @@ def test_the_derivative_by_the_turn() -> None:
     # At the solution: far from it the axes of the residual turn too.
     seen = flown(true, np.zeros(2), 6, 4, own=0.0)
     many = true[None][np.zeros(len(seen), dtype=int)]
-    here = _by_turn(many, seen)
+    here = derivative_by_turn(many, seen)
     for i, way in enumerate(step * np.eye(2)):
         up, down = (
-            linearise(many, _turned_back(seen, true[None], sign * way[None]), ()).residual
+            linearise(many, turned_back(seen, true[None], sign * way[None]), ()).residual
             for sign in (1.0, -1.0)
         )
         np.testing.assert_allclose((up - down) / (2 * step), here[..., i], rtol=1e-5, atol=0.01)

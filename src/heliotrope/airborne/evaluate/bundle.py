@@ -194,6 +194,8 @@ class Adjusted:
     place_covariance
         Covariance of each mirror's position relative to the mean position of the photographs that
         show it, m², (N, 3, 3): shared by all its reflections.
+    common_covariance
+        Part of it that all mirrors share, that of the mean of their positions, m², (3, 3).
     residual
         Residuals of the corners, in standard deviations, (K, 2).
     deviation
@@ -210,6 +212,7 @@ class Adjusted:
     offset_covariance: FloatArray
     position_sigma: FloatArray
     place_covariance: FloatArray
+    common_covariance: FloatArray
     residual: FloatArray
     deviation: float
     outlier: npt.NDArray[np.bool_]
@@ -334,15 +337,22 @@ def _result(
             positions[k] = np.sqrt(np.diag(_covariance(solver, layout.size, parts)))
     places = _place_covariances(layout, corners, solver)
     return Adjusted(
-        state, covariance, positions, places, scaled, deviation, outlier, rounds, converged
+        state, covariance, positions, *places, scaled, deviation, outlier, rounds, converged
     )
 
 
-def _place_covariances(layout: _Layout, corners: Corners, solver: "SuperLU") -> FloatArray:
-    """Return the covariance of d + δ + b less the mean t of a mirror's photographs, (N, 3, 3)."""
+def _place_covariances(
+    layout: _Layout, corners: Corners, solver: "SuperLU"
+) -> tuple[FloatArray, FloatArray]:
+    """Return the covariance of d + δ + b less the mean t of a mirror's photographs, (N, 3, 3).
+
+    The second is that of the mean over all mirrors that were seen, (3, 3).
+    """
     unit = np.eye(3)
     found = np.empty((layout.mirrors, 3, 3))
     pairs = np.unique(np.stack([corners.mirror, corners.photo]), axis=1)
+    seen = len(np.unique(pairs[0]))
+    whole: dict[int, FloatArray] = {}
     for n in range(layout.mirrors):
         mine = pairs[1, pairs[0] == n]
         parts = [(6 * int(k) + 3, -unit / len(mine)) for k in mine]
@@ -350,7 +360,9 @@ def _place_covariances(layout: _Layout, corners: Corners, solver: "SuperLU") -> 
         if layout.heliostats:
             parts.append((layout.survey + 3 * int(layout.owner[n]), unit))
         found[n] = _covariance(solver, layout.size, parts)
-    return found
+        for place, share in parts if len(mine) else ():
+            whole[place] = whole.get(place, 0.0) + share / seen
+    return found, _covariance(solver, layout.size, list(whole.items()))
 
 
 def _priors(

@@ -164,6 +164,8 @@ def _evaluate_dark(
         priors.offset**2 * np.eye(3),
         np.full(position.shape, np.nan),
         places,
+        # The turn that all photographs share is nearly all of it.
+        places.mean(axis=0),
         np.empty((0, 2)),
         float("nan"),
         np.empty(0, np.bool_),

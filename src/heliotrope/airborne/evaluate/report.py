@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from heliotrope.airborne.evaluate.budget import Budget
 from heliotrope.airborne.evaluate.flight import CampaignResult
+from heliotrope.airborne.evaluate.flight_file import flight_document
 from heliotrope.airborne.evaluate.orientation import Orientation, Orientations
 from heliotrope.airborne.evaluate.pictures import field_map, heliostat_drawing
 from heliotrope.airborne.evaluate.reflections import join, write_reflections
@@ -21,6 +22,7 @@ from heliotrope.airborne.evaluate.tables import (
     write_table,
 )
 from heliotrope.airborne.mirror import MirrorShape
+from heliotrope.calibration.flights import write_flight
 from heliotrope.calibration.sighting_table import write_sightings
 from heliotrope.errors import InputError
 from heliotrope.files.html import STYLE, picture, render
@@ -56,7 +58,7 @@ def write_result(
     """Write the reflections, sightings and orientations of evaluated flights into a folder.
 
     ``reflections.csv`` (of a campaign ``reflections-FLIGHT.csv``), ``sightings.csv`` for the
-    calibration, and the report of `write_campaign_report`.
+    calibration, ``flight.json`` for a running plant, and the report of `write_campaign_report`.
 
     Parameters
     ----------
@@ -77,6 +79,9 @@ def write_result(
     if seen is not None:
         kinds = ["drone"] * len(seen)
         write_sightings(folder / "sightings.csv", seen, result.plant.names, kinds)
+    document = flight_document(result)
+    if document is not None:
+        write_flight(folder / "flight.json", document)
     if not page:
         write_table(folder / "orientations.csv", result.orientation_rows())
         return

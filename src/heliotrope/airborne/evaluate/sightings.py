@@ -18,12 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.airborne.evaluate.orientation import FEWEST, Orientation, Orientations, turned
-from heliotrope.airborne.mirror import measured_normal, orientation
+from heliotrope.airborne.mirror import measured_normal
+from heliotrope.calibration.fit.common import CommonErrors, fit_common
 from heliotrope.calibration.fit.estimator import FieldFit, fit
-from heliotrope.calibration.fit.residuals import linearise, whitening
-from heliotrope.calibration.sightings import Sightings, drone, join, ray_directions
+from heliotrope.calibration.sightings import Sightings, drone, join
 from heliotrope.errors import InputError
-from heliotrope.geometry import FloatArray, as_float, normalize, rotation
+from heliotrope.geometry import FloatArray, as_float, rotation
 from heliotrope.mechanism.chain import Mechanism
 
 #: One sighting for each reflection, or for each orientation.
@@ -31,10 +31,6 @@ Per = Literal["reflection", "orientation"]
 
 # Standard deviation of a difference with too few points to estimate it, rad.
 _UNTOLD = 1e-3
-# Rounds of fit and turn: two suffice, as the turn is linear to second order.
-_ROUNDS = 10
-# The turn has converged when it changes by less than this, rad.
-_SETTLED = 1e-7
 # Degrees of freedom from which the scatter of the poses is estimated.
 _ENOUGH = 8
 # Least scatter, as a share of the stated standard deviation.
@@ -96,7 +92,7 @@ def to_sightings(
     )
 
 
-def _sigma(o: Orientation, systematic: bool) -> float:
+def mean_sigma(o: Orientation, *, systematic: bool = False) -> float:
     """Return the standard deviation per axis of an orientation, rad."""
     mean = o.sigma_mean
     if o.count < FEWEST or not np.isfinite(mean).all():
@@ -108,7 +104,7 @@ def _sigma(o: Orientation, systematic: bool) -> float:
 def _of_mean(o: Orientation, counts: FloatArray, time: float, systematic: bool) -> Sightings:
     # With the lamp in the camera, on the normal, the ray turns by twice the error of the normal.
     place = o.vertex + o.distance * o.normal
-    sigma = 2.0 * _sigma(o, systematic)
+    sigma = 2.0 * mean_sigma(o, systematic=systematic)
     return drone([o.heliostat], counts[None], place, place, time=time, sigma=sigma)
 
 
@@ -126,7 +122,7 @@ def _of_points(o: Orientation, counts: FloatArray, time: float, systematic: bool
     led, camera = (
         o.vertex + np.einsum("nij,nj->ni", turn, end - point) for end in (seen.led, seen.camera)
     )
-    sigma = 2.0 * _sigma(o, systematic) / np.sqrt(share)
+    sigma = 2.0 * mean_sigma(o, systematic=systematic) / np.sqrt(share)
     return drone(
         np.full(len(kept), o.heliostat),
         np.tile(counts, (len(kept), 1)),
@@ -203,21 +199,26 @@ def fit_together(
     """
     alone = fit(mechanism, flights, model, priors=priors, loss="square", adapt_scale=False)
     count = len(mechanism)
-    spread, noise = _shared_spread(flights, count), _scatter(alone, flights)
+    noise = _scatter(alone, flights)
     known = replace(flights, sigma=flights.sigma * noise[flights.heliostat])
-    turn, found = np.zeros((count, 2)), alone.parameters
-    for _ in range(_ROUNDS):
-        seen = join([others, _turned_back(known, mechanism.with_parameters(found), turn)])
-        joint = fit(mechanism, seen, model, priors=priors, loss="square", adapt_scale=False)
-        found = joint.parameters
-        step, covariance = _joint_step(mechanism, seen, len(others), joint, turn, spread)
-        turn = turn + step
-        if np.abs(step).max(initial=0.0) < _SETTLED:
-            break
-    p = len(joint.names)
-    return Together(
-        replace(joint, covariance=covariance[:, :p, :p]), turn, covariance[:, p:, p:], noise
+    turned = np.arange(len(others) + len(known)) >= len(others)
+    common = CommonErrors(
+        np.zeros((len(turned), 3, 0)),
+        np.zeros(0),
+        np.zeros((0, 0)),
+        turned,
+        _shared_spread(flights, count),
     )
+    found = fit_common(
+        mechanism,
+        join([others, known]),
+        model,
+        common,
+        priors=priors,
+        loss="square",
+        adapt_scale=False,
+    )
+    return Together(found.fitted, found.turn, found.turn_covariance, noise)
 
 
 def _shared_spread(flights: Sightings, count: int) -> FloatArray:
@@ -234,49 +235,3 @@ def _scatter(alone: FieldFit, flights: Sightings) -> FloatArray:
     square = np.bincount(flights.heliostat, weights=alone.lengths**2, minlength=count)
     joint = np.clip(np.sqrt(square / np.maximum(free, 1)), _LEAST, None)
     return np.where(free >= _ENOUGH, joint, 1.0)
-
-
-def _turned_back(flights: Sightings, mechanism: Mechanism, turn: FloatArray) -> Sightings:
-    """Return drone sightings without the turn: their rays rotated about the vertices."""
-    R, vertex = orientation(mechanism[flights.heliostat], flights.counts)
-    axis = -np.einsum("mij,mj->mi", R[..., :2], turn[flights.heliostat])
-    back = rotation(axis, np.linalg.norm(axis, axis=-1))
-    source, destination = (
-        vertex + np.einsum("mij,mj->mi", back, end - vertex)
-        for end in (flights.source, flights.destination)
-    )
-    return replace(flights, source=source, destination=destination)
-
-
-def _joint_step(
-    mechanism: Mechanism,
-    seen: Sightings,
-    first: int,
-    joint: FieldFit,
-    turn: FloatArray,
-    spread: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the Gauss-Newton step of the turns (N, 2), and the covariance of all unknowns."""
-    fitted = mechanism.with_parameters(joint.parameters)[seen.heliostat]
-    lines = linearise(fitted, seen, joint.names)
-    by_turn = _by_turn(fitted, seen)
-    by_turn[:first] = 0.0
-    J = np.concatenate([lines.jacobian, by_turn], axis=-1)
-    weight = np.concatenate([joint.prior**-2, np.repeat(spread[:, None] ** -2, 2, axis=1)], axis=1)
-    off = np.concatenate([joint.values - joint.centre, turn], axis=1)
-    hessian, gradient = weight[:, :, None] * np.eye(weight.shape[1]), weight * off
-    np.add.at(hessian, seen.heliostat, np.einsum("map,maq->mpq", J, J))
-    np.add.at(gradient, seen.heliostat, np.einsum("map,ma->mp", J, lines.residual))
-    covariance = np.linalg.inv(hessian)
-    step = -np.einsum("npq,nq->np", covariance, gradient)
-    return step[:, -2:], as_float(covariance)
-
-
-def _by_turn(mechanism: Mechanism, seen: Sightings) -> FloatArray:
-    """Return derivatives of whitened residuals by the turn that is removed, (M, 2, 2)."""
-    R, vertex = orientation(mechanism, seen.counts)
-    axes, whiten = whitening(seen, vertex)
-    source, way = ray_directions(seen, vertex)
-    # The bisector v turns back by ω × v, and enters the residual with a minus sign.
-    moved = np.cross(np.swapaxes(R, -1, -2)[:, :2], normalize(source + way)[:, None])
-    return as_float(np.einsum("mab,mbk,mik->mai", whiten, axes, moved))

@@ -1,0 +1,303 @@
+r"""Fits of sightings that have errors in common.
+
+All reflections of a flight share the errors of its drone's position and of its lens, and all poses
+of one mirror the turn by its slope deviations. Taken as independent, such errors seem to average
+out over many sightings, and what remains is taken for the mirrors' own. Here they are unknowns: K
+of them, z, shared by all heliostats, and a turn of each mirror, beside the parameters of each.
+
+With H the normal matrix of one heliostat's own unknowns, B its coupling with z and C the covariance
+of z after all heliostats, the own unknowns have the covariance
+
+$$ H^{-1} + H^{-1} B\, C\, B^T H^{-1}, \qquad
+   C^{-1} = C_0^{-1} + \sum_i (Z_i - B_i^T H_i^{-1} B_i) $$
+
+(Schur complement). The term of heliostat i in the sum is its `CommonFit.information`: what its own
+sightings reveal of z.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration.fit._fit_kernels import CAUCHY_WIDTH
+from heliotrope.calibration.fit.estimator import FieldFit, Loss, fit
+from heliotrope.calibration.fit.residuals import linearise, whitening
+from heliotrope.calibration.sightings import Sightings, ray_directions
+from heliotrope.field.formats.frames import mirror_frame
+from heliotrope.geometry import FloatArray, as_float, normalize, rotation
+from heliotrope.mechanism.chain import Mechanism
+
+#: Most rounds of fit and step: two or three suffice, since the unknowns are small.
+_ROUNDS = 12
+#: The iteration ends when no common unknown changes by more than this share of its prior.
+_SETTLED = 1e-3
+#: Standard deviation of a turn that does not occur, rad: it stays 0.
+_NEVER = 1e-9
+
+
+@dataclass(frozen=True)
+class CommonErrors:
+    """Errors that M sightings of N heliostats have in common, K of them shared by all.
+
+    Attributes
+    ----------
+    shift
+        Displacement of both ends of each sighting by one unit of each shared error, recorded less
+        true, ENU, m, (M, 3, K). Only ends that are points move.
+    mean, covariance
+        What is known of the shared errors before these sightings, (K,), and (K, K) positive
+        definite.
+    turned
+        Whether a sighting shows its mirror turned, (M,).
+    turn_sigma
+        Standard deviation of that turn about each of two axes of the mirror, rad, (N,); 0: none.
+    """
+
+    shift: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+    turned: npt.NDArray[np.bool_]
+    turn_sigma: FloatArray
+
+
+@dataclass(frozen=True)
+class CommonFit:
+    """A fit of N heliostats with the errors that their sightings have in common.
+
+    Attributes
+    ----------
+    fitted
+        The fit; its covariance accounts for the common errors.
+    turn, turn_covariance
+        Turn about the mirror's x and y axes, rad, (N, 2) and (N, 2, 2).
+    shared, shared_covariance
+        The K shared errors after these sightings, and their covariance.
+    information, pull
+        What each heliostat's sightings reveal of the shared errors: its part of their inverse
+        covariance, (N, K, K), and of the inverse covariance times the mean, (N, K).
+    seen
+        The sightings without the errors that were found.
+    """
+
+    fitted: FieldFit
+    turn: FloatArray
+    turn_covariance: FloatArray
+    shared: FloatArray
+    shared_covariance: FloatArray
+    information: FloatArray
+    pull: FloatArray
+    seen: Sightings
+
+
+def fit_common(
+    mechanism: Mechanism,
+    sightings: Sightings,
+    model: str | tuple[str, ...],
+    common: CommonErrors,
+    *,
+    priors: Mapping[str, npt.ArrayLike] | None = None,
+    loss: Loss = "cauchy",
+    adapt_scale: bool = True,
+) -> CommonFit:
+    """Return the maximum a posteriori parameters together with the common errors.
+
+    Parameters
+    ----------
+    mechanism
+        Nominal mechanisms, batch shape (N,).
+    sightings
+        M sightings of these heliostats.
+    model, priors, loss, adapt_scale
+        See `heliotrope.calibration.fit.estimator.fit`.
+    common
+        The common errors.
+
+    Raises
+    ------
+    InputError, UnknownNameError
+        See `heliotrope.calibration.fit.estimator.fit`.
+    """
+    count, shared = len(mechanism), as_float(common.mean).copy()
+    turn = np.zeros((count, 2))
+    spread = np.sqrt(np.diagonal(common.covariance))
+    found: dict[str, FloatArray] = {}
+    for _ in range(_ROUNDS):
+        fixed = mechanism.with_parameters(found) if found else mechanism
+        seen = _without(sightings, fixed, common, turn, shared)
+        fitted = fit(mechanism, seen, model, priors=priors, loss=loss, adapt_scale=adapt_scale)
+        found = fitted.parameters
+        step = _Step.of(mechanism, seen, fitted, common, turn, shared, robust=loss == "cauchy")
+        turn, shared = turn + step.turn, shared + step.shared
+        moved = np.abs(step.shared) / np.maximum(spread, 1e-300)
+        leaned = np.abs(step.turn) / np.maximum(common.turn_sigma, _NEVER)[:, None]
+        if max(moved.max(initial=0.0), leaned.max(initial=0.0)) < _SETTLED:
+            break
+    p = len(fitted.names)
+    return CommonFit(
+        replace(fitted, covariance=step.covariance[:, :p, :p]),
+        turn,
+        step.covariance[:, p:, p:],
+        shared,
+        step.shared_covariance,
+        step.information,
+        # The gradients are those at the shared errors before the step.
+        np.einsum("nkl,l->nk", step.information, shared - step.shared) + step.push,
+        seen,
+    )
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A Gauss-Newton step of the common errors, and the covariances of all unknowns."""
+
+    turn: FloatArray
+    shared: FloatArray
+    covariance: FloatArray
+    shared_covariance: FloatArray
+    information: FloatArray
+    push: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        mechanism: Mechanism,
+        seen: Sightings,
+        fitted: FieldFit,
+        common: CommonErrors,
+        turn: FloatArray,
+        shared: FloatArray,
+        *,
+        robust: bool,
+    ) -> "_Step":
+        count, row = len(mechanism), seen.heliostat
+        here = mechanism.with_parameters(fitted.parameters)[row]
+        lines = linearise(here, seen, fitted.names)
+        by_turn = np.where(common.turned[:, None, None], derivative_by_turn(here, seen), 0.0)
+        own = np.concatenate([lines.jacobian, by_turn], axis=-1)
+        by_shared = _by_shared(here, seen, common.shift)
+        weight = fitted.scale[row] ** -2.0
+        if robust:
+            weight = weight / (1.0 + (fitted.lengths / CAUCHY_WIDTH) ** 2)
+        known = np.maximum(common.turn_sigma, _NEVER) ** -2.0
+        prior = np.concatenate([fitted.prior**-2.0, np.repeat(known[:, None], 2, axis=1)], axis=1)
+        off = np.concatenate([fitted.values - fitted.centre, turn], axis=1)
+        hessian, gradient = prior[:, :, None] * np.eye(prior.shape[1]), prior * off
+        coupling = np.zeros((count, prior.shape[1], len(shared)))
+        revealed, pulled = (
+            np.zeros((count, len(shared), len(shared))),
+            np.zeros_like(coupling[:, 0]),
+        )
+        for total, term in (
+            (hessian, np.einsum("m,map,maq->mpq", weight, own, own)),
+            (gradient, np.einsum("m,map,ma->mp", weight, own, lines.residual)),
+            (coupling, np.einsum("m,map,mak->mpk", weight, own, by_shared)),
+            (revealed, np.einsum("m,mak,mal->mkl", weight, by_shared, by_shared)),
+            (pulled, np.einsum("m,mak,ma->mk", weight, by_shared, lines.residual)),
+        ):
+            np.add.at(total, row, term)
+        inverse = np.linalg.inv(hessian)
+        back = inverse @ coupling
+        information = revealed - np.swapaxes(coupling, -1, -2) @ back
+        push = -(pulled - np.einsum("npk,np->nk", back, gradient))
+        before = np.linalg.inv(common.covariance)
+        covariance = np.linalg.inv(before + information.sum(axis=0))
+        moved = covariance @ (push.sum(axis=0) - before @ (shared - common.mean))
+        step = -np.einsum("npq,nq->np", inverse, gradient) - back @ moved
+        spread = inverse + back @ covariance @ np.swapaxes(back, -1, -2)
+        return cls(step[:, -2:], moved, spread, covariance, information, push)
+
+
+def turned_back(flights: Sightings, mechanism: Mechanism, turn: FloatArray) -> Sightings:
+    """Return sightings without the turn of their mirrors: their rays rotated about the vertices.
+
+    Parameters
+    ----------
+    flights
+        M sightings of N heliostats.
+    mechanism, turn
+        Of the N heliostats; the turn about the mirror's x and y axes, rad, (N, 2).
+    """
+    here = mechanism[flights.heliostat]
+    axes, vertex = _axes(here, flights.counts), here.pose(flights.counts).vertex
+    axis = -np.einsum("mij,mi->mj", axes, turn[flights.heliostat])
+    back = rotation(axis, np.linalg.norm(axis, axis=-1))
+    ends = (
+        base + np.einsum("mij,mj->mi", back, end - base)
+        for end, base in (
+            (flights.source, np.where(flights.source_at_infinity[:, None], 0.0, vertex)),
+            (flights.destination, np.where(flights.destination_at_infinity[:, None], 0.0, vertex)),
+        )
+    )
+    source, destination = ends
+    return replace(flights, source=source, destination=destination)
+
+
+def derivative_by_turn(mechanism: Mechanism, seen: Sightings) -> FloatArray:
+    """Return derivatives of whitened residuals by the turn that is removed, (M, 2, 2).
+
+    Parameters
+    ----------
+    mechanism
+        One for each sighting, batch shape (M,).
+    seen
+        M sightings.
+    """
+    vertex = mechanism.pose(seen.counts).vertex
+    axes, whiten = whitening(seen, vertex)
+    source, way = ray_directions(seen, vertex)
+    # The bisector v turns back by ω × v, and enters the residual with a minus sign.
+    moved = np.cross(_axes(mechanism, seen.counts), normalize(source + way)[:, None])
+    return as_float(np.einsum("mab,mbk,mik->mai", whiten, axes, moved))
+
+
+def _axes(mechanism: Mechanism, counts: FloatArray) -> FloatArray:
+    """Return the x and y axes of mirrors in ENU, (M, 2, 3)."""
+    frame = mirror_frame(mechanism.normal)
+    # A mechanism turns any direction fixed to the mirror as it turns the normal.
+    right = replace(mechanism, normal=frame[..., 0]).pose(counts).normal
+    up = np.cross(mechanism.pose(counts).normal, right)
+    return np.stack([right, up], axis=1)
+
+
+def _by_shared(mechanism: Mechanism, seen: Sightings, shift: FloatArray) -> FloatArray:
+    """Return derivatives of whitened residuals by the shared errors removed, (M, 2, K)."""
+    vertex = mechanism.pose(seen.counts).vertex
+    axes, whiten = whitening(seen, vertex)
+    ways = ray_directions(seen, vertex)
+    turned = np.zeros((len(seen), 3, 3))
+    for way, end, far in (
+        (ways[0], seen.source, seen.source_at_infinity),
+        (ways[1], seen.destination, seen.destination_at_infinity),
+    ):
+        distance = np.where(far, np.inf, np.linalg.norm(end - vertex, axis=-1))
+        turned += (np.eye(3) - way[:, :, None] * way[:, None, :]) / distance[:, None, None]
+    size = np.linalg.norm(ways[0] + ways[1], axis=-1)[:, None, None]
+    # The ends move back by shift @ z, and the bisector enters the residual with a minus sign.
+    return as_float(whiten @ axes @ (turned / size) @ shift)
+
+
+def _without(
+    seen: Sightings,
+    mechanism: Mechanism,
+    common: CommonErrors,
+    turn: FloatArray,
+    shared: FloatArray,
+) -> Sightings:
+    """Return sightings without the common errors."""
+    moved = common.shift @ shared
+    near = replace(
+        seen,
+        source=np.where(seen.source_at_infinity[:, None], seen.source, seen.source - moved),
+        destination=np.where(
+            seen.destination_at_infinity[:, None], seen.destination, seen.destination - moved
+        ),
+    )
+    back = turned_back(near, mechanism, turn)
+    kept = common.turned[:, None]
+    return replace(
+        near,
+        source=np.where(kept, back.source, near.source),
+        destination=np.where(kept, back.destination, near.destination),
+    )

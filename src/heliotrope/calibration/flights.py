@@ -1,0 +1,251 @@
+"""Flights of a drone as a plant takes them: sightings with the errors that they share.
+
+`drone evaluate` writes the file ``flight.json``, and a plant reads it. Each row is the orientation
+of one mirror in one pose; see ``docs/reference/formats.md``. A row holds what is its own, and the
+file what all rows share: a wrong position of the RTK base displaces the drone alike in all rows,
+and a wrong focal length displaces each mirror away from the middle of the flight.
+"""
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from heliotrope.calibration.sightings import Sightings, drone, is_covariance
+from heliotrope.errors import FormatError, InputError
+from heliotrope.files.text import read_text, write_text
+from heliotrope.geometry import FloatArray
+
+#: Most rows of a flight, and most errors that they share.
+MOST_ROWS, MOST_SHARED = 20_000, 24
+#: Largest file, bytes.
+LARGEST = 8 << 20
+#: Largest coordinate, m; largest standard deviation, rad; largest variance, m².
+_FAR, _WIDE, _VARIANCE = 1e5, 0.1, 1e4
+
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Coordinate = Annotated[float, Field(ge=-_FAR, le=_FAR, allow_inf_nan=False)]
+_Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f]+$")]
+_Shares = Annotated[list[_Coordinate], Field(max_length=MOST_SHARED)]
+_Variances = Annotated[
+    list[Annotated[float, Field(ge=-_VARIANCE, le=_VARIANCE, allow_inf_nan=False)]],
+    Field(max_length=MOST_SHARED),
+]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class FlightRow(_Strict):
+    """One orientation: what the drone saw of one mirror in one pose.
+
+    Attributes
+    ----------
+    heliostat, time
+        Name, and POSIX s.
+    counts
+        Of its drives.
+    place_m
+        Point on the mirror's normal at the distance of the drone, ENU: as if lamp and camera were
+        one.
+    sigma_rad
+        Standard deviation of the normal about each axis, beside the errors below.
+    turn_rad
+        Standard deviation of the turn that all poses of this mirror show alike: unknown slopes, and
+        the survey of its position.
+    covariance_m2
+        Covariance of the mirror's position relative to the drone that this row shares with no
+        other, ENU.
+    shift
+        Displacement of the drone relative to the mirror by one unit of each shared error, recorded
+        less true, ENU, m: three lists, east, north and up.
+    """
+
+    heliostat: _Name
+    time: Annotated[float, Field(ge=0.0, le=1e11, allow_inf_nan=False)]
+    counts: Annotated[list[_Number], Field(min_length=1, max_length=4)]
+    place_m: Annotated[list[_Coordinate], Field(min_length=3, max_length=3)]
+    sigma_rad: Annotated[float, Field(gt=0.0, le=_WIDE)]
+    turn_rad: Annotated[float, Field(ge=0.0, le=_WIDE)]
+    covariance_m2: Annotated[list[_Variances], Field(min_length=3, max_length=3)]
+    shift: Annotated[list[_Shares], Field(min_length=3, max_length=3)]
+
+
+class FlightDocument(_Strict):
+    """A flight as its file has it.
+
+    Attributes
+    ----------
+    format, version
+        Of the file.
+    name
+        Of the flight: unique in a plant.
+    shared
+        Names of the K errors that all rows share.
+    covariance
+        Their covariance, (K, K).
+    rows
+        The orientations.
+    """
+
+    format: Literal["heliotrope-flight"]
+    version: Literal[1]
+    name: _Name
+    shared: Annotated[list[_Name], Field(max_length=MOST_SHARED)]
+    covariance: Annotated[list[_Variances], Field(max_length=MOST_SHARED)]
+    rows: Annotated[list[FlightRow], Field(min_length=1, max_length=MOST_ROWS, fail_fast=True)]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        """Check shapes and covariances.
+
+        Raises
+        ------
+        ValueError
+            Shapes that do not fit, or a matrix that is not a covariance.
+        """
+        count = len(self.shared)
+        if len(self.covariance) != count or any(len(r) != count for r in self.covariance):
+            raise ValueError(f"covariance: give {count} by {count} values, one for each of shared")
+        if count and not _positive(np.array(self.covariance)):
+            raise ValueError("covariance: it is not symmetric and positive definite")
+        for k, row in enumerate(self.rows):
+            if any(len(line) != count for line in row.shift):
+                raise ValueError(f"rows.{k}.shift: give 3 lists of {count} values")
+            if any(len(line) != 3 for line in row.covariance_m2):
+                raise ValueError(f"rows.{k}.covariance_m2: give 3 lists of 3 values")
+        good = is_covariance(np.array([row.covariance_m2 for row in self.rows]))
+        if not good.all():
+            k = int(np.flatnonzero(~good)[0])
+            raise ValueError(f"rows.{k}.covariance_m2: it is not a covariance")
+        if len({len(row.counts) for row in self.rows}) > 1:
+            raise ValueError("rows: all need counts of the same number of drives")
+        return self
+
+
+def _positive(matrix: FloatArray) -> bool:
+    scale = np.sqrt(np.maximum(np.diagonal(matrix), 0.0))
+    if not (scale > 0.0).all() or np.abs(matrix - matrix.T).max() > 1e-9 * scale.max() ** 2:
+        return False
+    return bool(np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0] > 1e-9)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """M orientations of N heliostats from the air, with the K errors that they share.
+
+    Attributes
+    ----------
+    name
+        Unique in a plant.
+    heliostats
+        Names of the N heliostats.
+    sightings
+        M sightings, rows of ``heliostats``; their covariances are what they do not share.
+    turn_sigma
+        Standard deviation of the turn that all poses of a mirror show alike, rad, (N,).
+    shared, covariance
+        Names of the shared errors, and their covariance, (K, K).
+    shift
+        Displacement of the drone relative to each sighting's mirror by one unit of each shared
+        error, recorded less true, ENU, m, (M, 3, K).
+    """
+
+    name: str
+    heliostats: tuple[str, ...]
+    sightings: Sightings
+    turn_sigma: FloatArray
+    shared: tuple[str, ...]
+    covariance: FloatArray
+    shift: FloatArray
+
+    @classmethod
+    def of(cls, document: FlightDocument) -> "Flight":
+        """Return the flight of a document."""
+        rows = document.rows
+        names = tuple(dict.fromkeys(row.heliostat for row in rows))
+        index = {name: i for i, name in enumerate(names)}
+        places = np.array([row.place_m for row in rows])
+        heliostat = np.array([index[row.heliostat] for row in rows])
+        turn = np.zeros(len(names))
+        np.maximum.at(turn, heliostat, np.array([row.turn_rad for row in rows]))
+        made = drone(
+            heliostat,
+            np.array([row.counts for row in rows]),
+            places,
+            places,
+            time=np.array([row.time for row in rows]),
+            # The ray turns by twice the error of the normal, and lamp and camera move together.
+            sigma=2.0 * np.array([row.sigma_rad for row in rows]),
+            camera_covariance=4.0 * np.array([row.covariance_m2 for row in rows]),
+        )
+        count = len(document.shared)
+        return cls(
+            document.name,
+            names,
+            made,
+            turn,
+            tuple(document.shared),
+            np.array(document.covariance).reshape(count, count),
+            np.array([row.shift for row in rows]).reshape(len(rows), 3, count),
+        )
+
+    def rows_of(self, heliostats: Iterable[str]) -> np.ndarray:
+        """Return the rows of the sightings of some heliostats, (m,)."""
+        wanted = set(heliostats)
+        known = np.array([name in wanted for name in self.heliostats], dtype=np.bool_)
+        return np.flatnonzero(known[self.sightings.heliostat])
+
+
+def parse_flight(data: bytes | str) -> FlightDocument:
+    """Return the document in the text of a flight's file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be used; the text names the place.
+    """
+    try:
+        return FlightDocument.model_validate_json(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise InputError(f"flight: {f'{place}: ' if place else ''}{first['msg']}") from None
+
+
+def read_flight(path: str | Path) -> FlightDocument:
+    """Return the document of a flight's file.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be read or used.
+    """
+    text = read_text(path, "the flight.json of `heliotrope drone evaluate`", LARGEST)
+    try:
+        return parse_flight(text)
+    except InputError as error:
+        raise FormatError(path, str(error).removeprefix("flight: ")) from None
+
+
+def write_flight(path: str | Path, document: FlightDocument) -> None:
+    """Write the file of a flight, one row a line."""
+    given = document.model_dump()
+    rows = ",\n  ".join(_text(row) for row in given.pop("rows"))
+    head = ",\n ".join(f"{json.dumps(key)}: {_text(value)}" for key, value in given.items())
+    write_text(path, f'{{{head},\n "rows": [\n  {rows}]}}\n')
+
+
+def _text(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def flight_name(parts: Sequence[str], at: float) -> str:
+    """Return a name for a flight: those of its parts, and its time (POSIX s)."""
+    day = np.datetime_as_string(np.datetime64(round(at), "s"))
+    return f"{day}Z {' '.join(part for part in parts if part)}".strip()[:64]
