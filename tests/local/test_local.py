@@ -105,6 +105,26 @@ def _ended(raw: socket.socket, within: float = 5.0) -> bool:
 # -- frames ------------------------------------------------------------------------------------
 
 
+def test_a_request_too_large_for_the_plant_cuts_off_nobody(tmp_path: Path) -> None:
+    """It is refused where it begins, and what others have asked through the connection goes on."""
+
+    async def work(path: Path, _: _Echo) -> None:
+        line = LocalConnection(path, HELLO)
+        async with asyncio.TaskGroup() as group:
+            running = group.create_task(line.run())
+            while not line.up:
+                await asyncio.sleep(0.01)
+            other = group.create_task(line.ask("echo", {"wait": 0.3}))
+            await asyncio.sleep(0.05)
+            for names, blob in ([["x" * (1 << 20)], b""], [[], bytes((8 << 20) + 1)]):
+                with pytest.raises(FrameError, match="at most 1048576"):
+                    await line.ask("echo", {"names": names}, blob)
+            assert (await other)[0] == {"wait": 0.3}
+            running.cancel()
+
+    _run(tmp_path / "local", work)
+
+
 def test_a_frame_there_and_back() -> None:
     data = pack({"id": 1, "call": "a"}, b"xyz")
     head, blob = lengths(data[:12], 100, 100)

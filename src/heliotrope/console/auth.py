@@ -84,6 +84,9 @@ class Console:
     #: Port of the way for EMERGENCY alone; 0: none.
     emergency_port: int = 0
 
+    #: Number of heliostats; 0 before it is known, see `heliostats`.
+    size: int = 0
+
     #: Threads that wait for the store, which the plant's process has.
     threads: ThreadPoolExecutor = field(
         default_factory=lambda: ThreadPoolExecutor(4, "console store")
@@ -122,6 +125,12 @@ class Console:
         if len(times) < MOST_NOTED or now - times[0] >= SPAN:
             times.append(now)
             await self.plant.note(kind, who, address_of(self, connection), plain(detail))
+
+    async def heliostats(self) -> int:
+        """Return the number of heliostats of the plant."""
+        if not self.size:
+            self.size = int(await self.plant.ask("size"))
+        return self.size
 
     def forget(self) -> None:
         """Drop the shared answers that a change may have made stale."""

@@ -17,8 +17,10 @@ from heliotrope.console.auth import AtLeast, caller
 from heliotrope.plant.authority import Role
 
 #: Largest body, bytes: of a stranger or where none is expected; of a form; of points or names for
-#: every heliostat of a large field.
+#: every heliostat of the largest field.
 TINY, FORM, LARGEST = 4096, 1 << 14, 16 << 20
+#: The same for each heliostat of a plant, bytes: the longest name, and a point with all its digits.
+EACH = 160
 READ = ("GET", "HEAD")
 
 

@@ -11,6 +11,8 @@ from heliotrope.local.frames import (
     ANSWER_BLOB,
     ANSWER_HEAD,
     PREFIX,
+    REQUEST_BLOB,
+    REQUEST_HEAD,
     Frame,
     FrameError,
     head_of,
@@ -115,6 +117,8 @@ class LocalConnection:
             If the plant refuses it.
         AwayError
             If the plant cannot be reached, or does not answer in time.
+        FrameError
+            A request that is larger than the plant reads; nothing is sent.
         """
         writer = self._writer
         if writer is None:
@@ -122,12 +126,15 @@ class LocalConnection:
         self._number += 1
         number = self._number
         head = {"id": number, "call": call, "arguments": arguments, "for": on_behalf}
+        data = pack(head, blob)
+        # The plant cuts off a caller that sends more, with all that others have asked through it.
+        lengths(data[:PREFIX], REQUEST_HEAD, REQUEST_BLOB)
         future = asyncio.get_running_loop().create_future()
         self._waiting[number] = future
         try:
             async with asyncio.timeout(self._timeout):
                 async with self._turn:
-                    writer.write(pack(head, blob))
+                    writer.write(data)
                     await writer.drain()
                 answer = await future
         except TimeoutError:

@@ -132,6 +132,7 @@ def _unhold(desk: Desk, who: Person, given: orders.GivenBack, _: bytes) -> Any:
 
 _VIEWS = {
     "field": _see(lambda desk: desk.field()),
+    "size": _see(lambda desk: len(desk.operations.names)),
     "summary": _see(lambda desk: desk.operations.summary()),
     "sun": _see(lambda desk: desk.operations.sun()),
     "clusters": _see(lambda desk: desk.operations.cluster_rows()),
