@@ -1,7 +1,7 @@
 """Errors of beam and normal under given parameters, and splits of sightings for testing."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,7 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, angle_between, bisector, reflect
 from heliotrope.mechanism.chain import Mechanism
 
-Split = Literal["random", "chronological", "neighbour"]
+Split = Literal["random", "chronological", "neighbour", "sequential"]
 #: Share of the sightings that a held-out neighbourhood has; at least three sightings.
 NEIGHBOURHOOD = 0.1
 
@@ -75,7 +75,8 @@ def split(
     sightings
         Sightings of any number of heliostats.
     kind
-        "random"; "chronological" (the earliest are for training); or "neighbour" (whole
+        "random"; "chronological" and "sequential" (the earliest are for training; the second
+        then learns on from each held-out sighting after predicting it); or "neighbour" (whole
         neighbourhoods of source directions are held out). A random choice flatters: it
         leaves sightings of ten minutes earlier in the training part.
     fraction
@@ -89,8 +90,8 @@ def split(
         If the fraction is out of range or the kind is unknown.
     """
     check_fraction(fraction)
-    if kind not in ("random", "chronological", "neighbour"):
-        raise InputError(f"split {kind!r}: give random, chronological or neighbour")
+    if kind not in get_args(Split):
+        raise InputError(f"split {kind!r}: give random, chronological, neighbour or sequential")
     chosen = np.zeros(len(sightings), dtype=np.bool_)
     for heliostat in np.unique(sightings.heliostat):
         rows = np.flatnonzero(sightings.heliostat == heliostat)

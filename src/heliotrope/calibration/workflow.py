@@ -18,6 +18,7 @@ from heliotrope.calibration.learn import models
 from heliotrope.calibration.learn.assessment import Assessment, assess
 from heliotrope.calibration.learn.learning import FEWEST, Learned, Runner, learn
 from heliotrope.calibration.learn.models import ScoredModel
+from heliotrope.calibration.learn.sequential import predict_in_turn
 from heliotrope.calibration.report.content import CalibrationReport
 from heliotrope.calibration.sighting_table import read_sightings
 from heliotrope.calibration.sightings import Sightings, of_measurements
@@ -237,7 +238,11 @@ def evaluate(
         runner=runner,
         progress=_step(steps, "learning from the training part"),
     )
-    return HeldOutEvaluation(learned, assess(names, learned), scores)
+    found = None
+    if split == "sequential":
+        step = _step(steps, "predicting each sighting from those before it")
+        found = predict_in_turn(learned, priors=priors, runner=runner, progress=step)
+    return HeldOutEvaluation(learned, assess(names, learned, found), scores)
 
 
 def calibrate(

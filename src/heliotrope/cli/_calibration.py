@@ -33,9 +33,10 @@ PriorOption = Annotated[
     list[str] | None, typer.Option(help="NAME=SIGMA in rad, m or 1; may be repeated.")
 ]
 SplitOption = Annotated[
-    Literal["random", "chronological", "neighbour"],
+    Literal["random", "chronological", "neighbour", "sequential"],
     typer.Option(
-        help="Held-out sightings: random, the latest, or whole neighbourhoods of the sun."
+        help="Held-out sightings: random, the latest, whole neighbourhoods of the sun, or the "
+        "latest, each predicted from all before it."
     ),
 ]
 SeedOption = Annotated[int, typer.Option(help="Seed of the random choice.")]

@@ -28,6 +28,7 @@ def evaluate(
     training part alone.
     """
     from heliotrope.calibration import evaluation, workflow
+    from heliotrope.calibration.learn.assessment import unexplained_mirrors
     from heliotrope.calibration.learn.models import describe
 
     evaluation.check_fraction(fraction)
@@ -53,10 +54,14 @@ def evaluate(
         **found.document(),
         "left_out": list(field.left_out),
     }
+    document["unexplained_mirrors"] = unexplained_mirrors(field.heliostats.names, found.learned)
+    document["unusable_sightings"] = [field.ids[k] for k in found.assessment.unusable]
+    document["unexplained_sightings"] = [field.ids[k] for k in found.assessment.unexplained]
     if as_json:
         print_json(document)
         return
     _print(document)
+    _print_left_out(document)
     for line in describe(found.scores):
         print(line)
 
@@ -73,6 +78,21 @@ def _print_axes(document: dict[str, Any], shown: Callable[[Any], str]) -> None:
         rows,
         title="each axis, mrad: zero before the fit, scatter after it (Guo (44)-(47))",
     )
+
+
+def _print_left_out(document: dict[str, Any]) -> None:
+    if document["unexplained_sightings"]:
+        print(
+            f"no mechanism explains {', '.join(document['unexplained_sightings'])}; without them "
+            f"the mean of means is {document['mean_of_means_explained_mrad']:.2f} mrad"
+        )
+    for line in document["unexplained_mirrors"]:
+        print(line)
+    if document["unusable_sightings"]:
+        print(
+            f"left out: {', '.join(document['unusable_sightings'])}: counts beyond the reach of "
+            "the drives; check them against the log of the measurements"
+        )
 
 
 def _print(document: dict[str, Any]) -> None:

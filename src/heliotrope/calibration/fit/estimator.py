@@ -336,7 +336,8 @@ def _regress(
         )
         low = abs(c - r) + 1e-3 + stroke - min(ends.min(), stroke)
         high = c + r - 1e-3 + stroke - max(ends.max(), stroke)
-        trials += list(np.linspace(low, high, 200) - stroke)
+        # Counts that span more than the triangle allows leave no length to try.
+        trials += list(np.linspace(low, high, 200) - stroke) if low < high else []
     best = (np.inf, 0.0, 0.0)
     for longer in trials:
         moved = drive if longer == 0.0 else drive.replace(stroke_offset=stroke + longer)

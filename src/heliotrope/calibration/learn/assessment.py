@@ -7,9 +7,16 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.evaluation import ErrorSummary, summarise
-from heliotrope.calibration.learn.learning import Learned, Prediction, predict
+from heliotrope.calibration.learn.learning import (
+    Learned,
+    Prediction,
+    moved_by,
+    predict,
+    squared_distance,
+)
 from heliotrope.calibration.sightings import ray_directions
 from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.axis_accuracy import AxisAccuracy, axis_accuracy
 from heliotrope.mechanism.tracking import track
 
@@ -17,6 +24,10 @@ from heliotrope.mechanism.tracking import track
 FAR = 1e6
 #: Heliostats with fewer sightings are listed but do not enter the overall figures.
 ENOUGH = 20
+#: Beam error beyond which a sighting that the others contradict shows something else, rad.
+ELSEWHERE = 5e-3
+#: Share of such sightings from which a mirror is named, and share beyond which nothing agrees.
+SHARE, NOTHING = 0.15, 0.6
 
 
 @dataclass(frozen=True)
@@ -98,7 +109,14 @@ class Assessment:
         has that many.
     blunders
         Number of held-out sightings more than `BLUNDER` standard deviations away; they enter
-        every figure.
+        every figure but ``mean_explained``.
+    unexplained
+        Rows of the held-out sightings that no mechanism explains: more than `BLUNDER` standard
+        deviations and `ELSEWHERE` away.
+    mean_explained
+        ``mean_of_means`` without them, rad.
+    unusable
+        Rows of sightings beyond the reach of the drives; they enter no figure.
     """
 
     heliostats: tuple[HeliostatFigures, ...]
@@ -108,6 +126,9 @@ class Assessment:
     beam: ErrorSummary
     fewest: int
     blunders: int
+    unexplained: npt.NDArray[np.intp]
+    mean_explained: float
+    unusable: npt.NDArray[np.intp]
 
     def document(self) -> dict[str, Any]:
         """Return the figures for JSON, in mrad."""
@@ -120,6 +141,9 @@ class Assessment:
             "rms_beam_mrad": 1e3 * self.beam.rms,
             "p95_beam_mrad": 1e3 * self.beam.p95,
             "blunders_held_out": self.blunders,
+            "unexplained_held_out": len(self.unexplained),
+            "mean_of_means_explained_mrad": 1e3 * self.mean_explained,
+            "unusable": len(self.unusable),
             "enough": self.fewest,
         }
 
@@ -128,7 +152,7 @@ class Assessment:
 BLUNDER = 5.3
 
 
-def assess(names: tuple[str, ...], learned: Learned) -> Assessment:
+def assess(names: tuple[str, ...], learned: Learned, found: Prediction | None = None) -> Assessment:
     """Return the errors of the sightings that were not used in learning.
 
     Parameters
@@ -137,22 +161,38 @@ def assess(names: tuple[str, ...], learned: Learned) -> Assessment:
         Names of the N heliostats.
     learned
         Learnt from a part of its sightings.
+    found
+        Prediction of the others, in their order, if it was made in another way.
     """
     rows = np.flatnonzero(~learned.used)
     seen = learned.sightings.take(rows)
-    found = predict(learned, seen)
+    if found is None:
+        found = predict(learned, seen)
     counts = np.bincount(learned.sightings.heliostat, minlength=len(names))
     figures = [
-        _one(names[i], int(i), int(counts[i]), learned, found, np.flatnonzero(seen.heliostat == i))
+        _one(
+            names[i],
+            int(i),
+            int(counts[i]),
+            learned,
+            found,
+            np.flatnonzero((seen.heliostat == i) & found.usable),
+        )
         for i in np.flatnonzero(counts)
     ]
     tested = [h for h in figures if h.beam.count]
     fewest = ENOUGH if any(h.count >= ENOUGH for h in tested) else 0
     enough = [h for h in tested if h.count >= fewest]
-    inside = np.isin(seen.heliostat, [names.index(h.name) for h in enough])
-    far = np.sum(
-        found.plane * np.linalg.solve(found.covariance, found.plane[:, :, None])[..., 0], axis=-1
-    )
+    inside = found.usable & np.isin(seen.heliostat, [names.index(h.name) for h in enough])
+    far = squared_distance(found.plane, found.covariance) > BLUNDER**2
+    strange = inside & far & (found.errors.beam > ELSEWHERE)
+    means = [
+        found.errors.beam[(seen.heliostat == names.index(h.name)) & inside & ~strange]
+        for h in enough
+    ]
+    means = [m for m in means if len(m)]
+    unusable = learned.unusable.copy()
+    unusable[rows[~found.usable]] = True
     return Assessment(
         tuple(figures),
         float(np.median([h.beam.median for h in enough])) if enough else np.nan,
@@ -160,7 +200,10 @@ def assess(names: tuple[str, ...], learned: Learned) -> Assessment:
         float(found.inside[inside].mean()) if inside.any() else np.nan,
         summarise(found.errors.beam[inside]),
         fewest,
-        int((far[inside] > BLUNDER**2).sum()),
+        int(far[inside].sum()),
+        rows[strange],
+        float(np.mean([m.mean() for m in means])) if means else np.nan,
+        np.flatnonzero(unusable),
     )
 
 
@@ -181,23 +224,23 @@ def _one(
         normal=summarise(found.errors.normal[rows]),
         mean=float(beam.mean()) if len(rows) else np.nan,
         coverage=float(found.inside[rows].mean()) if len(rows) else np.nan,
-        axes=_axes(learned, np.flatnonzero(~learned.used)[rows]) if len(rows) > 1 else None,
+        axes=_axes(learned, found.values[rows], rows) if len(rows) > 1 else None,
         outliers=int(learned.outlier[mine].sum()),
         regimes=len(np.unique(learned.regime[mine & (learned.regime >= 0)])),
         steps=len(learned.members[i].data.steps),
     )
 
 
-def _axes(learned: Learned, rows: npt.NDArray[np.intp]) -> AxisAccuracy | None:
-    """Return the zeros before the fit and the scatter after it, of sightings ``rows``.
+def _axes(learned: Learned, values: FloatArray, rows: npt.NDArray[np.intp]) -> AxisAccuracy | None:
+    """Return the zeros before the fit and the scatter after it, of held-out sightings ``rows``.
 
     Guo's γ', α' are the drives' angles: those of the nominal drives for the zeros, (44) and
     (46), so that a zero is found as such and not what the fit leaves of it; those of the
     learnt drives for the scatter, (45) and (47). His γ, α, (43), are the angles at which the
     learnt mechanism sends the source to the destination that was seen.
     """
-    seen = learned.sightings.take(rows)
-    learnt = learned.mechanism_at(seen.heliostat, seen.time)
+    seen = learned.sightings.take(np.flatnonzero(~learned.used)[rows])
+    learnt = moved_by(learned.mechanism, seen.heliostat, learned.names, values)
     vertex = learnt.pose(seen.counts).vertex
     source, way = ray_directions(seen, vertex)
     aim = np.where(seen.destination_at_infinity[:, None], vertex + FAR * way, seen.destination)
@@ -223,3 +266,49 @@ def _axes(learned: Learned, rows: npt.NDArray[np.intp]) -> AxisAccuracy | None:
             return None
     before, after = found
     return replace(after, gamma_0=before.gamma_0, alpha_0=before.alpha_0)
+
+
+def unexplained_mirrors(names: tuple[str, ...], learned: Learned) -> tuple[str, ...]:
+    """Return a line on each mirror with many sightings that no parameters explain, with a reason.
+
+    Parameters
+    ----------
+    names
+        Names of the N heliostats.
+    learned
+        The sightings that were not used are not considered.
+    """
+    lines = []
+    odd = np.flatnonzero(learned.outlier)
+    where = predict(learned, learned.sightings.take(odd)).errors.beam
+    elsewhere = np.zeros(len(learned.sightings), dtype=np.bool_)
+    elsewhere[odd[where > ELSEWHERE]] = True
+    for i, (name, member) in enumerate(zip(names, learned.members, strict=True)):
+        mine = learned.used & (learned.sightings.heliostat == i)
+        kept = learned.rows[i][~learned.outlier[learned.rows[i]]]
+        white = np.linalg.norm(member.left_out()[1], axis=1)
+        far = int((white * learned.sightings.sigma[kept] > ELSEWHERE).sum())
+        beyond, count = int((learned.unusable & mine).sum()), int(mine.sum())
+        strange = far + int((elsewhere & mine).sum())
+        if beyond + strange < 2 or beyond + strange < SHARE * count:
+            continue
+        lines.append(f"{name}: {_reason(beyond, strange, count)}")
+    return tuple(lines)
+
+
+def _reason(beyond: int, strange: int, count: int) -> str:
+    if beyond > strange:
+        return (
+            f"{beyond} of {count} sightings have counts beyond the reach of its drives. Probably "
+            "the counts were recorded wrongly, or the properties of its drives are wrong."
+        )
+    if strange > NOTHING * count:
+        return (
+            f"{strange} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from where the "
+            "others put them; no parameters explain them together. Probably the counts were "
+            "recorded wrongly."
+        )
+    return (
+        f"{strange} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from where the "
+        "others, which agree, put them. Probably these photographs show another mirror's beam."
+    )

@@ -23,6 +23,7 @@ from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn import drift
 from heliotrope.calibration.learn.drift import DAY, Hyperparameters, Linear, Posterior
 from heliotrope.calibration.learn.regimes import find_regimes, regime_at
+from heliotrope.calibration.learn.unusable import find_unusable, is_usable
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism import parameters as parameter_table
@@ -66,6 +67,11 @@ class Prediction:
         Whether the error lies in the 90 % ellipse, (M,).
     beam
         Matrices that turn a whitened residual into ``plane``, (M, 2, 2).
+    values
+        The parameters' deviations at that time, (M, P).
+    usable
+        Whether the mechanism can say where the beam went, (M,); ``inside`` is false and
+        ``covariance`` NaN where it cannot. See `heliotrope.calibration.learn.unusable`.
     """
 
     errors: BeamErrors
@@ -73,6 +79,8 @@ class Prediction:
     covariance: FloatArray
     inside: npt.NDArray[np.bool_]
     beam: FloatArray
+    values: FloatArray
+    usable: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -99,6 +107,8 @@ class Learned:
         Regime of each sighting; −1 if not used, (M,).
     outlier
         Mask of the outliers among the sightings used, (M,).
+    unusable
+        Mask of the sightings that no parameters near the fit can produce, (M,); they are left out.
     rows
         For each heliostat the rows of its sightings, outliers included, in the order of its
         member.
@@ -113,6 +123,7 @@ class Learned:
     members: tuple[Posterior, ...]
     regime: npt.NDArray[np.int64]
     outlier: npt.NDArray[np.bool_]
+    unusable: npt.NDArray[np.bool_]
     rows: tuple[npt.NDArray[np.intp], ...]
 
     @property
@@ -154,7 +165,7 @@ class Learned:
     def mechanism_at(self, heliostat: npt.ArrayLike, time: npt.ArrayLike) -> Mechanism:
         """Return the mechanisms expected of ``heliostat`` (M,) at ``time`` (M,)."""
         values, _ = self.parameters_at(heliostat, time)
-        return _moved(self.mechanism, heliostat, self.names, values)
+        return moved_by(self.mechanism, heliostat, self.names, values)
 
 
 def predict(learned: Learned, sightings: Sightings) -> Prediction:
@@ -169,20 +180,32 @@ def predict(learned: Learned, sightings: Sightings) -> Prediction:
     """
     rows = sightings.heliostat
     values, spread = learned.parameters_at(rows, sightings.time)
-    moved = _moved(learned.mechanism, rows, learned.names, values)
+    moved = moved_by(learned.mechanism, rows, learned.names, values)
     alone = replace(sightings, heliostat=np.arange(len(rows)))
     found = beam_errors(moved, alone)
     line = linearise(moved, sightings, learned.names)
     noise = np.array([m.hyper.noise**2 * m.hyper.heavy for m in learned.members])[rows]
-    white = line.jacobian @ spread @ np.swapaxes(line.jacobian, -1, -2)
+    usable = is_usable(line)
+    jacobian = np.where(usable[:, None, None], line.jacobian, 0.0)
+    white = jacobian @ spread @ np.swapaxes(jacobian, -1, -2)
     white += noise[:, None, None] * np.eye(2)
     covariance = line.beam @ white @ np.swapaxes(line.beam, -1, -2)
-    square = np.einsum("ma,mab,mb->m", found.offset, np.linalg.inv(covariance), found.offset)
-    inside = square <= CHI_SQUARE_90
-    return Prediction(found, found.offset, covariance, inside, line.beam)
+    covariance[~usable] = np.nan
+    inside = squared_distance(found.offset, covariance) <= CHI_SQUARE_90
+    return Prediction(found, found.offset, covariance, inside, line.beam, values, usable)
 
 
-def _moved(
+def squared_distance(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return squared lengths (M,) of errors (M, 2) in units of covariances (M, 2, 2); may be NaN.
+
+    In closed form, because a matrix of NaN has no inverse.
+    """
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    x, y = error[:, 0], error[:, 1]
+    return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))
+
+
+def moved_by(
     mechanism: Mechanism, heliostat: npt.ArrayLike, names: tuple[str, ...], values: FloatArray
 ) -> Mechanism:
     """Mechanisms of rows ``heliostat`` (M,) with deviations ``values`` (M, P)."""
@@ -213,6 +236,7 @@ class Prepared:
     regime: npt.NDArray[np.int64]
     field: tuple[Linear, ...]
     rows: tuple[npt.NDArray[np.intp], ...]
+    unusable: npt.NDArray[np.bool_]
 
 
 def prepare(
@@ -230,6 +254,12 @@ def prepare(
     regime = np.where(used, 0, -1)
     offsets, order = _by_heliostat(sightings, used, len(mechanism))
     static = fit(mechanism, sightings, model, keep=used, priors=priors, loss=loss)
+    unusable = used & find_unusable(mechanism, sightings, static)
+    if unusable.any():
+        used = used & ~unusable
+        regime[unusable] = -1
+        offsets, order = _by_heliostat(sightings, used, len(mechanism))
+        static = fit(mechanism, sightings, model, keep=used, priors=priors, loss=loss)
     for turn in range(TURNS):
         moved = mechanism.with_parameters(static.parameters)
         # Regimes shift a pair of zeros; a mechanism with one drive has none.
@@ -272,7 +302,26 @@ def prepare(
             )
         )
         rows.append(part)
-    return Prepared(static, regime, tuple(field), tuple(rows))
+    prepared = Prepared(static, regime, tuple(field), tuple(rows), unusable)
+    return _without_unusable(prepared, is_usable(line)[order])
+
+
+def _without_unusable(prepared: Prepared, usable: npt.NDArray[np.bool_]) -> Prepared:
+    """Leave out sightings; ``usable`` is in the order of the rows of all heliostats."""
+    if usable.all():
+        return prepared
+    regime, unusable = prepared.regime.copy(), prepared.unusable.copy()
+    gone = np.concatenate(prepared.rows)[~usable]
+    regime[gone], unusable[gone] = -1, True
+    cuts = np.cumsum([len(d) for d in prepared.field])[:-1]
+    parts = np.split(usable, cuts)
+    return Prepared(
+        prepared.static,
+        regime,
+        tuple(d.take(good) for d, good in zip(prepared.field, parts, strict=True)),
+        tuple(r[good] for r, good in zip(prepared.rows, parts, strict=True)),
+        unusable,
+    )
 
 
 def relinearise(
@@ -291,7 +340,7 @@ def relinearise(
         [m.at(d.time, d.regime)[0] for m, d in zip(members, prepared.field, strict=True)]
     )
     seen = sightings.take(rows)
-    line = linearise(_moved(mechanism, seen.heliostat, names, values), seen, names)
+    line = linearise(moved_by(mechanism, seen.heliostat, names, values), seen, names)
     offsets = np.concatenate([[0], np.cumsum([len(d) for d in prepared.field])])
     field = []
     for k, d in enumerate(prepared.field):
@@ -299,7 +348,7 @@ def relinearise(
         jacobian = np.ascontiguousarray(line.jacobian[part])
         value = np.einsum("nap,np->na", jacobian, values[part] - d.centre) - line.residual[part]
         field.append(replace(d, jacobian=jacobian, value=value))
-    return replace(prepared, field=tuple(field))
+    return _without_unusable(replace(prepared, field=tuple(field)), is_usable(line))
 
 
 def repeatability(time: FloatArray, residual: FloatArray) -> float:
@@ -340,7 +389,7 @@ def learn_field(
     if not teachers:
         return hyper
     # The field's, because a heliostat full of mistakes has a large noise of its own.
-    usual = max(float(np.median(prepared.static.scale[teachers])), hyper.noise)
+    usual = max(float(np.nanmedian(prepared.static.scale[teachers])), hyper.noise)
     for _ in range(LINEARISED):
         known = [finish(replace(hyper, noise=usual), d, own=False)[0] for d in prepared.field]
         prepared = relinearise(mechanism, sightings, prepared, known)
@@ -532,11 +581,13 @@ def _join(
 ) -> Learned:
     regime = np.full(len(sightings), -1)
     outlier = np.zeros(len(sightings), dtype=np.bool_)
+    unusable = outlier.copy()
     lengths = np.full(len(sightings), np.nan)
     rows: list[npt.NDArray[np.intp]] = []
     for piece, part in zip(pieces, parts, strict=True):
         mine = np.flatnonzero(np.isin(sightings.heliostat, piece))
         regime[mine], outlier[mine] = part.prepared.regime, part.outlier
+        unusable[mine] = part.prepared.unusable
         lengths[mine] = part.prepared.static.lengths
         rows += [mine[r] for r in part.prepared.rows]
     fits = [part.prepared.static for part in parts]
@@ -548,7 +599,17 @@ def _join(
     static = FieldFit(names=model, lengths=lengths, **whole)
     members = tuple(m for part in parts for m in part.members)
     return Learned(
-        mechanism, sightings, model, used, static, hyper, members, regime, outlier, tuple(rows)
+        mechanism,
+        sightings,
+        model,
+        used,
+        static,
+        hyper,
+        members,
+        regime,
+        outlier,
+        unusable,
+        tuple(rows),
     )
 
 

@@ -1,0 +1,47 @@
+"""Sightings that a mechanism cannot produce.
+
+Counts beyond the reach of a jack (its triangle is stretched flat) leave the joint where it is, so
+that the derivative is infinite and one such row would spoil the whole field. It is left out.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration.fit.estimator import FieldFit
+from heliotrope.calibration.fit.residuals import Linearised, linearise
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.mechanism.chain import Mechanism
+
+#: Largest derivative of a whitened residual. A jack at a hundredth of a radian from its flat
+#: triangle reaches 1e5 with a centroid of 0.5 mrad; beyond the triangle it is 1e16 or infinite.
+STEEPEST = 1e7
+
+
+def is_usable(line: Linearised) -> npt.NDArray[np.bool_]:
+    """Return whether residuals and derivatives are those of a mechanism within its reach, (M,)."""
+    with np.errstate(invalid="ignore"):
+        flat = (np.abs(line.jacobian) < STEEPEST).all(axis=(1, 2))
+    return np.asarray(flat & np.isfinite(line.residual).all(axis=1))
+
+
+def find_unusable(
+    mechanism: Mechanism, sightings: Sightings, found: FieldFit
+) -> npt.NDArray[np.bool_]:
+    """Return the mask of sightings beyond the reach at the start of a fit or at its end, (M,).
+
+    Parameters
+    ----------
+    mechanism
+        Nominal, (N,).
+    sightings
+        M of these heliostats.
+    found
+        Fit of them.
+    """
+    bad = np.zeros(len(sightings), dtype=np.bool_)
+    ended = np.where(np.isfinite(found.values), found.values, found.centre)
+    for values in (found.centre, ended):
+        moved = mechanism.with_parameters({n: values[:, p] for p, n in enumerate(found.names)})
+        line = linearise(moved[sightings.heliostat], sightings, found.names)
+        bad |= ~is_usable(line)
+    return bad
