@@ -16,7 +16,7 @@ from heliotrope.links.clock import SystemClock
 from heliotrope.links.link import running
 from support.paced_pty import PacedBus
 
-PATIENCE = 20.0
+PATIENCE = 90.0
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from heliotrope.links.clock import SystemClock
 from heliotrope.links.link import LinkClosedError, LinkError, SendOutcome, running
 
 QUICK = BusSettings(baud_rate=115200, first_pause=0.02, longest_pause=0.1)
-PATIENCE = 10.0
+PATIENCE = 90.0
 #: Of an answer: long, since a busy machine may take its time; a test waits for it only if
 #: nothing comes.
 ANSWER = 2.0

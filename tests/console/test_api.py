@@ -326,7 +326,7 @@ def test_what_has_expired_leaves_the_store(console: LiveConsole) -> None:
                 await console.server.app.state.console.forget_expired()
 
     console.console_wait(begin())
-    console.until(lambda: old.key not in {one.key for one in people.tokens()}, 5.0)
+    console.until(lambda: old.key not in {one.key for one in people.tokens()})
     assert new.key in {one.key for one in people.tokens()}
     people.revoke_token(new.key)
 
@@ -418,7 +418,7 @@ def test_tokens_end_with_the_password_of_their_owner(console: LiveConsole, perso
 
 
 def _take(ask: Ask, role: str = "operator") -> None:
-    until = time.monotonic() + 20.0
+    until = time.monotonic() + 90.0
     while (answer := ask(role, "POST", "authority")).status_code != 200:
         assert time.monotonic() < until, answer.text
         time.sleep(0.2)
@@ -436,7 +436,7 @@ def test_a_command_has_one_record(console: LiveConsole, ask: Ask) -> None:
     answer = ask("operator", "POST", "commands", order)
     assert answer.status_code == 200, answer.text
     identity = answer.json()["identity"]
-    until = time.monotonic() + 15.0
+    until = time.monotonic() + 90.0
     while not (seen := ask("viewer", "GET", f"commands/{identity}").json())["finished"]:
         assert time.monotonic() < until, seen
         time.sleep(0.2)
@@ -632,7 +632,7 @@ def test_an_emergency_of_a_viewer(console: LiveConsole, ask: Ask) -> None:
         found = ask("viewer", "POST", "emergency", {"reason": "smoke"}).json()
         assert (found["on"], found["act"], found["who"]) == (True, "DEFOCUS", "viewer")
         assert found["heliostats"] == 64
-        until = time.monotonic() + 10.0
+        until = time.monotonic() + 90.0
         while ask("viewer", "GET", "emergency").json()["acknowledged"] < 64:
             assert time.monotonic() < until
             time.sleep(0.1)

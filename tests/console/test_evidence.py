@@ -23,7 +23,7 @@ def recorded(console: LiveConsole, text: str, since: float = 0.0) -> Event:
             (e for e in found if e.source == "security" and text in e.text and e.at >= since), None
         )
 
-    found = console.until(find, 10.0)
+    found = console.until(find)
     assert isinstance(found, Event)
     return found
 

@@ -231,7 +231,7 @@ def test_every_change_is_a_security_event(holder: Holder) -> None:
         f"{NAME}: changed a second factor: {what} (from 127.0.0.1)"
         for what in ("set up", "a recovery code was used, 7 are left", "removed")
     }
-    assert holder.console.until(lambda: wanted <= texts(), 60.0)
+    assert holder.console.until(lambda: wanted <= texts())
 
 
 def test_ctl_sets_it_up_and_asks_for_it(holder: Holder, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -95,7 +95,7 @@ def test_wrong_password(field: LiveConsole, browser: Any) -> None:
 
 
 def test_select_by_lasso_and_stow(field: LiveConsole, enter: Callable[[str], Any]) -> None:
-    field.until(lambda: field.live.operations.summary().states.get("STOWED", 0) < 320, 60.0)
+    field.until(lambda: field.live.operations.summary().states.get("STOWED", 0) < 320)
     page = enter("operator")
     page.click(".hx-tools >> text=Lasso")
     box = page.locator(".hx-map-field").bounding_box()
@@ -249,7 +249,7 @@ def test_dark_and_light(enter: Callable[[str], Any]) -> None:
 def test_calibration_is_seen(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page = enter("viewer")
     page.click(".hx-tabs >> text=Calibration")
-    page.wait_for_selector(".hx-calibration td:has-text('✓ calibrated')", timeout=60_000)
+    page.wait_for_selector(".hx-calibration td:has-text('✓ calibrated')", timeout=180_000)
     row = page.inner_text(".hx-calibration tbody tr:has-text('✓ calibrated') >> nth=0")
     assert any(target in row for target in field.live.operations.targets)
     page.select_option(".hx-tools select", "error")
@@ -259,7 +259,7 @@ def test_calibration_is_seen(field: LiveConsole, enter: Callable[[str], Any]) ->
 def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page = enter("engineer")
     page.click("#emergency")
-    order = field.until(lambda: field.live.operations.plant.emergency, 5.0)
+    order = field.until(lambda: field.live.operations.plant.emergency)
     assert order.who == "engineer"
     page.wait_for_selector(".hx-alert.on")
     page.wait_for_function(
@@ -269,7 +269,7 @@ def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any])
     page.click("dialog >> text='Withdraw'")
     page.click(".hx-tabs >> text=Alarms")
     # Each row can be acknowledged when its cause has gone: the order, then the light.
-    end = time.monotonic() + 30.0
+    end = time.monotonic() + 120.0
     while page.locator(".hx-alert.on").count():
         assert time.monotonic() < end, page.inner_text(".hx-alarms")
         button = page.locator(".hx-alarms >> text=Acknowledge all")

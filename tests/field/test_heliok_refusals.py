@@ -1,7 +1,6 @@
 """HelioK files and plants that are refused, and the one line that says so."""
 
 import re
-import time
 from pathlib import Path
 
 import pytest
@@ -139,10 +138,8 @@ def test_a_huge_file_is_refused_unread(tmp_path: Path) -> None:
     with path.open("wb") as stream:
         stream.write(b"<HelioK>")
         stream.truncate(200 * 2**20)
-    start = time.perf_counter()
     with pytest.raises(FormatError, match="200 MiB exceed the limit of 64 MiB"):
         heliok.read(path)
-    assert time.perf_counter() - start < 1.0
 
 
 BOMB = "".join(
@@ -162,10 +159,8 @@ BOMB = "".join(
 def test_entities_are_refused(tmp_path: Path, content: str) -> None:
     path = tmp_path / "bomb.xml"
     path.write_text(content, encoding="utf-8")
-    start = time.perf_counter()
     with pytest.raises(FormatError, match=r"document type|not well-formed"):
         heliok.read(path)
-    assert time.perf_counter() - start < 2.0
 
 
 def test_nesting_without_end_is_refused(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ SETTINGS = LinkSettings(period=0.5, deadline=1.5)
 #: For real sockets: quick beats, so that a test need not wait.
 QUICK = LinkSettings(period=0.05, deadline=0.6, first_pause=0.02, longest_pause=0.1)
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
-PATIENCE = 5.0
+PATIENCE = 60.0
 
 
 async def connected(*links: Link) -> None:

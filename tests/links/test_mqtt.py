@@ -22,7 +22,7 @@ from support.broker import MOSQUITTO, Mosquitto, mosquitto_for
 
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
 PREFIX = "heliotrope/test"
-PATIENCE = 20.0
+PATIENCE = 60.0
 #: Beats that are quick against the broker's keepalive of 60 s, and slow for a busy machine.
 QUICK = LinkSettings(period=0.1, deadline=1.0, open_limit=1.0, first_pause=0.05, longest_pause=0.2)
 CALM = LinkSettings(period=0.1, deadline=10.0, open_limit=5.0)

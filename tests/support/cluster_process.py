@@ -26,7 +26,7 @@ from heliotrope.links.messages import (
 from support.clusters import Board
 
 KEY = bytes(range(32))
-PATIENCE = 40.0
+PATIENCE = 90.0
 COMMAND = [sys.executable, "-c", "from heliotrope.cli import main; main()", "cluster"]
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-PATIENCE = 30.0
+PATIENCE = 90.0
 _SBIN = "/usr/sbin:/usr/local/sbin"
 GPSD = shutil.which("gpsd") or shutil.which("gpsd", path=_SBIN)
 GPSFAKE = shutil.which("gpsfake")

@@ -37,7 +37,7 @@ def entering(address: str, browser: Any) -> Iterator[Callable[..., Any]]:
 
     def go(role: str, **options: Any) -> Any:
         context = browser.new_context(**{"viewport": {"width": 1600, "height": 900}, **options})
-        context.set_default_timeout(20_000)
+        context.set_default_timeout(90_000)
         opened.append(context)
         page = context.new_page()
         page.on("pageerror", lambda error: wrong.append(str(error)))
