@@ -1,6 +1,7 @@
 """Parts of the twin: flash, motors, clocks, the bus and its faults, many runs."""
 
 import asyncio
+import contextlib
 import math
 import random
 from contextvars import copy_context
@@ -27,7 +28,7 @@ from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.runs import RunAccount
 from heliotrope.twin.records import RecordsDisk
 from heliotrope.twin.world.scene import USUAL, scene_of
-from heliotrope.twin.world.simulation import SETTINGS, RunPlan
+from heliotrope.twin.world.simulation import SETTINGS, RunPlan, Simulation
 from heliotrope.twin.world.soak import run_many
 
 
@@ -159,6 +160,29 @@ def test_a_soak_goes_on_where_it_stopped(tmp_path: Path) -> None:
         run_many(plans, progress=kept)
     with pytest.raises(InputError, match="soak with 0 processes; give 1 or more"):
         run_many(plans, processes=0)
+
+
+def test_a_run_that_does_not_end_is_told_and_the_soak_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    live = Simulation.live
+
+    async def stuck() -> None:
+        while True:
+            with contextlib.suppress(asyncio.CancelledError):
+                await asyncio.Event().wait()
+
+    async def haunted(simulation: Simulation) -> None:
+        if simulation.plan.seed == 1:
+            kept.append(asyncio.get_running_loop().create_task(stuck()))
+        await live(simulation)
+
+    kept: list[asyncio.Task[None]] = []
+    monkeypatch.setattr(Simulation, "live", haunted)
+    found = run_many([RunPlan(seed, 2.0, 1) for seed in range(3)])
+    assert found.runs == 3
+    assert [text.split(":")[0] for text in found.broken] == ["the run does not end"]
+    assert "--seed 1" in found.broken[0]
 
 
 def test_a_bus_carries_no_more() -> None:

@@ -568,16 +568,20 @@ class Simulation:
 def run(plan: RunPlan) -> RunResult:
     """Run a plan; failures are part of the outcome and are not raised."""
     outcome = RunResult(plan, seconds=plan.seconds)
-    with asyncio.Runner(loop_factory=lambda: VirtualLoop(plan.seed)) as runner:
-        loop = runner.get_loop()
-        assert isinstance(loop, VirtualLoop)
-        begin = loop.time()
-        simulation = Simulation(plan, loop)
-        try:
-            runner.run(simulation.live())
-        except (Exception, BaseExceptionGroup) as error:  # noqa: BLE001 - it is the finding
-            _blame(error, outcome)
-            outcome.seconds = loop.time() - begin
+    runner = asyncio.Runner(loop_factory=lambda: VirtualLoop(plan.seed))
+    loop = runner.get_loop()
+    assert isinstance(loop, VirtualLoop)
+    begin = loop.time()
+    simulation = Simulation(plan, loop)
+    try:
+        runner.run(simulation.live())
+    except (Exception, BaseExceptionGroup) as error:  # noqa: BLE001 - it is the finding
+        _blame(error, outcome)
+        outcome.seconds = loop.time() - begin
+    try:
+        runner.close()
+    except RuntimeError as error:  # a task does not end, such as one of a program that is frozen
+        outcome.problem = outcome.problem or f"the run does not end: {error}"
     outcome.checks = sum(
         (pod.observer.checks for pod in simulation.pods),
         simulation.observer.checks + simulation.beams.checks + simulation.readings.checks,
