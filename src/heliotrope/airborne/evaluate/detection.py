@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.airborne._photo_metadata import read_metadata
+from heliotrope.airborne.visibility import MARGIN, Labels
 from heliotrope.errors import FormatError
 from heliotrope.files.text import read_bytes
 from heliotrope.geometry import FloatArray, as_float
@@ -19,6 +20,7 @@ from heliotrope.geometry import FloatArray, as_float
 Picture = npt.NDArray[np.uint8]
 Rows = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
+Light = npt.NDArray[np.float32]
 
 #: Readings of this and more are clipped.
 CLIPPED = 253
@@ -26,6 +28,10 @@ CLIPPED = 253
 _FILLED = (0.995, 0.9995, 0.97)
 #: Share of an edge left out at each end, profiles across it, and points measured on it.
 _ENDS, _PROFILES, _GROUPS = 0.1, 32, 8
+#: An edge is drawn no closer than this to its true place, px.
+_UNSURE = 1.5
+#: Of the three groups nearest a corner, as many must be seen.
+_NEAR_CORNER = 2
 #: A spot exceeds its mirror by this many standard deviations of the noise, and by this share
 #: of full scale.
 _SPOT_SIGMAS, _SPOT_LEAST = 7.0, 0.02
@@ -56,14 +62,48 @@ class Outlines:
         Standard deviation of a corner in each direction, px, (M,).
     contrast
         Contrast of the weakest edge, share of full scale, (M,).
-    found
-        Whether all four edges were found, (M,).
+    known
+        Whether both edges of a corner were found, (M, 4).
     """
 
     corners: FloatArray
     sigma: FloatArray
     contrast: FloatArray
-    found: Mask
+    known: Mask
+
+    @property
+    def found(self) -> Mask:
+        """Whether all four edges were found, (M,)."""
+        return np.asarray(self.known.all(axis=1))
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Which of M mirrors each pixel of a photograph shows, where mirrors overlap.
+
+    Attributes
+    ----------
+    labels
+        See `heliotrope.airborne.visibility.draw_labels`, (H, W).
+    own
+        Label of each of the M mirrors, (M,).
+    """
+
+    labels: Labels
+    own: Rows
+
+    def clear(self, places: FloatArray, steps: FloatArray) -> Mask:
+        """Return which profiles across edges, (M, 4, P), lead from their mirror to the ground.
+
+        ``places`` are pixels, (M, 4, P, S, 2); ``steps`` the S distances from the edge, px.
+        """
+        height, width = self.labels.shape
+        x = np.clip(np.round(places[..., 0]), 0, width - 1).astype(np.intp)
+        y = np.clip(np.round(places[..., 1]), 0, height - 1).astype(np.intp)
+        label = self.labels[y, x]
+        own = label == self.own[:, None, None, None]
+        good = np.where(steps < 0.0, own, label == 0) | (np.abs(steps) < _UNSURE)
+        return np.asarray(good.all(axis=-1))
 
 
 @dataclass(frozen=True)
@@ -131,6 +171,17 @@ def _linear() -> npt.NDArray[np.float32]:
 # -- patches ---------------------------------------------------------------------------
 
 
+def brightness(picture: Picture, scale: float) -> tuple[Light, Light]:
+    """Return the light of a picture reduced by ``scale``, and the share of blue in it."""
+    import cv2
+
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    light = _linear()[small]
+    total = light[..., 0] + light[..., 1] + light[..., 2]
+    blue = light[..., 0] / np.maximum(total, np.float32(1e-4))
+    return np.asarray(total / np.float32(3.0)), np.asarray(blue)
+
+
 def find_patches(picture: Picture, expected: float) -> tuple[Patches, ...]:
     """Return patches of about ``expected`` px² that differ from their surroundings.
 
@@ -142,14 +193,9 @@ def find_patches(picture: Picture, expected: float) -> tuple[Patches, ...]:
     import cv2
 
     scale = float(np.clip(12.0 / np.sqrt(expected), 0.05, 1.0))
-    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    light = _linear()[small]
-    total = light[..., 0] + light[..., 1] + light[..., 2]
-    grey = total / np.float32(3.0)
-    blue = light[..., 0] / np.maximum(total, np.float32(1e-4))
     side = max(3, int(10.0 * np.sqrt(expected) * scale)) | 1
     found = []
-    for feature in (grey, blue):
+    for feature in brightness(picture, scale):
         above = np.clip(feature - cv2.blur(feature, (side, side)), 0.0, None)
         # A quantile rather than the maximum: the lamp is brighter than any mirror, but small.
         for top in np.quantile(above, _FILLED):
@@ -199,7 +245,11 @@ def sample(picture: Picture, places: FloatArray) -> FloatArray:
 
 
 def find_outlines(
-    picture: Picture, expected: FloatArray, reach: float, profiles: int = _PROFILES
+    picture: Picture,
+    expected: FloatArray,
+    reach: float,
+    profiles: int = _PROFILES,
+    shown: Overlap | None = None,
 ) -> Outlines:
     """Return the outlines of mirrors near the expected ones.
 
@@ -217,11 +267,13 @@ def find_outlines(
         Largest distance of an edge from the expected one, px.
     profiles
         Across each edge, a multiple of eight; fewer are quicker.
+    shown
+        What each pixel shows, if mirrors overlap: only edges against the ground are measured.
     """
     count = len(expected)
     if count == 0:
         none = np.empty(0)
-        return Outlines(np.empty((0, 4, 2)), none, none, none.astype(np.bool_))
+        return Outlines(np.empty((0, 4, 2)), none, none, np.empty((0, 4), np.bool_))
     start, end = expected, np.roll(expected, -1, axis=1)
     along = end - start
     length = np.linalg.norm(along, axis=-1, keepdims=True)
@@ -239,24 +291,34 @@ def find_outlines(
         + steps[None, None, None, :, None] * outward[:, :, None, None]
     )
     colour = sample(picture, places)
-    offset, contrast, known = _edges(colour, steps, reach)
+    clear = np.ones(colour.shape[:3], np.bool_) if shown is None else shown.clear(places, steps)
+    offset, contrast, known = _edges(colour, steps, reach, clear)
     middles = part.reshape(_GROUPS, -1).mean(axis=1)
     points = start[:, :, None] + middles[:, None] * along[:, :, None]
     points = points + offset[..., None] * outward[:, :, None]
     lines, spread, enough = _lines(points, known, outward)
     corners = _crossings(lines)
     # At its ends, the error of a line is about twice that in its middle.
-    sigma = np.sqrt(np.sum(spread**2, axis=1) / 4.0) * 2.0
-    found: Mask = np.asarray(enough.all(axis=1) & np.isfinite(corners).all(axis=(1, 2)))
-    return Outlines(np.where(found[:, None, None], corners, np.nan), sigma, contrast, found)
+    count = np.maximum(enough.sum(axis=1), 1)
+    sigma = np.sqrt(np.sum(np.where(enough, spread**2, 0.0), axis=1) / count) * 2.0
+    # The corner between an edge and the one before it: the end of that, the start of this.
+    start_seen = known[..., :3].sum(axis=-1) >= _NEAR_CORNER
+    end_seen = np.roll(known[..., -3:].sum(axis=-1) >= _NEAR_CORNER, 1, axis=1)
+    both = enough & np.roll(enough, 1, axis=1) & np.isfinite(corners).all(axis=-1)
+    of_corner: Mask = np.asarray(both if shown is None else both & start_seen & end_seen)
+    return Outlines(np.where(of_corner[..., None], corners, np.nan), sigma, contrast, of_corner)
 
 
 def _edges(
-    colour: FloatArray, steps: FloatArray, reach: float
+    colour: FloatArray, steps: FloatArray, reach: float, clear: Mask
 ) -> tuple[FloatArray, FloatArray, Mask]:
     """Return offsets (M, 4, groups) of the edges, the least contrast (M,), and which are valid."""
     inner, outer = steps < -reach, steps > reach
-    levels = colour[..., inner, :].mean(axis=(2, 3)), colour[..., outer, :].mean(axis=(2, 3))
+    share = clear / np.maximum(clear.sum(axis=-1, keepdims=True), 1)
+    levels = [
+        np.einsum("mepc,mep->mec", colour[..., side, :].mean(axis=3), share)
+        for side in (inner, outer)
+    ]
     apart = levels[0] - levels[1]
     contrast = np.linalg.norm(apart, axis=-1)
     direction = apart / np.maximum(contrast, 1e-9)[..., None]
@@ -276,7 +338,9 @@ def _edges(
     # A true edge has most of the contrast.
     jump = np.sum(np.where(near, slope, 0.0), axis=-1)
     known = (jump > 0.5 * contrast[..., None]) & (total > 0.0)
-    return offset, contrast.min(axis=1) / np.sqrt(3.0), known
+    known &= clear.reshape(*clear.shape[:2], _GROUPS, -1).all(axis=-1)
+    hidden = ~clear.any(axis=-1)
+    return offset, np.where(hidden, np.inf, contrast).min(axis=1) / np.sqrt(3.0), known
 
 
 def _lines(
@@ -322,7 +386,7 @@ def _crossings(lines: FloatArray) -> FloatArray:
 
 
 def find_spots(
-    picture: Picture, corners: FloatArray, most: int = 12
+    picture: Picture, corners: FloatArray, most: int = 12, shown: Overlap | None = None
 ) -> tuple[Spots, tuple[str, ...]]:
     """Return the lamp's spots on mirrors, and why a mirror gives none ("" if it may).
 
@@ -334,11 +398,13 @@ def find_spots(
         Corners of the mirrors, px, (M, 4, 2).
     most
         A mirror with more spots than this is left out as "cluttered": they are not the lamp's.
+    shown
+        What each pixel shows, if mirrors overlap: hidden parts are not searched.
     """
     found: list[tuple[int, FloatArray, float, float, int]] = []
     reasons = []
     for k, outline in enumerate(corners):
-        seen, reason = _spots_of(picture, outline)
+        seen, reason = _spots_of(picture, outline, shown, k)
         if len(seen) > most:
             seen, reason = [], f"cluttered: {len(seen)} bright spots"
         reasons.append(reason)
@@ -353,7 +419,7 @@ def find_spots(
 
 
 def _spots_of(
-    picture: Picture, outline: FloatArray
+    picture: Picture, outline: FloatArray, shown: Overlap | None, k: int
 ) -> tuple[list[tuple[FloatArray, float, float, int]], str]:
     """Return centre, sigma, flux and clipped pixels of a mirror's spots, or why there are none."""
     import cv2
@@ -366,12 +432,16 @@ def _spots_of(
     raw = picture[low[1] : high[1], low[0] : high[0]]
     inside = np.zeros(raw.shape[:2], np.uint8)
     cv2.fillConvexPoly(inside, np.round((outline - low) * 16).astype(np.int32), 1, shift=4)
-    inside = np.asarray(cv2.erode(inside, np.ones((3, 3), np.uint8)), np.uint8)
+    if shown is not None:
+        inside &= shown.labels[low[1] : high[1], low[0] : high[0]] == shown.own[k]
+    narrower = MARGIN if shown is not None else 1
+    square = np.ones((3, 3), np.uint8)
+    inside = np.asarray(cv2.erode(inside, square, iterations=narrower), np.uint8)
     # For three colours, operators are quicker than NumPy's reductions.
     bright = np.minimum(np.minimum(raw[..., 0], raw[..., 1]), raw[..., 2]) >= CLIPPED
     area = int(inside.sum())
     if area < 30:
-        return [], "too small: fewer than 30 pixels"
+        return [], "hidden: " * (shown is not None) + "too small: fewer than 30 pixels"
     if int((bright & (inside > 0)).sum()) > max(60, 0.3 * area):
         return [], "overexposed: the mirror is clipped"
     colour = _linear()[raw]
@@ -425,9 +495,9 @@ def _centroid(
     if int(ring.sum()) < 6:
         return None
     above = np.where(held, part - np.median(part[ring]), 0.0)
-    # Where gaps between facets cross, the surrounding mean is low; a true spot is also brighter
-    # than the bright part of its surroundings.
-    if float(part[far < 1.2].mean() - np.quantile(part[ring], 0.8)) < 0.8 * raised:
+    # Where gaps between facets cross, or beside a hidden part, the surrounding mean is low; a true
+    # spot is also brighter than the bright part of its surroundings.
+    if float(part[far < 1.2].mean() - np.quantile(part[ring], 0.9)) < 0.8 * raised:
         return None
     clipped = int(np.sum(bright[np.ix_(rows, columns)] & (far <= _WINDOW)))
     peak = float(above.max())

@@ -16,6 +16,8 @@ ShapeOf = Callable[[int], MirrorShape]
 
 #: The position of a spot on a mirror is not known better than this share of a pixel.
 SPOT_FLOOR = 0.15
+#: A spot between facets is the mirror's own if it has this share of the typical light.
+_WEAK = 0.6
 
 
 def spot_reflections(
@@ -53,6 +55,8 @@ def spot_reflections(
     if shifts is not None:
         place = place - shifts[number, mirror]
     spread = np.hypot(np.concatenate([s.spot_sigma for s in seen]), SPOT_FLOOR / camera.focal)
+    flux = np.concatenate([s.flux for s in seen])
+    typical = float(np.median(flux)) if len(flux) else 0.0
     turns = as_float([p.rotation for p in photos])
     position = as_float([p.position for p in photos])
     lamp = as_float([p.led_position(camera) for p in photos])
@@ -65,6 +69,9 @@ def spot_reflections(
         start = (position[number[mine]] - stand.vertex[row]) @ turned
         facet, xy = _intersect(shape(int(row)), start, ways[mine] @ turned, beside)
         kept = facet >= 0
+        if beside == 0.0:
+            # Through a gap between facets the spot of a mirror behind shines, weakly.
+            kept &= (shape(int(row)).facet_at(xy) >= 0) | (flux[mine] > _WEAK * typical)
         distance = np.linalg.norm(start, axis=-1)
         # Foreshortening blurs the position of a spot along an oblique mirror.
         slant = np.maximum(np.abs(start[:, 2]) / distance, 0.2)

@@ -7,7 +7,7 @@ the image. A photograph that cannot be used is reported with the reason; it rais
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.airborne.evaluate.detection import (
+    Outlines,
+    Overlap,
     Picture,
     decode,
     find_outlines,
@@ -23,6 +25,7 @@ from heliotrope.airborne.evaluate.detection import (
     find_spots,
 )
 from heliotrope.airborne.evaluate.identification import (
+    FEWEST,
     Identified,
     expected_size,
     find_lights,
@@ -31,8 +34,10 @@ from heliotrope.airborne.evaluate.identification import (
     nearest_rotation,
     quad_area,
 )
+from heliotrope.airborne.evaluate.projection import outlines, overlay
 from heliotrope.airborne.photo import LedCamera, Photo
 from heliotrope.airborne.standing import MirrorPoses
+from heliotrope.airborne.visibility import SMALLEST, draw_labels, seen_from
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.field.camera import undistort
 from heliotrope.files.archives import read_arrays
@@ -44,13 +49,13 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 Rows = npt.NDArray[np.intp]
 
-#: Mirrors with a shorter side are not measured, px.
-SMALLEST = 12.0
 #: Corner error beyond that of the edges, from texture beside the mirror, px.
 CORNER_FLOOR = 0.07
 #: Corners this far from a common shift of the outline belong to another edge: px, and share of
 #: the mirror's side.
 _SKEW, _SKEW_SHARE = 1.5, 0.03
+#: Largest distance of edges from those of mirrors laid over a photograph, px.
+_OVERLAID = 3.0
 #: With fewer photographs, starting processes costs more time than it saves.
 FEWEST_FOR_PROCESSES = 4
 
@@ -194,6 +199,8 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) 
         return PhotoReading(
             photo.name, f"overexposed: {100 * clipped:.0f} % of it is clipped; shorten the exposure"
         )
+    if seen_from(stand, photo.position, camera.focal).overlapping:
+        return _look_overlapping(picture, photo, camera, stand)
     found = Identified(photo.rotation, _no_rows(), _no_rows(), "nothing: no patches")
     for patches in find_patches(picture, typical**2):
         one = identify(camera, photo, stand, patches.center)
@@ -206,44 +213,103 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) 
         if is_dark(picture):
             return _lights(picture, photo, camera, stand)
         return PhotoReading(photo.name, found.reason)
-    return _measure(picture, photo, camera, stand, found)
-
-
-def _measure(
-    picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses, found: Identified
-) -> PhotoReading:
-    """Return the corners and spots of the mirrors that were identified."""
-    rows, expected = _in_frame(photo.moved(photo.position, found.rotation), camera, stand)
+    there = photo.moved(photo.position, found.rotation)
+    rows, expected = _in_frame(there, camera, stand)
     if not len(rows):
-        return PhotoReading(photo.name, "nothing: no mirror is completely in the frame")
-    size = np.sqrt(quad_area(expected))
-    reach = float(np.clip(0.12 * np.median(size), 2.0, 6.0))
+        return _nothing_in_frame(photo)
+    reach = float(np.clip(0.12 * np.median(np.sqrt(quad_area(expected))), 2.0, 6.0))
     first = find_outlines(picture, expected, reach, profiles=16)
     better = np.where(first.found[:, None, None], first.corners, expected)
     lines = find_outlines(picture, better, 2.0)
-    # A turn of the camera moves the corners of a mirror together, not one by one.
-    shift = lines.corners - expected
-    skew = np.linalg.norm(shift - np.median(shift, axis=1, keepdims=True), axis=-1).max(axis=1)
-    good = lines.found & (skew < np.maximum(_SKEW, _SKEW_SHARE * size))
-    outline = np.where(good[:, None, None], lines.corners, expected)
-    spots, reasons = find_spots(picture, outline)
+    lines = replace(lines, known=np.repeat(lines.found[:, None], 4, axis=1))
+    return _measure(picture, there, camera, stand, rows, expected, lines)
+
+
+def _look_overlapping(
+    picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses
+) -> PhotoReading:
+    """Return what a picture shows in which mirrors hide parts of each other."""
+    if is_dark(picture):
+        return _lights(picture, photo, camera, stand)
+    found = overlay(picture, camera, photo, stand)
+    if found.reason:
+        return PhotoReading(photo.name, found.reason)
+    there = photo.moved(photo.position, found.rotation)
+    # Edges against the ground correct the attitude; then they are measured where they belong.
+    for reach in (_OVERLAID, 2.0):
+        rows, expected = _in_frame(there, camera, stand)
+        if not len(rows):
+            return _nothing_in_frame(photo)
+        shown = Overlap(draw_labels(*outlines(there, camera, stand), camera.size), rows + 1)
+        lines = find_outlines(picture, expected, reach, shown=shown)
+        good = _consistent(lines, expected)
+        if int(good.sum()) < FEWEST:
+            return PhotoReading(
+                photo.name,
+                f"nothing: {int(good.sum())} corners of mirrors stand clear of others, {FEWEST} "
+                "are needed; fly higher",
+            )
+        corners = np.full(lines.corners.shape, np.nan)
+        corners[good] = undistort(camera, lines.corners[good])
+        there = there.moved(photo.position, _attitude(there.rotation, photo, stand, rows, corners))
+    return _measure(picture, there, camera, stand, rows, expected, lines, shown)
+
+
+def _nothing_in_frame(photo: Photo) -> PhotoReading:
+    return PhotoReading(photo.name, "nothing: no mirror is completely in the frame")
+
+
+def _consistent(lines: Outlines, expected: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return the corners (M, 4) that were found and are not another edge's."""
+    size = np.sqrt(quad_area(expected))
+    shift = np.where(lines.known[..., None], lines.corners - expected, np.nan)
+    if not lines.known.any():
+        return lines.known
+    # A turn of the camera moves the corners of a mirror together, not one by one. Of one or two
+    # corners the median says nothing; then that of the photograph does.
+    common = np.broadcast_to(np.nanmedian(shift, axis=(0, 1)), (len(shift), 1, 2)).copy()
+    several = lines.known.sum(axis=1) >= 3
+    common[several] = np.nanmedian(shift[several], axis=1, keepdims=True)
+    limit = np.maximum(_SKEW, _SKEW_SHARE * size)[:, None]
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.linalg.norm(shift - common, axis=-1) < limit)
+
+
+def _measure(
+    picture: Picture,
+    there: Photo,
+    camera: LedCamera,
+    stand: MirrorPoses,
+    rows: Rows,
+    expected: FloatArray,
+    lines: Outlines,
+    shown: Overlap | None = None,
+) -> PhotoReading:
+    """Return the corners and spots of the mirrors ``rows``, expected at corners (M, 4, 2)."""
+    good = _consistent(lines, expected)
+    if shown is None:
+        good = np.repeat(np.asarray(good.all(axis=1))[:, None], 4, axis=1)
+    whole, some = np.asarray(good.all(axis=1)), np.asarray(good.any(axis=1))
+    outline = np.where(whole[:, None, None], lines.corners, expected)
+    spots, reasons = find_spots(picture, outline, shown=shown)
     if all(r.startswith("overexposed") for r in reasons):
         return PhotoReading(
-            photo.name,
+            there.name,
             f"overexposed: all {len(rows)} mirrors are clipped; shorten the exposure",
         )
     notes = [
-        reason or ("" if whole else "outline: hidden, or no straight edges")
-        for reason, whole in zip(reasons, good, strict=True)
+        reason or ("" if known else "outline: hidden, or no straight edges")
+        for reason, known in zip(reasons, some, strict=True)
     ]
     corners = np.full(lines.corners.shape, np.nan)
     corners[good] = undistort(camera, lines.corners[good])
+    sigma = np.where(some & np.isfinite(lines.sigma), lines.sigma, 1.0)
     return PhotoReading(
-        name=photo.name,
-        rotation=_attitude(found.rotation, photo, stand, rows, corners),
+        name=there.name,
+        rotation=_attitude(there.rotation, there, stand, rows, corners),
         mirror=rows,
         corners=corners,
-        corner_sigma=np.hypot(np.where(good, lines.sigma, 1.0), CORNER_FLOOR) / camera.focal,
+        corner_sigma=np.hypot(sigma, CORNER_FLOOR) / camera.focal,
         spot_mirror=rows[spots.mirror],
         spot=undistort(camera, spots.pixel),
         spot_sigma=spots.sigma / camera.focal,

@@ -1,10 +1,18 @@
 """Simulated flights with their truth: reflections by the law, rendered photographs, and trials.
 
 `fly` simulates a flight. `render_flight` writes its photographs, and
-`reflections_of` gives its reflections without images. `trials` measures one mirror
-again and again, to find how many photographs a flight needs.
+`reflections_of` gives its reflections without images. `fly_rendered` evaluates the photographs too
+and compares the result with the truth. `trials` measures one mirror again and again, to find how
+many photographs a flight needs.
 """
 
+from heliotrope.airborne.simulate.rendered import (
+    Compared,
+    compare,
+    fly_rendered,
+    paper_field,
+    paper_flight,
+)
 from heliotrope.airborne.simulate.rendering import (
     Conditions,
     dark,
@@ -26,20 +34,25 @@ from heliotrope.airborne.simulate.simulation import (
 from heliotrope.airborne.simulate.trial import TrialConditions, Trials, four_facets, trials
 
 __all__ = [
+    "Compared",
     "Conditions",
     "Errors",
     "Flight",
     "Installed",
     "TrialConditions",
     "Trials",
+    "compare",
     "dark",
     "exact_reflections",
     "fly",
+    "fly_rendered",
     "four_facets",
     "hover_grid",
     "install",
     "look_counts",
     "night",
+    "paper_field",
+    "paper_flight",
     "reflections_of",
     "render_flight",
     "trials",

@@ -1,0 +1,198 @@
+"""A rendered flight beside its truth: photographs used, reflections on the right mirrors, errors.
+
+`fly_rendered` writes a flight's photographs and evaluates them like real ones; nothing but the
+files, the plant and the lens goes from one to the other.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from heliotrope.airborne.evaluate.flight import PRIORS, CampaignResult, evaluate_flight
+from heliotrope.airborne.evaluate.orientation import rotation_between
+from heliotrope.airborne.evaluate.reflections import Reflections
+from heliotrope.airborne.photo import LedCamera
+from heliotrope.airborne.simulate.rendering import Conditions, render_flight
+from heliotrope.airborne.simulate.simulation import Errors, Flight, fly, hover_grid, look_counts
+from heliotrope.airborne.visibility import draw_labels
+from heliotrope.field.camera import look_at
+from heliotrope.field.example import azimuth_elevation
+from heliotrope.field.heliostats import Facets, Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray, as_float, direction
+from heliotrope.sun import Site
+
+#: A found reflection is the true one if it is this close on the same mirror, m.
+_SAME = 0.25
+#: 90 % of a bivariate normal distribution lie within this many variances.
+_ELLIPSE = 4.605170185988091
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A rendered flight beside its truth.
+
+    Attributes
+    ----------
+    photographs, used
+        Rendered, and evaluated.
+    shown, found, right
+        True reflections on visible parts of mirrors; those found; of them, those on the right one.
+    count
+        Reflections of each of K measured mirrors, (K,).
+    error, sigma
+        True error and σ_tot of each, rad, rotX and rotY, (K, 2).
+    """
+
+    photographs: int
+    used: int
+    shown: int
+    found: int
+    right: int
+    count: FloatArray
+    error: FloatArray
+    sigma: FloatArray
+
+    @property
+    def identified(self) -> float:
+        """Share of the found reflections that are on the right mirror."""
+        return self.right / max(self.found, 1)
+
+    @property
+    def within(self) -> float:
+        """Share of the errors within the 90 % ellipse of σ_tot."""
+        return float(np.mean(np.sum((self.error / self.sigma) ** 2, axis=-1) < _ELLIPSE))
+
+
+def fly_rendered(
+    flight: Flight,
+    plant: Plant,
+    folder: Path,
+    *,
+    conditions: Conditions | None = None,
+    seed: int = 0,
+    fewest: int = 1,
+) -> Compared:
+    """Render a flight into a folder, evaluate it, and return the result beside the truth.
+
+    Parameters
+    ----------
+    flight
+        A simulated flight.
+    plant
+        The field that contains its heliostats.
+    folder
+        Folder for the photographs.
+    conditions, seed
+        See `heliotrope.airborne.simulate.rendering.render_flight`.
+    fewest
+        Mirrors with fewer reflections are not compared.
+
+    Raises
+    ------
+    InputError
+        If no photograph can be used.
+    """
+    site = plant.site
+    origin = (site.latitude_deg, site.longitude_deg, site.height)
+    exact = render_flight(flight, folder, origin, conditions=conditions, seed=seed)
+    result = evaluate_flight(folder, plant, priors=PRIORS)
+    return compare(flight, exact, result, fewest)
+
+
+def compare(
+    flight: Flight, exact: Reflections, result: CampaignResult, fewest: int = 1
+) -> Compared:
+    """Return the only flight of a result beside its truth."""
+    found = result.flights[0].evaluation
+    names = {photo.name: k for k, photo in enumerate(flight.taken)}
+    number = np.array([names[p.name] for p in found.photos])
+    rows = np.array([flight.truth.names.index(n) for n in found.stand.names])
+    mine = found.reflections
+    key = number[mine.photo] * len(rows) + rows[mine.heliostat]
+    true = exact.photo * len(rows) + exact.heliostat
+    right = 0
+    for place, k in zip(mine.xy, key.tolist(), strict=True):
+        there = exact.xy[true == k]
+        right += bool(len(there) and np.linalg.norm(there - place, axis=-1).min() < _SAME)
+    kept = [o for o in result.flights[0].measured.found.found if o.count >= fewest]
+    return Compared(
+        len(flight.taken),
+        len(found.photos),
+        len(_visible(flight, exact)),
+        len(mine),
+        right,
+        as_float([o.count for o in kept]),
+        as_float(
+            [
+                rotation_between(o.rotation, flight.truth.rotation[rows[o.heliostat]])[:2]
+                for o in kept
+            ]
+        ).reshape(-1, 2),
+        as_float([o.sigma_total for o in kept]).reshape(-1, 2),
+    )
+
+
+def _visible(flight: Flight, exact: Reflections) -> Reflections:
+    """Return the reflections that no nearer mirror hides, within the frame."""
+    stand, camera, kept = flight.truth, flight.camera, []
+    for k, photo in enumerate(flight.taken):
+        away = np.linalg.norm(stand.vertex - photo.position, axis=-1)
+        labels = draw_labels(photo.pixels(camera, stand.corners), away, camera.size)
+        for i in np.flatnonzero(exact.photo == k).tolist():
+            row = int(exact.heliostat[i])
+            point = flight.shapes[row].point_at(exact.facet[i : i + 1], exact.xy[i : i + 1])[0]
+            seen = photo.pixels(camera, stand.vertex[row] + stand.rotation[row] @ point)
+            if np.isfinite(seen).all():
+                x, y = np.round(seen).astype(int).tolist()
+                inside = 0 <= x < camera.size[0] and 0 <= y < camera.size[1]
+                if inside and labels[y, x] == row + 1:
+                    kept.append(i)
+    return exact.take(np.array(kept, dtype=np.intp))
+
+
+def paper_field(rows: int = 6, columns: int = 8) -> Heliostats:
+    """Return mirrors like HelioPoint's: four facets, 3.2 m by 2.5 m together.
+
+    They stand in staggered rows 6 m apart, 4.6 m from each other; the paper states no distances.
+    """
+    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
+    east = 4.6 * (grid[:, 0] + 0.5 * (grid[:, 1] % 2) - 0.5 * columns)
+    place = np.stack([east, 100.0 + 6.0 * grid[:, 1], np.full(len(grid), 2.0)], axis=-1)
+    n = len(place)
+    center, right, up = np.zeros((3, n, 4, 3))
+    center[..., 0] = np.array([-0.8, 0.8, -0.8, 0.8])
+    center[..., 1] = np.array([-0.625, -0.625, 0.625, 0.625])
+    right[..., 0], up[..., 1] = 0.79, 0.615
+    names = tuple(f"J{i // columns + 1}{chr(65 + i % columns)}" for i in range(n))
+    facets = Facets(center, right, up)
+    return Heliostats(names, azimuth_elevation(place), np.full(n, 3.2), np.full(n, 2.5), facets)
+
+
+def paper_flight(
+    camera: LedCamera,
+    site: Site,
+    errors: Errors | None = None,
+    *,
+    columns: int = 7,
+    rows: int = 6,
+    seed: int = 0,
+    mirrors: Heliostats | None = None,
+) -> tuple[Flight, Plant]:
+    """Return a flight in HelioPoint's geometry, and its field.
+
+    The mirrors face a drone 150 m away at 13.5° of elevation and 214° of azimuth, the means of the
+    paper's tables 4 and 5. The pattern covers a mirror and a pointing error of 5 mrad.
+    """
+    field = mirrors or paper_field()
+    middle = field.position.mean(axis=0)
+    drone = middle + 150.0 * direction(np.radians(214.0), np.radians(13.5))
+    width, height = 3.2 + 1.5, 2.5 + 1.5
+    pattern = hover_grid(drone, middle, columns, rows, 1.0)
+    step = np.array([width / columns, height / rows])
+    across = (pattern - drone) @ (axes := look_at(drone, middle))
+    places = drone + (across[:, :2] * step) @ axes[:, :2].T
+    counts = look_counts(field, drone)
+    flown = fly(field, camera, counts, places, middle, errors=errors, seed=seed)
+    return flown, Plant("paper", site, {"azel": field})
