@@ -9,7 +9,7 @@ from tests.support.machines import jacks
 from heliotrope.calibration.evaluation import split
 from heliotrope.calibration.learn.assessment import assess, unexplained_mirrors
 from heliotrope.calibration.learn.learning import learn, predict
-from heliotrope.calibration.learn.sequential import predict_in_turn
+from heliotrope.calibration.learn.sequential import predict_by_stream, predict_in_turn
 from heliotrope.calibration.sightings import Sightings, sightings
 from heliotrope.geometry import direction, reflect
 from heliotrope.mechanism import kinds
@@ -81,6 +81,24 @@ def test_a_sighting_is_predicted_from_those_before_it(field: tuple[Mechanism, Si
     figures = assess(("A", "B", "C"), learned, found)
     assert figures.beam.count == len(held)
     assert 1e3 * figures.median_of_medians < 1.0
+
+
+def test_the_stream_predicts_as_if_all_were_learnt_afresh(
+    field: tuple[Mechanism, Sightings],
+) -> None:
+    """With jacks that are not linear, and without any event; a late sighting is linearised once."""
+    nominal, seen = field
+    learned = learn(nominal, seen, MODEL, used=split(seen, "sequential", 0.7), own=False)
+    one, other = predict_by_stream(learned), predict_in_turn(learned)
+    sigma = np.sqrt(np.einsum("maa->ma", other.covariance))
+    assert np.abs((one.plane - other.plane) / sigma).max() < 0.5
+    ratio = np.einsum("maa->m", one.covariance) / np.einsum("maa->m", other.covariance)
+    assert 0.6 < ratio.min() < ratio.max() < 1.6
+    assert 1e3 * np.median(one.errors.beam) < 1.0
+    # What comes later is not known yet.
+    later = np.flatnonzero(~learned.used)[-1:]
+    again = predict_by_stream(dataclasses.replace(learned, sightings=_moved(seen, later)))
+    np.testing.assert_array_equal(again.values, one.values)
 
 
 def _beyond(seen: Sightings, rows: np.ndarray) -> Sightings:

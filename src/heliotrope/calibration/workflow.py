@@ -18,7 +18,7 @@ from heliotrope.calibration.learn import models
 from heliotrope.calibration.learn.assessment import Assessment, assess
 from heliotrope.calibration.learn.learning import FEWEST, Learned, Runner, learn
 from heliotrope.calibration.learn.models import ScoredModel
-from heliotrope.calibration.learn.sequential import predict_in_turn
+from heliotrope.calibration.learn.sequential import predict_by_stream, predict_in_turn
 from heliotrope.calibration.report.content import CalibrationReport
 from heliotrope.calibration.sighting_table import read_sightings
 from heliotrope.calibration.sightings import Sightings, of_measurements
@@ -28,6 +28,8 @@ from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.mechanism.chain import Mechanism
 
+#: How the sequential split learns on.
+Learner = Literal["stream", "batch"]
 #: Called with (name of the step, done, all).
 Steps = Callable[[str, int, int], None]
 
@@ -197,6 +199,7 @@ def evaluate(
     priors: Mapping[str, npt.ArrayLike] | None = None,
     runner: Runner | None = None,
     steps: Steps | None = None,
+    learner: Learner = "stream",
 ) -> HeldOutEvaluation:
     """Learn from a part of each heliostat's sightings and assess the rest.
 
@@ -219,6 +222,9 @@ def evaluate(
         Learns chunks elsewhere; see `heliotrope.calibration.learn.on_dask`.
     steps
         Progress.
+    learner
+        For the split "sequential": "stream" updates a belief by one sighting after another
+        (`heliotrope.calibration.learn.stream`); "batch" learns every history afresh.
 
     Raises
     ------
@@ -241,7 +247,10 @@ def evaluate(
     found = None
     if split == "sequential":
         step = _step(steps, "predicting each sighting from those before it")
-        found = predict_in_turn(learned, priors=priors, runner=runner, progress=step)
+        if learner == "stream":
+            found = predict_by_stream(learned, progress=step)
+        else:
+            found = predict_in_turn(learned, priors=priors, runner=runner, progress=step)
     return HeldOutEvaluation(learned, assess(names, learned, found), scores)
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -20,6 +20,10 @@ def evaluate(
     centroid: shared.CentroidOption = "utis",
     prior: shared.PriorOption = None,
     scheduler: shared.SchedulerOption = None,
+    learner: Annotated[
+        Literal["stream", "batch"],
+        typer.Option(help="How --split sequential learns on: one update each, or all afresh."),
+    ] = "stream",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Learn from a part of each heliostat's sightings and print the errors of the rest.
@@ -46,6 +50,7 @@ def evaluate(
             priors=priors,
             runner=runner,
             steps=steps,
+            learner=learner,
         )
     document = {
         "split": split,

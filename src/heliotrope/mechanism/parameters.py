@@ -6,6 +6,7 @@ standard deviation that installation and survey leave (the prior).
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 from heliotrope.errors import UnknownNameError
 from heliotrope.mechanism.kernels import slots as slot
@@ -242,6 +243,14 @@ def table(
     linear
         For each driven joint, whether its drive is a jack.
     """
+    return dict(_table(joints, driven, linear))
+
+
+@cache
+def _table(
+    joints: tuple[str, ...], driven: tuple[int, ...], linear: tuple[bool, ...]
+) -> dict[str, Parameter]:
+    """As `table`: there are few kinds, and every moved mechanism asks again."""
     rows = list(_PLACE)
     for index, name in enumerate(joints):
         if name in _JOINTS:

@@ -1,6 +1,7 @@
 """Learns a field: parameters, their drift in time, noise, steps, regimes and outliers.
 
-Begin with `learn`; `predict` and `assess` compare the result with sightings. `compare_models` and
+Begin with `learn`; `predict` and `assess` compare the result with sightings; `beliefs_of` goes on
+from it, one sighting after another (`observe`). `compare_models` and
 `choose_model` find the model. Learning on several machines (`calibration.learn.on_dask`) needs the
 optional dask.distributed and stays in its module.
 """
@@ -20,9 +21,17 @@ from heliotrope.calibration.learn.models import (
     choose_model,
     compare_models,
 )
+from heliotrope.calibration.learn.sequential import (
+    beliefs_of,
+    predict_by_stream,
+    predict_in_turn,
+)
+from heliotrope.calibration.learn.stream import Belief, Event, begin, observe, read_belief, update
 
 __all__ = [
     "Assessment",
+    "Belief",
+    "Event",
     "HeliostatFigures",
     "Hyperparameters",
     "Learned",
@@ -31,10 +40,17 @@ __all__ = [
     "Process",
     "ScoredModel",
     "assess",
+    "begin",
+    "beliefs_of",
     "candidate_models",
     "choose_model",
     "compare_models",
     "learn",
     "left_out_errors",
+    "observe",
     "predict",
+    "predict_by_stream",
+    "predict_in_turn",
+    "read_belief",
+    "update",
 ]

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from heliotrope.calibration.evaluation import ErrorSummary, summarise
 from heliotrope.calibration.learn.learning import (
+    FEWEST,
     Learned,
     Prediction,
     moved_by,
@@ -290,7 +291,7 @@ def unexplained_mirrors(names: tuple[str, ...], learned: Learned) -> tuple[str, 
         far = int((white * learned.sightings.sigma[kept] > ELSEWHERE).sum())
         beyond, count = int((learned.unusable & mine).sum()), int(mine.sum())
         strange = far + int((elsewhere & mine).sum())
-        if beyond + strange < 2 or beyond + strange < SHARE * count:
+        if count < FEWEST or beyond + strange < 2 or beyond + strange < SHARE * count:
             continue
         lines.append(f"{name}: {_reason(beyond, strange, count)}")
     return tuple(lines)

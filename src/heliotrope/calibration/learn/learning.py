@@ -178,8 +178,25 @@ def predict(learned: Learned, sightings: Sightings) -> Prediction:
     sightings
         M of these heliostats, at any time.
     """
+    values, spread = learned.parameters_at(sightings.heliostat, sightings.time)
+    return predict_with(learned, sightings, values, spread)
+
+
+def predict_with(
+    learned: Learned, sightings: Sightings, values: FloatArray, spread: FloatArray
+) -> Prediction:
+    """Return the predicted beams of sightings (M,) under given parameters.
+
+    Parameters
+    ----------
+    learned
+        Of N heliostats: their nominal mechanisms and their noise.
+    sightings
+        M of these heliostats.
+    values, spread
+        Deviations at each sighting, (M, P), and their covariance, (M, P, P).
+    """
     rows = sightings.heliostat
-    values, spread = learned.parameters_at(rows, sightings.time)
     moved = moved_by(learned.mechanism, rows, learned.names, values)
     alone = replace(sightings, heliostat=np.arange(len(rows)))
     found = beam_errors(moved, alone)

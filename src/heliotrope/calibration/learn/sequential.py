@@ -7,18 +7,80 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.evaluation import BeamErrors
+from heliotrope.calibration.fit.residuals import linearise
+from heliotrope.calibration.learn import stream
+from heliotrope.calibration.learn.drift import DAY
 from heliotrope.calibration.learn.learning import (
     Learned,
     Prediction,
     Progress,
     Runner,
     learn,
+    moved_by,
     predict,
+    predict_with,
 )
+from heliotrope.calibration.learn.stream import Belief
+from heliotrope.calibration.learn.unusable import is_usable
 from heliotrope.calibration.sightings import Sightings
 
 #: Sightings predicted at once: memory grows with this times the sightings of a heliostat.
 CHUNK = 50
+
+
+def beliefs_of(learned: Learned) -> tuple[Belief, ...]:
+    """Return the belief of each heliostat after the sightings that it was learnt from.
+
+    This is the work of a night: hyperparameters, the centre of the priors and the derivatives of
+    the past come from the batch, each sighting linearised about the posterior at its time; steps,
+    regimes and mistakes are weighed again as the sightings come. ``stream.observe`` goes on.
+    """
+    seen = learned.sightings
+    found = []
+    for i, member in enumerate(learned.members):
+        rows = np.flatnonzero((seen.heliostat == i) & learned.used & ~learned.unusable)
+        # Unknown times first: they say nothing about drift, and a belief does not go back.
+        when = np.nan_to_num(seen.time[rows], nan=-np.inf)
+        rows = rows[np.argsort(when, kind="stable")]
+        belief = stream.begin(member.hyper, member.data.centre, member.data.own)
+        if len(rows):
+            mine = seen.take(rows)
+            at, _ = learned.parameters_at(mine.heliostat, mine.time)
+            moved = moved_by(learned.mechanism, mine.heliostat, learned.names, at)
+            line = linearise(moved, mine, learned.names)
+            gap = at - member.data.centre
+            value = np.einsum("nap,np->na", line.jacobian, gap) - line.residual
+            for k in np.flatnonzero(is_usable(line)):
+                belief = stream.update(belief, line.jacobian[k], value[k], mine.time[k] / DAY)
+        found.append(belief)
+    return tuple(found)
+
+
+def predict_by_stream(learned: Learned, progress: Progress | None = None) -> Prediction:
+    """Return the held-out sightings, each predicted by the belief after all earlier ones.
+
+    Parameters
+    ----------
+    learned
+        Learnt from the earliest sightings of each heliostat.
+    progress
+        Called with (done, all) held-out sightings.
+    """
+    seen, size = learned.sightings, len(learned.names)
+    beliefs = list(beliefs_of(learned))
+    asked = np.flatnonzero(~learned.used)
+    values, spread = np.empty((len(asked), size)), np.empty((len(asked), size, size))
+    order = np.argsort(seen.time[asked], kind="stable")
+    for done, place in enumerate(order):
+        row = asked[place]
+        i = int(seen.heliostat[row])
+        values[place], spread[place] = beliefs[i].at(seen.time[row] / DAY)
+        beliefs[i] = stream.observe(
+            beliefs[i], learned.mechanism[i : i + 1], seen.take([row]).of(i)
+        )
+        if progress:
+            progress(done + 1, len(asked))
+    return predict_with(learned, seen.take(asked), values, spread)
 
 
 def predict_in_turn(

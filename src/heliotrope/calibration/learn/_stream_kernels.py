@@ -1,0 +1,227 @@
+"""Compiled: one sighting updates the weighted hypotheses of a mirror; see stream.py.
+
+A state holds the P constants, the offsets of the Z zeros in the present regime, and the C
+Ornstein-Uhlenbeck processes. Each hypothesis is a Gaussian of it: mean (S,), covariance (S, S).
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from heliotrope.jit import OPTIONS
+
+# What happened before a sighting; UNKNOWN weighs all of it.
+UNKNOWN, NOTHING, STEP, REGIME, RETURN, BLUNDER = -1, 0, 1, 2, 3, 4
+#: Most hypotheses after a sighting, and the smallest weight of one.
+MOST, LEAST = 8, 1e-4
+#: Hypotheses whose means and standard deviations differ by less than this are one.
+ALIKE = 0.3
+
+
+@njit(**OPTIONS)
+def propagate(mean, covariance, first, amplitude, tau, days):
+    """Let the processes of one hypothesis pass ``days``, in place."""
+    for c in range(amplitude.shape[0]):
+        k = first + c
+        decay = math.exp(-days / tau[c])
+        mean[k] *= decay
+        for j in range(mean.shape[0]):
+            covariance[k, j] *= decay
+            covariance[j, k] *= decay
+        covariance[k, k] += amplitude[c] * amplitude[c] * (1.0 - decay * decay)
+
+
+@njit(**OPTIONS)
+def moments(weight, mean, covariance, first, amplitude, tau, days):
+    """Mean (S,) and covariance (S, S) of all hypotheses together after ``days``."""
+    count, size = mean.shape
+    middle, spread = np.zeros(size), np.zeros((size, size))
+    later, spreads = mean.copy(), covariance.copy()
+    for k in range(count):
+        propagate(later[k], spreads[k], first, amplitude, tau, days)
+        middle += weight[k] * later[k]
+    for k in range(count):
+        for p in range(size):
+            for q in range(size):
+                away = (later[k, p] - middle[p]) * (later[k, q] - middle[q])
+                spread[p, q] += weight[k] * (spreads[k, p, q] + away)
+    return middle, spread
+
+
+@njit(**OPTIONS)
+def reset(mean, covariance, k, variance):
+    """Forget component k of one hypothesis, in place."""
+    mean[k] = 0.0
+    for j in range(mean.shape[0]):
+        covariance[k, j] = 0.0
+        covariance[j, k] = 0.0
+    covariance[k, k] = variance
+
+
+@njit(**OPTIONS)
+def _log_density(x, y, a, b, c):
+    determinant = a * c - b * b
+    square = (c * x * x - 2.0 * b * x * y + a * y * y) / determinant
+    return -0.5 * square - 0.5 * math.log(determinant) - math.log(2.0 * math.pi)
+
+
+@njit(**OPTIONS)
+def _compare(mean, covariance, rows, value, noise, far):
+    """Compare one hypothesis with a sighting.
+
+    Returns the covariance of the state with it (S, 2), the gap, the gap's covariance, and the log
+    density of the gap, as it stands and with the variance ``far`` of a blunder.
+    """
+    size = mean.shape[0]
+    gain = np.zeros((size, 2))
+    x, y = value[0], value[1]
+    for j in range(size):
+        x -= rows[0, j] * mean[j]
+        y -= rows[1, j] * mean[j]
+        for k in range(size):
+            gain[j, 0] += covariance[j, k] * rows[0, k]
+            gain[j, 1] += covariance[j, k] * rows[1, k]
+    a, b, c = noise[0, 0], noise[0, 1], noise[1, 1]
+    for j in range(size):
+        a += rows[0, j] * gain[j, 0]
+        b += rows[0, j] * gain[j, 1]
+        c += rows[1, j] * gain[j, 1]
+    return gain, x, y, a, b, c, _log_density(x, y, a, b, c), _log_density(x, y, a + far, b, c + far)
+
+
+@njit(**OPTIONS)
+def _condition(mean, covariance, found):
+    """Update one hypothesis by the sighting that it was compared with, in place."""
+    gain, x, y, a, b, c = found[0], found[1], found[2], found[3], found[4], found[5]
+    determinant = a * c - b * b
+    p, q, r = c / determinant, -b / determinant, a / determinant
+    size = mean.shape[0]
+    for j in range(size):
+        first = gain[j, 0] * p + gain[j, 1] * q
+        second = gain[j, 0] * q + gain[j, 1] * r
+        mean[j] += first * x + second * y
+        for k in range(j + 1):
+            covariance[j, k] -= first * gain[k, 0] + second * gain[k, 1]
+            covariance[k, j] = covariance[j, k]
+
+
+@njit(**OPTIONS)
+def _same(mean, covariance, i, j):
+    for k in range(mean.shape[1]):
+        a, b = covariance[i, k, k], covariance[j, k, k]
+        if a <= 0.0 and b <= 0.0:
+            if mean[i, k] != mean[j, k]:
+                return False
+            continue
+        if abs(mean[i, k] - mean[j, k]) > ALIKE * math.sqrt(min(a, b)):
+            return False
+        if abs(math.sqrt(a) - math.sqrt(b)) > ALIKE * math.sqrt(min(a, b)):
+            return False
+    return True
+
+
+@njit(**OPTIONS)
+def _merge(mean, covariance, weight, i, j):
+    """Moments of hypotheses i and j together, into i."""
+    total = weight[i] + weight[j]
+    a, b = weight[i] / total, weight[j] / total
+    size = mean.shape[1]
+    gap = mean[j] - mean[i]
+    for p in range(size):
+        for q in range(size):
+            covariance[i, p, q] = (
+                a * covariance[i, p, q] + b * covariance[j, p, q] + a * b * gap[p] * gap[q]
+            )
+    for p in range(size):
+        mean[i, p] += b * gap[p]
+    weight[i] = total
+
+
+@njit(**OPTIONS)
+def _reduce(mean, covariance, weight, regime, count):
+    """Order hypotheses by weight, merge those alike and drop the improbable; return their number.
+
+    The best are at the places in ``keep``.
+    """
+    order = np.argsort(-weight[:count])
+    keep = np.empty(MOST, dtype=np.int64)
+    kept = 0
+    total = weight[:count].sum()
+    for n in range(count):
+        i = order[n]
+        if weight[i] < LEAST * total and kept > 0:
+            break
+        merged = False
+        for m in range(kept):
+            j = keep[m]
+            if regime[i] == regime[j] and _same(mean, covariance, j, i):
+                _merge(mean, covariance, weight, j, i)
+                merged = True
+                break
+        if not merged and kept < MOST:
+            keep[kept] = i
+            kept += 1
+    return keep[:kept]
+
+
+@njit(**OPTIONS)
+def update(
+    weight, mean, covariance, regime, rows, value, noise, days, event,
+    zeros, offsets, first, step, lost, amplitude, tau, chance, far
+):  # fmt: skip
+    """Hypotheses (weight, mean, covariance, regime) after one more sighting, and its log density.
+
+    ``rows`` (2, S) are the derivatives of the whitened values ``value`` (2,) by the state;
+    ``noise`` (2, 2); ``zeros`` and ``offsets`` (Z,) the places of the zeros' constants and of their
+    offsets; ``first`` the place of the first process; ``step`` and ``lost`` (Z,) the variances of a
+    step and of a regime's offset; ``chance`` (5,) the probabilities of what happened; ``far`` the
+    variance of a blunder. The last result is the probability that the sighting is a blunder.
+    """
+    count, size = mean.shape
+    most = 5 * count
+    new_mean, new_cov = np.empty((most, size)), np.empty((most, size, size))
+    log_weight, new_regime = np.full(most, -np.inf), np.zeros(most, dtype=np.bool_)
+    blunder = np.zeros(most, dtype=np.bool_)
+    used = 0
+    for k in range(count):
+        m, p = mean[k].copy(), covariance[k].copy()
+        if days > 0.0:
+            propagate(m, p, first, amplitude, tau, days)
+        base = math.log(weight[k])
+        for what in range(4):
+            if event not in (UNKNOWN, what):
+                continue
+            if what == RETURN and not regime[k]:
+                continue
+            prior = 0.0 if event != UNKNOWN else math.log(max(chance[what], 1e-300))
+            if event == UNKNOWN and chance[what] <= 0.0:
+                continue
+            new_mean[used], new_cov[used] = m, p
+            new_regime[used] = regime[k]
+            for z in range(zeros.shape[0]):
+                if what == STEP:
+                    new_cov[used, zeros[z], zeros[z]] += step[z]
+                elif what == REGIME:
+                    reset(new_mean[used], new_cov[used], offsets[z], lost[z])
+                    new_regime[used] = True
+                elif what == RETURN:
+                    reset(new_mean[used], new_cov[used], offsets[z], 0.0)
+                    new_regime[used] = False
+            found = _compare(new_mean[used], new_cov[used], rows, value, noise, far)
+            _condition(new_mean[used], new_cov[used], found)
+            log_weight[used] = base + prior + found[6]
+            used += 1
+            if what == NOTHING and event == UNKNOWN and chance[BLUNDER] > 0.0:
+                new_mean[used], new_cov[used] = m, p
+                new_regime[used], blunder[used] = regime[k], True
+                log_weight[used] = base + math.log(chance[BLUNDER]) + found[7]
+                used += 1
+    top = log_weight[:used].max()
+    new_weight = np.exp(log_weight[:used] - top)
+    density = top + math.log(new_weight.sum())
+    mistaken = new_weight[blunder[:used]].sum() / new_weight.sum()
+    keep = _reduce(new_mean, new_cov, new_weight, new_regime, used)
+    kept_weight = new_weight[keep]
+    kept_weight /= kept_weight.sum()
+    return kept_weight, new_mean[keep], new_cov[keep], new_regime[keep], density, mistaken
