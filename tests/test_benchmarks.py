@@ -47,6 +47,10 @@ COLUMNS = {
         "work", "heliostats", "calibrated", "visits", "median_mrad", "predicted_mrad", "within_90",
         "cpu_s_per_h", "memory_mib",
     },
+    "learning": {
+        "sightings_before", "stream_us", "batch_ms", "ratio", "difference_sigma", "hypotheses",
+        "state_kB",
+    },
     "bus": {"line", "question", "bytes", "wire_ms", "median_ms", "p99_ms", "cycle_of_32_s"},
 }  # fmt: skip
 RESULT = {
