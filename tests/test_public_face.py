@@ -59,7 +59,7 @@ def test_faces_list_what_they_show(package: str) -> None:
 
 def test_a_notebook_from_plant_to_calibrated_error() -> None:
     """Measure a rough heliostat on its target, calibrate it, and predict fresh measurements."""
-    plant = ht.prototype()
+    plant = ht.example_plant()
     nominal = plant.groups["azel"].mechanism
     actual = ht.roughly_installed(nominal, seed=3)
     aim = plant.targets[0].center

@@ -37,7 +37,15 @@ if TYPE_CHECKING:
     from heliotrope.calibration.fit import fit
     from heliotrope.calibration.learn import learn
     from heliotrope.calibration.sightings import sightings
-    from heliotrope.field import Heliostats, Plant, Receiver, Target, prototype, roughly_installed
+    from heliotrope.field import (
+        Heliostats,
+        Plant,
+        Receiver,
+        Target,
+        example_plant,
+        prototype,
+        roughly_installed,
+    )
     from heliotrope.field.formats import open_plant
     from heliotrope.field.formats.plant_file import read_plant, write_plant
     from heliotrope.mechanism import Mechanism, Tracking, track
@@ -62,6 +70,7 @@ _HOMES = {
     "calibrate": "heliotrope.calibration",
     "camera_target": "heliotrope.calibration",
     "evaluate": "heliotrope.calibration",
+    "example_plant": "heliotrope.field",
     "fit": "heliotrope.calibration.fit",
     "image_offsets": "heliotrope.optics",
     "learn": "heliotrope.calibration.learn",
@@ -104,6 +113,7 @@ __all__ = [
     "calibrate",
     "camera_target",
     "evaluate",
+    "example_plant",
     "fit",
     "geometry",
     "image_offsets",

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from heliotrope.airborne.plan.airspace import Airspace, KeepOut, path_length, tower
 from heliotrope.airborne.plan.flight_files import read_airspace
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.geometry import FloatArray, as_float
 
 TOWER = KeepOut("tower", as_float([[0.0, 0.0]]), 15.0, top=150.0)
@@ -113,7 +113,7 @@ def test_keep_out_between_heights() -> None:
 
 
 def test_tower_of_a_plant() -> None:
-    plant = prototype()
+    plant = example_plant()
     found = tower(plant)
     assert {k.name for k in found} == {"receiver", "target"}
     assert max(k.top for k in found) == pytest.approx(16.5 + 0.75 + 10.0)

@@ -8,14 +8,14 @@ import typer
 
 from heliotrope.cli.drone.plan import plan
 from heliotrope.errors import InputError
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.field.formats.plant_file import write_plant
 from support.waypoint_files import read_litchi, read_qgc, read_wpml
 
 
 @pytest.fixture
 def field(tmp_path: Path) -> Path:
-    write_plant(prototype(), tmp_path / "plant.toml")
+    write_plant(example_plant(), tmp_path / "plant.toml")
     return tmp_path / "plant.toml"
 
 
@@ -42,7 +42,7 @@ def test_plan_of_the_example(
     assert printed["files"] == 3 + 3 * printed["sorties"]
     assert (into / "map.png").read_bytes().startswith(b"\x89PNG")
     held = json.loads((into / "plan.json").read_text())
-    assert held["plant"] == "prototype"
+    assert held["plant"] == "example"
     assert [k["name"] for k in held["airspace"]["keep_out"]] == ["receiver", "target"]
 
 

@@ -17,7 +17,7 @@ from heliotrope.calibration.report.content import CalibrationReport
 from heliotrope.calibration.report.page import write_report
 from heliotrope.calibration.sightings import Sightings, of_measurements
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.field.formats import measurements, paint
 from heliotrope.field.formats.plant_file import read_plant
 from heliotrope.field.plant import Plant
@@ -48,7 +48,7 @@ def test_json_reads_back(learnt: learning.Learned, tmp_path: Path) -> None:
     assert again.time == pytest.approx(found.time, abs=1e-5)
     document = json.loads((tmp_path / "c.json").read_text(encoding="utf-8"))
     assert document["heliostats"]["H3"]["outliers"] == ["m3"]
-    plant = prototype()
+    plant = example_plant()
     group = plant.groups["azel"].take(range(6))
     renamed = dataclasses.replace(group, names=("H0", "H1", "X", "H3", "H4", "H5"))
     applied = again.apply(renamed)
@@ -82,7 +82,7 @@ def test_json_that_is_wrong(
 
 
 def test_report_is_one_page_that_reads_back(learnt: learning.Learned, tmp_path: Path) -> None:
-    plant = prototype()
+    plant = example_plant()
     group = dataclasses.replace(
         plant.groups["azel"].take(range(6)), names=NAMES, mechanism=learnt.mechanism
     )

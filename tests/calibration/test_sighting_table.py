@@ -26,7 +26,7 @@ from heliotrope.calibration.sightings import (
     sun_sensor,
 )
 from heliotrope.errors import FormatError, InputError, UnknownNameError
-from heliotrope.field.example import azimuth_elevation, prototype
+from heliotrope.field.example import azimuth_elevation, example_plant
 from heliotrope.files.cells import format_time, parse_time
 from heliotrope.geometry import MRAD, TAU, bisector, direction, normalize, reflect, tangent_axes
 from heliotrope.mechanism.chain import Mechanism
@@ -547,7 +547,7 @@ MALAN = (
 
 @pytest.mark.parametrize("separator", [";", ",", "\t"])
 def test_malan(separator: str, tmp_path: Path) -> None:
-    plant = prototype()
+    plant = example_plant()
     (target,) = plant.targets
     path = tmp_path / "p6a.csv"
     text = f"\ufeff{MALAN}\n2026-06-21T12:00:00+02:00;30;45;0.25;-0.5;1000;2000\n"
@@ -583,7 +583,7 @@ MALAN_GOOD = "2026-06-21T12:00:00Z;30;45;0.25;-0.5;1000;2000"
     ],
 )
 def test_malans_bad_rows_are_named(old: str, new: str, says: str, tmp_path: Path) -> None:
-    (target,) = prototype().targets
+    (target,) = example_plant().targets
     path = tmp_path / "m.csv"
     path.write_text(f"{MALAN}\n{MALAN_GOOD}\n{MALAN_GOOD.replace(old, new)}\n", encoding="utf-8")
     seen, left_out = read_malan(path, "A", ("A",), target)
@@ -594,10 +594,10 @@ def test_malans_bad_rows_are_named(old: str, new: str, says: str, tmp_path: Path
 
 
 def test_malans_guards(tmp_path: Path) -> None:
-    (target,) = prototype().targets
+    (target,) = example_plant().targets
     path = tmp_path / "m.csv"
     path.write_text(f"{MALAN.replace('timestamp', 'time')}\n{MALAN_GOOD}\n", encoding="utf-8")
     with pytest.raises(FormatError, match=r"there is no column timestamp; add it\. There are time"):
         read_malan(path, "A", ("A",), target)
     with pytest.raises(UnknownNameError, match="there is no heliostat 'P6D'; did you mean"):
-        read_malan(path, "P6D", prototype().names, target)
+        read_malan(path, "P6D", example_plant().names, target)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from heliotrope.cli import main
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.field.formats.plant_file import write_plant
 
 TOML = """\
@@ -391,7 +391,7 @@ ARGUMENTS: list[tuple[list[str], str]] = [
 def test_arguments(arguments, says, tmp_path, capsys, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     (tmp_path / "empty").mkdir()
     (tmp_path / "paint").mkdir()
-    write_plant(prototype(), tmp_path / "plant.toml")
+    write_plant(example_plant(), tmp_path / "plant.toml")
     _paint_folder(tmp_path / "paint", json.dumps(PAINT), json.dumps(TOWER), MEASURED)
     places = {
         "PLANT": str(tmp_path / "plant.toml"),

@@ -17,7 +17,7 @@ from heliotrope.calibration.report import page as report
 from heliotrope.calibration.sighting_table import write_sightings
 from heliotrope.calibration.sightings import join, sightings
 from heliotrope.cli import main
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.field.formats import open_plant
 from heliotrope.field.formats.plant_file import read_plant, write_plant
 from heliotrope.geometry import azimuth_elevation, reflect
@@ -50,7 +50,7 @@ def call(capsys: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
 @pytest.fixture
 def plant_file(tmp_path: Path) -> Path:
     """The example plant as a file."""
-    write_plant(prototype(), tmp_path / "plant.toml")
+    write_plant(example_plant(), tmp_path / "plant.toml")
     return tmp_path / "plant.toml"
 
 
@@ -90,7 +90,7 @@ def test_track_gives_both_branches(call: Any, plant_file: Path) -> None:
         )
     )
     assert len(found["branches"]) == 2
-    plant = prototype()
+    plant = example_plant()
     mechanism = plant.heliostat("P6A")
     vector = sun.vector("2026-09-02T10:00:00Z", plant.site)
     keys = {

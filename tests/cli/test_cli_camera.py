@@ -15,7 +15,7 @@ import pytest
 
 from heliotrope.cli import main
 from heliotrope.field.camera import project
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.field.formats.plant_file import read_plant, write_plant
 from imaging.test_lens import HELD, MATRIX, drawn, held
 from imaging.test_teaching import (
@@ -259,7 +259,7 @@ def test_show(call: Any, place: Path) -> None:
     assert found[0]["targets"]["target"]["distance"] == pytest.approx(np.sqrt(665.0))
     assert "no cameras; heliotrope camera teach" in call("show", place / "bare.toml")
     assert json.loads(call("show", place / "bare.toml", "--json")) == []
-    bare = replace(prototype(), cameras=(replace(CAMERA, position=None, R_enu_camera=None),))
+    bare = replace(example_plant(), cameras=(replace(CAMERA, position=None, R_enu_camera=None),))
     write_plant(bare, place / "lens.toml")
     assert "camera south: its position is not known" in call("show", place / "lens.toml")
 

@@ -10,8 +10,8 @@ import pytest
 
 from heliotrope.console.live import rows_of
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.field.example import board_prototype
 from heliotrope.field.layouts import lay_out
+from heliotrope.field.stellenbosch import prototype
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
@@ -27,7 +27,7 @@ ENGINEER, OPERATOR = Person("engineer", Role.ENGINEER), Person("operator", Role.
 
 def _live(work: Callable[[LivePlant], Awaitable[None]], records: Keeper | None = None) -> None:
     """Run two boards that nobody wants to move."""
-    design = board_prototype()
+    design = prototype()
     (group,) = design.groups.values()
     two = replace(design, groups={"azel": group.take([0, 1])})
     options = LiveOptions(

@@ -9,10 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.field.formats import paint, plant_file
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
+from heliotrope.field.stellenbosch import prototype
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere
 from heliotrope.mechanism import kinds
@@ -110,8 +111,8 @@ def test_any_field_survives(tmp_path_factory, places, latitude, tilt, offset) ->
     _same(plant, plant_file.read_plant(folder / "p.toml"))
 
 
-def test_prototype_and_juelich_survive(tmp_path: Path) -> None:
-    for plant in (prototype(), paint.read_plant(juelich())):
+def test_examples_and_juelich_survive(tmp_path: Path) -> None:
+    for plant in (example_plant(), prototype(), paint.read_plant(juelich())):
         plant_file.write_plant(plant, tmp_path / "plant.toml")
         _same(plant, plant_file.read_plant(tmp_path / "plant.toml"))
         assert not [
@@ -155,7 +156,7 @@ gate = [0, 120, 1.7]
 def with_text(folder: Path, text: str) -> Path:
     """The prototype's file with more at its end."""
     path = folder / "plant.toml"
-    plant_file.write_plant(prototype(), path)
+    plant_file.write_plant(example_plant(), path)
     lines = path.read_text(encoding="utf-8").splitlines()
     kept = [line for line in lines if not line.startswith(("keep_out =", "[eyes_m]"))]
     path.write_text("\n".join(kept) + text, encoding="utf-8")
@@ -376,7 +377,7 @@ def test_machine_that_cannot_be_is_one_line(
 def test_warnings_of_check(tmp_path: Path) -> None:
     near = kinds.azimuth_elevation(np.array([[0.0, -30, 0], [0.5, -30, 0], [0, 40, 0]]))
     heliostats = Heliostats(("A", "B", "C"), near, np.full(3, 2.0), np.full(3, 2.0))
-    target = prototype().targets
+    target = example_plant().targets
     plant_file.write_plant(
         Plant("w", Site(0.0, 0.0, 0.0), {"g": heliostats}, target), tmp_path / "p.toml"
     )
@@ -394,13 +395,13 @@ def test_schema_in_the_docs_is_current() -> None:
 def test_nothing_half_written(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     with pytest.raises(InputError, match="cannot be written"):
-        plant_file.write_plant(prototype(), tmp_path / "nowhere" / "plant.toml")
-    plant_file.write_plant(prototype(), tmp_path / "folder" / "plant.toml")
+        plant_file.write_plant(example_plant(), tmp_path / "nowhere" / "plant.toml")
+    plant_file.write_plant(example_plant(), tmp_path / "folder" / "plant.toml")
     assert sorted(p.name for p in (tmp_path / "folder").iterdir()) == ["plant.csv", "plant.toml"]
 
 
-def test_prototype_is_the_thesis_s() -> None:
-    plant = prototype()
+def test_example_plant() -> None:
+    plant = example_plant()
     assert len(plant) == 18
     assert len(set(plant.groups["azel"].cluster)) == 6
     group, row = plant.find("P6A")
@@ -411,7 +412,7 @@ def test_prototype_is_the_thesis_s() -> None:
 # --- the arrays themselves ----------------------------------------------------------------
 
 ONE = kinds.azimuth_elevation(np.zeros((2, 3)))
-CORNERS = prototype().targets[0].corners
+CORNERS = example_plant().targets[0].corners
 
 
 @pytest.mark.parametrize(
@@ -435,8 +436,8 @@ CORNERS = prototype().targets[0].corners
         (lambda: Target("t", CORNERS * [1, 0, 0], CORNERS[0]), "span no area"),
         (lambda: Receiver("r", "flat", CORNERS[0], CORNERS[1], 1.0, 1.0), "kind 'flat'; known"),
         (lambda: Receiver("r", "planar", CORNERS[0], CORNERS[1], -1.0, 1.0), "width -1.0 m"),
-        (lambda: prototype().heliostat("P9Z"), "there is no heliostat 'P9Z'"),
-        (lambda: prototype().target("tower"), "there is no target 'tower'"),
+        (lambda: example_plant().heliostat("P9Z"), "there is no heliostat 'P9Z'"),
+        (lambda: example_plant().target("tower"), "there is no target 'tower'"),
     ],
 )
 def test_guards(make, text: str) -> None:  # type: ignore[no-untyped-def]

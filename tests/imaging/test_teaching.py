@@ -20,7 +20,7 @@ import pytest
 
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.field.camera import Camera, look_at, project, rays
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.field.formats.plant_file import read_plant, write_plant
 from heliotrope.field.marks import Mark
 from heliotrope.field.plant import Plant
@@ -67,8 +67,10 @@ MARKS = (
 )
 #: Of the same points, nothing but their names and places.
 BARE = replace(
-    prototype(),
-    targets=(replace(prototype().targets[0], markers={mark.name: mark.point for mark in MARKS}),),
+    example_plant(),
+    targets=(
+        replace(example_plant().targets[0], markers={mark.name: mark.point for mark in MARKS}),
+    ),
 )
 CAMERA = Camera(
     "south",
@@ -96,7 +98,7 @@ def photograph(
     fine, half = 250, 2.0
     n = int(2 * half * fine)
     face = np.full((n, n), 90, np.uint8)
-    target = prototype().targets[0]
+    target = example_plant().targets[0]
 
     def fill(shape: FloatArray, light: int) -> None:
         spots = (np.stack([shape[:, 0] + half, half - shape[:, 1]], axis=-1) * fine - 0.5) * 16
@@ -267,7 +269,7 @@ def test_pictures_show_what_is_about_their_point(blotted: Frame) -> None:
         # Upright in the plane, as seen: the same cut out of the picture by the true camera.
         n = len(picture)
         offset = (np.arange(n) - n // 2) * mark.size / n
-        place = prototype().targets[0].plane_coordinates(mark.point)
+        place = example_plant().targets[0].plane_coordinates(mark.point)
         right, up = np.meshgrid(offset, -offset)
         spots = project(CAMERA, PLAIN.targets[0].point(place + np.stack([right, up], axis=-1)))
         maps = spots.astype(np.float32)
@@ -428,8 +430,8 @@ def test_pictures_that_are_missing_or_no_pictures(blotted: Frame, tmp_path: Path
 def test_points_have_one_name_each() -> None:
     target = Target(
         "t",
-        prototype().targets[0].corners,
-        prototype().targets[0].center,
+        example_plant().targets[0].corners,
+        example_plant().targets[0].center,
         markers={"upper_left": np.array([-1.4, 0.0, 14.4]), "rivet": np.array([0.0, 0.0, 13.5])},
         marks=(Mark("rivet", "disc", np.array([0.0, 0.0, 13.4]), 0.1),),
     )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import InputError
-from heliotrope.field.example import prototype, roughly_installed
+from heliotrope.field.example import example_plant, roughly_installed
 from heliotrope.geometry import MRAD, direction
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import direct
@@ -41,7 +41,7 @@ def test_a_small_turn_of_the_normal_is_doubled_in_the_beam() -> None:
 
 def test_on_the_real_target_the_camera_sees_the_mirror_image() -> None:
     """The target's front looks back at the heliostat, so its right is the mirror's left."""
-    plant = prototype()
+    plant = example_plant()
     target = plant.targets[0]
     moved = NOMINAL.with_parameters({"azimuth_bias": 1e-3})
     from_mirror = image_offsets(NOMINAL, moved, SUNS, target.center)
@@ -52,7 +52,7 @@ def test_on_the_real_target_the_camera_sees_the_mirror_image() -> None:
 
 
 def test_a_whole_field_for_a_day() -> None:
-    plant = prototype()
+    plant = example_plant()
     nominal = plant.groups["azel"].mechanism
     found = image_offsets(nominal, roughly_installed(nominal), SUNS[:, None], AIM)
     assert found.right.shape == (3, 18)

@@ -8,7 +8,7 @@ from zlib import crc32
 import numpy as np
 import pytest
 
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency
@@ -19,7 +19,7 @@ from heliotrope.safety import Act
 from heliotrope.sun import fast_vector
 from support.plant_bench import OPERATOR, Bench, running
 
-DESIGN = prototype()
+DESIGN = example_plant()
 AIM = (2.0, 0.0, 15.0)
 NAME = "P5A"
 

@@ -6,7 +6,7 @@ from zlib import crc32
 
 import pytest
 
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Command, Emergency, Parameters
@@ -15,7 +15,7 @@ from heliotrope.plant.authority import RefusedError
 from heliotrope.safety import alarms
 from support.plant_bench import ENGINEER, OPERATOR, Bench, ScriptedCluster, running
 
-DESIGN = prototype()
+DESIGN = example_plant()
 PAIR = ("P5A", "P5B")
 CRC = {name: crc32(items_of(DESIGN.heliostat(name))["armature"]) for name in DESIGN.names}
 

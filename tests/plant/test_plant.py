@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.field.volumes import Sphere
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
@@ -354,7 +354,7 @@ def test_of_those_that_join_each_is_proven_by_its_own_way(tmp_path: Path) -> Non
 
 def test_whose_beam_would_sweep_through_a_volume_does_not_join(tmp_path: Path) -> None:
     walkway = Sphere("walkway", (0.0, -12.0, 8.0), 1.0)
-    design = prototype()
+    design = example_plant()
     group, row = design.find("P5A")
 
     async def scene(bench: Bench) -> None:
@@ -416,7 +416,7 @@ def test_what_is_stored_is_compared_and_pushed(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="item 'address' of 2 bytes cannot be pushed"):
             plant.parameters(ENGINEER, token, "P1A", {"address": b"12"})
 
-    mechanism = prototype().heliostat("P1A")
+    mechanism = example_plant().heliostat("P1A")
     wanted = Wanted({"P1A": items_of(mechanism, machine)})
     bench = play(tmp_path, scene, wanted=wanted)
     assert {ask.what for ask in bench.cluster_of("P1A").of(Ask)} == {"stored"}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import AssignedError, AssignedFile, grouped, points_of
@@ -138,4 +138,4 @@ def test_standby_points_where_beams_burn_an_eye_are_refused(tmp_path: Path) -> N
 
     run_virtual(main)
     with pytest.raises(InputError, match=r"eyes\[0, 2\]: nan is not a finite number"):
-        BeamCheck(prototype(), ("P1A",), (), ((0.0, 0.0, float("nan")),))
+        BeamCheck(example_plant(), ("P1A",), (), ((0.0, 0.0, float("nan")),))

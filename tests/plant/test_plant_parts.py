@@ -16,7 +16,7 @@ import pytest
 
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.errors import FormatError, InputError, UnknownNameError
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.lcu import drives, states
 from heliotrope.lcu.config import Config
 from heliotrope.links.clock import VirtualClock
@@ -316,7 +316,7 @@ def test_a_field_that_does_not_hold_together_is_refused() -> None:
         FieldState({"K": ("A",), "L": ("A",)})
     with pytest.raises(InputError, match="no cluster has a heliostat"):
         FieldState({"K": ()})
-    assert set(clusters_of(prototype())) == {f"pod-{i}" for i in range(1, 7)}
+    assert set(clusters_of(example_plant())) == {f"pod-{i}" for i in range(1, 7)}
 
 
 def test_rows_are_put_by_their_names_and_strangers_left_out() -> None:

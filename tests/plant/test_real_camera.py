@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import FetchError, InputError
-from heliotrope.field.example import board_prototype
 from heliotrope.field.plant import Plant
+from heliotrope.field.stellenbosch import prototype
 from heliotrope.geometry import normalize
 from heliotrope.imaging.files import read_image, write_image
 from heliotrope.imaging.frame import Frame
@@ -39,7 +39,7 @@ OFF = 0.4
 @pytest.fixture(scope="module")
 def plant() -> Plant:
     """The prototype's, with half as many pixels each way: quicker to draw and to read."""
-    found = board_prototype()
+    found = prototype()
     (camera,) = found.cameras
     matrix = camera.matrix * [[0.5], [0.5], [1.0]]
     width, height = camera.size
@@ -50,10 +50,10 @@ def plant() -> Plant:
 def frame(plant: Plant) -> Frame:
     """A photograph of a beam, 0.4 m right of the middle."""
     target = plant.targets[0]
-    vertex = np.asarray(target.center) + 60.0 * np.asarray(target.normal) * [1.0, 1.0, 0.0]
+    vertex = np.asarray(target.center) + 38.0 * np.asarray(target.normal) * [1.0, 1.0, 0.0]
     point = np.asarray(target.center) + OFF * target.axes[0]
     normal = normalize(SUN + normalize(point - vertex, "beam"), "normal")
-    mirror = TrueMirror("H", vertex, normal, 1.8, 1.2)
+    mirror = TrueMirror("H", vertex, normal, 0.3, 0.3)
     sight = FieldSnapshot(SystemClock(), lambda: [mirror], lambda: SUN, latency=0.0)
     camera = RenderedCamera(
         sight, [Scene(plant.cameras[0], (target,))], optics=Optics(facets=(1, 1))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.field.target import Receiver
 from heliotrope.lcu import names, states
 from heliotrope.lcu.config import Config
@@ -23,7 +23,7 @@ from support.plant_bench import Bench, running
 
 #: South of the tower, where P5A to P5C shine easily.
 FURNACE = Receiver("furnace", "planar", (0.0, -12.0, 8.0), (0.0, -1.0, 0.0), 1.0, 1.0)  # type: ignore[arg-type]
-DESIGN = replace(prototype(), receivers=(FURNACE,))
+DESIGN = replace(example_plant(), receivers=(FURNACE,))
 ON, BESIDE = (0.0, -12.0, 8.0), (-8.0, 0.0, 8.0)
 LIT = [
     state

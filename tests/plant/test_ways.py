@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver
@@ -46,7 +46,7 @@ from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 WALKWAY = Sphere("walkway", (0.0, -12.0, 8.0), 1.0)
 SOUTH = np.array([0.0, -1.0, 0.0])
 WEST, EAST = (-8.0, 0.0, 8.0), (8.0, 0.0, 16.5)
-DESIGN = replace(prototype(), keep_outs=(WALKWAY,))
+DESIGN = replace(example_plant(), keep_outs=(WALKWAY,))
 
 
 def play(folder: Path, scene: Callable[[Bench], Awaitable[None]], design: Plant = DESIGN) -> Bench:
@@ -207,7 +207,7 @@ def test_by_night_and_without_volumes_nothing_is_in_the_way() -> None:
     rows = np.array([0], dtype=np.intp)
     path = np.array([[[0.0, 0.0], [6.0, 1.5]]])
     aim = np.array([[0.0, 0.0, 15.0]])
-    for design, sun in ((DESIGN, (0.0, 0.6, -0.8)), (prototype(), (0.0, -0.6, 0.8))):
+    for design, sun in ((DESIGN, (0.0, 0.6, -0.8)), (example_plant(), (0.0, -0.6, 0.8))):
         check = BeamCheck(design, design.names)
         assert check.moving(rows, path, np.array(sun)) == {}
         assert check.around(rows, aim, 0.3, np.array(sun)) == {}
@@ -601,7 +601,7 @@ def test_an_approach_is_refused_by_name_and_the_others_go(tmp_path: Path) -> Non
 def test_an_approach_across_the_receiver_is_refused_by_name(tmp_path: Path) -> None:
     """It needs no keep-out volume, and beams are still sent to the receiver."""
     furnace = Receiver("furnace", "planar", np.array([0.0, -12.0, 8.0]), SOUTH, 1.0, 1.0)
-    design = replace(prototype(), receivers=(furnace,), keep_outs=())
+    design = replace(example_plant(), receivers=(furnace,), keep_outs=())
 
     async def scene(bench: Bench) -> None:
         plant = bench.plant

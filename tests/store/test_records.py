@@ -18,7 +18,7 @@ from heliotrope.calibration.record import (
 )
 from heliotrope.calibration.sightings import Sightings, camera_target
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.geometry import normalize, reflect
 from heliotrope.links.messages import decode, encode
 from heliotrope.mechanism.chain import Mechanism
@@ -211,7 +211,7 @@ class TestParameters:
 
 def _small_case() -> tuple[Mechanism, Sightings]:
     """A mechanism whose pedestal leans to north by 4 mrad, and what it does."""
-    nominal = prototype().groups["azel"].mechanism[np.array([0])]
+    nominal = example_plant().groups["azel"].mechanism[np.array([0])]
     leaning = nominal.with_parameters({"tilt_north": np.array([0.004])})
     rng = np.random.default_rng(3)
     counts = rng.uniform(2000.0, 20000.0, (12, 2))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from heliotrope.field.example import azimuth_elevation, prototype
+from heliotrope.field.example import azimuth_elevation, example_plant
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver
@@ -44,4 +44,4 @@ def staggered(count: int, canting: float = np.inf) -> Plant:
     receiver = Receiver(
         "receiver", "planar", np.array([0.0, 0.0, 80.0]), np.array([0.0, 1.0, 0.0]), 6.0, 6.0
     )
-    return Plant("staggered", prototype().site, {"azel": group}, receivers=(receiver,))
+    return Plant("staggered", example_plant().site, {"azel": group}, receivers=(receiver,))

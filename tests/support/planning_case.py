@@ -4,14 +4,14 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.field.target import Target
 from heliotrope.mechanism.parameters import MODELS
 
 START = datetime(2026, 9, 2, tzinfo=UTC).timestamp()
 DAY = 86400.0
 NAMES = MODELS["malan8"]
-PLANT = prototype()
+PLANT = example_plant()
 FIELD = PLANT.groups["azel"].mechanism
 AIM = PLANT.receivers[0].center
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.field.example import prototype
+from heliotrope.field.example import example_plant
 from heliotrope.field.plant import Plant
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, sleep_until
@@ -208,7 +208,7 @@ class Bench:
         **options: Any,
     ) -> None:
         self.clock = clock
-        self.design = design or prototype()
+        self.design = design or example_plant()
         self.audit = JsonLines(folder / "audit.jsonl", clock.utc())
         held: dict[str, list[str]] = {}
         for group in self.design.groups.values():

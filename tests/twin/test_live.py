@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import InputError
-from heliotrope.field.example import board_prototype
 from heliotrope.field.layouts import lay_out, malan_plant
 from heliotrope.field.plant import Plant
+from heliotrope.field.stellenbosch import prototype
 from heliotrope.field.target import Target
 from heliotrope.geometry import bisector, normalize, reflect
 from heliotrope.imaging.synthetic.scenes import Scene
@@ -312,7 +312,7 @@ def test_heliostats_of_the_default_plant_fall_below_half_a_milliradian() -> None
 
 
 def test_boards_learn_as_a_vectorised_field_does() -> None:
-    design = board_prototype()
+    design = prototype()
     (group,) = design.groups.values()
     few = replace(design, groups={"azel": group.take([0, 1, 2])})
 

@@ -29,12 +29,12 @@ def demo(
     from heliotrope.calibration.demonstration import day_picture, measure, track_day
     from heliotrope.calibration.report.page import write_report
     from heliotrope.calibration.workflow import FieldSightings, calibrate
-    from heliotrope.field.example import prototype, roughly_installed
+    from heliotrope.field.example import example_plant, roughly_installed
     from heliotrope.field.formats.plant_file import write_plant
     from heliotrope.files.text import write_file
 
     say = (lambda _text: None) if as_json else print
-    plant = prototype()
+    plant = example_plant()
     group, target = plant.groups["azel"], plant.targets[0]
     truth = roughly_installed(group.mechanism, seed)
     into.mkdir(parents=True, exist_ok=True)

@@ -2,15 +2,14 @@
 
 `Plant` holds everything: the site, `Heliostats` in groups of one kind of mechanism, `Target`s,
 `Receiver`s, `Camera`s and keep-out volumes. `formats` reads and writes plants; `layouts` makes new
-ones; `prototype` is an example of 18 heliostats.
+ones; `example_plant` has 18 heliostats, `prototype` is Malan's.
 """
 
 from heliotrope.field.camera import (
     Camera,
 )
 from heliotrope.field.example import (
-    board_prototype,
-    prototype,
+    example_plant,
     roughly_installed,
 )
 from heliotrope.field.heliostats import (
@@ -22,6 +21,9 @@ from heliotrope.field.marks import (
 )
 from heliotrope.field.plant import (
     Plant,
+)
+from heliotrope.field.stellenbosch import (
+    prototype,
 )
 from heliotrope.field.target import (
     Receiver,
@@ -49,7 +51,7 @@ __all__ = [
     "Sphere",
     "Target",
     "Volume",
-    "board_prototype",
+    "example_plant",
     "outline",
     "prototype",
     "roughly_installed",

@@ -1,18 +1,13 @@
-"""An example plant: a field like Malan's prototype at Stellenbosch.
+"""An example plant of 18 heliostats, ours: finer gears and larger mirrors than the prototype.
 
-The thesis gives the place (−33.93, 18.87), eighteen heliostats in six groups of three,
-the calibrated heliostat 30.8 m south and 19.2 m east of the tower with its pivot 1.2 m
-above ground, and a target 13 m up. The other positions, the sizes of mirrors and target
-and the gears are ours, chosen so that the field could be built.
+Six groups of three heliostats of 2.2 m², south of a tower at Stellenbosch with a target 13 m up.
+One of them stands where Malan calibrated his (30.8 m south, 19.2 m east, its pivot 1.2 m up).
+His own machine is `stellenbosch.prototype`.
 """
-
-from dataclasses import replace
 
 import numpy as np
 
-from heliotrope.field import layouts
 from heliotrope.field.heliostats import Heliostats
-from heliotrope.field.layout_tower import square_target, watching_camera
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray, as_float, direction
@@ -29,7 +24,7 @@ _RADIUS = 3.2
 _PIVOT_HEIGHT = 1.2
 
 
-def prototype() -> Plant:
+def example_plant() -> Plant:
     """Return the example plant of 18 azimuth-elevation heliostats south of their tower."""
     names, positions, clusters = [], [], []
     for pod, (east, north) in enumerate(_PODS, start=1):
@@ -38,11 +33,11 @@ def prototype() -> Plant:
             names.append(f"P{pod}{'ABC'[k]}")
             positions.append((east + east_k, north + north_k, 0.0))
             clusters.append(f"pod-{pod}")
-    # The heliostat that the thesis calibrates.
+    # Where the thesis calibrates its heliostat.
     positions[names.index("P6A")] = (19.2, -30.8, 0.0)
     position = np.array(positions)
     return Plant(
-        name="prototype",
+        name="example",
         site=Site(-33.93, 18.87, 120.0, name="Stellenbosch"),
         groups={
             "azel": Heliostats(
@@ -64,27 +59,6 @@ def prototype() -> Plant:
                 1.5,
             ),
         ),
-    )
-
-
-def board_prototype() -> Plant:
-    """Return the example plant with the gears of a local controller: to be run.
-
-    Places and receiver are those of `prototype`; a turn of a joint has 400,000 steps, and the
-    target has marks and a camera.
-    """
-    like = prototype()
-    (group,) = like.groups.values()
-    mirror = layouts.HeliostatSize(1.83, 1.22, pivot_height=_PIVOT_HEIGHT)
-    mechanism = layouts.stepped(group.position, mirror)
-    machines = (layouts.stepped_machine(mechanism, like.receivers[0]),) * len(group)
-    target = square_target("target", like.targets[0].center, 3.0, np.pi)
-    camera = watching_camera(target, "camera", 20.0, 2.0, 3.0)
-    return replace(
-        like,
-        groups={"azel": replace(group, mechanism=mechanism, machines=machines)},
-        targets=(target,),
-        cameras=(camera,),
     )
 
 

@@ -48,7 +48,9 @@ def run(
     prototype: Annotated[
         bool,
         typer.Option(
-            "--prototype", help="Run 18 heliostats on simulated boards.", rich_help_panel=_TWIN
+            "--prototype",
+            help="Run Malan's prototype: 18 heliostats on simulated boards.",
+            rich_help_panel=_TWIN,
         ),
     ] = False,
     speed: Annotated[
@@ -284,9 +286,9 @@ def _design(field: Path | None, heliostats: int | None, *, prototype: bool) -> "
     if field is not None:
         return open_plant(field)
     if prototype:
-        from heliotrope.field.example import board_prototype
+        from heliotrope.field.stellenbosch import prototype as malans
 
-        return board_prototype()
+        return malans()
     from heliotrope.field.layouts import malan_plant
 
     return malan_plant(10_000 if heliostats is None else heliostats)

@@ -1,0 +1,44 @@
+"""Malan's prototype, by the figures of his thesis."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from heliotrope.field.layouts import HeliostatSize, nearest_gap
+from heliotrope.field.stellenbosch import MICROSTEPS, STEPS, WORM, prototype
+from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.kernels import slots as slot
+
+MRAD = 1e-3
+PLANT = prototype()
+GROUP = PLANT.groups["azel"]
+
+
+def test_three_structures_of_six_with_mirrors_of_a_square_foot() -> None:
+    assert Counter(GROUP.cluster) == {f"structure-{k}": 6 for k in (1, 2, 3)}
+    assert set(GROUP.width) == set(GROUP.height) == {0.3}
+    size = HeliostatSize(0.3, 0.3, pivot_height=1.2, pivot_offset=0.05)
+    assert nearest_gap(GROUP.position, size) > 0.0
+
+
+def test_targets_are_four_square_metres_forty_metres_away() -> None:
+    (target,), (receiver,) = PLANT.targets, PLANT.receivers
+    assert target.width * target.height == pytest.approx(4.0)
+    assert target.center[2] == 13.0
+    pivots = GROUP.position + [0.0, 0.0, 1.2]
+    slant = np.linalg.norm(receiver.center - pivots.mean(axis=0))
+    assert slant == pytest.approx(40.0, abs=1.0)
+    assert receiver.center[2] + 0.5 * receiver.height <= 18.0
+    place = GROUP.position[GROUP.names.index("S3B")]
+    np.testing.assert_allclose(place, [19.2, -30.8, 0.0], atol=1e-9)
+
+
+def test_a_turn_has_48_000_steps_and_a_full_step_is_a_milliradian() -> None:
+    assert STEPS * MICROSTEPS * WORM == 48_000
+    table = GROUP.mechanism.drives.table[0]
+    counts = Drive(table).counts(np.full(2, 2.0 * np.pi))
+    np.testing.assert_allclose(np.abs(counts - Drive(table).counts(np.zeros(2))), 48_000.0)
+    step = 2.0 * np.pi / 48_000
+    assert step == pytest.approx(0.13 * MRAD, abs=0.005 * MRAD)
+    np.testing.assert_allclose(table[:, slot.WORM_RATIO], 30.0)
