@@ -1,4 +1,4 @@
-"""Inputs that are the same on all boards: switches, limits, supply, watchdog."""
+"""Parts that are the same on all boards: switches, limits, supply, watchdog, drivers."""
 
 import hashlib
 
@@ -7,10 +7,10 @@ DIVIDER = 11
 
 
 class Inputs:
-    """Inputs read the same way on all boards.
+    """Inputs read, and outputs set, the same way on all boards.
 
-    ``good``, ``limits`` and ``address`` are pins of the board, ``local`` too or None, ``dog`` its
-    watchdog.
+    ``good``, ``limits`` and ``address`` are pins of the board, ``local`` and ``enable`` are pins or
+    None, ``dog`` is its watchdog.
     """
 
     def sha256(self, data):
@@ -31,6 +31,11 @@ class Inputs:
     def limit_hit(self):
         # Switches open when they are hit, so that a broken wire stops the axis too.
         return any([pin() for pin in self.limits])
+
+    def drivers(self, on):
+        # ENABLE of the usual drivers (A4988, DRV8825, TMC22xx) is low for on.
+        if self.enable is not None:
+            self.enable(not on)
 
     def switched_off(self):
         # The contact is closed while the drives have power, so that a broken wire locks too.

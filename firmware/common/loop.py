@@ -17,7 +17,8 @@ class Loop:
 
     ``board`` has ``storage``, ``timer`` (with ``pump``), ``port``, ``serial``, ``firmware``,
     ``sha256``, ``key``, ``switches()`` (0: none), ``supply_mv()``, ``temperature_degc()``,
-    ``supply_good()``, ``limit_hit()``, ``switched_off()``, ``tilt()`` and ``feed()``.
+    ``supply_good()``, ``limit_hit()``, ``switched_off()``, ``tilt()``, ``feed()`` and
+    ``drivers(on)``.
     """
 
     def __init__(self, board):
@@ -34,6 +35,7 @@ class Loop:
             board.key,
             board.tilt,
             board.feed,
+            board.drivers,
         )
         config = self.node.controller.config
         if config.address == 0:

@@ -6,6 +6,8 @@ BAUD = 115200
 KEY = b""
 #: Pin of the contact that opens when the drives are switched off at the mirror; None: no contact.
 LOCAL_SWITCH = None
+#: Pin of both drivers' ENABLE, low for on; None: they are always on.
+ENABLE = None
 PINS = {
     "bus": (17, 16), "flash": (18, 23, 19, 5),
     "drive": 4, "steps": (25, 26, 27, 14),

@@ -27,6 +27,8 @@ class Board(Inputs):
         self.address = [Pin(number, Pin.IN, Pin.PULL_UP) for number in pins["switches"]]
         local = settings.LOCAL_SWITCH
         self.local = None if local is None else Pin(local, Pin.IN, Pin.PULL_UP)
+        enable = settings.ENABLE
+        self.enable = None if enable is None else Pin(enable, Pin.OUT, value=0)
         self.supply, self.warmth = ADC(pins["supply"]), ADC(ADC.CORE_TEMP)
         self.dog = machine.WDT(timeout=2000)
 

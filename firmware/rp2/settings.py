@@ -6,6 +6,8 @@ BAUD = 115200
 KEY = b""
 #: Pin of the contact that opens when the drives are switched off at the mirror; None: no contact.
 LOCAL_SWITCH = None
+#: Pin of both drivers' ENABLE, low for on; None: they are always on.
+ENABLE = None
 PINS = {
     "bus": (0, 1), "flash": (18, 19, 16, 17),
     "drive": 2, "steps": (6, 7, 8, 9),

@@ -27,6 +27,8 @@ class Board(Inputs):
         self.address = [Pin(name, Pin.IN, Pin.PULL_UP) for name in pins["switches"]]
         local = settings.LOCAL_SWITCH
         self.local = None if local is None else Pin(local, Pin.IN, Pin.PULL_UP)
+        enable = settings.ENABLE
+        self.enable = None if enable is None else Pin(enable, Pin.OUT_PP, value=0)
         self.supply = pyb.ADC(Pin(pins["supply"]))
         self.chip = pyb.ADCAll(12, 0x70000)
         self.dog = machine.WDT(timeout=2000)

@@ -6,6 +6,8 @@ BAUD = 115200
 KEY = b""
 #: Pin of the contact that opens when the drives are switched off at the mirror; None: no contact.
 LOCAL_SWITCH = None
+#: Pin of both drivers' ENABLE, low for on; None: they are always on.
+ENABLE = None
 PINS = {
     # The chip fixes these pins of UART 2 and SPI 2; only the flash's select can change.
     "bus": ("A2", "A3"), "flash": ("B13", "B15", "B14", "B12"),

@@ -1,14 +1,17 @@
 """Malan's prototype, by the figures of his thesis."""
 
 from collections import Counter
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
 
 from heliotrope.field.layouts import HeliostatSize, nearest_gap
 from heliotrope.field.stellenbosch import MICROSTEPS, STEPS, WORM, prototype
+from heliotrope.mechanism import track
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.kernels import slots as slot
+from heliotrope.sun import vector
 
 MRAD = 1e-3
 PLANT = prototype()
@@ -42,3 +45,20 @@ def test_a_turn_has_48_000_steps_and_a_full_step_is_a_milliradian() -> None:
     step = 2.0 * np.pi / 48_000
     assert step == pytest.approx(0.13 * MRAD, abs=0.005 * MRAD)
     np.testing.assert_allclose(table[:, slot.WORM_RATIO], 30.0)
+
+
+def test_full_steps_cost_him_three_quarters_of_a_milliradian() -> None:
+    # 6.2: full steps in normal operation; the beam's error over a day of his table 6.1.
+    mechanism = GROUP.mechanism[[GROUP.names.index("S3B")]]
+    errors = []
+    for minutes in range(0, 600, 10):
+        when = datetime(2012, 9, 2, 5, 40, tzinfo=UTC) + timedelta(minutes=minutes)
+        found = track(mechanism, vector(when, PLANT.site), PLANT.targets[0].center)
+        counts = found.chosen(found.counts)
+        ideal = mechanism.pose(counts).normal
+        for full in (1, MICROSTEPS):
+            normal = mechanism.pose(np.round(counts / full) * full).normal
+            errors.append(2.0 * np.linalg.norm(normal - ideal))
+    fine, rough = np.sqrt(np.mean(np.square(errors).reshape(-1, 2), axis=0))
+    assert fine == pytest.approx(0.10 * MRAD, abs=0.02 * MRAD)
+    assert rough == pytest.approx(0.8 * MRAD, abs=0.1 * MRAD)

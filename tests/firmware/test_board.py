@@ -25,13 +25,22 @@ BOARDS = ("rp2", "esp32", "stm32")
 class Plant:
     """A board that runs its main loop, and who talks to it."""
 
-    def __init__(self, board: str, *, configured: bool = True, local: object = None) -> None:
+    def __init__(
+        self,
+        board: str,
+        *,
+        configured: bool = True,
+        local: object = None,
+        settings: dict[str, object] | None = None,
+    ) -> None:
         self.world = World()
         items = items_of_heliostat(heliostat()) if configured else {}
         with board_path(board, self.world) as load:
             self.settings: Any = load("settings")
             self.settings.KEY = KEY
             self.settings.LOCAL_SWITCH = local
+            for key, value in (settings or {}).items():
+                setattr(self.settings, key, value)
             self.world.pins[local] = 0
             self.pins = self.settings.PINS
             self.world.pins[self.pins["supply_good"]] = 1
@@ -294,3 +303,25 @@ def test_flash_writes_over_the_borders_of_pages() -> None:
     chip.spi.busy_until = world.us + 10**8
     with pytest.raises(OSError, match="stays busy"):
         chip.write(0, b"x")
+
+
+def test_drivers_are_enabled_for_motions_and_off_at_rest() -> None:
+    for name in BOARDS:
+        Partition.device = None
+        plant = Plant(name, settings={"ENABLE": "enable"})
+        plant.run(1.5)
+        assert plant.world.pins["enable"] == 0  # low is on
+        plant.order("LOCK")
+        assert plant.order("SET_STEPPING", 4, 4, 1) == messages.DONE
+        plant.run(1.0)
+        assert plant.world.pins["enable"] == 1
+        plant.order("UNLOCK")
+        plant.order("IDLE")
+        plant.order("GOTO", STOW[0] - 900, STOW[1] - 700)
+        plant.run(3)
+        assert plant.world.pins["enable"] == 1
+        assert pulses(plant) == [-900, -700]
+        for axis in (0, 1):
+            rises = plant.world.rises[plant.pins["steps"][2 * axis]]
+            assert {levels["enable"] for _, levels in rises} == {0}
+    Partition.device = None

@@ -128,6 +128,8 @@ class Board:
         self.fed = True
     def tilt(self):
         return None
+    def drivers(self, on):
+        raise AssertionError
     def switches(self):
         return 5
     def supply_good(self):

@@ -354,3 +354,66 @@ def test_tracking_spares_the_flash_and_a_cut_says_what_is_in_doubt() -> None:
     assert locked.order("LOCK") == DONE
     locked.run(3)
     assert locked.journal.rest
+
+
+def resting(full: int = 8) -> Bench:
+    """A bench whose drivers rest between motions; it has come to standby."""
+    bench = Bench()
+    bench.run(2)
+    assert bench.motors.powered
+    assert bench.order("LOCK") == DONE
+    assert bench.order("SET_STEPPING", full, full, 1) == DONE
+    assert bench.order("UNLOCK") == DONE
+    assert bench.order("AIM", *AIM) == bench.order("APPROACH") == DONE
+    bench.run(240, until="IDLE")
+    return bench
+
+
+def test_drivers_that_rest_are_off_between_steps_and_on_for_fine_stepping() -> None:
+    bench = resting()
+    assert bench.order("TRACK") == DONE
+    bench.run(30)
+    on = off = 0
+    for _ in range(600):
+        bench.run(0.05)
+        on, off = on + bench.motors.powered, off + (not bench.motors.powered)
+        if not bench.motors.powered:
+            assert [made % 8 for made in bench.made] == [0, 0]
+    assert off > 0 < on
+    # Between full steps a motor needs its current.
+    assert bench.order("ROUGH", 0) == DONE
+    bench.run(5)
+    assert any(made % 8 for made in bench.made)
+    assert all(bench.motors.powered for _ in range(100) if bench.run(0.05) is None)
+    assert bench.order("ROUGH", 1) == DONE
+    assert bench.order("STOW") == DONE
+    bench.run(400, until="STOWED")
+    bench.run(1)
+    assert not bench.motors.powered
+
+
+def test_stepping_is_kept_and_rough_from_the_start() -> None:
+    bench = resting()
+    assert bench.order("STOW") == DONE
+    bench.run(400, until="STOWED")
+    bench.start(bench.flash)
+    assert bench.controller.config.microsteps == (8, 8)
+    assert bench.controller.motion.rough
+    bench.sender = wire.Sender(0, bench.sender.epoch + 1, sha256)
+    bench.run(2)
+    assert not bench.motors.powered
+    assert bench.order("LOCK") == DONE
+    assert bench.order("SET_STEPPING", 1, 1, 0) == DONE
+    bench.run(1)
+    assert bench.motors.powered
+    assert not bench.controller.motion.rough
+
+
+@pytest.mark.parametrize("numbers", [(0, 8, 1), (8, 0, 1), (8, 257, 1), (8, 8, 2)])
+def test_stepping_out_of_range_is_refused(numbers: tuple[int, int, int]) -> None:
+    bench = Bench()
+    bench.run(2)
+    assert bench.order("LOCK") == DONE
+    assert bench.order("SET_STEPPING", *numbers) == messages.BAD_VALUE
+    assert bench.controller.config.microsteps == (1, 1)
+    assert not bench.controller.config.rests

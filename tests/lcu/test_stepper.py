@@ -195,6 +195,25 @@ def test_rough_stepping_moves_seldom() -> None:
     assert moves[25] < moves[0] / 3
 
 
+def test_rough_stepping_ends_on_the_nearest_full_step() -> None:
+    for backlash in (0, 40):
+        stepper = _stepper(backlash=backlash)
+        stepper.rough, stepper.full = 16, (8, 4)
+        motors = Motors(stepper)
+        for second in range(200):
+            stepper.follow(second, -second)
+            motors.run(20)
+            if stepper.still():
+                assert [made % full for made, full in zip(motors.made, (8, 4), strict=True)] == [
+                    0,
+                    0,
+                ]
+                assert abs(motors.made[0] - second) <= 4
+                # On its way down it is ahead by an eighth of the backlash, in full steps.
+                assert abs(motors.made[1] + second) <= 2 + (8 if backlash else 0)
+        assert abs(motors.made[0]) > 180
+
+
 def test_a_dry_queue_starts_from_rest() -> None:
     stepper = _stepper()
     motors = Motors(stepper)

@@ -176,10 +176,12 @@ class Motors:
 
     def __init__(self) -> None:
         self.made, self.undone, self.stops = list(STOW), (0, 0), 0
+        self.powered = True
         self.node: Node | None = None
 
     def play(self, axis: int, direction: int, count: int, interval_us: int) -> None:
         assert self.node is not None
+        assert self.powered
         assert interval_us * LIMITS[0] >= 1_000_000
         self.made[axis] += direction * count
         limits = self.node.controller.config.axes[axis]
@@ -231,7 +233,7 @@ class Bench:
         counts = [kept.primary, kept.secondary]
         self.slip = [s + m - c for s, m, c in zip(self.slip, before, counts, strict=True)]
         self.made = counts
-        self.motors.node = None
+        self.motors.node, self.motors.powered = None, True
         self.node = Node(
             flash,
             self.motors,
@@ -242,6 +244,7 @@ class Bench:
             key=KEY,
             sensor=self.read_tilt,
             feed=self.feed,
+            drivers=self.drive,
         )
         self.motors.node = self.node
         self.journal.zero = self.declare  # type: ignore[method-assign]
@@ -257,6 +260,14 @@ class Bench:
     def read_tilt(self) -> tuple[float, float] | None:
         """The accelerometer."""
         return self.tilt
+
+    def drive(self, on: bool) -> None:
+        """Switch the motors' drivers; without current a rotor turns to a full step."""
+        self.motors.powered = on
+        if not on:
+            assert self.controller.config.rests
+            for made, full in zip(self.made, self.controller.config.microsteps, strict=True):
+                assert made % full == 0
 
     def feed(self) -> None:
         """The watchdog."""

@@ -25,7 +25,7 @@ from heliotrope.geometry import FloatArray, as_float, direction
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
-from heliotrope.mechanism.machine import Machine
+from heliotrope.mechanism.machine import Machine, Stepping
 from heliotrope.sun import Site
 
 #: Steps of a motor's turn, microsteps of a step, and turns of the worm to a turn of the joint.
@@ -37,8 +37,8 @@ _MIRROR, _TARGET = 0.3, 2.0
 _LOWER, _UPPER = 13.0, 17.0
 #: Distance of neighbouring heliostats of a structure, and of the structures' middles, m.
 _SPACING, _APART = 0.75, 3.0
-#: Steps/s of the motors (7.5 °/s of the joint), and the final approach from below, one full step.
-_RATE, _BACKLASH = 1000.0, MICROSTEPS
+#: Steps/s of the motors: 7.5 °/s of the joint.
+_RATE = 1000.0
 
 
 def prototype() -> Plant:
@@ -104,7 +104,9 @@ def _mechanism(position: FloatArray) -> Mechanism:
 
 
 def _machine(mechanism: Mechanism, receiver: Receiver) -> Machine:
-    """Limits and stow: upright and facing north, at which both counts are 0."""
+    """Limits, stow (upright and facing north: both counts are 0), and drivers that rest (6.2)."""
     made = layouts.stepped_machine(mechanism, receiver)
-    first, second = (replace(axis, backlash=_BACKLASH) for axis in made.axes)
-    return replace(made, axes=(first, second), stow=(0, 0))
+    # Elastic cords and the mirror's weight keep the gears on one flank (5.1.3).
+    first, second = (replace(axis, backlash=0) for axis in made.axes)
+    stepping = Stepping((MICROSTEPS, MICROSTEPS), rests=True)
+    return replace(made, axes=(first, second), stow=(0, 0), stepping=stepping)

@@ -18,6 +18,8 @@ FAR, MOST_STEPS = 1e5, 1 << 29
 LEAST_DEFOCUS, MOST_DEFOCUS = 0.02, 1.6
 #: Points that fit in the item "way".
 MOST_POINTS = 4
+#: Microsteps of a full step that drivers have.
+MOST_MICROSTEPS = 256
 
 
 def is_place(point: "tuple[float, ...]") -> bool:
@@ -44,6 +46,9 @@ class Config:
         empty: see ``Motion``.
     azimuth_axis
         The axis (0, 1) that moves first when leaving stow and last when returning, from SET_WAY.
+    microsteps, rests
+        Microsteps of a full step by axis, and whether the drivers are off between motions, from
+        SET_STEPPING.
     serial, firmware, address
         As in HERE.
     lease_ms, stow_wait_ms, silence_ms
@@ -66,6 +71,8 @@ class Config:
         self.standby: tuple[float, float, float] | None = None
         self.path: list[tuple[float, float, float]] = []
         self.azimuth_axis = 0
+        self.microsteps: tuple[int, ...] = (1, 1)
+        self.rests = False
         self.serial, self.firmware, self.address = 0, 0, 0
         self.lease_ms, self.stow_wait_ms, self.silence_ms = 6000, 30_000, 6000
         self.slot_ms, self.ahead_ms, self.stride = 50, 100, STRIDE
@@ -146,6 +153,10 @@ class Config:
             self.azimuth_axis = axis
             points = [values[2 + 3 * i : 5 + 3 * i] for i in range(count)]
             self.path = [(east, north, up) for east, north, up in points]
+        elif name == "stepping":
+            if not 1 <= min(values[:2]) <= max(values[:2]) <= MOST_MICROSTEPS or values[2] > 1:
+                return False
+            self.microsteps, self.rests = values[:2], values[2] == 1
         elif name == "address":
             if not 1 <= values[0] < 0xFFFF:
                 return False

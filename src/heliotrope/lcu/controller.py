@@ -15,6 +15,7 @@ NOTE          state, aim as bytes or None: ``Journal.note``
 ZEROED        counts (2): ``Journal.zero``
 HALT          stop the step timer at once; then call ``halted``
 FEED          the watchdog may be fed
+DRIVERS       on: switch the motors' drivers on, before segments, or off
 """
 
 import struct
@@ -44,7 +45,9 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
 
     from .wire import Frame, Gate
 
-(SEGMENT, ANSWER, STORE, RECALL, BEFORE_STEPS, AT_REST, NOTE, ZEROED, HALT, FEED) = range(10)
+(SEGMENT, ANSWER, STORE, RECALL, BEFORE_STEPS, AT_REST, NOTE, ZEROED, HALT, FEED, DRIVERS) = range(
+    11
+)
 
 #: Faults; their texts, and the names of the flags' bits, are in ``names``.
 (
@@ -78,7 +81,8 @@ MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT)
 STATES_OF = {
     "SET_ARMATURE": POSE, "SET_BIAS": POSE, "SET_POSITION": HARMLESS,
     "SET_DEFOCUS": HARMLESS, "SET_DRIVES": MACHINE, "SET_LIMITS": MACHINE,
-    "SET_STOW": MACHINE, "SET_WAY": MACHINE, "ZERO": MACHINE, "SET_ADDRESS": HARMLESS,
+    "SET_STOW": MACHINE, "SET_WAY": MACHINE, "SET_STEPPING": MACHINE, "ZERO": MACHINE,
+    "SET_ADDRESS": HARMLESS,
 }  # fmt: skip
 
 #: States that hold a position for as long as the cluster is heard.
@@ -138,6 +142,7 @@ class Controller:
         self._doubtful = self._aim_locked = False
         self._clock_jumped = self._ticks_jumped = False
         self._moving = False
+        self._powered = True
 
     # Start.
 
@@ -268,6 +273,9 @@ class Controller:
                 # flash would wear it out in a year.
                 self._moving = False
                 self.out.append((AT_REST, one, two))
+            if motion.may_rest(elapsed) == self._powered:
+                self._powered = not self._powered
+                self.out.insert(place, (DRIVERS, self._powered))
         self._sunless_ms = min(self._sunless_ms + elapsed, 1_000_000)
         needs_sun = self.state in states.NEED_SUN or motion.kind in FOLLOWS
         if not needs_sun or self._sunless_ms <= self.config.lease_ms + LATE_MS:

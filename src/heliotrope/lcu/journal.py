@@ -69,6 +69,7 @@ ITEMS = (
     ("defocus", "ff"),
     ("standby", "fff"),
     ("way", "BB12f"),
+    ("stepping", "HHB"),
 )
 SIZE_OF = {row[0]: struct.calcsize("<" + row[1]) for row in ITEMS}
 CODES_OF = {row[0]: "<" + row[1] for row in ITEMS}
@@ -84,10 +85,11 @@ TARGETS = {
     "SET_LIMITS": ("limits_primary", "limits_secondary"),
     "SET_DEFOCUS": ("defocus",),
     "SET_WAY": ("way",),
+    "SET_STEPPING": ("stepping",),
     "ZERO": (),
 }
 
-MAGIC, LAYOUT = 0x48, 2
+MAGIC, LAYOUT = 0x48, 3
 SLOT_HEAD = "<BBHI"  # magic, layout, which items are there, counter
 SLOT_HEAD_SIZE = 8
 SLOT_SIZE = SLOT_HEAD_SIZE + sum(SIZE_OF.values()) + 4

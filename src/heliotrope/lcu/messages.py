@@ -91,7 +91,8 @@ MESSAGES = (
     (0x42, "JOG", AUTHORITY, "Bi", "axis steps"),
     # Move to step counts.
     (0x43, "GOTO", AUTHORITY, "ii", "primary secondary"),
-    # Rough or fine stepping.
+    # Rough (1) or fine (0) stepping: by full steps of the motors where SET_STEPPING has told them,
+    # else by 16 steps at a time.
     (0x44, "ROUGH", AUTHORITY, "B", "rough"),
     # Move the beam in a spiral about its aim until the target's camera finds it.
     (0x45, "SEARCH", AUTHORITY, "ff", "pitch_rad radius_rad"),
@@ -122,6 +123,10 @@ MESSAGES = (
     # returning, the number of points (0: the way is found without them), and the points
     # that the beam passes on its way from the ground to the standby point, ENU.
     (0x59, "SET_WAY", KEY, "BB12f", "azimuth_axis points path_m"),
+    # Microsteps of a full step of each motor, and whether the drivers rest (0, 1): then stepping is
+    # rough from the start, motions that follow the sun end on full steps, and the drivers are off
+    # between them.
+    (0x5A, "SET_STEPPING", KEY, "HHB", "microsteps_primary microsteps_secondary rests"),
 )  # fmt: skip
 
 NUMBER_OF = {row[1]: row[0] for row in MESSAGES}

@@ -33,8 +33,10 @@ RENEW_MS, KNOT_MS, KNOT_LIMIT = 200, 4000, 1e-3
 PIECE = 0.1
 #: Time that the spiral rests on a point, ms.
 DWELL_MS = 2000
-#: Rough stepping waits for this many steps.
+#: Rough stepping waits for this many steps, where a full step is not known.
 ROUGH_STEPS = 16
+#: Drivers that rest are off after this rest of the motors, ms.
+RELEASE_MS = 200
 #: Rest before a diagnosis reads the sensor, ms.
 SETTLE_MS = 500
 
@@ -97,6 +99,7 @@ class Motion:
         self._wait_ms = 0
         self._diagnosis: Diagnosis | None = None
         self._home = [0, 0]
+        self._rests, self._resting_ms = False, 0
         self.rebuild()
 
     # The axes.
@@ -104,6 +107,9 @@ class Motion:
     def rebuild(self) -> None:
         """Apply the settings; new limits only at rest."""
         config = self.config
+        if config.rests != self._rests:
+            self._rests = config.rests
+            self.set_rough(ROUGH_STEPS if config.rests else 0)
         first, second = config.axes
         if first is None or second is None:
             return
@@ -112,6 +118,7 @@ class Motion:
             self.stepper = Stepper([first, second], config.slot_ms, config.ahead_ms)
             self.stepper.rough = self.rough
             self.declare(self.counts[0], self.counts[1], self.known)
+        self.stepper.full = config.microsteps
         for i in (0, 1):
             drive, axis = config.drives[i], self.stepper.axes[i]
             if drive is not None:
@@ -154,6 +161,20 @@ class Motion:
             and self.place(0) == stow[0]
             and self.place(1) == stow[1]
         )
+
+    def may_rest(self, elapsed_ms: int) -> bool:
+        """Whether the drivers may be off: full steps hold without current.
+
+        Between full steps a motor without current turns to the nearest one, unseen by the counts.
+        """
+        full = self.config.microsteps
+        at_rest = self.still() and (self.rough > 0 or not self.following())
+        on_full = self.place(0) % full[0] == 0 and self.place(1) % full[1] == 0
+        if not (self.config.rests and at_rest and on_full):
+            self._resting_ms = 0
+            return False
+        self._resting_ms = min(self._resting_ms + elapsed_ms, RELEASE_MS)
+        return self._resting_ms >= RELEASE_MS
 
     def halted(self, primary: int, secondary: int) -> None:
         """After an emergency stop: take back these signed steps, emitted but not made."""

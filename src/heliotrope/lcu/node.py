@@ -70,6 +70,10 @@ def no_watchdog() -> None:
     """Feed nothing."""
 
 
+def no_enable(on: bool) -> None:
+    """Switch nothing: the motors' drivers are always on."""
+
+
 class Node:
     """One local controller.
 
@@ -94,6 +98,8 @@ class Node:
         Returns the mirror's tilt (x, y), rad, or None; see ``Motion``.
     feed
         Feeds the hardware's watchdog.
+    drivers
+        Switches the motors' drivers on (True) or off; they are on at the start.
 
     Attributes
     ----------
@@ -115,9 +121,10 @@ class Node:
         key: bytes = b"",
         sensor: "Callable[[], tuple[float, float] | None]" = no_sensor,
         feed: "Callable[[], Any]" = no_watchdog,
+        drivers: "Callable[[bool], Any]" = no_enable,
     ) -> None:
         self.timer, self.reader, self.trouble = timer, wire.Reader(), ""
-        self._write, self._feed = write, feed
+        self._write, self._feed, self._drivers = write, feed, drivers
         self.journal = journal = Journal(storage)
         config = Config()
         config.serial, config.firmware = serial, firmware
@@ -224,6 +231,8 @@ class Node:
                 self.timer.play(action[1], action[2], action[3], action[4])
             elif kind == controller.FEED:
                 self._feed()
+            elif kind == controller.DRIVERS:
+                self._drivers(action[1])
             elif kind == controller.ANSWER:
                 self._answer(action[1], action[2], kept, now_ms)
             elif kind == controller.RECALL:

@@ -163,6 +163,8 @@ class Stepper:
         self.slot_ms, self.ahead_ms = slot_ms, max(slot_ms, ahead_ms)
         self.order = BOTH
         self.rough = 0
+        #: Microsteps of a full step by axis: rough stepping then ends on full steps.
+        self.full: tuple[int, ...] = (1, 1)
         self.queued_ms = 0
 
     def go(self, primary: int, secondary: int, order: int) -> bool:
@@ -175,17 +177,23 @@ class Stepper:
         """Stay on goals that move slowly, without passing them by the backlash every time.
 
         An axis that must go down is set ahead by an eighth of its backlash and waits until the
-        goal has gone by as much. In rough stepping an axis waits for ``rough`` steps.
+        goal has gone by as much. In rough stepping an axis goes to the nearest full step, or
+        waits for ``rough`` steps where a full step is one.
         """
         self.order = BOTH
         inside = True
-        for axis, goal in zip(self.axes, (primary, secondary)):  # noqa: B905 - not in MicroPython
+        goals = primary, secondary
+        for i in (0, 1):
+            axis, goal = self.axes[i], goals[i]
             inside = axis.low <= goal <= axis.high and inside
-            lead = -(-axis.backlash // 8)
+            full, wait = (self.full[i] if self.rough else 1), max(1, self.rough)
+            if full > 1:
+                goal, wait = (goal + full // 2) // full * full, 1
+            lead = -(-axis.backlash // (8 * full)) * full
             error = goal - axis.goal
-            if error >= max(1, self.rough, lead + 1 if axis.led else 0):
+            if error >= max(wait, lead + 1 if axis.led else 0):
                 axis.aim(goal)
-            elif error <= -max(1, self.rough, lead):
+            elif error <= -max(wait, lead):
                 axis.aim(goal - lead)
                 axis.led = True
         return inside

@@ -134,6 +134,8 @@ def _machine_numbers(machine: Machine) -> dict[str, tuple[object, ...]]:
     numbers: dict[str, tuple[object, ...]] = {"stow": machine.stow, "defocus": machine.defocus}
     if machine.standby is not None:
         numbers["standby"] = machine.standby
+    if machine.stepping is not None:
+        numbers["stepping"] = (*machine.stepping.microsteps, machine.stepping.rests)
     rest = (0.0,) * (3 * (WAY_POINTS - len(machine.way)))
     points = (x for point in machine.way for x in point)
     numbers["way"] = (machine.azimuth_axis, len(machine.way), *points, *rest)

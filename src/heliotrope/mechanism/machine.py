@@ -8,7 +8,13 @@ import math
 from dataclasses import dataclass
 
 from heliotrope.errors import InputError
-from heliotrope.lcu.config import LEAST_DEFOCUS, MOST_DEFOCUS, MOST_POINTS, Config
+from heliotrope.lcu.config import (
+    LEAST_DEFOCUS,
+    MOST_DEFOCUS,
+    MOST_MICROSTEPS,
+    MOST_POINTS,
+    Config,
+)
 
 #: Points of the safe way that a local controller can store.
 WAY_POINTS = MOST_POINTS
@@ -58,6 +64,34 @@ class AxisLimits:
 
 
 @dataclass(frozen=True)
+class Stepping:
+    """How the motors' drivers step.
+
+    Attributes
+    ----------
+    microsteps
+        Microsteps of a full step of each motor.
+    rests
+        Whether the drivers are off between motions, which then end on full steps.
+
+    Raises
+    ------
+    InputError
+        Microsteps out of range.
+    """
+
+    microsteps: tuple[int, int]
+    rests: bool = False
+
+    def __post_init__(self) -> None:
+        if not 1 <= min(self.microsteps) <= max(self.microsteps) <= MOST_MICROSTEPS:
+            raise InputError(
+                f"stepping: {self.microsteps} microsteps of a full step; give 1 to "
+                f"{MOST_MICROSTEPS} for each axis"
+            )
+
+
+@dataclass(frozen=True)
 class Machine:
     """Motor limits and resting places of one heliostat.
 
@@ -76,12 +110,14 @@ class Machine:
     way
         Points that the beam passes from the ground to the standby point, ENU, m, at most
         `WAY_POINTS`; (): the local controller finds its own.
+    stepping
+        How the drivers step; None: the local controller keeps what it has, at first no rest.
 
     Raises
     ------
     InputError
-        A stow position outside the limits, a defocus that would leave the beam on the receiver,
-        or too many points.
+        A stow position outside the limits or, for drivers that rest, between full steps, a
+        defocus that would leave the beam on the receiver, or too many points.
     """
 
     axes: tuple[AxisLimits, AxisLimits]
@@ -90,6 +126,7 @@ class Machine:
     standby: tuple[float, float, float] | None = None
     azimuth_axis: int = 0
     way: tuple[tuple[float, float, float], ...] = ()
+    stepping: Stepping | None = None
 
     def __post_init__(self) -> None:
         for name, axis, steps in zip(_NAMES, self.axes, self.stow, strict=True):
@@ -98,6 +135,14 @@ class Machine:
                     f"machine: stow at {steps} steps of the {name} axis is outside its limits "
                     f"{axis.low} to {axis.high}"
                 )
+        if self.stepping is not None and self.stepping.rests:
+            for name, steps, full in zip(_NAMES, self.stow, self.stepping.microsteps, strict=True):
+                if steps % full:
+                    raise InputError(
+                        f"machine: stow at {steps} steps of the {name} axis is between full steps "
+                        f"of {full}, where a driver that rests cannot hold it; choose "
+                        f"{round(steps / full) * full}"
+                    )
         size = max(map(abs, self.defocus))
         if not LEAST_DEFOCUS <= size <= MOST_DEFOCUS:
             raise InputError(

@@ -24,7 +24,7 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS, Drive
 from heliotrope.mechanism.kernels import slots as slot
-from heliotrope.mechanism.machine import AxisLimits, Machine
+from heliotrope.mechanism.machine import AxisLimits, Machine, Stepping
 from heliotrope.sun import Site
 
 # Numbers of a drive as the writer names them; names such as "rate" have no unit because it
@@ -296,6 +296,10 @@ class _Reader:
             None if table.standby_m is None else self.array("machine.standby_m", table.standby_m)
         )
         way = tuple((x, y, z) for x, y, z in table.way_m)
+        stepping = None
+        if table.stepping is not None:
+            one, two = table.stepping.microsteps
+            stepping = Stepping((one, two), table.stepping.rests)
         made: dict[tuple[Any, ...], Machine] = {}
         found = []
         for k in range(len(self.rows)):
@@ -308,7 +312,7 @@ class _Reader:
             )
             if numbers not in made:
                 limits = (AxisLimits(*numbers[0]), AxisLimits(*numbers[1]))
-                made[numbers] = Machine(limits, *numbers[2:], joints.index(first), way)
+                made[numbers] = Machine(limits, *numbers[2:], joints.index(first), way, stepping)
             found.append(made[numbers])
         return tuple(found)
 
@@ -464,4 +468,9 @@ def _machine_document(
         document["standby_m"] = first("machine.standby_m", standby)
     if machines[0].way:
         document["way_m"] = [list(point) for point in machines[0].way]
+    if (stepping := machines[0].stepping) is not None:
+        document["stepping"] = {
+            "microsteps": list(stepping.microsteps),
+            "rests": stepping.rests,
+        }
     return {**document, "axes": axes}

@@ -248,6 +248,17 @@ class AxisTable(StrictTable):
     max_deg: Number | None = None
 
 
+class SteppingTable(StrictTable):
+    """``[groups.NAME.machine.stepping]``: the motors' drivers."""
+
+    microsteps: Annotated[
+        list[Annotated[int, Field(ge=1, le=256)]], Field(min_length=2, max_length=2)
+    ] = Field(description="Of a full step, of both driven joints in their order.")
+    rests: bool = Field(
+        False, description="Whether the drivers are off between motions, which end on full steps."
+    )
+
+
 class MachineTable(StrictTable):
     """``[groups.NAME.machine]``: what local controllers store besides the calibration."""
 
@@ -271,6 +282,9 @@ class MachineTable(StrictTable):
         default_factory=list,
         description="Points that the beam passes from the ground to the standby point; default: "
         "the local controller finds its own.",
+    )
+    stepping: SteppingTable | None = Field(
+        None, description="Without: the local controller keeps what it has."
     )
 
 

@@ -91,6 +91,8 @@ class Board:
         Reading of the accelerometer, or None.
     switched_off
         Whether the drives are switched off at the mirror.
+    powered
+        Whether the motors' drivers are on.
     """
 
     def __init__(
@@ -115,7 +117,7 @@ class Board:
         self.slip = [0, 0]
         self.now = 0.0
         self.tilt: tuple[float, float] | None = None
-        self.switched_off = False
+        self.switched_off, self.powered = False, True
         self._out = bytearray()
         self._looked = -math.inf
         self._restless = False
@@ -151,6 +153,7 @@ class Board:
                 sha256=sha256,
                 key=self.outfit.key,
                 sensor=lambda: self.tilt,
+                drivers=self._drive,
             )
             self._switch()
         except PowerCutError:
@@ -182,6 +185,13 @@ class Board:
             self.node.on_fault(SWITCH, self.ticks.at(self.now), True)
         elif self.node is not None:
             self.node.fault_gone(SWITCH)
+
+    def _drive(self, on: bool) -> None:
+        node = self.node
+        self.powered = on
+        if not on and node is not None:
+            for axis, full in zip(self.axes, node.controller.config.microsteps, strict=True):
+                axis.release(full)
 
     def _die(self) -> None:
         for axis in self.axes:

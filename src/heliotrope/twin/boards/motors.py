@@ -85,6 +85,11 @@ class MotorAxis:
         # The joint is carried along by the flank that pushes.
         self.joint = min(max(self.joint, float(self.turned)), self.turned + self.play)
 
+    def release(self, full: int) -> None:
+        """Take the current off: the rotor turns to the nearest of its full steps."""
+        away = (self.turned + full // 2) % full - full // 2
+        self._turn(-1 if away > 0 else 1, abs(away))
+
     def stop(self) -> int:
         """Stop at once; return the signed steps that were ordered and not made."""
         undone = sum(direction * count for direction, count, _ in self._queue)
