@@ -10,7 +10,7 @@ class Inputs:
     """Inputs read, and outputs set, the same way on all boards.
 
     ``good``, ``limits`` and ``address`` are pins of the board, ``local`` and ``enable`` are pins or
-    None, ``dog`` is its watchdog.
+    None, ``accelerometer`` has ``read()`` or is None, ``dog`` is its watchdog.
     """
 
     def sha256(self, data):
@@ -20,7 +20,7 @@ class Inputs:
         self.dog.feed()
 
     def tilt(self):
-        return None
+        return None if self.accelerometer is None else self.accelerometer.read()
 
     def switches(self):
         return sum([(not pin()) << place for place, pin in enumerate(self.address)])

@@ -8,6 +8,8 @@ KEY = b""
 LOCAL_SWITCH = None
 #: Pin of both drivers' ENABLE, low for on; None: they are always on.
 ENABLE = None
+#: Pins of an accelerometer's SDA and SCL, any two that are free; None: none is fitted.
+TILT = None
 PINS = {
     "bus": (17, 16), "flash": (18, 23, 19, 5),
     "drive": 4, "steps": (25, 26, 27, 14),

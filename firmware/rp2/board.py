@@ -4,10 +4,11 @@ from binascii import crc32
 
 import machine
 from inputs import DIVIDER, Inputs
-from machine import ADC, SPI, UART, Pin
+from machine import ADC, I2C, SPI, UART, Pin
 from nor import SpiNor
 from rs485 import Port
 from steps import Timer
+from tilt import Lis3dh
 
 
 class Board(Inputs):
@@ -29,6 +30,11 @@ class Board(Inputs):
         self.local = None if local is None else Pin(local, Pin.IN, Pin.PULL_UP)
         enable = settings.ENABLE
         self.enable = None if enable is None else Pin(enable, Pin.OUT, value=0)
+        wires = settings.TILT
+        self.accelerometer = None
+        if wires is not None:
+            data, clock = Pin(wires[0]), Pin(wires[1])
+            self.accelerometer = Lis3dh(I2C(0, sda=data, scl=clock, freq=400_000))
         self.supply, self.warmth = ADC(pins["supply"]), ADC(ADC.CORE_TEMP)
         self.dog = machine.WDT(timeout=2000)
 

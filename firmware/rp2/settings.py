@@ -8,6 +8,8 @@ KEY = b""
 LOCAL_SWITCH = None
 #: Pin of both drivers' ENABLE, low for on; None: they are always on.
 ENABLE = None
+#: Pins of an accelerometer's SDA and SCL, of I2C 0: (4, 5) or (12, 13); None: none is fitted.
+TILT = None
 PINS = {
     "bus": (0, 1), "flash": (18, 19, 16, 17),
     "drive": 2, "steps": (6, 7, 8, 9),

@@ -5,11 +5,12 @@ from binascii import crc32
 import machine
 import pyb
 from inputs import DIVIDER, Inputs
-from machine import SPI, UART
+from machine import I2C, SPI, UART
 from nor import SpiNor
 from pyb import Pin
 from rs485 import Port
 from steps import Timer
+from tilt import Lis3dh
 
 
 class Board(Inputs):
@@ -29,6 +30,10 @@ class Board(Inputs):
         self.local = None if local is None else Pin(local, Pin.IN, Pin.PULL_UP)
         enable = settings.ENABLE
         self.enable = None if enable is None else Pin(enable, Pin.OUT_PP, value=0)
+        wires = settings.TILT
+        self.accelerometer = None
+        if wires is not None:
+            self.accelerometer = Lis3dh(I2C(1, freq=400_000))
         self.supply = pyb.ADC(Pin(pins["supply"]))
         self.chip = pyb.ADCAll(12, 0x70000)
         self.dog = machine.WDT(timeout=2000)

@@ -8,6 +8,8 @@ KEY = b""
 LOCAL_SWITCH = None
 #: Pin of both drivers' ENABLE, low for on; None: they are always on.
 ENABLE = None
+#: Pins of an accelerometer's SDA and SCL: ("B7", "B6"), those of I2C 1; None: none is fitted.
+TILT = None
 PINS = {
     # The chip fixes these pins of UART 2 and SPI 2; only the flash's select can change.
     "bus": ("A2", "A3"), "flash": ("B13", "B15", "B14", "B12"),

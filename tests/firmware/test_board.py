@@ -1,5 +1,6 @@
 """Whole boards: a bus with a cluster controller, flash, switches, supply and watchdog."""
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -46,7 +47,7 @@ class Plant:
             self.world.pins[self.pins["supply_good"]] = 1
             for pin in self.pins["switches"]:
                 self.world.pins[pin] = 1
-            load("nor"), load("rs485"), load("inputs"), load("steps")
+            load("nor"), load("rs485"), load("inputs"), load("steps"), load("tilt")
             made = load("board").Board(self.settings)
             if items:
                 book = Journal(made.storage)
@@ -279,7 +280,7 @@ def test_a_chip_that_does_not_answer_is_named(board: str) -> None:
 
         machine.SPI.dead = True
         settings: Any = load("settings")
-        load("nor"), load("rs485"), load("inputs"), load("steps")
+        load("nor"), load("rs485"), load("inputs"), load("steps"), load("tilt")
         with pytest.raises(OSError, match="no flash chip answers"):
             load("board").Board(settings)
 
@@ -325,3 +326,39 @@ def test_drivers_are_enabled_for_motions_and_off_at_rest() -> None:
             rises = plant.world.rises[plant.pins["steps"][2 * axis]]
             assert {levels["enable"] for _, levels in rises} == {0}
     Partition.device = None
+
+
+@pytest.mark.parametrize("name", BOARDS)
+def test_a_diagnosis_over_the_bus_reads_the_chip(name: str) -> None:
+    Partition.device = None
+    plant = Plant(name, settings={"TILT": ("data", "clock")})
+    plant.run(1.5)
+    chip = plant.loop.board.accelerometer.i2c
+    stuck = False
+
+    def follow() -> None:
+        # The elevation turns the mirror about x, by the motor's steps of 3.3 µrad.
+        turned = 0.0 if stuck else -2.0 * math.pi / 1_920_000 * pulses(plant)[1]
+        chip.gravity = (0.0, math.sin(0.1 + turned), math.cos(0.1 + turned))
+
+    assert plant.order("IDLE") == messages.DONE
+    for stuck, fault in ((False, controller.NO_FAULT), (True, controller.STUCK_SECONDARY)):
+        if plant.own.fault:
+            assert plant.order("CLEAR_FAULT") == messages.DONE
+        assert plant.order("DIAGNOSE") == messages.DONE
+        for _ in range(80):
+            follow()
+            plant.run(0.25)
+        ((answer, told),) = plant.ask("QUERY_DIAGNOSIS")
+        assert answer == "DIAGNOSIS"
+        assert plant.own.fault == fault, told
+        assert bool(told[0] & 2) is not stuck
+        assert told[2] != 0
+        assert math.hypot(*told[3:]) == pytest.approx(0.0 if stuck else 0.02, abs=1e-3)
+    Partition.device = None
+
+
+def test_a_board_without_one_says_so() -> None:
+    Partition.device = None
+    plant = Plant("rp2")
+    assert plant.loop.board.tilt() is None

@@ -1,13 +1,16 @@
 """Stand-ins for the modules of MicroPython's boards: they do what the chips do, cycle by cycle.
 
 Written from the data sheets of RP2040 (chapter 3, PIO), STM32F4 (RM0090, chapter 17, advanced
-timers) and W25Q, and from MicroPython's documentation of ``rp2``, ``esp32.RMT``, ``pyb.Timer`` and
-``machine``. ``Pulses`` are what a motor's driver would see at its step and direction inputs.
+timers), W25Q and LIS3DH, and from MicroPython's documentation of ``rp2``, ``esp32.RMT``,
+``pyb.Timer`` and ``machine``. ``Pulses`` are what a motor's driver would see at its step and
+direction inputs.
 """
 
 import contextlib
 import importlib
 import importlib.util
+import random
+import struct
 import sys
 import types
 from collections.abc import Callable, Iterator
@@ -143,6 +146,64 @@ class Chip:
         assert code == 0x03
         assert self.world.us >= self.busy_until, "read while busy"
         return bytes(self.cells[at : at + size])
+
+
+class Lis3dh:
+    """A LIS3DH by its registers (DocID17530): identity, controls, and the FIFO in stream mode.
+
+    ``gravity`` is what it measures, in g; each reading scatters by ``noise``. A measurement comes
+    every 10 ms once it is set up.
+    """
+
+    world: World
+    gravity = (0.0, 0.0, 1.0)
+    noise = 0.7e-3
+    identity = 0x33
+    there = True
+
+    def __init__(self, *args: object, **settings: object) -> None:
+        self.registers = {0x0F: self.identity, 0x20: 0x07}
+        self.since = self.world.us
+        self.chance = random.Random(5)
+
+    def _reached(self, address: int) -> None:
+        if address != 0x18 or not self.there:
+            raise OSError(19)  # ENODEV: nobody acknowledged
+
+    def _waiting(self) -> int:
+        """Measurements that nobody has read yet."""
+        streaming = self.registers.get(0x24, 0) & 0x40 and self.registers.get(0x2E, 0) >> 6 == 2
+        if not streaming or self.registers[0x20] != 0x57:
+            return 0
+        return int((self.world.us - self.since) / 10_000)
+
+    def writeto_mem(self, address: int, register: int, data: bytes) -> None:
+        self._reached(address)
+        assert register in (0x20, 0x21, 0x22, 0x23, 0x24, 0x25, 0x2E), "read only"
+        (self.registers[register],) = data
+        self.since = self.world.us
+
+    def readfrom_mem(self, address: int, register: int, size: int) -> bytes:
+        self._reached(address)
+        if register & 0x7F != 0x28:
+            assert size == 1 or register & 0x80, "the number of the register rises only if told"
+            if register == 0x2F:
+                waiting = self._waiting()
+                return bytes([0x40 | 31 if waiting > 31 else waiting or 0x20])
+            return bytes([self.registers.get(register, 0)])
+        assert register & 0x80
+        assert size % 6 == 0
+        # High resolution and ±2 g: 12 bits of 1 mg, left-justified; else 10 bits of 4 mg.
+        fine = self.registers.get(0x23, 0) == 0x88
+        data = b""
+        assert size // 6 <= min(32, self._waiting()), "more than there is"
+        for _ in range(size // 6):
+            for part in self.gravity:
+                mg = 1000.0 * (part + self.chance.gauss(0.0, self.noise))
+                value = 16 * round(mg) if fine else 64 * round(mg / 4.0)
+                data += struct.pack("<h", max(-32768, min(32767, value)))
+        self.since = self.world.us
+        return data
 
 
 # rp2
@@ -552,6 +613,7 @@ def modules(board: str, world: World) -> dict[str, ModuleType]:
             UART=bound(Uart, drive=DRIVE[board]),
             ADC=adc,
             SPI=bound(Chip, select=SELECT[board]),
+            I2C=bound(Lis3dh),
             WDT=dog,
             mem32=memory,
             unique_id=lambda: b"\1\2\3\4",
@@ -574,7 +636,7 @@ def modules(board: str, world: World) -> dict[str, ModuleType]:
 @contextlib.contextmanager
 def board_path(board: str, world: World) -> Iterator[Callable[[str], ModuleType]]:
     """Import the firmware's modules as on a board; what was imported before comes back."""
-    names = ["board", "steps", "nor", "rs485", "inputs", "loop", "settings"]
+    names = ["board", "steps", "nor", "rs485", "inputs", "loop", "settings", "tilt"]
     clock = SimpleNamespace(
         ticks_ms=world.ticks_ms,
         ticks_diff=lambda one, two: ((one - two + 2**29) & 0x3FFFFFFF) - 2**29,
