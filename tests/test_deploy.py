@@ -147,7 +147,7 @@ def test_every_state_command_and_fault_is_in_the_handbook() -> None:
     people = {
         row[1] for row in messages.MESSAGES if row[2] in (messages.ANYONE, messages.AUTHORITY)
     }
-    assert rows("## Commands") == people | {"ZERO", "SET_ADDRESS"}
+    assert rows("## Commands") == people | {"ZERO", "LOCK_POSITION", "SET_ADDRESS"}
 
 
 def test_the_emergency_comes_first() -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from heliotrope.console.live import rows_of
@@ -13,9 +14,10 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.layouts import lay_out
 from heliotrope.field.stellenbosch import prototype
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.mechanism import track
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
-from heliotrope.plant.operations.zero import zero
+from heliotrope.plant.operations.zero import lock_position, zero
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Event
 from heliotrope.twin.field import Field, FieldBus
@@ -81,6 +83,44 @@ def test_who_may_and_what_fits() -> None:
         ):
             with pytest.raises(error, match=text):
                 zero(plant, ENGINEER, token, names, values)
+
+    _live(work)
+
+
+def test_lock_position_restores_counts_that_were_lost() -> None:
+    async def work(live: LivePlant) -> None:
+        plant, (name, other) = live.plant, live.names
+        token = plant.take_authority(ENGINEER).token
+        await asyncio.sleep(3.0)
+        with pytest.raises(RefusedError, match=f"LOCK POSITION: {name}: it is not locked"):
+            lock_position(plant, ENGINEER, token, [name])
+        with pytest.raises(RefusedError, match="2 heliostats"):
+            lock_position(plant, ENGINEER, token, live.names)
+        assert await plant.command(ENGINEER, token, "LOCK", live.names).end(20.0)
+        with pytest.raises(RefusedError, match="it has no aim"):
+            lock_position(plant, ENGINEER, token, [name])
+        target = plant.design.targets[0].center
+        assert await plant.aim(ENGINEER, token, dict.fromkeys(live.names, target)).end(20.0)
+        # The mirror stands where its beam is at the aim; its counts are 40 and -25 steps wrong.
+        mechanism = plant.beliefs.present(name)[0]
+        found = track(mechanism, plant.sun_vector(), target)
+        right = np.round(found.chosen(found.counts))
+        wrong = (right + [40.0, -25.0]).tolist()
+        assert await zero(plant, ENGINEER, token, [name], wrong).end(20.0)
+        await asyncio.sleep(3.0)
+        ticket, text = lock_position(plant, ENGINEER, token, [name])
+        assert await ticket.end(20.0), ticket.text
+        await asyncio.sleep(3.0)
+        row = plant.field.rows[plant.field.place(name)]
+        # The sun went on by some tens of seconds, 2 mrad: 15 of 7,639 steps a radian at most.
+        assert np.abs(right - (int(row["primary"]), int(row["secondary"]))).max() < 20
+        assert f"counts {wrong[0]:.0f}, {wrong[1]:.0f} become" in text
+        # The other one stands at stow, far from its aim: nothing is sent.
+        still = int(plant.field.rows[plant.field.place(other)]["primary"])
+        with pytest.raises(RefusedError, match="above 100 mrad: is it this heliostat's beam"):
+            lock_position(plant, ENGINEER, token, [other])
+        await asyncio.sleep(3.0)
+        assert plant.field.rows[plant.field.place(other)]["primary"] == still
 
     _live(work)
 

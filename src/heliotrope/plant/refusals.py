@@ -124,6 +124,13 @@ ONE_HELIOSTAT = Refusal(
     "{what}: {count} heliostats; step counts differ from one to the next, give one heliostat",
     "Repeat the command for each heliostat.",
 )
+NO_POSITION = Refusal(
+    "no position to lock",
+    "LOCK POSITION is given where the counts of the aim cannot be the mirror's.",
+    "LOCK POSITION: {heliostat}: {why}",
+    "Bring the beam to its aim by JOG, lock the heliostat, and repeat the command; where its "
+    "counts are lost, give it counts by ZERO first.",
+)
 PARAMETERS_DIFFER = Refusal(
     "parameters differ",
     "A motion is given to a heliostat that stores parameters other than the wanted ones.",

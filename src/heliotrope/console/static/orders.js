@@ -61,6 +61,15 @@ async function zero() {
   if (v) await act(() => api("POST", "commands", { command: "ZERO", heliostats: [name], values: [Number(v.primary), Number(v.secondary)] }), `Zero ${name}`);
 }
 
+// Declares that the beam is at its aim now: the counts become those that belong there.
+async function lockPosition() {
+  const rows = [...store.selection];
+  if (rows.length !== 1) { say("Lock position: select exactly one heliostat", true); return; }
+  const name = store.field.names[rows[0]];
+  const sure = await ask(`Is the beam of ${name} at its aim now? It must be locked. Its controller stores the step counts that belong there; nothing moves.`, [], "It is at its aim");
+  if (sure) await act(() => api("POST", "commands", { command: "LOCK_POSITION", heliostats: [name] }), `Lock position ${name}`);
+}
+
 const plainly = (name) => (heliostats) => api("POST", "commands", { command: name, heliostats });
 const ORDERS = [
   ["Stow", "S", (f) => order("STOW", "Stow", (heliostats) => api("POST", "stow", { heliostats })), "safe"],
@@ -79,6 +88,7 @@ const ORDERS = [
     [{ name: "pitch", label: "Pitch (mrad)", type: "number", value: "5" }, { name: "radius", label: "Radius (mrad)", type: "number", value: "30" }])],
   ["Clear fault", "", () => order("CLEAR_FAULT", "Clear fault", plainly("CLEAR_FAULT")), "engineer"],
   ["Zero…", "", zero, "engineer"],
+  ["Lock position…", "", lockPosition, "engineer"],
   ["Out of service…", "", () => order("HOLD", "Out of service", (heliostats, v) => api("POST", "holds", { heliostats: heliostats.length ? heliostats : store.field.names, reason: v.reason, hours: Number(v.hours) || null }),
     [{ name: "reason", label: "Reason: it goes to stow, and nobody moves it until it is given back by name" }, { name: "hours", label: "Expected back in (hours)", type: "number", value: "4", required: false }]), "free"],
   ["Automatic", "", () => order("AUTO", "Give to automatic control", (heliostats) => api("POST", "automatic", { heliostats }), null, true), "free"],

@@ -12,7 +12,7 @@ from heliotrope.plant.interface.desk import Desk
 from heliotrope.plant.interface.encoding import frame_parts
 from heliotrope.plant.interface.overview import overview
 from heliotrope.plant.operations.security import SecurityEvent
-from heliotrope.plant.operations.zero import zero
+from heliotrope.plant.operations.zero import lock_position, zero
 from heliotrope.plant.tickets import Ticket
 
 
@@ -93,8 +93,15 @@ def _withdraw(desk: Desk, who: Person, *_: Any) -> Any:
 
 def _command(desk: Desk, who: Person, given: orders.CommandOrder, _: bytes) -> Ticket:
     here, token = desk.operations, desk.token_of(who)
-    if given.command != "ZERO":
+    if given.command not in ("ZERO", "LOCK_POSITION"):
         return here.command(who, token, given.command, given.heliostats, given.values)
+    ticket: Ticket
+    if given.command == "LOCK_POSITION":
+        if given.values:
+            raise InputError("LOCK_POSITION: it takes no values; they are those of the aim")
+        ticket, text = lock_position(here.plant, who, token, given.heliostats)
+        here.logbook.event("command", who.name, text)
+        return ticket
     ticket = zero(here.plant, who, token, given.heliostats, given.values)
     here.logbook.event("command", who.name, f"ZERO {given.heliostats[0]}")
     return ticket

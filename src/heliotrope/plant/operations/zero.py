@@ -1,11 +1,25 @@
-"""ZERO: the position of one heliostat's axes, as a person declares it."""
+"""ZERO and LOCK POSITION: the position of one heliostat's axes, as a person declares it.
+
+ZERO takes step counts. LOCK POSITION (Malan, table D.1, 0xD4) takes the aim at which the person
+sees the beam: the counts become those that the calibrated mirror would have now, its beam there.
+"""
 
 from collections.abc import Sequence
 
+import numpy as np
+
+from heliotrope.geometry import angle_between
+from heliotrope.lcu import states
+from heliotrope.mechanism import track
+from heliotrope.mechanism.tracking import TrackingStatus
 from heliotrope.plant import refusals
 from heliotrope.plant.authority import Person
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.tickets import Ticket
+
+#: Largest turn of the mirror's normal that LOCK POSITION may declare, rad: a beam that is off by
+#: more than twice as much is another heliostat's, or the aim is another.
+MOST_TURN = 0.1
 
 
 def zero(
@@ -43,3 +57,65 @@ def zero(
     if len(heliostats) != 1:
         raise refusals.ONE_HELIOSTAT.error(what="ZERO", count=len(heliostats) or "all")
     return plant.zero(person, token, heliostats[0], values)
+
+
+def lock_position(
+    plant: PlantController, person: Person, token: int, heliostats: Sequence[str]
+) -> tuple[Ticket, str]:
+    """Declare that the beam of one locked heliostat is at its aim now; its counts become that.
+
+    Nothing moves. Bring the beam to its aim by JOG and lock it before.
+
+    Parameters
+    ----------
+    plant
+        The controller.
+    person, token
+        The person commanding, and the token of the command authority.
+    heliostats
+        The name of one.
+
+    Returns
+    -------
+        The ticket, and the change in words.
+
+    Raises
+    ------
+    RefusedError
+        If it is not accepted; nothing is sent then.
+    UnknownNameError
+        If there is no such heliostat.
+    """
+    what = "LOCK POSITION"
+    if len(heliostats) != 1:
+        raise refusals.ONE_HELIOSTAT.error(what=what, count=len(heliostats) or "all")
+    (name,) = heliostats
+    row = plant.field.place(name)
+    problem = refusals.NO_POSITION
+    if not plant.field.among((states.LOCKED,), plant.now())[row]:
+        raise problem.error(heliostat=name, why="it is not locked, or has not reported lately")
+    aim, sun = plant.aims[row], plant.sun_vector()
+    if not np.isfinite(aim).all():
+        raise problem.error(heliostat=name, why="it has no aim")
+    if sun[2] <= 0.0:
+        raise problem.error(heliostat=name, why="the sun is below the horizon")
+    here = plant.field.rows[row]
+    counts = np.array([float(here["primary"]), float(here["secondary"])])
+    mechanism = plant.beliefs.present(name)[0]
+    found = track(mechanism, sun, aim, current=counts)
+    if TrackingStatus(int(found.chosen(found.status))) is not TrackingStatus.OK:
+        raise problem.error(heliostat=name, why="its axes cannot turn the beam to its aim now")
+    wanted = np.round(found.chosen(found.counts))
+    turn = float(angle_between(mechanism.pose(counts).normal, mechanism.pose(wanted).normal))
+    if turn > MOST_TURN:
+        raise problem.error(
+            heliostat=name,
+            why=f"its counts would change by {1e3 * turn:.0f} mrad of the mirror, above "
+            f"{1e3 * MOST_TURN:.0f} mrad: is it this heliostat's beam, and this its aim?",
+        )
+    ticket = plant.zero(person, token, name, wanted.tolist())
+    places = ", ".join(f"{x:.2f}" for x in aim)
+    return ticket, (
+        f"{what} {name} at ({places}) m: counts {counts[0]:.0f}, {counts[1]:.0f} become "
+        f"{wanted[0]:.0f}, {wanted[1]:.0f}, {1e3 * turn:.2f} mrad of the mirror"
+    )
