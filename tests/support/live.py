@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import AsyncIterator, Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from heliotrope.field.plant import Plant
@@ -14,6 +14,7 @@ from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAsse
 from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.audit import Audit
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import Records
@@ -59,6 +60,7 @@ class LivePlant:
         records: Records | None = None,
         assigned: Assigned | None = None,
         extra: Callable[[], Mapping[str, Any]] = dict,
+        pictures: Pictures | None = None,
     ) -> None:
         chosen = options or LiveOptions()
         self.design, self.clock = design, clock
@@ -66,6 +68,7 @@ class LivePlant:
         ports = self.world.ports(
             audit=audit, disk=disk, records=records, assigned=assigned, facts=extra
         )
+        ports = replace(ports, pictures=pictures)
         self.assembly = PlantAssembly(design, ports, chosen.settings())
         self.plant, self.operations = self.assembly.plant, self.assembly.operations
         self.names, self.cameras, self.field = (

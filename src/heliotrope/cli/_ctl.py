@@ -2,6 +2,7 @@
 
 import os
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -349,6 +350,56 @@ def calibration(
     print(f"calibration {'on' if found['on'] else 'off'}; {found['done']} calibrated")
 
 
+@app.command()
+def calibrate(
+    context: typer.Context,
+    heliostat: Annotated[str, typer.Argument(help="Heliostat.")],
+    target: Annotated[str, typer.Option(help="Target; any if left out.")] = "",
+) -> None:
+    """Have automatic control calibrate a heliostat next, as soon as a target is free."""
+    with _client(context) as client:
+        order = {"heliostat": heliostat, "target": target}
+        found = client.ask("POST", "calibration/next", order)
+    print(f"asked for: {', '.join(found['asked'])}")
+
+
+@app.command()
+def photograph(
+    context: typer.Context,
+    target: Annotated[str, typer.Argument(help="Target.")],
+) -> None:
+    """Photograph a target now, and print what is seen on it."""
+    from urllib.parse import quote
+
+    with _client(context) as client:
+        found = client.ask("POST", f"targets/{quote(target, safe='')}/photograph")
+    print(f"{target}, photograph {found['version']}", *found["reading"], sep="\n")
+
+
+@app.command()
+def photographs(
+    context: typer.Context,
+    heliostat: Annotated[
+        str, typer.Argument(help="Heliostat; those that persons asked for if left out.")
+    ] = "",
+    limit: Annotated[int, typer.Option(help="Newest ones, at most this many.")] = 50,
+    as_json: Json = False,
+) -> None:
+    """List the kept photographs of a heliostat, each with the result of its visit."""
+    from urllib.parse import quote
+
+    with _client(context) as client:
+        found = client.get(f"photographs?heliostat={quote(heliostat, safe='')}&limit={limit}")
+    if as_json:
+        print_json(found)
+        return
+    rows = [
+        (str(one["identity"]), _utc(one["at"]), one["target"], one["outcome"], one["text"])
+        for one in found
+    ]
+    print_table(("number", "time", "target", "outcome", ""), rows)
+
+
 @app.command("out-of-service")
 def out_of_service(
     context: typer.Context,
@@ -380,6 +431,10 @@ def resume(context: typer.Context) -> None:
     with _client(context) as client:
         client.ask("POST", "automatic/resume")
     print("automatic control resumed")
+
+
+def _utc(at: float) -> str:
+    return datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def _names(heliostats: list[str] | None, everybody: bool) -> list[str]:

@@ -40,6 +40,7 @@ router = APIRouter(prefix="/api/v1", responses=REFUSALS)
 
 Named = Annotated[str, Path(max_length=64)]
 Limit = Annotated[int, Query(ge=1, le=2000)]
+Identity = Annotated[int, Path(ge=1, le=2**53)]
 
 
 def answer(value: Any) -> JSONResponse:
@@ -142,6 +143,32 @@ async def target(console: Here, who: Anyone, name: Named) -> JSONResponse:
     """Return the findings of the software in the last photograph of a target."""
     del who
     return answer(await console.plant.ask("target", name=name))
+
+
+@router.get("/photographs", response_model=models.many(models.PictureRow), tags=["calibration"])
+async def kept(
+    console: Here,
+    who: Anyone,
+    heliostat: Annotated[str, Query(max_length=64)] = "",
+    limit: Limit = 50,
+) -> JSONResponse:
+    """Return the newest kept photographs of a heliostat; without one, those asked for."""
+    del who
+    return answer(await console.plant.ask("kept_photographs", heliostat=heliostat, limit=limit))
+
+
+@router.get(
+    "/photographs/{identity}",
+    tags=["calibration"],
+    response_class=Response,
+    responses={200: {"content": {"image/jpeg": {}}}},
+)
+async def kept_photograph(console: Here, who: Anyone, identity: Identity) -> Response:
+    """Return a kept photograph, annotated with the findings of the software."""
+    del who
+    _, jpeg = await console.plant.fetch("kept_photograph", identity=identity)
+    headers = {"Cache-Control": "private, max-age=86400, immutable"}
+    return Response(jpeg, media_type="image/jpeg", headers=headers)
 
 
 @router.get("/alarms", response_model=models.many(models.AlarmRow), tags=["alarms"])

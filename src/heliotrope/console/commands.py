@@ -151,6 +151,20 @@ async def switch(console: Here, who: Operator, to: orders.Switch) -> JSONRespons
     return answer(await console.plant.ask("switch_calibration", who.person, on=to.on))
 
 
+@router.post("/calibration/next", response_model=models.CalibrationView, tags=["calibration"])
+async def calibrate(console: Here, who: Operator, order: orders.OneCalibration) -> JSONResponse:
+    """Calibrate a heliostat as soon as a target is free, before all others."""
+    return answer(await console.plant.ask("calibrate", who.person, **order.model_dump()))
+
+
+@router.post(
+    "/targets/{name}/photograph", response_model=models.CameraReading, tags=["calibration"]
+)
+async def take_photograph(console: Here, who: Operator, name: Named) -> JSONResponse:
+    """Photograph a target now, with whatever beam is on it."""
+    return answer(await console.plant.ask("take_photograph", who.person, name=name))
+
+
 @router.post("/holds", response_model=models.many(models.Lockout), tags=["commands"])
 async def hold(console: Here, who: Operator, order: orders.HoldOrder) -> JSONResponse:
     """Take heliostats out of service: they go to stow, and nobody moves them."""

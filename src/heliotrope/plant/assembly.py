@@ -25,6 +25,7 @@ from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.operations.pictures import KeptCamera
 from heliotrope.plant.operations.views import CalibrationEntry, Planned
 from heliotrope.plant.ports import Cameras, Ports, Sensors
 from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
@@ -125,7 +126,12 @@ class PlantAssembly:
         cycle = (
             None
             if cameras is None
-            else CalibrationCycle(self.plant, cameras, chosen.cycle, Centring())
+            else CalibrationCycle(
+                self.plant,
+                cameras if ports.pictures is None else KeptCamera(cameras, ports.pictures),
+                chosen.cycle,
+                Centring(),
+            )
         )
         self.schedule = None if cycle is None else self._schedule(cycle)
         self.operations = Operations(
@@ -138,6 +144,7 @@ class PlantAssembly:
             truth=ports.truth,
             settings=chosen.work,
             extra=ports.facts,
+            pictures=ports.pictures,
         )
         if chosen.machines is not MachineTables.UNKNOWN:
             self._rest_on_machines()
@@ -203,6 +210,8 @@ class PlantAssembly:
             if self.ports.disk is not None:
                 self.ports.disk.close()
             self.ports.audit.close()
+            if self.ports.pictures is not None:
+                self.ports.pictures.close()
             if cameras is not None:
                 cameras.close()
 

@@ -17,6 +17,7 @@ from heliotrope.links.clock import Clock
 from heliotrope.links.link import Link
 from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.audit import Audit
+from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.sensors import Readings
 from heliotrope.plant.visits.photographs import Shot
@@ -94,6 +95,8 @@ class Ports:
     disk
         Does the work of audit and assigned points; it is closed with the plant. None: they are
         written in the loop, as virtual time needs it.
+    pictures
+        Keeps photographs of calibrations; it is closed with the plant. None: they are not kept.
     records
         Store of sightings, events and holds; None: they end with the program.
     assigned
@@ -114,6 +117,7 @@ class Ports:
     cameras: Cameras | None = None
     sensors: Sensors | None = None
     disk: Disk | None = field(default=None, kw_only=True)
+    pictures: Pictures | None = field(default=None, kw_only=True)
     records: Records | None = field(default=None, kw_only=True)
     assigned: Assigned | None = field(default=None, kw_only=True)
     beside: Callable[[], AbstractAsyncContextManager[object]] = field(

@@ -131,6 +131,13 @@ NO_POSITION = Refusal(
     "Bring the beam to its aim by JOG, lock the heliostat, and repeat the command; where its "
     "counts are lost, give it counts by ZERO first.",
 )
+NO_CALIBRATION = Refusal(
+    "no calibration now",
+    "A heliostat is to be calibrated while automatic control cannot do it.",
+    "calibration of {heliostat}: {why}",
+    "Give the heliostat to automatic control (*Automatic*), release the command authority, switch "
+    "calibration on, or wait for the sun, as the text says; then repeat the command.",
+)
 PARAMETERS_DIFFER = Refusal(
     "parameters differ",
     "A motion is given to a heliostat that stores parameters other than the wanted ones.",

@@ -26,6 +26,7 @@ from heliotrope.geometry import as_float
 from heliotrope.lcu import states
 from heliotrope.plant.assembly import PlantAssembly
 from heliotrope.plant.interface import ConsoleProcess, PlantInterface
+from heliotrope.plant.operations.pictures import Pictures, PictureSettings
 from heliotrope.store.database import make_private, tighten
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry
@@ -61,6 +62,7 @@ class Shown:
     minutes: float | None = None
     every: float = EVERY
     evidence: Evidence = field(default_factory=Evidence)
+    photographs: PictureSettings = field(default_factory=PictureSettings)
 
     def __post_init__(self) -> None:
         for name, value in (("minutes", self.minutes), ("every", self.every)):
@@ -188,6 +190,12 @@ def store(shown: Shown) -> Iterator[tuple[Keeper, Path]]:
         os.umask(mask)
         if shown.data is None:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def pictures(shown: Shown, folder: Path, *, waits: bool = False) -> Pictures:
+    """Return the place where photographs are kept; ``waits``: the loop waits for the disk."""
+    disk = None if waits else DiskThread()
+    return Pictures(folder / "photographs", shown.photographs, disk)
 
 
 @contextlib.asynccontextmanager

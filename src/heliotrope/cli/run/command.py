@@ -213,6 +213,18 @@ def run(
             help="Hours between heads, in that folder and to syslog.", rich_help_panel=_KEPT
         ),
     ] = 1.0,
+    photographs_days: Annotated[
+        float,
+        typer.Option(
+            help="Days for which photographs of calibrations are kept: all for 30 of them, then "
+            "one a day of each heliostat.",
+            rich_help_panel=_KEPT,
+        ),
+    ] = 400.0,
+    photographs_gb: Annotated[
+        float,
+        typer.Option(help="Size of all kept photographs, GB.", rich_help_panel=_KEPT),
+    ] = 4.0,
 ) -> None:
     """Run a plant: it tracks, photographs, learns and corrects; by default in simulation.
 
@@ -223,6 +235,7 @@ def run(
     from heliotrope.cli.run._evidence import Evidence
     from heliotrope.cli.run._shared import Shown
     from heliotrope.errors import InputError
+    from heliotrope.plant.operations.pictures import PictureSettings
 
     if not 0.0 < speed <= 1000.0:
         raise InputError(f"run: --speed {speed:g}; give above 0 to 1000")
@@ -250,6 +263,9 @@ def run(
         minutes=minutes,
         every=every,
         evidence=Evidence(syslog, syslog_authority, heads, heads_every),
+        photographs=PictureSettings(
+            min(30.0, photographs_days), photographs_days, 1e9 * photographs_gb
+        ),
     )
     if clusters is None:
         if configure or check:

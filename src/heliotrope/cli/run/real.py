@@ -3,11 +3,11 @@
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from heliotrope.cli.run._shared import Shown, at_work, begin, one_error, store
+from heliotrope.cli.run._shared import Shown, at_work, begin, one_error, pictures, store
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.files.disk import DiskThread
@@ -169,7 +169,8 @@ async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outsid
     with store(shown) as (keeper, folder):
         clock = SystemClock()
         ports = outside.ports(design, choice, shown, clock, keeper)
-        live = PlantAssembly(design, ports, _settings(choice))
+        kept = pictures(shown, folder)
+        live = PlantAssembly(design, replace(ports, pictures=kept), _settings(choice))
         if live.plant.unwatched:
             print(f"no readings for: {', '.join(live.plant.unwatched)}", flush=True)
         papers = _papers(outside, shown)

@@ -1,10 +1,10 @@
 """A simulated plant with its store, its local interface and its console."""
 
 import asyncio
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 
-from heliotrope.cli.run._shared import Shown, at_work, begin, one_error, store
+from heliotrope.cli.run._shared import Shown, at_work, begin, one_error, pictures, store
 from heliotrope.field.plant import Plant
 from heliotrope.files.disk import DiskThread
 from heliotrope.links.clock import SystemClock, VirtualClock
@@ -52,5 +52,7 @@ async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
             assigned=KeptPoints(keeper),
             facts=lambda: {"lag": loop.lag, "speed": loop.speed},
         )
-        live = PlantAssembly(design, ports, settings)
+        # A record takes long in a time that runs faster, so there the loop waits for it.
+        kept = pictures(shown, folder, waits=choice.speed > 1.0)
+        live = PlantAssembly(design, replace(ports, pictures=kept), settings)
         await at_work(live, keeper, shown, folder, ending, choice.speed)

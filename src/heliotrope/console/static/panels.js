@@ -77,8 +77,9 @@ export function heliostat(box) {
         : "Click a heliostat on the map to see it here."));
       return;
     }
-    const one = await api("GET", `heliostats/${encodeURIComponent(store.field.names[store.focus])}`);
-    body.replaceChildren(...heliostatView(one));
+    const name = encodeURIComponent(store.field.names[store.focus]);
+    const [one, kept] = await Promise.all([api("GET", `heliostats/${name}`), api("GET", `photographs?heliostat=${name}&limit=40`)]);
+    body.replaceChildren(...heliostatView(one), ...keptView(kept, one.history));
     const canvas = body.querySelector("canvas");
     if (canvas && one.history.length) chart(canvas, [
       { points: one.history.map((s) => [s.at, 1e3 * s.error]), colour: colourOf("APPROACHING"), dots: true },
@@ -93,6 +94,8 @@ function heliostatView(one) {
   const stale = one.live ? "" : "hx-stale", point = (p) => (p[0] === null ? "none" : p.map((v) => number(v, 1)).join(", "));
   return [
     h("h2", { className: stale }, one.name, h("span", { className: "hx-chip" }, one.live ? one.state : `stale: ${span(one.age)} old`)),
+    canCommand() ? h("div", { className: "hx-row" }, h("button", { className: "hx-button", title: "Automatic control calibrates it as soon as a target is free",
+      onclick: () => act(() => api("POST", "calibration/next", { heliostat: one.name }), `calibrate ${one.name}`) }, "Calibrate now")) : "",
     facts([["Cluster", one.cluster], ["Heard", one.live ? `${number(one.age, 1)} s ago` : `${span(one.age)} ago`],
       ["Fault", one.live ? one.fault : "unknown", one.live && one.fault !== "none" ? "bad" : stale], ["Aims at", one.on || "nothing"],
       ["Aim E, N, U (m)", point(one.aim)], ["Standby E, N, U (m)", point(one.standby)],
@@ -114,13 +117,24 @@ function heliostatView(one) {
     one.flags.length ? h("p", { className: "hx-hint" }, one.flags.join(" · ")) : "",
   ];
 }
+
+// The kept photographs, each with the error of its sighting: a sighting has the time of its photograph.
+function keptView(kept, history) {
+  const sighting = (p) => history.find((s) => Math.abs(s.at - p.at) < 0.5);
+  return [h("h3", {}, `Kept photographs (${kept.length})`), kept.length
+    ? table([["Time", (p) => h("a", { href: `/api/v1/photographs/${p.identity}`, target: "_blank", rel: "noopener" }, clock(p.at))], ["Target", (p) => p.target],
+      ["Sighting (mrad)", (p) => { const s = sighting(p); return s ? mrad(s.error) : "–"; }, "num"],
+      ["Result of its visit", (p) => h("span", { className: p.outcome === "calibrated" ? "good" : "warn", title: `${p.text}\n${p.reading.join("\n")}` }, p.used ? p.outcome.replaceAll("_", " ") : `not used: ${p.reading.at(-1) ?? ""}`)]], kept)
+    : h("p", { className: "hx-hint" }, "None yet.")];
+}
 const parameter = (value, unit) => (value === null ? "–" : unit === "rad" ? (1e3 * value).toFixed(3) : value.toFixed(4));
 
 export function targets(box) {
   const off = [], shown = new Map();
   for (const name of store.field.targets) {
     const image = h("img", { alt: `Photograph of ${name}` }), said = h("p", { className: "hx-reading" }), at = h("span", { className: "hx-chip" }, "no photograph yet");
-    box.append(h("h3", {}, name, at), h("div", { className: "hx-photo" }, image), said);
+    box.append(h("h3", {}, name, at), canCommand() ? h("div", { className: "hx-row" }, h("button", { className: "hx-button",
+      onclick: () => act(() => api("POST", `targets/${encodeURIComponent(name)}/photograph`), `photograph ${name}`) }, "Photograph now")) : "", h("div", { className: "hx-photo" }, image), said);
     shown.set(name, { image, said, at });
     off.push(refreshed(async () => {
       if (!store.head?.cameras?.[name]) return;
@@ -147,7 +161,7 @@ export function calibration(box) {
       h("div", { className: "hx-row" }, h("b", { className: view.on ? "good" : "warn" }, view.on ? "Running" : `Off: ${view.reason}`),
         canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("PUT", "calibration", { on: !view.on }), "calibration") }, view.on ? "Switch off" : "Switch on") : ""),
       facts([["Calibrated", count(view.done)], ["Waiting", count(view.waiting)], ["Failed", count(view.failed)]]),
-      h("ul", { className: "hx-list" }, running.length ? running : h("li", {}, "no measurement in progress")),
+      h("ul", { className: "hx-list" }, running.length ? running : h("li", {}, "no measurement in progress"), view.asked.length ? h("li", {}, `asked for next: ${view.asked.join(", ")}`) : ""),
       h("h3", {}, "Error of the calibrated heliostats (mrad)"), lines,
       h("p", { className: "hx-keys" }, key("predicted, median", colourOf("APPROACHING")), key("90th percentile", colourOf("APPROACHING"), true),
         truth ? [key("true (twin), median", colourOf("SEARCHING")), key("90th percentile", colourOf("SEARCHING"), true)] : ""),

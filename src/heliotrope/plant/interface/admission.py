@@ -17,7 +17,8 @@ OWN, ALL = (10.0, 100.0), (30.0, 200.0)
 ORDERS = frozenset(
     (
         "withdraw_emergency", "acknowledge", "take_authority", "seize_authority", "command", "aim",
-        "standby", "automatic", "resume", "switch_calibration", "hold", "unhold",
+        "standby", "automatic", "resume", "switch_calibration", "calibrate", "take_photograph",
+        "hold", "unhold",
     )
 )  # fmt: skip
 

@@ -8,7 +8,7 @@ from typing import Any
 from heliotrope.errors import InputError
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.interface import orders
-from heliotrope.plant.interface.desk import Desk
+from heliotrope.plant.interface.desk import Desk, reading_of
 from heliotrope.plant.interface.encoding import frame_parts
 from heliotrope.plant.interface.overview import overview
 from heliotrope.plant.operations.security import SecurityEvent
@@ -71,14 +71,11 @@ def _photograph(desk: Desk, _: Person, given: orders.Picture, __: bytes) -> With
 
 
 def _target(desk: Desk, _: Person, given: orders.Named, __: bytes) -> dict[str, Any]:
-    view = desk.operations.camera(given.name)
-    return {
-        "target": view.target,
-        "version": view.version,
-        "at": view.at,
-        "reading": view.reading,
-        "centroid": view.centroid,
-    }
+    return reading_of(desk.operations.camera(given.name))
+
+
+async def _kept_one(desk: Desk, _: Person, identity: int) -> WithBlob:
+    return WithBlob({"identity": identity}, await desk.kept_picture(identity))
 
 
 def _emergency(desk: Desk, who: Person, given: orders.EmergencyCall, _: bytes) -> Any:
@@ -126,6 +123,11 @@ def _switch(desk: Desk, who: Person, given: orders.Switch, _: bytes) -> Any:
     return desk.operations.calibration()
 
 
+def _calibrate(desk: Desk, who: Person, given: orders.OneCalibration, _: bytes) -> Any:
+    desk.operations.calibrate(who, given.heliostat, given.target)
+    return desk.operations.calibration()
+
+
 def _hold(desk: Desk, who: Person, given: orders.HoldOrder, _: bytes) -> Any:
     hours = math.nan if given.hours is None else given.hours
     desk.operations.hold(who, given.heliostats, given.reason, hours)
@@ -156,6 +158,12 @@ _VIEWS = {
     "one_command": Call(Role.VIEWER, orders.Named, lambda d, _, a, __: d.tickets.get(a.name)),
     "target": Call(Role.VIEWER, orders.Named, _target),
     "photograph": Call(Role.VIEWER, orders.Picture, _photograph),
+    "kept_photographs": Call(
+        Role.VIEWER, orders.KeptOf, lambda _d, _who, given, _b: given, Desk.kept
+    ),
+    "kept_photograph": Call(
+        Role.VIEWER, orders.KeptOne, lambda _d, _who, given, _b: given.identity, _kept_one
+    ),
     "events": Call(Role.VIEWER, orders.Some, lambda d, _, a, __: d.operations.events(a.limit)),
     "packets": Call(
         Role.VIEWER, orders.Some, lambda d, _, a, __: d.operations.packets(a.limit, a.cluster)
@@ -202,6 +210,10 @@ _ORDERS = {
     ),
     "resume": Call(Role.OPERATOR, orders.Nothing, lambda d, who, *_: d.operations.resume(who)),
     "switch_calibration": Call(Role.OPERATOR, orders.Switch, _switch),
+    "calibrate": Call(Role.OPERATOR, orders.OneCalibration, _calibrate),
+    "take_photograph": Call(
+        Role.OPERATOR, orders.Named, lambda _d, _who, given, _b: given.name, Desk.photographed
+    ),
     "hold": Call(Role.OPERATOR, orders.HoldOrder, _hold),
     "unhold": Call(Role.OPERATOR, orders.GivenBack, _unhold),
 }

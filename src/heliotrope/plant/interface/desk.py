@@ -7,20 +7,25 @@ expires by the plant's time, which may run faster than that of people.
 import asyncio
 import math
 import time
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
+from heliotrope.errors import UnknownNameError
 from heliotrope.field.volumes import outline
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.plant import refusals
 from heliotrope.plant.authority import Person
+from heliotrope.plant.interface import orders
 from heliotrope.plant.interface.tickets import Tickets, state_of
 from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.operations.views import CameraView, PictureRow
 from heliotrope.plant.orders import RECORDING
 from heliotrope.plant.tickets import Ticket
 
 #: A holder of the authority counts as present for this long after renewing it, s.
 PRESENT = 8.0
+T = TypeVar("T")
 
 
 class Desk:
@@ -132,6 +137,32 @@ class Desk:
         await ticket.written(RECORDING + 1.0)
         return state_of(ticket)
 
+    # -- photographs -----------------------------------------------------------------------
+
+    async def photographed(self, person: Person, target: str) -> dict[str, Any]:
+        """Photograph a target now; return what is seen."""
+        return reading_of(await self.operations.photograph(person, target))
+
+    async def kept(self, _: Person, given: orders.KeptOf) -> list[PictureRow]:
+        """Return the newest kept photographs of a heliostat."""
+        pictures = self.operations.pictures
+        if pictures is None:
+            return []
+        return await _answer(lambda then: pictures.find(given.heliostat, given.limit, then))
+
+    async def kept_picture(self, identity: int) -> bytes:
+        """Return a kept photograph as JPEG.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is none of that number.
+        """
+        pictures = self.operations.pictures
+        if pictures is None:
+            raise UnknownNameError("kept photograph", str(identity), ())
+        return await _answer(lambda then: pictures.read(identity, then))
+
     # -- views -----------------------------------------------------------------------------
 
     def field(self) -> dict[str, Any]:
@@ -162,3 +193,30 @@ class Desk:
             "states": states.STATES,
             "faults": meanings.FAULTS,
         }
+
+
+def reading_of(view: CameraView) -> dict[str, Any]:
+    """Return the findings in a photograph, without the picture."""
+    return {
+        "target": view.target,
+        "version": view.version,
+        "at": view.at,
+        "reading": view.reading,
+        "centroid": view.centroid,
+    }
+
+
+async def _answer(ask: Callable[[Callable[[T | Exception], None]], None]) -> T:
+    """Wait for the answer of a disk."""
+    told: asyncio.Future[T] = asyncio.get_running_loop().create_future()
+
+    def then(found: T | Exception) -> None:
+        if told.done():
+            return  # who asked has gone
+        if isinstance(found, Exception):
+            told.set_exception(found)
+        else:
+            told.set_result(found)
+
+    ask(then)
+    return await told

@@ -86,6 +86,26 @@ class Picture(Strict):
     known: int = -1
 
 
+class OneCalibration(Strict):
+    """A heliostat to be calibrated next, and the target ("": any)."""
+
+    heliostat: Name
+    target: Annotated[str, Field(max_length=64)] = ""
+
+
+class KeptOf(Strict):
+    """The newest kept photographs of a heliostat ("": those that persons asked for)."""
+
+    heliostat: Annotated[str, Field(max_length=64)] = ""
+    limit: Annotated[int, Field(ge=1, le=2000)] = 50
+
+
+class KeptOne(Strict):
+    """A kept photograph."""
+
+    identity: Annotated[int, Field(ge=1, le=2**53)]
+
+
 class Note(Strict):
     """A security event: its name, the person, the address of the caller, and details."""
 

@@ -18,6 +18,7 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
+from heliotrope.plant import refusals
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, TrueErrors
@@ -25,6 +26,7 @@ from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.losses import Losses
+from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.operations.service import Service
 from heliotrope.plant.operations.views import CalibrationView, Planned
@@ -119,6 +121,7 @@ class AutomaticControl:
         records: Records | None,
         truth: Callable[[], FloatArray] | None,
         settings: AutomaticSettings,
+        pictures: Pictures | None = None,
     ) -> None:
         self._plant, self._log, self._settings = plant, logbook, settings
         self._on, self._day, self._gave_way_at = settings.calibrate, True, -math.inf
@@ -141,7 +144,7 @@ class AutomaticControl:
         self._calibrating: Calibrating | None = None
         if cycle is not None and scheduler is not None:
             self._calibrating = Calibrating(
-                plant, logbook, cycle, scheduler, self.book, self._keeping, self.truth
+                plant, logbook, cycle, scheduler, self.book, self._keeping, self.truth, pictures
             )
         self._stopped = False
         if cycle is not None:
@@ -156,6 +159,22 @@ class AutomaticControl:
     def want(self, heliostats: Sequence[str], *, wanted: bool, by_person: bool = False) -> None:
         """Give heliostats to automatic control, or take them out of it; see `Raising.want`."""
         self._raising.want(heliostats, wanted=wanted, by_person=by_person)
+        if not wanted and self._calibrating is not None:
+            self._calibrating.withdraw(heliostats or self._plant.field.names)
+
+    def calibrate(self, heliostat: str, target: str = "") -> None:
+        """Calibrate a heliostat before all others; see `Operations.calibrate`."""
+        row = self._plant.field.place(heliostat)
+        if target:
+            self._plant.design.target(target)
+        why = self._why_not()
+        if not why and self.service.rows()[row]:
+            why = "it is out of service"
+        if not why and not self._raising.wanted[row]:
+            why = "automatic control does not have it"
+        if why or self._calibrating is None:
+            raise refusals.NO_CALIBRATION.error(heliostat=heliostat, why=why)
+        self._calibrating.ask(heliostat, target)
 
     @property
     def waits(self) -> str:
@@ -200,6 +219,7 @@ class AutomaticControl:
             tuple(running.values()),
             tuple(list(self.book.results)[:-51:-1]),
             tuple(self.book.quality),
+            () if self._calibrating is None else self._calibrating.asked,
         )
 
     def plan(self, limit: int) -> tuple[Planned, ...]:

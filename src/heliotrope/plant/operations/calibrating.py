@@ -16,6 +16,7 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import CalibrationEntry, Planned, Running
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
 
@@ -85,6 +86,8 @@ class Calibrating:
         Take the results.
     truth
         True errors, known to a twin only.
+    pictures
+        Keeps the photographs with the results; None: they are not kept.
     """
 
     def __init__(
@@ -96,10 +99,27 @@ class Calibrating:
         book: CalibrationBook,
         keeping: Keeping,
         truth: TrueErrors,
+        pictures: Pictures | None = None,
     ) -> None:
         self._plant, self._log, self._cycle, self._scheduler = plant, log, cycle, scheduler
         self._book, self._keeping, self._truth = book, keeping, truth
+        self._pictures = pictures
         self._running: dict[str, Running] = {}
+        self._asked: dict[str, str] = {}
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """Heliostats that persons want calibrated next, in the order in which they were asked."""
+        return tuple(self._asked)
+
+    def ask(self, heliostat: str, target: str) -> None:
+        """Calibrate a heliostat before all others, on a target or, for "", on the next free one."""
+        self._asked[heliostat] = target
+
+    def withdraw(self, heliostats: Sequence[str]) -> None:
+        """Forget that persons wanted these heliostats calibrated."""
+        for name in heliostats:
+            self._asked.pop(name, None)
 
     @property
     def running(self) -> Mapping[str, Running]:
@@ -115,19 +135,20 @@ class Calibrating:
     ) -> str:
         """Calibrate the next of the ready heliostats (N,); return its name, "" if none is due.
 
-        Heliostats whose step counts are in doubt come first: a photograph ends it.
+        Those that persons asked for come first, then those whose step counts are in doubt: a
+        photograph ends it.
         """
-        doubtful = ready & self._plant.doubts.standing
-        chosen = self._scheduler.next(target, doubtful) if doubtful.any() else None
-        chosen = chosen or self._scheduler.next(target, ready)
-        if chosen is None:
+        name = self._chosen(target, ready)
+        if not name:
             return ""
-        name, begun = chosen.heliostat, self._now()
+        begun = self._now()
 
         def tell(stage: str) -> None:
             self._running[target] = Running(name, target, stage, begun)
 
         tell("on the way")
+        if self._pictures is not None:
+            self._pictures.begin(name)
         row = self._plant.field.place(name)
         truth, sigma = self._truth.now(row), float(self._book.error[row])
         try:
@@ -141,6 +162,16 @@ class Calibrating:
             self._running.pop(target, None)
         self._conclude(target, result, truth, begun, sigma)
         return name
+
+    def _chosen(self, target: str, ready: npt.NDArray[np.bool_]) -> str:
+        for name, where in self._asked.items():
+            if where in ("", target) and ready[self._plant.field.place(name)]:
+                del self._asked[name]
+                return name
+        doubtful = ready & self._plant.doubts.standing
+        chosen = self._scheduler.next(target, doubtful) if doubtful.any() else None
+        chosen = chosen or self._scheduler.next(target, ready)
+        return "" if chosen is None else chosen.heliostat
 
     def _now(self) -> float:
         return self._plant.clock.utc().timestamp()
@@ -171,3 +202,5 @@ class Calibrating:
         self._scheduler.done(entry)
         self._log.event("calibration", entry.heliostat, f"at {target}: {entry.text}")
         self._keeping.keep(entry, begun, sigma)
+        if self._pictures is not None:
+            self._pictures.conclude(entry)

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from heliotrope import sun
 from heliotrope.errors import UnknownNameError
 from heliotrope.field.plant import Plant
+from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.optics import FluxView, predict_flux
 from heliotrope.plant import refusals
@@ -31,6 +32,7 @@ from heliotrope.plant.lockouts import Lockout
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.security import SecurityLog
 from heliotrope.plant.operations.viewing import Viewer
 from heliotrope.plant.operations.views import (
@@ -49,6 +51,7 @@ from heliotrope.plant.operations.views import (
 )
 from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
+from heliotrope.plant.visits.photographs import Shot
 from heliotrope.safety import Act
 from heliotrope.store.records import Records
 
@@ -69,6 +72,10 @@ class Photographer(Protocol):
 
     def view(self, target: str) -> CameraView:
         """Return the last photograph."""
+        ...
+
+    async def photograph(self, target: Target, heliostat: str) -> Shot:
+        """Return what a new photograph shows."""
         ...
 
 
@@ -102,10 +109,12 @@ class Operations:
         Settings of automatic control.
     extra
         Returns further rows of the summary, such as the speed of a twin.
+    pictures
+        Keeps photographs with their results; None: they are not kept.
 
     Attributes
     ----------
-    plant, logbook, automatic, security
+    plant, logbook, automatic, security, pictures
         See their classes.
     """
 
@@ -121,8 +130,9 @@ class Operations:
         truth: Callable[[], FloatArray] | None = None,
         settings: AutomaticSettings | None = None,
         extra: Callable[[], Mapping[str, Any]] | None = None,
+        pictures: Pictures | None = None,
     ) -> None:
-        self.plant, self.logbook = plant, logbook
+        self.plant, self.logbook, self.pictures = plant, logbook, pictures
         self._cameras, self._extra = dict(cameras or {}), extra
         self.automatic = AutomaticControl(
             plant,
@@ -132,6 +142,7 @@ class Operations:
             records=records,
             truth=truth,
             settings=settings or AutomaticSettings(),
+            pictures=pictures,
         )
         self.security = SecurityLog(logbook, plant.clock)
         self._viewer = Viewer(plant, self.automatic)
@@ -309,6 +320,41 @@ class Operations:
         _operator(person, "calibration")
         self.automatic.switch(on)
         self._tell(person, f"calibration switched {'on' if on else 'off'}")
+
+    def calibrate(self, person: Person, heliostat: str, target: str = "") -> None:
+        """Calibrate a heliostat as soon as a target ("": any) is free, before all others.
+
+        Raises
+        ------
+        RefusedError
+            If the person is a viewer, or automatic control cannot do it now.
+        UnknownNameError
+            If there is no such heliostat or target.
+        """
+        _operator(person, "calibration")
+        self.automatic.calibrate(heliostat, target)
+        self._tell(person, f"asked for a calibration of {heliostat}{target and f' on {target}'}")
+
+    async def photograph(self, person: Person, target: str) -> CameraView:
+        """Photograph a target now, with whatever beam is on it; return what is seen.
+
+        Raises
+        ------
+        RefusedError
+            If the person is a viewer.
+        UnknownNameError
+            If no camera looks at it.
+        FetchError
+            If its camera gives no frame.
+        """
+        _operator(person, "photograph")
+        before = self.camera(target).version
+        shot = await self._cameras[target].photograph(self.design.target(target), "")
+        view = self.camera(target)
+        if self.pictures is not None and view.version != before:
+            self.pictures.keep(view, shot, person.name)
+        self._tell(person, f"photographed {target}")
+        return view
 
     def camera(self, target: str) -> CameraView:
         """Return the last photograph of a target.

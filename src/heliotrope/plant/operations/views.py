@@ -398,6 +398,8 @@ class CalibrationView:
         Results of the last visits, newest first.
     quality
         Quality over time, oldest first.
+    asked
+        Heliostats that persons want calibrated next.
     """
 
     on: bool
@@ -408,6 +410,37 @@ class CalibrationView:
     running: tuple[Running, ...]
     results: tuple[CalibrationEntry, ...]
     quality: tuple[QualityPoint, ...]
+    asked: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class PictureRow:
+    """A kept photograph.
+
+    Attributes
+    ----------
+    identity
+        Its number.
+    heliostat, target
+        Names; no heliostat where a person asked for it.
+    at
+        Middle of the exposure, POSIX s: that of its sighting.
+    used
+        Whether its beam could be used.
+    reading
+        The findings of the software, line by line.
+    outcome, text
+        The result of its visit, and the same for people.
+    """
+
+    identity: int
+    heliostat: str
+    target: str
+    at: float
+    used: bool
+    reading: tuple[str, ...]
+    outcome: str
+    text: str
 
 
 @dataclass(frozen=True)

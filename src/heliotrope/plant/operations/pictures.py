@@ -1,0 +1,282 @@
+"""The photographs of calibrations, kept with their results: found by heliostat and time.
+
+The pictures lie in a folder as JPEG, one row each in `pictures.sqlite` beside them. They are
+thinned by age, and the folder never grows beyond its limit by more than one visit: the oldest go
+first. A disk that fails costs pictures, never a calibration.
+"""
+
+import contextlib
+import sqlite3
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
+from heliotrope.field.target import Target
+from heliotrope.files.disk import AtOnce, Disk, DiskBusyError
+from heliotrope.plant.operations.views import CalibrationEntry, CameraView, PictureRow
+from heliotrope.plant.visits.photographs import Shot, TargetCamera
+
+#: Photographs of one visit that are kept at most: of a long search the last ones.
+_MOST = 24
+#: Time between two looks for pictures that are too old, s.
+_THIN_EVERY = 600.0
+_DAY = 86_400.0
+T = TypeVar("T")
+_TABLE = """
+CREATE TABLE IF NOT EXISTS picture (
+    identity INTEGER PRIMARY KEY AUTOINCREMENT, heliostat TEXT NOT NULL, target TEXT NOT NULL,
+    at REAL NOT NULL, used INTEGER NOT NULL, reading TEXT NOT NULL, outcome TEXT NOT NULL,
+    text TEXT NOT NULL, size INTEGER NOT NULL);
+CREATE INDEX IF NOT EXISTS picture_of ON picture (heliostat, at);
+CREATE INDEX IF NOT EXISTS picture_at ON picture (at);
+"""
+#: Pictures of a heliostat's day but its first one that was used, or else its first.
+_SPARE = """
+SELECT identity FROM (
+    SELECT identity, ROW_NUMBER() OVER (
+        PARTITION BY heliostat, CAST(at / 86400 AS INTEGER) ORDER BY used DESC, at) AS place
+    FROM picture WHERE at < ?) WHERE place > 1
+"""
+
+
+@dataclass(frozen=True)
+class PictureSettings:
+    """How long pictures are kept.
+
+    Attributes
+    ----------
+    whole
+        Age up to which every picture is kept, days; after it one a day of each heliostat.
+    last
+        Age at which the last ones go, days.
+    most
+        Size of all pictures, bytes.
+
+    Raises
+    ------
+    InputError
+        An age or a size that is not above 0, or ``whole`` above ``last``.
+    """
+
+    whole: float = 30.0
+    last: float = 400.0
+    most: float = 4e9
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.whole <= self.last and self.most > 0.0):
+            raise InputError(
+                f"pictures: every one for {self.whole:g} days, the last for {self.last:g} days, "
+                f"{self.most / 1e9:g} GB; give days above 0, no more for every one than for the "
+                "last, and a size above 0"
+            )
+
+
+@dataclass(frozen=True)
+class _Taken:
+    view: CameraView
+    shot: Shot
+
+
+class Pictures:
+    """The pictures of a plant's calibrations.
+
+    Parameters
+    ----------
+    folder
+        Where they lie; it is made if it does not exist.
+    settings
+        See `PictureSettings`.
+    disk
+        Does everything that waits for the folder; None: it is done where it is asked for.
+
+    Attributes
+    ----------
+    problem
+        Why the last picture was not kept, "" if it was.
+    """
+
+    def __init__(
+        self, folder: Path, settings: PictureSettings | None = None, disk: Disk | None = None
+    ) -> None:
+        self._folder, self._settings = folder, settings or PictureSettings()
+        self._disk = disk or AtOnce()
+        self._taken: dict[str, list[_Taken]] = {}
+        self._thinned = float("-inf")
+        self.problem = ""
+
+    def close(self) -> None:
+        """Write what waits, and end."""
+        self._disk.close()
+
+    # -- a visit ---------------------------------------------------------------------------
+
+    def begin(self, heliostat: str) -> None:
+        """Begin a visit: photographs of one that ended without a result are forgotten."""
+        self._taken.pop(heliostat, None)
+
+    def take(self, heliostat: str, view: CameraView, shot: Shot) -> None:
+        """Take a photograph of a visit."""
+        taken = self._taken.setdefault(heliostat, [])
+        taken.append(_Taken(view, shot))
+        del taken[:-_MOST]
+
+    def conclude(self, entry: CalibrationEntry) -> None:
+        """Keep the photographs of a visit with its result."""
+        taken = self._taken.pop(entry.heliostat, [])
+        if taken:
+            self._put(taken, entry.heliostat, entry.outcome.name.lower(), entry.text, entry.at)
+
+    def keep(self, view: CameraView, shot: Shot, who: str) -> None:
+        """Keep a photograph that a person has asked for, under no heliostat."""
+        self._put([_Taken(view, shot)], "", "asked for", f"asked for by {who}", view.at)
+
+    def _put(
+        self, taken: list[_Taken], heliostat: str, outcome: str, text: str, now: float
+    ) -> None:
+        def done(error: Exception | None) -> None:
+            self.problem = "" if error is None else str(error)
+
+        try:
+            self._disk.do(lambda: self._write(taken, heliostat, outcome, text, now), done)
+        except DiskBusyError as error:
+            done(error)
+
+    def _write(
+        self, taken: list[_Taken], heliostat: str, outcome: str, text: str, now: float
+    ) -> None:
+        with self._table() as table:
+            for one in taken:
+                row = table.execute(
+                    "INSERT INTO picture (heliostat, target, at, used, reading, outcome, text, "
+                    "size) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                    (
+                        heliostat,
+                        one.view.target,
+                        one.view.at,
+                        not one.shot.reasons,
+                        "\n".join(one.view.reading),
+                        outcome,
+                        text,
+                        len(one.view.jpeg),
+                    ),
+                )
+                self._path(int(row.lastrowid or 0)).write_bytes(one.view.jpeg)
+            self._thin(table, now)
+
+    def _thin(self, table: sqlite3.Connection, now: float) -> None:
+        settings = self._settings
+        gone: list[int] = []
+        if now - self._thinned >= _THIN_EVERY:
+            self._thinned = now
+            old = "SELECT identity FROM picture WHERE at < ?"
+            gone += [row[0] for row in table.execute(old, (now - _DAY * settings.last,))]
+            gone += [row[0] for row in table.execute(_SPARE, (now - _DAY * settings.whole,))]
+        self._remove(table, gone)
+        (size,) = table.execute("SELECT COALESCE(SUM(size), 0) FROM picture").fetchone()
+        gone = []
+        for identity, own in table.execute("SELECT identity, size FROM picture ORDER BY at"):
+            if size <= settings.most:
+                break
+            size -= own
+            gone.append(identity)
+        self._remove(table, gone)
+
+    def _remove(self, table: sqlite3.Connection, gone: list[int]) -> None:
+        for identity in gone:
+            self._path(identity).unlink(missing_ok=True)
+            table.execute("DELETE FROM picture WHERE identity = ?", (identity,))
+
+    # -- finding ---------------------------------------------------------------------------
+
+    def find(
+        self, heliostat: str, limit: int, then: Callable[[list[PictureRow] | Exception], None]
+    ) -> None:
+        """Call ``then`` with the newest pictures of a heliostat ("": asked for by persons)."""
+
+        def work() -> list[PictureRow]:
+            with self._table() as table:
+                rows = table.execute(
+                    "SELECT identity, heliostat, target, at, used, reading, outcome, text "
+                    "FROM picture WHERE heliostat = ? ORDER BY at DESC LIMIT ?",
+                    (heliostat, limit),
+                ).fetchall()
+            return [
+                PictureRow(i, name, target, at, bool(used), tuple(said.splitlines()), outcome, text)
+                for i, name, target, at, used, said, outcome, text in rows
+            ]
+
+        self._ask(work, then)
+
+    def read(self, identity: int, then: Callable[[bytes | Exception], None]) -> None:
+        """Call ``then`` with a picture as JPEG."""
+
+        def work() -> bytes:
+            try:
+                return self._path(identity).read_bytes()
+            except FileNotFoundError:
+                raise UnknownNameError("kept photograph", str(identity), ()) from None
+
+        self._ask(work, then)
+
+    def _ask(self, work: Callable[[], T], then: Callable[[T | Exception], None]) -> None:
+        found: list[T] = []
+
+        def told(error: Exception | None) -> None:
+            then(found[0] if error is None else error)
+
+        try:
+            self._disk.do(lambda: found.append(work()), told)
+        except DiskBusyError as error:
+            then(error)
+
+    def _path(self, identity: int) -> Path:
+        return self._folder / f"{identity:08d}.jpg"
+
+    @contextlib.contextmanager
+    def _table(self) -> Iterator[sqlite3.Connection]:
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with contextlib.closing(sqlite3.connect(self._folder / "pictures.sqlite")) as table:
+                table.executescript(_TABLE)
+                with table:
+                    yield table
+        except (OSError, sqlite3.Error) as error:
+            raise PicturesError(f"pictures: {self._folder}: {error}") from None
+
+
+class PicturesError(HeliotropeError):
+    """The folder of the pictures cannot be read or written."""
+
+
+class KeptCamera:
+    """A camera of targets whose photographs are kept.
+
+    Parameters
+    ----------
+    camera
+        With the last photograph of each target as its ``view``.
+    pictures
+        Takes the photographs.
+    """
+
+    def __init__(self, camera: "ViewedCamera", pictures: Pictures) -> None:
+        self._camera, self._pictures = camera, pictures
+
+    async def photograph(self, target: Target, heliostat: str) -> Shot:
+        """Return what a new photograph shows of a heliostat's beam."""
+        before = self._camera.view(target.name).version
+        shot = await self._camera.photograph(target, heliostat)
+        view = self._camera.view(target.name)
+        if view.version != before:
+            self._pictures.take(heliostat, view, shot)
+        return shot
+
+
+class ViewedCamera(TargetCamera, Protocol):
+    """A camera of targets that shows the last photograph of each."""
+
+    def view(self, target: str) -> CameraView:
+        """Return the last photograph of a target, for people."""
+        ...
