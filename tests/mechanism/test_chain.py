@@ -37,7 +37,8 @@ def test_jacobian_is_the_derivative(kind: str) -> None:
     counts[0] = 0.0 if kind != "two_jacks" else 30000.0
     if kind == "two_jacks":
         counts[1:3] = [0.0, 0.0], [68745.0, 75308.0]  # the stops of AA39
-    names = tuple(mechanism.parameters)
+    # The ratio of a worm is searched and never fitted: its derivative counts as 0.
+    names = tuple(name for name in mechanism.parameters if not name.endswith("_worm_ratio"))
     jacobian = mechanism.jacobian(counts, names)
     for p, name in enumerate(names):
         normal, vertex = _richardson(mechanism, counts, name)

@@ -6,19 +6,28 @@ That a cycle makes a real mirror better is shown in test_plant_whole.py.
 import asyncio
 import re
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
+import numpy as np
 import pytest
 
+from heliotrope import sun
+from heliotrope.calibration.fit import fit
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.example import example_plant
+from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
+from heliotrope.geometry import angle_between, normalize, reflect
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Parameters
-from heliotrope.mechanism.board_items import items_of
+from heliotrope.mechanism.board_items import items_of, packed
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.visits.calibration_cycle import (
@@ -27,6 +36,7 @@ from heliotrope.plant.visits.calibration_cycle import (
     CycleSettings,
     Shot,
 )
+from heliotrope.plant.visits.settings import SIMPLE
 from heliotrope.plant.visits.visit import Visit
 from heliotrope.safety import alarms
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
@@ -59,17 +69,23 @@ class Eye:
         return Shot(target.intersect(pose.vertex, ray), at, 1e-4, self.reasons)
 
 
-async def follow(bench: Bench) -> None:
-    """The scripted mirror tracks the target as its nominal mechanism says."""
-    cluster = bench.cluster_of(NAME)
-    group, row = bench.design.find(NAME)
-    place = cluster.names.index(NAME)
+async def follow(bench: Bench, *, learns: bool) -> None:
+    """The scripted mirror tracks the target as its nominal mechanism, or its board, says."""
+    cluster, plant = bench.cluster_of(NAME), bench.plant
+    place, row = cluster.names.index(NAME), np.array([plant.field.place(NAME)])
+    aim, nominal = bench.design.targets[0].center, plant.beliefs.nominal(NAME)[0]
     while True:
-        found = track(
-            group.mechanism[row], bench.plant.sun_vector(), bench.design.targets[0].center
-        )
+        if learns:
+            aims = plant.aims[row] if np.isfinite(plant.aims[row]).all() else aim[None]
+            poses = plant.beams.poses(row, aims, plant.sun_vector())
+            counts = poses.chosen(poses.counts)[0]
+            armature = packed("armature", tuple(plant.beams.armature.table[row[0]]))
+            cluster.rows["armature_crc"][place] = crc32(armature)
+        else:
+            found = track(nominal, plant.sun_vector(), aim)
+            counts = found.chosen(found.counts)
         for axis, end in enumerate(("primary", "secondary")):
-            count = round(float(found.chosen(found.counts)[axis]))
+            count = round(float(counts[axis]))
             cluster.rows[end][place] = cluster.rows[f"{end}_goal"][place] = count
         await bench.wait(0.2)
 
@@ -79,13 +95,15 @@ def cycle(
     scene: Callable[[Bench, CalibrationCycle, Eye, int], Awaitable[None]],
     settings: CycleSettings | None = None,
     state: int = HOME,
+    design: Plant | None = None,
+    learns: bool = False,
     **error: float,
 ) -> Bench:
     """Play a scene with a heliostat at standby and an engineer who stays."""
     made: list[Bench] = []
 
     async def main(clock: VirtualClock) -> None:
-        bench = Bench(clock, folder)
+        bench = Bench(clock, folder, design=design)
         made.append(bench)
         bench.cluster_of(NAME).set(state, NAME)
         async with running(bench):
@@ -100,7 +118,10 @@ def cycle(
                     await bench.wait(1.0)
 
             async with asyncio.TaskGroup() as group:
-                others = [group.create_task(stay()), group.create_task(follow(bench))]
+                others = [
+                    group.create_task(stay()),
+                    group.create_task(follow(bench, learns=learns)),
+                ]
                 await scene(bench, whole, eye, token)
                 for other in others:
                     other.cancel()
@@ -451,3 +472,71 @@ def test_a_beam_that_is_beside_its_place_confirms_nothing(tmp_path: Path) -> Non
 
     given = CycleSettings(shots=1, interval=5.0, least=5)
     cycle(tmp_path, scene, given, azimuth_bias=3e-3)
+
+
+#: To the next visit, s: from June 21, 10:00 UTC, to September 21 and December 21, so that the
+#: elevation crosses half a radian, 2.6 turns of the worm.
+HOUR = 3600.0
+STEPS_OF_TIME = [2 * HOUR, 2 * HOUR, (92 * 24 - 8) * HOUR]
+STEPS_OF_TIME += [1.5 * HOUR] * 5 + [(91 * 24 - 8.5) * HOUR] + [1.5 * HOUR] * 8
+
+
+def ungeared() -> Plant:
+    """The plant without the ratios of the worms in its plant file."""
+    plant = example_plant()
+    groups = {}
+    for name, group in plant.groups.items():
+        drives = group.mechanism.drives.replace(worm_ratio=0.0)
+        groups[name] = replace(group, mechanism=replace(group.mechanism, drives=drives))
+    return replace(plant, groups=groups)
+
+
+def test_the_plant_finds_a_worm_that_the_constants_leave(tmp_path: Path) -> None:
+    """Malan's worm, 1.35 mrad at 30:1 on the elevation; the plant file does not name it."""
+    results: list[CycleResult] = []
+    left: dict[str, list[float]] = {"constants": [], "plant": []}
+
+    async def scene(bench: Bench, whole: CalibrationCycle, eye: Eye, token: int) -> None:
+        for step in STEPS_OF_TIME:
+            results.append(await whole.run(ENGINEER, token, NAME, "target"))
+            bench.clock.jump(step)
+            await bench.wait(3.0)
+            bench.cluster_of(NAME).set(HOME, NAME)
+        beliefs = bench.plant.beliefs
+        seen, nominal = beliefs.seen(NAME), beliefs.nominal(NAME)
+        assert seen is not None
+        constants = nominal.with_parameters(fit(nominal, seen.sightings, SIMPLE).parameters)
+        real = nominal.with_parameters(eye.error)
+        for day in (20, 60):
+            for hour in range(7, 17):
+                utc = bench.clock.utc() + timedelta(days=day, hours=hour)
+                light = sun.vector(utc, bench.design.site)
+                if light[2] < 0.25:
+                    continue
+                aim = bench.design.targets[0].center
+                for name, machine in (("constants", constants), ("plant", beliefs.present(NAME))):
+                    found = track(machine, light, aim)
+                    pose = real.pose(found.chosen(found.counts))
+                    ray = reflect(light, pose.normal[0])
+                    left[name].append(float(angle_between(ray, normalize(aim - pose.vertex[0]))))
+
+    made = cycle(
+        tmp_path,
+        scene,
+        CycleSettings(shots=2, interval=5.0, least=2, model="auto"),
+        design=ungeared(),
+        learns=True,
+        tilt_north=3e-3,
+        azimuth_bias=-4e-3,
+        elevation_worm_cos=1.03e-3,
+        elevation_worm_sin=0.87e-3,
+        elevation_worm_ratio=30.0,
+    )
+    assert results[0].record is not None
+    assert results[0].record.model == SIMPLE
+    last = made.plant.beliefs.record(NAME)
+    assert last is not None
+    assert last.model.endswith("worm")
+    assert float(np.sqrt(np.mean(np.square(left["constants"])))) > 1e-3
+    assert float(np.sqrt(np.mean(np.square(left["plant"])))) < 0.5e-3
+    assert last.parameters["elevation_worm_ratio"] == pytest.approx(30.0, abs=0.5)

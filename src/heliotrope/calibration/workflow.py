@@ -5,7 +5,7 @@
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +18,11 @@ from heliotrope.calibration.learn import models
 from heliotrope.calibration.learn.assessment import Assessment, assess
 from heliotrope.calibration.learn.learning import FEWEST, Learned, Runner, learn
 from heliotrope.calibration.learn.models import ScoredModel
+from heliotrope.calibration.learn.periodic import (
+    PeriodicError,
+    search_periodic_errors,
+    with_ratios,
+)
 from heliotrope.calibration.learn.sequential import predict_by_stream, predict_in_turn
 from heliotrope.calibration.report.content import CalibrationReport
 from heliotrope.calibration.sighting_table import read_sightings
@@ -125,13 +130,43 @@ def _read_folder(plant: Plant, place: Path, centroid: Literal["utis", "helios"])
     return FieldSightings(plant, group, seen, ids, (*found.left_out, *left))
 
 
+@dataclass(frozen=True)
+class ModelChoice:
+    """The simplest model that explains the sightings of a field.
+
+    Attributes
+    ----------
+    parameters
+        To be fitted.
+    mechanism
+        Nominal, (N,), with the ratios of the periodic errors that were found and are part of it.
+    scores
+        All models compared; empty if the sightings are too few.
+    periodic
+        The best periodic error of each drive whose ratio is unknown, significant or not.
+    """
+
+    parameters: tuple[str, ...]
+    mechanism: Mechanism
+    scores: tuple[ScoredModel, ...] = ()
+    periodic: tuple[PeriodicError, ...] = ()
+
+    def describe(self) -> tuple[str, ...]:
+        """Return lines for people: the comparison, and the periodic errors that were found."""
+        found = tuple(f"{error}." for error in self.periodic if error.found)
+        return (*models.describe(self.scores), *found)
+
+
 def find_model(
     mechanism: Mechanism,
     sightings: Sightings,
     used: npt.NDArray[np.bool_] | None = None,
     steps: Steps | None = None,
-) -> tuple[tuple[str, ...], tuple[ScoredModel, ...]]:
-    """Return the parameters of the simplest model that explains the sightings, and all scores.
+) -> ModelChoice:
+    """Return the simplest model that explains the sightings.
+
+    The periodic error of a drive is among the candidates where the plant gives its ratio, or
+    where `search_periodic_errors` finds one in the residuals.
 
     Parameters
     ----------
@@ -145,11 +180,13 @@ def find_model(
     steps
         Progress.
     """
-    trials = models.candidate_models(mechanism)
     keep = np.ones(len(sightings), np.bool_) if used is None else used
     counts = np.bincount(sightings.heliostat[keep], minlength=len(mechanism))
     if counts.max(initial=0) < FEWEST:
-        return next(iter(trials.values())), ()
+        return ModelChoice(next(iter(models.candidate_models(mechanism).values())), mechanism)
+    errors = search_periodic_errors(mechanism, sightings, used=keep)
+    geared = with_ratios(mechanism, errors)
+    trials = models.candidate_models(geared)
     tried: list[str] = []
 
     def next_model(name: str) -> None:
@@ -157,8 +194,10 @@ def find_model(
             steps("comparing models", len(tried), len(trials))
         tried.append(name)
 
-    scored = models.compare_models(mechanism, sightings, trials, used=keep, progress=next_model)
-    return models.choose_model(scored).parameters, scored
+    scored = models.compare_models(geared, sightings, trials, used=keep, progress=next_model)
+    chosen = models.choose_model(scored).parameters
+    part = tuple(e for e in errors if f"{e.joint}_worm_cos" in chosen)
+    return ModelChoice(chosen, with_ratios(mechanism, part), scored, errors)
 
 
 @dataclass(frozen=True)
@@ -171,19 +210,21 @@ class HeldOutEvaluation:
         Learnt from the training part alone.
     assessment
         Figures of the held-out part.
-    scores
-        The models that were compared; empty if the model was given.
+    choice
+        How the model was chosen; None if it was given.
     """
 
     learned: Learned
     assessment: Assessment
-    scores: tuple[ScoredModel, ...] = ()
+    choice: ModelChoice | None = None
 
     def document(self) -> dict[str, Any]:
         """Return the figures for JSON."""
         document = {"model": list(self.learned.model), **self.assessment.document()}
-        if self.scores:
-            document["models"] = {c.name: c.document() for c in self.scores}
+        if self.choice is not None and self.choice.scores:
+            document["models"] = {c.name: c.document() for c in self.choice.scores}
+        if self.choice is not None and self.choice.periodic:
+            document["periodic_errors"] = [e.document() for e in self.choice.periodic]
         return document
 
 
@@ -232,9 +273,10 @@ def evaluate(
         If the fraction is not between 0 and 1 or the split is unknown.
     """
     training = evaluation.split(sightings, split, fraction, seed)
-    scores: tuple[ScoredModel, ...] = ()
+    choice = None
     if model == "auto":
-        model, scores = find_model(mechanism, sightings, training, steps)
+        choice = find_model(mechanism, sightings, training, steps)
+        model, mechanism = choice.parameters, choice.mechanism
     learned = learn(
         mechanism,
         sightings,
@@ -251,7 +293,7 @@ def evaluate(
             found = predict_by_stream(learned, progress=step)
         else:
             found = predict_in_turn(learned, priors=priors, runner=runner, progress=step)
-    return HeldOutEvaluation(learned, assess(names, learned, found), scores)
+    return HeldOutEvaluation(learned, assess(names, learned, found), choice)
 
 
 def calibrate(
@@ -279,9 +321,10 @@ def calibrate(
     if fraction != 1.0:
         evaluation.check_fraction(fraction)
     names, mechanism = field.heliostats.names, field.heliostats.mechanism
-    scores: tuple[ScoredModel, ...] = ()
+    comparison: tuple[str, ...] = ()
     if model == "auto":
-        model, scores = find_model(mechanism, field.seen, None, steps)
+        choice = find_model(mechanism, field.seen, None, steps)
+        model, mechanism, comparison = choice.parameters, choice.mechanism, choice.describe()
     options: dict[str, Any] = {"priors": priors, "runner": runner}
     tested = None
     if fraction != 1.0:
@@ -300,14 +343,22 @@ def calibrate(
     return CalibrationReport(
         names,
         learned,
-        field.plant,
+        _with_mechanism(field.plant, field.group, mechanism),
         field.group,
         tested,
         field.ids,
         field.left_out,
         f"{split} split, {100 * fraction:.0f} % to learn from, seed {seed}",
-        models.describe(scores),
+        comparison,
     )
+
+
+def _with_mechanism(plant: Plant, group: str, mechanism: Mechanism) -> Plant:
+    """Return the plant with these nominal mechanisms, with the ratios found, in a group."""
+    if mechanism is plant.groups[group].mechanism:
+        return plant
+    changed = replace(plant.groups[group], mechanism=mechanism)
+    return replace(plant, groups={**plant.groups, group: changed})
 
 
 def _step(steps: Steps | None, name: str) -> Callable[[int, int], None] | None:

@@ -33,7 +33,6 @@ def evaluate(
     """
     from heliotrope.calibration import evaluation, workflow
     from heliotrope.calibration.learn.assessment import unexplained_mirrors
-    from heliotrope.calibration.learn.models import describe
 
     evaluation.check_fraction(fraction)
     priors = shared.parse_priors(prior or [])
@@ -67,7 +66,7 @@ def evaluate(
         return
     _print(document)
     _print_left_out(document)
-    for line in describe(found.scores):
+    for line in found.choice.describe() if found.choice else ():
         print(line)
 
 

@@ -187,6 +187,19 @@ _ANY_DRIVE = (
             ("Malan (6.1)",),
         ),
     ),
+    (
+        "worm_ratio",
+        slot.WORM_RATIO,
+        # Searched in the residuals, never fitted: its derivative counts as 0.
+        Parameter(
+            "",
+            "1",
+            "turns of the worm in a turn (jack: rad in 1 m of stroke), searched and not fitted",
+            "the worm turns faster than the plant file says",
+            0.5,
+            ("Malan (6.1)",),
+        ),
+    ),
 )
 
 _LINEAR_DRIVE = (

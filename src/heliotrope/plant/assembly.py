@@ -36,7 +36,7 @@ from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.safety import alarms
 
 #: A calibration that removes the errors of a quick installation.
-CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model="malan8+canting")
+CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model="auto")
 #: Age from which a silent heliostat is not waited for at the end, s.
 SILENT = 10.0
 #: Period of reading the sensors, s.

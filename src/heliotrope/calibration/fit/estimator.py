@@ -146,7 +146,8 @@ def fit(
     Raises
     ------
     InputError
-        If a sighting is of a heliostat that is not there, or a prior is not above 0.
+        If a sighting is of a heliostat that is not there, a prior is not above 0, or the model
+        names the ratio of a worm.
     UnknownNameError
         If the model or one of its parameters is unknown.
     """
@@ -226,6 +227,12 @@ def _priors(
 ) -> FloatArray:
     for name in given:
         mechanism.parameter(name)
+    for name in names:
+        if name.endswith("_worm_ratio"):
+            raise InputError(
+                f"fit: {name} is searched, not fitted; give worm_ratio in the plant file, or the "
+                "model auto"
+            )
     columns = []
     for name in names:
         value = as_float(given.get(name, mechanism.parameter(name).prior))

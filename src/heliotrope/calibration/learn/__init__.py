@@ -1,9 +1,10 @@
 """Learns a field: parameters, their drift in time, noise, steps, regimes and outliers.
 
 Begin with `learn`; `predict` and `assess` compare the result with sightings; `beliefs_of` goes on
-from it, one sighting after another (`observe`). `compare_models` and
-`choose_model` find the model. Learning on several machines (`calibration.learn.on_dask`) needs the
-optional dask.distributed and stays in its module.
+from it, one sighting after another (`observe`). `compare_models` and `choose_model` find the model
+of a field, `choose_own_model` that of one heliostat, and `search_periodic_errors` worms of unknown
+ratio. Learning on several machines (`calibration.learn.on_dask`) needs the optional
+dask.distributed and stays in its module.
 """
 
 from heliotrope.calibration.learn.assessment import Assessment, HeliostatFigures, assess
@@ -21,6 +22,8 @@ from heliotrope.calibration.learn.models import (
     choose_model,
     compare_models,
 )
+from heliotrope.calibration.learn.own_model import OwnModel, choose_own_model
+from heliotrope.calibration.learn.periodic import PeriodicError, search_periodic_errors
 from heliotrope.calibration.learn.sequential import (
     beliefs_of,
     predict_by_stream,
@@ -35,6 +38,8 @@ __all__ = [
     "HeliostatFigures",
     "Hyperparameters",
     "Learned",
+    "OwnModel",
+    "PeriodicError",
     "Posterior",
     "Prediction",
     "Process",
@@ -44,6 +49,7 @@ __all__ = [
     "beliefs_of",
     "candidate_models",
     "choose_model",
+    "choose_own_model",
     "compare_models",
     "learn",
     "left_out_errors",
@@ -52,5 +58,6 @@ __all__ = [
     "predict_by_stream",
     "predict_in_turn",
     "read_belief",
+    "search_periodic_errors",
     "update",
 ]

@@ -6,6 +6,7 @@ cross-validation in closed form: Rasmussen & Williams 2006, (5.10)-(5.12)). The 
 candidate within one standard error of the best is chosen (Breiman et al. 1984).
 """
 
+import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from heliotrope.calibration.learn import learning
 from heliotrope.calibration.sightings import Sightings
-from heliotrope.errors import InputError
+from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
@@ -67,8 +68,8 @@ def candidate_models(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
     known = mechanism.parameters
     found: dict[str, tuple[str, ...]] = {}
     for name in ("guo6", "jacks", "khalsa8", "malan8"):
-        if all(p in known for p in parameter_table.MODELS[name]):
-            found[name] = parameter_table.MODELS[name]
+        with contextlib.suppress(UnknownNameError):
+            found[name] = parameter_table.model(name, known)
     if "jacks" in found:
         found = {"jacks": found["jacks"]}
         found["jacks8"] = tuple(p for p in found["jacks"] if not p.endswith("_offset")) + tuple(

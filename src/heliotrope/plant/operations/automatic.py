@@ -127,7 +127,9 @@ class AutomaticControl:
         self._on, self._day, self._gave_way_at = settings.calibrate, True, -math.inf
         self._token, self._sun_at = 0, -math.inf
         self.truth = TrueErrors(plant, truth)
-        self.book = CalibrationBook(plant, "malan8" if cycle is None else cycle.settings.model)
+        self.book = CalibrationBook(
+            plant, "malan8" if cycle is None else cycle.settings.first_model
+        )
         self.installed = self.book.installed()
         self._keeping = Keeping(plant.field.names, plant.beliefs, records)
         self.service = Service(plant, self._keeping)

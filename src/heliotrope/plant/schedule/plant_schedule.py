@@ -39,7 +39,7 @@ def settings_for(cycle: CycleSettings, settings: Settings | None = None) -> Sett
     """Return settings of a schedule whose visits are those of a calibration cycle."""
     return replace(
         settings or Settings(),
-        model=cycle.model,
+        model=cycle.first_model,
         shots=cycle.shots,
         interval=cycle.interval,
         sigma=cycle.sigma,

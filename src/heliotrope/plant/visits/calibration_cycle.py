@@ -16,7 +16,7 @@ import numpy as np
 
 from heliotrope import sun
 from heliotrope.calibration.evaluation import beam_errors
-from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome, fit
+from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome
 from heliotrope.calibration.record import (
     CalibrationOutcome,
     HeliostatCalibration,
@@ -29,6 +29,7 @@ from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.visits.model_of_each import ModelOfEach
 from heliotrope.plant.visits.photographs import (
     Centred,
     Photographing,
@@ -88,6 +89,7 @@ class CycleResult:
 class _Fit:
     """A fit beside the present belief: beam errors, rad RMS, and why it is rejected, "" if not."""
 
+    model: str
     fitted: FieldFit
     nominal: Mechanism
     before: float
@@ -133,6 +135,7 @@ class CalibrationCycle:
             if centring is None
             else Centred(camera, self.settings, centring)
         )
+        self._models = ModelOfEach(self.settings)
         self._verification = Verification(
             camera, self.settings, centring or Centring(), self._sighting
         )
@@ -220,7 +223,7 @@ class CalibrationCycle:
                 len(here),
                 measured,
             )
-        found = self._fit(name, every)
+        found = await self._fit(name, every)
         pushed: tuple[str, ...] = ()
         if not found.problem:
             with self._plant.doubts.unverified(name):
@@ -250,14 +253,15 @@ class CalibrationCycle:
             record,
         )
 
-    def _fit(self, name: str, every: Sightings) -> _Fit:
+    async def _fit(self, name: str, every: Sightings) -> _Fit:
         beliefs = self._plant.beliefs
         nominal, present = beliefs.nominal(name), beliefs.present(name)
-        fitted = fit(nominal, every, self.settings.model)
+        model = await self._models.of(name, nominal, every)
+        fitted = model.fit(nominal, every)
         new = nominal.with_parameters(fitted.parameters)
         before, after = (root_mean_square(beam_errors(m, every).beam) for m in (present, new))
         outcome, problem = self._judge(fitted, before, after)
-        return _Fit(fitted, nominal, before, after, outcome, problem)
+        return _Fit(model.name, fitted, nominal, before, after, outcome, problem)
 
     def _judge(
         self, fitted: FieldFit, before: float, after: float
@@ -267,7 +271,9 @@ class CalibrationCycle:
         ending = FitOutcome(int(fitted.outcome[0]))
         if ending is not FitOutcome.CONVERGED:
             return CalibrationOutcome.FIT_FAILED, ending.text
-        far = np.abs(fitted.values[0]) / fitted.prior[0]
+        # The ratio of a worm is searched; its significance has been tested there.
+        fits = np.array([not name.endswith("_worm_ratio") for name in fitted.names])
+        far = fits * np.abs(fitted.values[0]) / fitted.prior[0]
         if far.max() > settings.most:
             p = int(np.argmax(far))
             return CalibrationOutcome.IMPLAUSIBLE, (
@@ -327,7 +333,7 @@ class CalibrationCycle:
             found.nominal,
             every,
             known.identities,
-            model=self.settings.model_name,
+            model=found.model,
             person=visit.person.name,
             pushed=pushed,
             version=1 if last is None else last.version + 1,

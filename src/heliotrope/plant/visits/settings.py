@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 from heliotrope.errors import InputError
 
+#: The model of a heliostat with few sightings where the model is "auto".
+SIMPLE = "malan8+canting"
+
 
 @dataclass(frozen=True)
 class CycleSettings:
@@ -16,7 +19,8 @@ class CycleSettings:
     arrival
         Longest time to reach an aim, s.
     model
-        Parameters to fit; see `calibration.fit.estimator.fit`.
+        Parameters to fit; see `calibration.fit.estimator.fit`. "auto": `SIMPLE` at first, then the
+        simplest candidate that explains the heliostat's own sightings.
     least
         Sightings that a fit needs, all visits together.
     sigma
@@ -56,9 +60,9 @@ class CycleSettings:
             )
 
     @property
-    def model_name(self) -> str:
-        """The model as one word."""
-        return self.model if isinstance(self.model, str) else "+".join(self.model)
+    def first_model(self) -> str | tuple[str, ...]:
+        """The model of a heliostat with few sightings; its parameters are in every later one."""
+        return SIMPLE if self.model == "auto" else self.model
 
 
 @dataclass(frozen=True)

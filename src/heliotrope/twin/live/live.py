@@ -64,7 +64,7 @@ _MOST_TICKS = 20
 _SMALL, _STEPS_EVERY = 320, 5
 #: Settings of a calibration that removes the errors of a quick installation, with the deviation
 #: of a beam in this world, rad.
-CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model="malan8+canting", sigma=2e-4)
+CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model="auto", sigma=2e-4)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,167 @@
+"""Chooses the model of one heliostat from its own sightings, in a fraction of a second.
+
+`models` compares candidates over a field, with drift and population: minutes of work for a report.
+A running plant knows one heliostat at a time and has to go on. Here each candidate is one robust
+fit; its score is the log probability density of each visit given the others, under its priors and
+white noise (Rasmussen & Williams 2006, (5.10)-(5.12), for blocks of two). The simplest candidate
+within one standard error of the best is chosen, as there.
+"""
+
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+
+from heliotrope.calibration.fit.estimator import FieldFit, fit
+from heliotrope.calibration.fit.residuals import linearise
+from heliotrope.calibration.learn import models, periodic
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism import parameters as parameter_table
+from heliotrope.mechanism.chain import Mechanism
+
+#: Fewest visits for a comparison.
+FEWEST = 8
+#: Only the last visits are compared: older ones cost time and tell of an older machine.
+MOST = 60
+#: Trial sizes of the noise of a visit, in units of the scale of the fit.
+NOISES = np.geomspace(0.2, 2.0, 9)
+
+
+@dataclass(frozen=True)
+class OwnModel:
+    """The model of one heliostat.
+
+    Attributes
+    ----------
+    name, parameters
+        Its name, and the parameters to fit.
+    errors
+        Periodic errors of unknown ratio that are found and part of it.
+    """
+
+    name: str
+    parameters: tuple[str, ...]
+    errors: tuple[periodic.PeriodicError, ...] = ()
+
+    def fit(self, nominal: Mechanism, sightings: Sightings) -> FieldFit:
+        """Return the fit of a heliostat (1,), its ratios among the values.
+
+        The values are deviations from ``nominal``, so that they alone make the mechanism.
+        """
+        fitted = fit(periodic.with_ratios(nominal, self.errors), sightings, self.parameters)
+        if not self.errors:
+            return fitted
+        count, ratios = len(fitted.names), np.array([e.ratio for e in self.errors])
+        sigmas = np.array([e.sigma for e in self.errors])
+        covariance = np.zeros((1, count + len(ratios), count + len(ratios)))
+        covariance[:, :count, :count] = fitted.covariance
+        covariance[:, count:, count:] = np.diag(sigmas**2)
+
+        def more(values: FloatArray, added: FloatArray) -> FloatArray:
+            return np.concatenate([values, added[None]], axis=1)
+
+        return replace(
+            fitted,
+            names=fitted.names + tuple(f"{e.joint}_worm_ratio" for e in self.errors),
+            values=more(fitted.values, ratios),
+            centre=more(fitted.centre, ratios),
+            prior=more(fitted.prior, sigmas),
+            covariance=covariance,
+        )
+
+
+def choose_own_model(nominal: Mechanism, sightings: Sightings, simple: str) -> OwnModel:
+    """Return the simplest model that explains the sightings of one heliostat.
+
+    The candidates are those of `models.candidate_models`, periodic errors of searched ratio
+    among them, each together with the parameters of the simple model. With fewer than `FEWEST`
+    visits it is the simple model.
+
+    Parameters
+    ----------
+    nominal
+        Batch shape (1,).
+    sightings
+        M of this heliostat, row 0.
+    simple
+        Name of the model that few sightings allow.
+    """
+    steps = choosing(nominal, sightings, simple)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return cast("OwnModel", end.value)
+
+
+def choosing(
+    nominal: Mechanism, sightings: Sightings, simple: str
+) -> Generator[None, None, OwnModel]:
+    """Choose as `choose_own_model`, in steps of some ten ms between which others may work."""
+    base = parameter_table.model(simple, nominal.parameters)
+    mean = periodic.visit_means(nominal, sightings)
+    if len(mean) < FEWEST:
+        return OwnModel(simple, base)
+    recent = np.flatnonzero(mean[-MOST:].any(axis=0))
+    sightings = sightings.take(recent)
+    visits = min(len(mean), MOST)
+    errors = tuple(e for e in periodic.search_periodic_errors(nominal, sightings) if e.found)
+    yield
+    mechanism = periodic.with_ratios(nominal, errors)
+    trials = {simple: base}
+    for name, names in models.candidate_models(mechanism).items():
+        more = base + tuple(n for n in names if n not in base)
+        if more not in trials.values() and 2 * visits >= len(more) + periodic.FREEDOM:
+            trials[name] = more
+    yield
+    widest = fit(mechanism, sightings, max(trials.values(), key=len))
+    sightings = sightings.take(np.flatnonzero(widest.lengths < periodic.OUTLIER))
+    mean = periodic.visit_means(nominal, sightings)
+    scores = {}
+    for name, names in trials.items():
+        scores[name] = _left_out(mechanism, sightings, names, mean)
+        yield
+    best = models.choose_model(_scored(trials, scores))
+    used = tuple(e for e in errors if f"{e.joint}_worm_cos" in best.parameters)
+    return OwnModel(best.name, best.parameters, used)
+
+
+def _scored(
+    trials: Mapping[str, tuple[str, ...]], scores: Mapping[str, FloatArray]
+) -> tuple[models.ScoredModel, ...]:
+    best = max(scores, key=lambda name: float(scores[name].mean()))
+    found = []
+    for name, names in trials.items():
+        gap = scores[best] - scores[name]
+        error = float(gap.std() / np.sqrt(len(gap)))
+        mean = float(scores[name].mean())
+        found.append(models.ScoredModel(name, names, mean, float(gap.mean()), error, float("nan")))
+    return tuple(found)
+
+
+def _left_out(
+    mechanism: Mechanism, s: Sightings, names: tuple[str, ...], mean: FloatArray
+) -> FloatArray:
+    """Log density of each visit given the others, (V,), with the noise that makes it largest."""
+    fitted = fit(mechanism, s, names)
+    moved = mechanism.with_parameters(fitted.parameters)
+    line = linearise(moved[s.heliostat], s, names)
+    slope = np.einsum("vm,map->vap", mean, line.jacobian).reshape(2 * len(mean), -1)
+    residual = (mean @ line.residual).ravel() - slope @ (fitted.values[0] - fitted.centre[0])
+    spread = slope * fitted.prior[0]
+    values, vectors = np.linalg.eigh(spread @ spread.T)
+    turned = vectors.T @ residual
+    blocks = vectors.reshape(len(mean), 2, -1)
+    best = np.full(len(mean), -np.inf)
+    for noise in NOISES * max(float(fitted.scale[0]), 1e-9):
+        weight = 1.0 / (np.maximum(values, 0.0) + noise**2)
+        inverse = (blocks * weight) @ np.swapaxes(blocks, 1, 2)
+        alpha = blocks @ (weight * turned)
+        square = np.einsum("va,vab,vb->v", alpha, np.linalg.inv(inverse), alpha)
+        log = -0.5 * square + 0.5 * np.linalg.slogdet(inverse)[1] - np.log(2.0 * np.pi)
+        log = np.maximum(log, models.WORST)
+        if log.mean() > best.mean():
+            best = log
+    return best

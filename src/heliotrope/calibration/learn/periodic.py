@@ -1,0 +1,376 @@
+r"""Searches the residuals for a periodic error of a drive whose ratio is unknown.
+
+A worm or gear that runs out of true adds A cos(r x − δ) to the angle of its joint: x is the ideal
+angle of the drive (the stroke of a jack) and r the unknown ratio (Malan, thesis, (6.1), knew his:
+30). For each trial r a cosine and a sine are added to the model, linearised about a robust fit, and
+the constants float with them within their priors: the residuals are whitened by the noise and the
+priors together. Of one heliostat with ν degrees of freedom left by the constants and normal noise
+of unknown size, the share q of the squares that remains has the probability
+
+$$ P(q) = q^{(ν-2)/2} $$
+
+to be as small by chance (Baluev 2008, MNRAS 385, 1279, (6) and table 1, here with the constants of
+a mirror in place of his polynomial). −ln P is exponential, so its sum over N heliostats
+follows a gamma law of shape N. The probability of the highest peak by chance is at most the number
+of trials times that of one (Bonferroni). Residuals of real machines are not white: the height of a
+peak counts in units of the spectrum that remains around it.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize_scalar
+from scipy.special import gammaincc, gammaincinv
+
+from heliotrope.calibration.fit.estimator import fit
+from heliotrope.calibration.fit.residuals import linearise
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.geometry import TAU, FloatArray, as_float
+from heliotrope.mechanism import parameters as parameter_table
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import SLOTS, Drive
+from heliotrope.mechanism.kernels import slots as slot
+
+#: A peak that chance makes more often than this is not taken.
+LEVEL = 1e-3
+#: A second peak this close in −ln P leaves the ratio open: it is one hundredth as probable.
+RIVAL = float(np.log(100.0))
+#: Fewest degrees of freedom that the constants must leave.
+FREEDOM = 10
+#: The constants float within this many times their priors.
+WIDER = 3.0
+#: Fewest turns of the worm within the range of a drive; slower waves look like constants.
+FEWEST_TURNS = 1.5
+#: The peak is compared with the spectrum this many of its widths around, once it is taken out.
+AROUND = 5.0
+#: Trials in the width of a peak.
+OVERSAMPLING = 6
+#: Photographs this close together, s, are one visit: their errors are alike.
+VISIT = 300.0
+#: Residuals of the robust fit longer than this, in units of its scale, do not count.
+OUTLIER = 5.0
+
+
+@dataclass(frozen=True)
+class PeriodicError:
+    """A periodic error of one drive, the same ratio on N heliostats.
+
+    Attributes
+    ----------
+    joint
+        Name of the joint that the drive turns.
+    ratio
+        Periods in a turn of the joint (rotary), or radians in a metre of stroke (jack).
+    sigma
+        Standard deviation of the ratio.
+    amplitude, phase
+        A and δ of each heliostat, rad, (N,); NaN where a heliostat has too few sightings.
+    false_alarm
+        Probability that chance makes so high a peak anywhere in the search, at most.
+    clear
+        Whether no other ratio explains the sightings nearly as well.
+    """
+
+    joint: str
+    ratio: float
+    sigma: float
+    amplitude: FloatArray
+    phase: FloatArray
+    false_alarm: float
+    clear: bool
+
+    @property
+    def found(self) -> bool:
+        """Whether the error is significant and its ratio unambiguous."""
+        return self.clear and self.false_alarm < LEVEL
+
+    def document(self) -> dict[str, Any]:
+        """Return the error for JSON."""
+        return {
+            "joint": self.joint,
+            "ratio": self.ratio,
+            "ratio_sigma": self.sigma,
+            "amplitude_mrad": [float(1e3 * a) if np.isfinite(a) else None for a in self.amplitude],
+            "phase_deg": [float(np.degrees(p)) if np.isfinite(p) else None for p in self.phase],
+            "false_alarm": self.false_alarm,
+            "found": self.found,
+        }
+
+    def __str__(self) -> str:
+        """Return one line for people."""
+        size = 1e3 * float(np.nanmedian(self.amplitude))
+        seen = int(np.isfinite(self.amplitude).sum())
+        phase = f", phase {np.degrees(self.phase[0]):.0f}°" if len(self.phase) == 1 else ""
+        return (
+            f"Periodic error on {self.joint}: ratio {self.ratio:.2f} ± {self.sigma:.2f}, amplitude "
+            f"{size:.2f} mrad{phase}, from {seen} heliostat{'s' if seen != 1 else ''}, "
+            f"false-alarm probability {max(self.false_alarm, 1e-99):.0e}"
+        )
+
+
+@dataclass(frozen=True)
+class _Member:
+    """One heliostat: V visits, whitened residuals, and what the constants can explain.
+
+    Attributes
+    ----------
+    row
+        Row of the heliostat.
+    x, lever
+        Argument of the worm (V, D) and derivative of the residual by the angle, (V, 2, D).
+    whiten
+        Makes the noise white and takes the part of the constants out, (2 V, 2 V).
+    rest
+        Whitened residuals, (2 V,).
+    freedom
+        Degrees of freedom that the constants leave.
+    """
+
+    row: int
+    x: FloatArray
+    lever: FloatArray
+    whiten: FloatArray
+    rest: FloatArray
+    freedom: int
+
+    def waves(self, drive: int, ratios: FloatArray) -> FloatArray:
+        """Whitened cosine and sine of trial ratios (T,), (T, 2 V, 2)."""
+        u = ratios[:, None] * self.x[:, drive]
+        both = np.stack([np.cos(u), np.sin(u)], axis=-1)
+        raw = (both[:, :, None, :] * self.lever[:, :, drive, None]).reshape(len(u), -1, 2)
+        return np.asarray(self.whiten @ raw)
+
+    def solved(self, drive: int, ratios: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Coefficients of cosine and sine (T, 2), and −ln P of the trials, (T,)."""
+        waves = self.waves(drive, ratios)
+        normal = np.swapaxes(waves, 1, 2) @ waves
+        right = np.swapaxes(waves, 1, 2) @ self.rest
+        # A wave that the constants can imitate has next to no columns left; it gains nothing.
+        size = np.trace(normal, axis1=1, axis2=2)
+        normal = normal + (1e-9 * size + 1e-30)[:, None, None] * np.eye(2)
+        found = np.linalg.solve(normal, right[..., None])[..., 0]
+        share = np.sum(found * right, axis=-1) / float(self.rest @ self.rest)
+        share = np.clip(share, 0.0, 1.0 - 1e-12)
+        return found, -0.5 * (self.freedom - 2) * np.log1p(-share)
+
+
+def search_periodic_errors(
+    mechanism: Mechanism, sightings: Sightings, *, used: npt.ArrayLike | None = None
+) -> tuple[PeriodicError, ...]:
+    """Return the best periodic error of each drive without a known ratio, the clearest first.
+
+    Each has its probability of chance; take those that are `PeriodicError.found`. The search is
+    over `FEWEST_TURNS` to as many turns within the range of the drive as there are visits: more
+    turns than visits cannot be told from fewer. Empty if the sightings are too few.
+
+    Parameters
+    ----------
+    mechanism
+        Nominal, (N,), all of one kind.
+    sightings
+        M of these heliostats.
+    used
+        Mask of the sightings to learn from, (M,).
+    """
+    keep = np.ones(len(sightings), np.bool_) if used is None else np.asarray(used, np.bool_)
+    members = _members(mechanism, sightings.take(np.flatnonzero(keep)))
+    open_drives = [
+        k
+        for k, ratio in enumerate(_ratios(mechanism))
+        if not (ratio != 0.0).any() and f"{_joint(mechanism, k)}_worm_cos" in mechanism.parameters
+    ]
+    found: list[PeriodicError] = []
+    while members and open_drives:
+        best = _strongest(mechanism, members, open_drives)
+        if best is None:
+            break
+        drive, error = best
+        found.append(error)
+        open_drives.remove(drive)
+        if not error.found:
+            break
+        members = [_without(m, drive, error.ratio) for m in members]
+        members = [m for m in members if m.freedom >= FREEDOM]
+    return tuple(found)
+
+
+def with_ratios(mechanism: Mechanism, errors: tuple[PeriodicError, ...]) -> Mechanism:
+    """Return the mechanism with the ratios of the errors that are found."""
+    for error in errors:
+        if error.found:
+            mechanism = mechanism.with_parameters({f"{error.joint}_worm_ratio": error.ratio})
+    return mechanism
+
+
+def _joint(mechanism: Mechanism, drive: int) -> str:
+    return mechanism.joints[mechanism.driven[drive]]
+
+
+def _ratios(mechanism: Mechanism) -> FloatArray:
+    """Known ratios, (D, N)."""
+    table = mechanism.drives.table[..., SLOTS["worm_ratio"]]
+    return np.asarray(table.reshape(-1, len(mechanism.driven)).T)
+
+
+def arguments(drives: Drive, counts: FloatArray) -> FloatArray:
+    """Return x of each drive at its counts: ideal angle in rad, or stroke of a jack in m."""
+    t = drives.table
+    moved = t[..., slot.RATE] * counts
+    return np.asarray(np.where(t[..., slot.KIND] == slot.LINEAR, moved, t[..., slot.ZERO] + moved))
+
+
+def _members(mechanism: Mechanism, s: Sightings) -> list[_Member]:
+    """Heliostats with enough visits after a robust fit of all constants."""
+    names = parameter_table.model("full", mechanism.parameters)
+    fitted = fit(mechanism, s, names)
+    s = s.take(np.flatnonzero(np.isfinite(fitted.lengths) & (fitted.lengths < OUTLIER)))
+    biases = tuple(f"{_joint(mechanism, k)}_bias" for k in range(len(mechanism.driven)))
+    moved = mechanism.with_parameters(fitted.parameters)
+    line = linearise(moved[s.heliostat], s, names + biases)
+    x = arguments(Drive(mechanism.drives.table[s.heliostat]), s.counts)
+    members = []
+    for row in range(len(mechanism)):
+        mine = np.flatnonzero(s.heliostat == row)
+        if 2 * len(mine) < len(names) + FREEDOM:
+            continue
+        mean = _visit_means(s.time[mine], x[mine])
+        slope = np.einsum("vm,map->vap", mean, line.jacobian[mine])
+        constants, lever = np.split(slope, [len(names)], axis=2)
+        member = _Member(
+            row,
+            mean @ x[mine],
+            lever,
+            *_whitened(
+                (mean @ line.residual[mine]).ravel(),
+                constants.reshape(-1, len(names)),
+                fitted.values[row] - fitted.centre[row],
+                WIDER * fitted.prior[row] / max(float(fitted.scale[row]), 1e-9),
+            ),
+        )
+        if member.freedom >= FREEDOM and float(member.rest @ member.rest) > 0.0:
+            members.append(member)
+    return members
+
+
+def _whitened(
+    residual: FloatArray, constants: FloatArray, at: FloatArray, prior: FloatArray
+) -> tuple[FloatArray, FloatArray, int]:
+    """Whitening matrix, whitened residuals at the centre of the priors, degrees of freedom."""
+    moved = constants * prior
+    spread = np.eye(len(residual)) + moved @ moved.T
+    whiten = np.linalg.inv(np.linalg.cholesky(spread))
+    return whiten, whiten @ (residual - constants @ at), len(residual) - constants.shape[1]
+
+
+def visit_means(mechanism: Mechanism, s: Sightings) -> FloatArray:
+    """Return the matrix that averages M sightings of heliostat row 0 over visits, (V, M)."""
+    return _visit_means(s.time, arguments(Drive(mechanism.drives.table[s.heliostat]), s.counts))
+
+
+def _visit_means(time: FloatArray, x: FloatArray) -> FloatArray:
+    """Matrix that averages m sightings over V visits, (V, m): close in time and in angle."""
+    if not len(time):
+        return np.zeros((0, 0))
+    order = np.argsort(time, kind="stable")
+    # The fastest trial turns once for each visit: an eighth of that turn is one place.
+    near = np.ptp(x, axis=0) / (8.0 * len(x))
+    visit = np.empty(len(time), np.intp)
+    first, number = int(order[0]), -1
+    for k in order:
+        if number < 0 or not (
+            time[k] - time[first] < VISIT and (np.abs(x[k] - x[first]) <= near).all()
+        ):
+            first, number = int(k), number + 1
+        visit[k] = number
+    found = np.zeros((number + 1, len(time)))
+    found[visit, np.arange(len(time))] = 1.0
+    return as_float(found / found.sum(axis=1, keepdims=True))
+
+
+def _without(member: _Member, drive: int, ratio: float) -> _Member:
+    """Let a wave that was found float with the constants."""
+    basis, _ = np.linalg.qr(member.waves(drive, np.array([ratio]))[0])
+    out = np.eye(len(basis)) - basis @ basis.T
+    return replace(
+        member, whiten=out @ member.whiten, rest=out @ member.rest, freedom=member.freedom - 2
+    )
+
+
+def _trials(members: list[_Member], drive: int) -> tuple[FloatArray, float]:
+    """Trial ratios (T,) of a drive, and the width of a peak."""
+    span = float(max(np.ptp(m.x[:, drive]) for m in members))
+    visits = float(np.median([len(m.x) for m in members]))
+    if span <= 0.0 or visits < FEWEST_TURNS:
+        return np.empty(0), 1.0
+    width = TAU / span
+    step = width / OVERSAMPLING
+    return np.arange(FEWEST_TURNS * width, visits * width, step), width
+
+
+def _strongest(
+    mechanism: Mechanism, members: list[_Member], drives: list[int]
+) -> tuple[int, PeriodicError] | None:
+    """The drive with the highest peak, and its error."""
+    spectra: dict[int, tuple[FloatArray, FloatArray, float]] = {}
+    for drive in drives:
+        ratios, width = _trials(members, drive)
+        if len(ratios):
+            power = np.sum([m.solved(drive, ratios)[1] for m in members], axis=0)
+            spectra[drive] = ratios, power, width
+    if not spectra:
+        return None
+    drive = max(spectra, key=lambda k: float(spectra[k][1].max()))
+    ratios, power, width = spectra[drive]
+    top = float(ratios[np.argmax(power)])
+    step = width / OVERSAMPLING
+
+    def lost(ratio: float) -> float:
+        return -sum(float(m.solved(drive, np.array([ratio]))[1][0]) for m in members)
+
+    refined = minimize_scalar(lost, bounds=(top - step, top + step), method="bounded")
+    ratio, height = float(refined.x), -float(refined.fun)
+    # −ln P is a log likelihood ratio but for terms of order 1/ν: its curvature gives the variance.
+    far = 0.25 * step
+    curvature = (lost(ratio + far) - 2.0 * lost(ratio) + lost(ratio - far)) / far**2
+    others = [
+        spectrum[1][np.abs(spectrum[0] - ratio) > spectrum[2]] if k == drive else spectrum[1]
+        for k, spectrum in spectra.items()
+    ]
+    rival = max((float(o.max()) for o in others if len(o)), default=0.0)
+    trials = sum(len(spectrum[0]) for spectrum in spectra.values())
+    # Power that grows up to the first trial belongs to slower waves: no peak.
+    clear = height - rival > RIVAL and ratio > ratios[0] + 0.5 * step
+    height /= _colour(members, drive, ratio, ratios, width)
+    chance = min(1.0, trials * float(gammaincc(len(members), height)))
+    amplitude, phase = np.full((2, len(mechanism)), np.nan)
+    for m in members:
+        # The residual is model minus measurement: the error has the opposite sign.
+        cosine, sine = -m.solved(drive, np.array([ratio]))[0][0]
+        amplitude[m.row], phase[m.row] = np.hypot(cosine, sine), np.arctan2(sine, cosine)
+    return drive, PeriodicError(
+        _joint(mechanism, drive),
+        ratio,
+        float(1.0 / np.sqrt(max(curvature, 1e-12))),
+        amplitude,
+        phase,
+        chance,
+        clear,
+    )
+
+
+def _colour(
+    members: list[_Member], drive: int, ratio: float, ratios: FloatArray, width: float
+) -> float:
+    """How much higher than white noise the spectrum around a peak is without it, at least 1.
+
+    What the constants of a real machine leave is no white noise but a hill of slow waves: at
+    Jülich twice as high as noise up to some ten turns.
+    """
+    rest = [_without(m, drive, ratio) for m in members if m.freedom > FREEDOM]
+    near = ratios[np.abs(ratios - ratio) < AROUND * width]
+    if not rest:
+        return 1.0
+    power = np.sum([m.solved(drive, near)[1] for m in rest], axis=0)
+    return max(1.0, float(np.median(power)) / float(gammaincinv(len(rest), 0.5)))
