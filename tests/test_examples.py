@@ -80,6 +80,21 @@ def test_malan_intercept() -> None:
             assert found["ray trace"] - found["disks, (3.3)"] > 0.09
 
 
+def test_malan_chapter_6(tmp_path: Path) -> None:
+    """His mirror of table 6.1: below 1 mrad on three later days, and his worm of 30:1 found."""
+    found = _load("malan_chapter6").main(tmp_path)
+    assert found["before"] > 20.0
+    for day in ("6", "7", "8"):
+        # His 1.94 mrad of the beam on 6 September are 0.97 mrad of the normal.
+        assert 0.5 < 0.5 * found[f"constants {day}"] < 1.0
+    for day in ("7", "8"):
+        assert found[f"worm {day}"] < 0.3
+    assert found["ratio"] == pytest.approx(30.0, abs=1.5)
+    assert found["amplitude"] == pytest.approx(1.35, abs=0.2)
+    assert found["false alarm"] < 1e-6
+    assert imread(tmp_path / "malan-chapter-6.png")[..., :3].std() > 0.02
+
+
 def test_malan_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = imread(_load("malan_noise").main(tmp_path))
     assert picture[..., :3].std() > 0.02
