@@ -8,6 +8,7 @@ import sys
 import tty
 
 from heliotrope.lcu import wire
+from heliotrope.lcu.sender import Sender
 
 _STEPS = (120_000, -45_000, 120_010, -45_000)
 _STATUS = (5, 0x11, 0, 86_400, 950, 24_100, 31, 0x1234ABCD, 3)
@@ -15,7 +16,7 @@ _STATUS = (5, 0x11, 0, 86_400, 950, 24_100, 31, 0x1234ABCD, 3)
 
 def answer(frame: wire.Frame) -> bytes:
     """Return the answer of the local controller that a question addresses."""
-    sender = wire.Sender(frame.to, 1)
+    sender = Sender(frame.to, 1)
     sender.count = frame.sequence - 1
     if frame.name == "QUERY_STEPS":
         return sender.frame(0, "STEPS", *_STEPS)

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from benchmarks._run import ROOT, BenchmarkError, Result, Row
 from heliotrope.cluster.serial_bus import BusSettings, SerialBus
 from heliotrope.lcu import wire
+from heliotrope.lcu.sender import Sender
 from heliotrope.links.clock import SystemClock
 from heliotrope.links.link import running
 
@@ -70,7 +71,7 @@ async def _poll(
     port: str, settings: BusSettings, cycles: int
 ) -> dict[str, list[tuple[float, int]]]:
     """Return time (s) and bytes of each transaction, by question."""
-    clock, sender = SystemClock(), wire.Sender(0, 1)
+    clock, sender = SystemClock(), Sender(0, 1)
     bus = SerialBus(port, clock, settings)
     found: dict[str, list[tuple[float, int]]] = {question: [] for question in QUESTIONS}
     async with running(bus):

@@ -5,6 +5,8 @@ MicroPython does none of this itself:
 - integer constants replace their names, in other modules too;
 - the names of the states, which only the state table uses there, become letters;
 - code that no board calls is left out (the sender's side of the wire, texts for people);
+- private attributes get short names, which classes share: each name of its own costs memory, and
+  their table grows at once by 4 kB;
 - docstrings, annotations and code for the type checker are left out, and the texts of ValueError,
   which a board answers with "value out of range".
 
@@ -111,18 +113,55 @@ def letters(module: Module) -> None:
     names.value = ast.copy_location(ast.Constant("".join(short.values())), names.value)
 
 
+def shared_names(modules: Iterable[Module]) -> dict[str, str]:
+    """Return a short name for each private attribute that is no method.
+
+    Two attributes may share one if no class uses both on itself.
+    """
+    methods, together = set(), []
+    for module in modules:
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.FunctionDef):
+                methods.add(node.name)
+            elif isinstance(node, ast.ClassDef):
+                assert all(ast.unparse(base) in ("Protocol", "Base") for base in node.bases)
+                together.append(
+                    {
+                        inner.attr
+                        for inner in ast.walk(node)
+                        if isinstance(inner, ast.Attribute) and ast.unparse(inner.value) == "self"
+                    }
+                )
+    private = {
+        name
+        for names in together
+        for name in names
+        if name.startswith("_") and not name.startswith("__") and name not in methods
+    }
+    found: dict[str, str] = {}
+    for name in sorted(private):
+        taken = {
+            found[other] for names in together if name in names for other in names & set(found)
+        }
+        found[name] = next(short for i in range(len(private)) if (short := f"_{i}") not in taken)
+    return found
+
+
 class _Inliner(ast.NodeTransformer):
     """Replaces names of constants by their values; drops docstrings and annotations."""
 
-    def __init__(self, module: Module, numbers: dict[Key, int]) -> None:
-        self.module, self.numbers = module, numbers
+    def __init__(self, module: Module, numbers: dict[Key, int], short: dict[str, str]) -> None:
+        self.module, self.numbers, self.short = module, numbers, short
 
     def visit_Name(self, node: ast.Name) -> ast.expr:
         return self._replaced(node)
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
         replaced = self._replaced(node)
-        return replaced if replaced is not node else self.generic_visit(node)
+        if replaced is not node:
+            return replaced
+        node.attr = self.short.get(node.attr, node.attr)
+        return self.generic_visit(node)
 
     def _replaced(self, node: "ast.Name | ast.Attribute") -> ast.expr:
         meant = self.module.meant(node)
@@ -140,7 +179,7 @@ class _Inliner(ast.NodeTransformer):
     def visit_AnnAssign(self, node: ast.AnnAssign) -> "ast.Assign | None":
         if node.value is None:
             return None
-        plain = ast.Assign([node.target], self.visit(node.value))
+        plain = ast.Assign([self.visit(node.target)], self.visit(node.value))
         return ast.fix_missing_locations(ast.copy_location(plain, node))
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
@@ -284,8 +323,9 @@ def shrink(roots: Iterable[Key], folder: Path = CORE, package: str = PACKAGE) ->
     numbers = constants(modules, loaded)
     if "states" in modules:
         letters(modules["states"])
+    short = shared_names(modules.values())
     for module in modules.values():
-        _Inliner(module, numbers).visit(module.tree)
+        _Inliner(module, numbers, short).visit(module.tree)
     reach = _Reach(modules, roots)
     needed = {name for name, _ in reach.keys}
     return {"__init__": ""} | {

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from heliotrope.lcu import journal, messages, wire
+from heliotrope.lcu import journal, messages, signing, wire
 
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "wire.md"
 WHO = {
@@ -20,7 +20,7 @@ GROUPS = {
 }  # fmt: skip
 FRAME = f"""# The wire, version 2
 
-This page is made from the tables in the program (`scripts/wire_table.py`); the code is `heliotrope.lcu.wire`, `messages` and `journal`.
+This page is made from the tables in the program (`scripts/wire_table.py`); the code is `heliotrope.lcu.wire`, `signing`, `messages` and `journal`.
 
 ## A frame
 
@@ -28,13 +28,13 @@ Numbers are little-endian. COBS removes every zero from the frame, and a zero en
 
 | bytes | content |
 |---|---|
-| 1 | version, {wire.VERSION} |
+| 1 | version, {wire.VERSION}; {wire.SIGNED} if the frame is signed |
 | 2 | to: address, 0xFFFF all, 0 the cluster controller |
 | 2 | from |
 | 2 | sequence |
 | 1 | type |
 | 0 to {wire.PAYLOAD_LIMIT} | payload |
-| {wire.MAC_SIZE} | MAC, in messages that store: HMAC-SHA256 over all before it, truncated |
+| {wire.MAC_SIZE} | MAC, in messages that store: HMAC-SHA256 over all before it, truncated; in signed frames: their tag |
 | 4 | CRC-32 over all before it (that of zlib) |
 
 A frame whose stuffing, checksum, version or length is wrong changes nothing but a counter. A type that is not in the table is passed on with its bytes. A frame whose payload holds a number that is not finite does not act.
@@ -47,7 +47,22 @@ A frame whose stuffing, checksum, version or length is wrong changes nothing but
 - A command of the authority must carry the token of the last SESSION (0 is nobody's) and must not have expired: its last second is at most {wire.HORIZON_S} s ahead by the receiver's clock. Without a clock every command is void.
 - A message that stores must also carry the MAC of the receiver's key, and an edition greater than the last one stored. The edition is kept in the journal with what was set, so a recorded message is void for ever.
 
-All except the MAC prevents accidents; it does not stop a person at the bus.
+All except the MAC prevents accidents; it does not stop a person at the bus. Signed frames do.
+
+## Signed frames
+
+A bus may have a key of {signing.KEY_SIZE} bytes, which its cluster and its local controllers share ([why so](../decisions/0027-signed-frames.md)). The cluster then signs everything of the classes *cluster* and *the authority*: version {wire.SIGNED}, and a tag of {wire.MAC_SIZE} bytes before the CRC, HMAC-SHA256 under the key of the bus over a freshness value of 8 bytes, header and payload, truncated. The freshness value is not sent:
+
+| frame | freshness value |
+|---|---|
+| SESSION to one address | the number that its local controller has drawn and told in BUS; good once |
+| SESSION to all | epoch and 32-bit count, from its payload and header |
+| any other | epoch of the last SESSION, and 32-bit count, which the receiver completes from the sequence |
+
+- A local controller with a key refuses every unsigned frame of these classes ("wrong key"). Messages that store carry the MAC of its own key, as ever, and are not signed. DEFOCUS, STOW and questions are accepted from anyone; a question no longer counts as a sign of life of the cluster.
+- After a start, or {wire.SILENCE_MS // 1000} s without a good frame, it shows SESSION_WANTED in its STATUS. The cluster asks QUERY_BUS and sends a SESSION to its address, signed over its number. After a start it accepts no other.
+- SET_BUS_KEY carries the key added, modulo 2, to HMAC-SHA256 of the edition under the key of the local controller. It needs no session, and is taken while the mirror stands (stowed, locked, idle, defocused, in FAULT, unconfigured).
+- A local controller without a key of the bus takes signed frames and ignores their tags. Firmware that does not know them counts them as of another version and does not act.
 """  # noqa: E501
 
 

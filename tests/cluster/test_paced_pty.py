@@ -12,6 +12,7 @@ import pytest
 
 from heliotrope.cluster.serial_bus import BusSettings, SerialBus
 from heliotrope.lcu import wire
+from heliotrope.lcu.sender import Sender
 from heliotrope.links.clock import SystemClock
 from heliotrope.links.link import running
 from support.paced_pty import PacedBus
@@ -108,12 +109,12 @@ def test_a_transaction_over_it_takes_the_time_of_its_bytes(bus: PacedBus) -> Non
         while not over.is_set():
             if select.select([node.end], [], [], 0.02)[0]:
                 for frame in reader.feed(os.read(node.end, 4096)):
-                    sender = wire.Sender(frame.to, 1)
+                    sender = Sender(frame.to, 1)
                     sender.count = frame.sequence - 1
                     node.say(sender.frame(0, "STEPS", frame.to, 2, 3, 4))
 
     async def main() -> None:
-        clock, sender = SystemClock(), wire.Sender(0, 1)
+        clock, sender = SystemClock(), Sender(0, 1)
         master = SerialBus(bus.paths[0], clock, BusSettings())
         async with asyncio.timeout(PATIENCE), running(master):
             await master.opened()

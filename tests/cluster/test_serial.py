@@ -14,6 +14,7 @@ import pytest
 from heliotrope.cluster.serial_bus import BusSettings, SerialBus, ends_in_zero
 from heliotrope.errors import InputError
 from heliotrope.lcu import messages, wire
+from heliotrope.lcu.sender import Sender
 from heliotrope.links.clock import SystemClock
 from heliotrope.links.link import LinkClosedError, LinkError, SendOutcome, running
 
@@ -106,7 +107,7 @@ class Controller:
 
 
 def status(frame: wire.Frame) -> bytes:
-    sender = wire.Sender(frame.to, 1)
+    sender = Sender(frame.to, 1)
     sender.count = frame.sequence - 1
     return sender.frame(0, "STEPS", frame.to, -2, 3, -4)
 
@@ -120,7 +121,7 @@ def test_a_frame_of_the_wire_is_answered(line: Line) -> None:
     line.pause = 0.01  # it comes in two pieces
 
     async def main() -> None:
-        bus, sender = bus_of(line), wire.Sender(0, 1)
+        bus, sender = bus_of(line), Sender(0, 1)
         async with running(bus):
             await bus.opened()
             for address in (5, 6, 7):

@@ -8,6 +8,7 @@ import pytest
 
 from heliotrope.lcu import controller, messages, names, states, wire
 from heliotrope.lcu.journal import Journal
+from heliotrope.lcu.sender import Sender
 from support.board_chips import DRIVE, Partition, World, board_path
 from support.lcu_machines import (
     ADDRESS,
@@ -55,7 +56,7 @@ class Plant:
                 book.store(items)
                 book.zero(*STOW)
             self.loop: Any = load("loop").Loop(made)
-        self.sender = wire.Sender(0, START_S, sha256)
+        self.sender = Sender(0, START_S, sha256)
         self.uart = made.port.uart
         self.edition = 0
         self.said = 0.0

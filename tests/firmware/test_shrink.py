@@ -1,5 +1,6 @@
 """The small build: numbers in place, nothing that is called left out, the rest gone."""
 
+import ast
 import runpy
 import sys
 from pathlib import Path
@@ -109,6 +110,24 @@ def test_of_the_core_only_what_a_board_runs_is_left() -> None:
     assert "MESSAGES" not in small["messages"]
     for motion in ("hold", "defocus", "stow_directly", "approach", "search", "diagnose"):
         assert f"def {motion}(" in small["motion"]  # called by name from the state table
+
+
+def test_private_attributes_share_short_names_and_no_class_confuses_two() -> None:
+    modules = [
+        tool["Module"](path.stem, path.read_text(encoding="utf-8"))
+        for path in sorted(tool["CORE"].glob("*.py"))
+    ]
+    short = tool["shared_names"](modules)
+    assert len(set(short.values())) < 0.5 * len(short)
+    for module in modules:
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.ClassDef):
+                own = {
+                    inner.attr
+                    for inner in ast.walk(node)
+                    if isinstance(inner, ast.Attribute) and ast.unparse(inner.value) == "self"
+                }
+                assert len({short.get(name, name) for name in own}) == len(own), node.name
 
 
 def test_the_states_become_letters_and_every_transition_stays() -> None:

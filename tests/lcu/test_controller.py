@@ -21,6 +21,7 @@ from heliotrope.lcu.messages import (
     REFUSED_SWITCH,
 )
 from heliotrope.lcu.motion import HOLD, MOVE
+from heliotrope.lcu.sender import Sender
 from support.lcu_machines import (
     ADDRESS,
     AIM,
@@ -370,7 +371,7 @@ def brought_to(state: str) -> Bench:
 @pytest.mark.parametrize("name", ["DEFOCUS", "STOW"])
 def test_defocus_and_stow_work_in_every_state_from_anyone(state: str, name: str) -> None:
     bench = brought_to(state)
-    stranger = wire.Sender(99, 1)
+    stranger = Sender(99, 1)
     bench.answers.clear()
     bench.deliver(stranger.frame(ADDRESS, name))
     assert bench.answers == [(0x0D, (1, messages.NUMBER_OF[name], DONE))]
@@ -403,7 +404,7 @@ def test_commands_need_the_authority_and_to_be_fresh() -> None:
     assert bench.order("TRACK", token=TOKEN + 1) == REFUSED_AUTHORITY
     assert bench.order("TRACK", life_s=-1) == EXPIRED
     assert bench.order("TRACK", life_s=9000) == EXPIRED
-    stranger = wire.Sender(99, 1)
+    stranger = Sender(99, 1)
     life = bench.gps_ms() // 1000 + 5
     bench.deliver(stranger.frame(ADDRESS, "TRACK", TOKEN, life))
     assert bench.answers[-1][1][-1] == REFUSED_AUTHORITY

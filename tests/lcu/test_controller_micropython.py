@@ -25,9 +25,9 @@ LIMIT = 64 * 1024
 class Recorder(Bench):
     """A bench that writes down what comes to the board."""
 
-    def __init__(self) -> None:
+    def __init__(self, bus_key: bytes = b"") -> None:
         self.events: list[tuple[int, str | None]] = []
-        super().__init__()
+        super().__init__(bus_key=bus_key)
 
     def deliver(self, data: bytes) -> None:
         self.events.append((self.now, data.hex()))
@@ -38,9 +38,9 @@ class Recorder(Bench):
         self.events.append((self.now, None))
 
 
-@pytest.fixture(scope="module")
-def given() -> dict[str, Any]:
-    bench = Recorder()
+def recorded(bus_key: bytes = b"") -> dict[str, Any]:
+    """A day in short."""
+    bench = Recorder(bus_key)
     items = {name: data.hex() for name, data in bench.journal.items.items()}
     bench.to_tracking()
     bench.order("SEARCH", 5e-3, 0.01)
@@ -53,6 +53,11 @@ def given() -> dict[str, Any]:
     bench.run(60, until="STOWING")
     assert bench.state == "STOWING"
     return {"items": items, "counts": list(STOW), "start": 0, "events": bench.events}
+
+
+@pytest.fixture(scope="module")
+def given() -> dict[str, Any]:
+    return recorded()
 
 
 def script(events: int, measured: bool) -> str:
@@ -140,8 +145,23 @@ def firmware() -> Any:
 
 @pytest.fixture(scope="module")
 def day(given: dict[str, Any], firmware: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return folder_of(tmp_path_factory.mktemp("day"), given, firmware)
+
+
+@pytest.fixture(scope="module")
+def signed_given() -> dict[str, Any]:
+    return recorded(b"sixteen bytes !!")
+
+
+@pytest.fixture(scope="module")
+def signed_day(
+    signed_given: dict[str, Any], firmware: Any, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    return folder_of(tmp_path_factory.mktemp("signed"), signed_given, firmware)
+
+
+def folder_of(folder: Path, given: dict[str, Any], firmware: Any) -> Path:
     """A folder with the day as text, the code as the firmware is built, and its image."""
-    folder = tmp_path_factory.mktemp("day")
     code = folder / "code"
     for name, text in shrink([("node", "Node"), ("journal", "Journal")]).items():
         firmware["compiled"](text, f"lcu/{name}.py", code / "lcu" / f"{name}.mpy")
@@ -161,9 +181,26 @@ def day(given: dict[str, Any], firmware: Any, tmp_path_factory: pytest.TempPathF
 def test_the_day_is_the_same_in_a_heap_that_does_not_grow(
     in_place: bool, heap: str, day: Path, given: dict[str, Any], tmp_path: Path
 ) -> None:
+    replays(in_place, heap, day, given, tmp_path)
+
+
+@pytest.mark.parametrize(("in_place", "heap"), [(True, "64k"), (False, "80k")])
+def test_the_day_of_a_signed_bus_needs_little_more(
+    in_place: bool,
+    heap: str,
+    signed_day: Path,
+    signed_given: dict[str, Any],
+    tmp_path: Path,
+) -> None:
+    replays(in_place, heap, signed_day, signed_given, tmp_path)
+
+
+def replays(in_place: bool, heap: str, day: Path, given: dict[str, Any], tmp_path: Path) -> None:
+    """Replay a day in a heap that does not grow: it must be the same as here."""
     here = Replay(given, tmp_path / "flash")
     for event in given["events"]:
         here.event(*event)
+    assert here.result()[0] == states.STOWING
     script = "rom_on_micropython.py"
     if not in_place:
         script = "ram.py"

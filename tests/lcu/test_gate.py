@@ -6,6 +6,7 @@ import random
 import pytest
 
 from heliotrope.lcu import messages, ticks, wire
+from heliotrope.lcu.sender import Sender
 
 KEY = b"a key of sixteen"
 NOW = 1_480_000_000
@@ -20,7 +21,7 @@ class Ends:
     """A sender and a local controller at address 5, and what passes between them."""
 
     def __init__(self, edition: int = 0) -> None:
-        self.sender = wire.Sender(0, 100, sha256)
+        self.sender = Sender(0, 100, sha256)
         self.gate = wire.Gate(sha256, KEY, edition)
         self.tick = 0
 
@@ -155,7 +156,7 @@ def test_a_restarted_sender_is_heard_at_once_and_its_old_frames_are_not(ends: En
     old = ends.sender.session(TOKEN)
     assert ends.judge(old) == messages.DONE
     late_session, late = ends.sender.session(TOKEN), ends.track()
-    ends.sender = wire.Sender(0, 160, sha256)
+    ends.sender = Sender(0, 160, sha256)
     assert ends.judge(ends.sender.session(TOKEN + 1)) == messages.DONE
     assert ends.judge(ends.track(TOKEN + 1)) == messages.DONE
     assert ends.judge(late_session) == messages.DUPLICATE
@@ -164,9 +165,9 @@ def test_a_restarted_sender_is_heard_at_once_and_its_old_frames_are_not(ends: En
 
 def test_epochs_wrap(ends: Ends) -> None:
     ends.gate.replay.epoch = 2**32 - 1
-    ends.sender = wire.Sender(0, 3, sha256)
+    ends.sender = Sender(0, 3, sha256)
     assert ends.judge(ends.sender.session(TOKEN)) == messages.DONE
-    ends.sender = wire.Sender(0, 2**32 - 1, sha256)
+    ends.sender = Sender(0, 2**32 - 1, sha256)
     assert ends.judge(ends.sender.session(TOKEN)) == messages.DUPLICATE
 
 
@@ -227,7 +228,7 @@ class Network(Ends):
 
     def restart(self) -> None:
         self.token += 1
-        self.sender = wire.Sender(0, self.sender.epoch + self.rng.randint(1, 99), sha256)
+        self.sender = Sender(0, self.sender.epoch + self.rng.randint(1, 99), sha256)
 
     def send(self, step: int) -> None:
         if step % 7 == 0:

@@ -4,7 +4,8 @@ import random
 
 import pytest
 
-from heliotrope.lcu import controller, messages, motion, names, states, ticks, wire
+from heliotrope.lcu import controller, messages, motion, names, states, ticks
+from heliotrope.lcu.sender import Sender
 from support.lcu_machines import (
     ADDRESS,
     AIM,
@@ -153,7 +154,7 @@ class Fuzz:
         way = rand.randrange(6)
         before = self.moved_by()
         if way == 0:
-            data = wire.Sender(99, 2**31).frame(ADDRESS, name, TOKEN, life, *numbers)
+            data = Sender(99, 2**31).frame(ADDRESS, name, TOKEN, life, *numbers)
         elif way == 1:
             data = bench.sender.frame(ADDRESS, name, TOKEN ^ rand.randint(1, 99), life, *numbers)
         elif way == 2:
@@ -175,7 +176,7 @@ class Fuzz:
         """Invariant 4: taken from anyone, in any state; afterwards no beam stays."""
         name = self.random.choice(["DEFOCUS", "STOW"])
         self.bench.answers.clear()
-        self.bench.deliver(wire.Sender(self.random.randint(1, 99), 0).frame(ADDRESS, name))
+        self.bench.deliver(Sender(self.random.randint(1, 99), 0).frame(ADDRESS, name))
         assert self.bench.answers[-1][1][-1] == messages.DONE
         assert self.bench.state not in ("TRACKING", "SEARCHING", "APPROACHING", "IDLE")
         if name == "STOW" and self.bench.state not in ("UNCONFIGURED", "LOCKED", "FAULT"):

@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 import pytest
 
 from heliotrope.lcu import journal, messages, ticks, wire
+from heliotrope.lcu.sender import Sender
 from lcu.nor import Nor
 from lcu.test_wire import KEY, example, frame_of, sha256, traffic
 
@@ -111,7 +112,7 @@ def vectors() -> dict[str, Any]:
     stream = bytearray(b"".join(raw for _, raw in traffic(150, 62)))
     for _ in range(60):
         stream[rng.randrange(len(stream))] = rng.randrange(256)
-    other = struct.pack("<BHHHB", 3, 1, 0, 1, 0x20)
+    other = struct.pack("<BHHHB", 4, 1, 0, 1, 0x20)
     stream += b"\0" + wire.stuff(other + struct.pack("<I", zlib.crc32(other))) + b"\0"
     stream += bytes([7]) * 300 + b"\0"
     return {
@@ -157,7 +158,7 @@ def refusals() -> list[list[Any]]:
 
 
 def gate_traffic() -> list[list[Any]]:
-    sender = wire.Sender(0, 100, sha256)
+    sender = Sender(0, 100, sha256)
     out, tick = [], (1 << 30) - 5000
     for turn in range(60):
         tick = ticks.add(tick, 700 if turn % 20 else 15_000)

@@ -275,7 +275,8 @@ def sealed(body: bytes) -> bytes:
         (sealed(b"\2\5\0\0\0\1\0\x20x"), "length"),  # DEFOCUS has no payload
         (sealed(b"\2\5\0\0\0\1\0\x58" + bytes(7)), "length"),  # KEY, shorter than a MAC
         (b"x" * 250 + b"\0", "length"),
-        (sealed(b"\3\5\0\0\0\1\0\x20"), "version"),
+        (sealed(b"\4\5\0\0\0\1\0\x20"), "version"),
+        (sealed(b"\3\5\0\0\0\1\0\x11" + bytes(29)), "length"),  # signed, one byte short
     ],
 )
 def test_what_is_refused_is_counted(raw: bytes, count: str) -> None:

@@ -8,6 +8,7 @@ import importlib.util
 import math
 import struct
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -15,9 +16,11 @@ import numpy as np
 
 import heliotrope.lcu
 from heliotrope.geometry import direction
-from heliotrope.lcu import controller, drives, messages, states, ticks, wire
+from heliotrope.lcu import controller, drives, messages, signing, states, ticks, wire
 from heliotrope.lcu.journal import CODES_OF, Journal
+from heliotrope.lcu.names import FLAGS
 from heliotrope.lcu.node import Node
+from heliotrope.lcu.sender import Sender
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive, rotary
@@ -197,17 +200,28 @@ class Motors:
         return undone
 
 
+def signer(key: bytes) -> Callable[[bytes], bytes]:
+    """What signs frames with a key of the bus."""
+    return functools.partial(signing.tag, sha256, signing.pads_of(key))
+
+
+#: The flag of a board that wants a session signed over its own number.
+WANTED = 1 << FLAGS.index("SESSION_WANTED")
+
+
 class Bench:
     """A board with its node, a cluster controller that talks to it, and a sun.
 
-    Invariants are checked after every call; ``made`` counts the steps of the motors.
+    Invariants are checked after every call; ``made`` counts the steps of the motors. With a key
+    of the bus both ends have it.
     """
 
-    def __init__(self, flash: Flash | None = None, tick: int = 0) -> None:
+    def __init__(self, flash: Flash | None = None, tick: int = 0, bus_key: bytes = b"") -> None:
+        self.bus_key = bus_key
         self.machine = heliostat()
         self.motors, self.slip = Motors(), [0, 0]
         self.now, self.true_ms = tick, 0
-        self.sender = wire.Sender(0, START_S, sha256)
+        self.sender = self.new_sender(START_S)
         self.sends_sun = self.sends_time = True
         self.clock_error_ms = 0
         self.tilt: tuple[float, float] | None = None
@@ -224,6 +238,8 @@ class Bench:
             journal = Journal(flash)
             journal.load()
             journal.store(items_of_heliostat(self.machine))
+            if self.bus_key:
+                journal.store({"bus_keys": self.bus_key + signing.NO_KEY})
             journal.zero(*STOW)
         self.flash = flash
         before = self.made
@@ -321,6 +337,26 @@ class Bench:
 
     # The cluster controller.
 
+    def new_sender(self, epoch: int) -> Sender:
+        """A cluster that has just started."""
+        sender = Sender(0, epoch, sha256)
+        sender.sign = signer(self.bus_key) if self.bus_key else None
+        return sender
+
+    def ask_bus(self) -> tuple[bytes, int, int]:
+        """The number that the board has drawn, and the fingerprints of its keys."""
+        self.answers.clear()
+        self.send("QUERY_BUS")
+        ((number, (high, low, newest, old)),) = self.answers
+        assert number == 0x0F
+        return struct.pack("<II", high, low), newest, old  # type: ignore[return-value]
+
+    def meet(self) -> None:
+        """Begin a signed session with a board that wants one."""
+        if self.bus_key and self.controller.flags() & WANTED:
+            number, _, _ = self.ask_bus()
+            self.deliver(self.sender.session_to(ADDRESS, TOKEN, number, signer(self.bus_key)))
+
     def gps_ms(self) -> int:
         return START_S * 1000 + self.true_ms + self.clock_error_ms
 
@@ -358,6 +394,7 @@ class Bench:
         if self.sends_time:
             seconds, ms = divmod(self.gps_ms(), 1000)
             self.deliver(self.sender.session(TOKEN))
+            self.meet()
             self.send("TIME", seconds // 604_800, seconds % 604_800 * 1000 + ms, 1, to=0xFFFF)
         if self.sends_sun:
             self.last_sun_ms = self.true_ms

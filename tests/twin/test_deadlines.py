@@ -12,6 +12,7 @@ from hypothesis.stateful import (
 )
 
 from heliotrope.lcu import states, ticks, wire
+from heliotrope.lcu.sender import Sender
 from heliotrope.links.clock import gps_seconds
 from heliotrope.sun import broadcast_values
 from heliotrope.twin.boards.board import Board
@@ -58,7 +59,7 @@ class Deadlines(RuleBasedStateMachine):
         self.jumped = False
         self.board = Board(outfits(1, seed=2)[0], ticks=TickCounter(start))
         self.board.power_on(0.0)
-        self.sender = wire.Sender(0, int(gps_seconds(START)), sha256)
+        self.sender = Sender(0, int(gps_seconds(START)), sha256)
         for name, seconds in (("AIM", 1), ("APPROACH", 60), ("TRACK", 4)):
             self.second()
             self.command(name)

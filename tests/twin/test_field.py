@@ -8,6 +8,7 @@ import pytest
 from heliotrope.errors import InputError
 from heliotrope.lcu import states, wire
 from heliotrope.lcu.controller import STUCK_PRIMARY
+from heliotrope.lcu.sender import Sender
 from heliotrope.links.clock import gps_seconds
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
@@ -57,7 +58,7 @@ class Both:
             assert np.allclose(board.outfit.mechanism.armature.table, row, atol=1e-12)
         self.ticks = self.compared = 0
         self.play = 0.0
-        self.sender = wire.Sender(0, int(gps_seconds(START)), sha256)
+        self.sender = Sender(0, int(gps_seconds(START)), sha256)
         for board in self.boards:
             board.power_on(0.0)
 

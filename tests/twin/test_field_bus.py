@@ -9,6 +9,7 @@ from heliotrope.cluster.config import ClusterConfig, Member
 from heliotrope.cluster.controller import Cluster
 from heliotrope.errors import InputError
 from heliotrope.lcu import states, wire
+from heliotrope.lcu.sender import Sender
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.in_process import memory_pair
 from heliotrope.links.link import LinkClosedError, SendOutcome, running
@@ -88,7 +89,7 @@ def test_a_cluster_leads_rows_of_a_field() -> None:
 def test_answers_are_frames_of_the_wire() -> None:
     field = a_field()
     bus = FieldBus(field, range(4))
-    sender = wire.Sender(0, 1)
+    sender = Sender(0, 1)
 
     async def main(clock: VirtualClock) -> list[bytes]:
         del clock
@@ -136,7 +137,7 @@ def test_frames_are_stuffed_as_the_wire_does() -> None:
 def test_status_tells_faults_at_once_and_without_supply_nothing() -> None:
     field = a_field()
     bus = FieldBus(field, range(4))
-    sender = wire.Sender(0, 1)
+    sender = Sender(0, 1)
     every = np.arange(4)
 
     async def main(clock: VirtualClock) -> None:

@@ -19,6 +19,7 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import bisector, normalize, reflect
 from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.lcu import journal, messages, states, wire
+from heliotrope.lcu.sender import Sender
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import LinkClosedError, SendOutcome
 from heliotrope.mechanism.board_items import items_of
@@ -154,7 +155,7 @@ def _field(count: int = 3) -> Field:
 
 
 def _ask(field: Field, name: str, *values: object, key: bytes = b"", to: int = 2) -> wire.Frame:
-    sender = wire.Sender(wire.CLUSTER_ADDRESS, 1, lambda d: hashlib.sha256(d).digest())
+    sender = Sender(wire.CLUSTER_ADDRESS, 1, lambda d: hashlib.sha256(d).digest())
     bus = FieldBus(field, range(3))
     data = asyncio.run(bus.transact(sender.frame(to, name, *values, key=key), 0.1))
     (frame,) = wire.Reader().feed(data)

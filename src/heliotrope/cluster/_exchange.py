@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from heliotrope.cluster._nodes import ClusterNode, Question, answer_in
 from heliotrope.lcu import messages, wire
+from heliotrope.lcu.sender import Sender
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Bus, SendOutcome
 
@@ -51,7 +52,7 @@ class Exchange:
     """
 
     def __init__(self, bus: Bus, clock: Clock, answer: float, stored_answer: float) -> None:
-        self.sender = wire.Sender(wire.CLUSTER_ADDRESS, 0, sha256)
+        self.sender = Sender(wire.CLUSTER_ADDRESS, 0, sha256)
         self._bus, self._clock = bus, clock
         self._answer, self._stored_answer = answer, stored_answer
         self._hurry = False
@@ -67,7 +68,7 @@ class Exchange:
 
     def begin_epoch(self, epoch: int) -> None:
         """Restart the numbering of frames, in an epoch above all earlier ones (see `lcu.wire`)."""
-        self.sender = wire.Sender(wire.CLUSTER_ADDRESS, epoch, sha256)
+        self.sender = Sender(wire.CLUSTER_ADDRESS, epoch, sha256)
 
     def token(self, token: int) -> int:
         """Return the wire's token for a token of the command authority.

@@ -415,7 +415,9 @@ class Controller:
         elif values is None:
             result = messages.BAD_VALUE
         else:
-            self._heard.start(now_ms, self.config.silence_ms)
+            if who != messages.ASK or self.gate is None or not self.gate.keyed():
+                # Anybody can ask a question: where frames are signed, it holds no mirror in place.
+                self._heard.start(now_ms, self.config.silence_ms)
             if who == messages.ASK:
                 if reply or name == "DISCOVER":  # if all answered at once, none was understood
                     self._answer(name, values)
@@ -452,7 +454,7 @@ class Controller:
         elif name == "DISCOVER" and values[0] <= self.config.serial <= values[1]:
             answer = 0x0C, (self.config.serial, self.config.firmware, self.config.address)
         elif name == "QUERY_STORED" and 1 <= values[0] <= len(ITEMS):
-            if ITEMS[values[0] - 1][0] != "key_id":
+            if ITEMS[values[0] - 1][0] not in ("key_id", "bus_keys"):
                 self.out.append((RECALL, values[0]))
             return
         if answer:
@@ -496,6 +498,8 @@ class Controller:
                 motion.kind == DIAGNOSE,
                 self.sun.leaps,
                 self._present >> SWITCH,
+                self.gate is not None and self.gate.keyed(),
+                self.gate is not None and self.gate.waits(),
             )
         ):
             bits |= bool(value) << i

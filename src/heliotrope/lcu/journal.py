@@ -70,6 +70,7 @@ ITEMS = (
     ("standby", "fff"),
     ("way", "BB12f"),
     ("stepping", "HHB"),
+    ("bus_keys", "8I"),
 )
 SIZE_OF = {row[0]: struct.calcsize("<" + row[1]) for row in ITEMS}
 CODES_OF = {row[0]: "<" + row[1] for row in ITEMS}
@@ -89,10 +90,12 @@ TARGETS = {
     "ZERO": (),
 }
 
-MAGIC, LAYOUT = 0x48, 3
+MAGIC, LAYOUT = 0x48, 2
 SLOT_HEAD = "<BBHI"  # magic, layout, which items are there, counter
 SLOT_HEAD_SIZE = 8
 SLOT_SIZE = SLOT_HEAD_SIZE + sum(SIZE_OF.values()) + 4
+#: Sizes of records of firmware without the last item, or the last two; they are read too.
+FORMER_SIZES = (SLOT_SIZE - 32, SLOT_SIZE - 37)
 
 #: counter, primary, secondary, aim, state, flags, boots; then the CRC.
 RING_RECORD = "<Iii12sBBH"
@@ -140,6 +143,10 @@ def items_of(name: str, payload: bytes) -> "dict[str, bytes]":
     elif targets:
         items[targets[0]] = rest
     return items
+
+
+def _whole(data: bytes) -> bool:
+    return bool(struct.unpack("<I", data[-4:])[0] == crc32(data[:-4]))
 
 
 def _newer(counter: int, than: int) -> bool:
@@ -217,7 +224,9 @@ class Journal:
         for slot in (0, 1):
             data = self._storage.read(slot * self._storage.block_size, SLOT_SIZE)
             magic, layout, mask, counter = struct.unpack(SLOT_HEAD, data[:SLOT_HEAD_SIZE])
-            whole = struct.unpack("<I", data[-4:])[0] == crc32(data[:-4])
+            whole = _whole(data)
+            for size in FORMER_SIZES:
+                whole = whole or _whole(data[:size])
             if not whole or magic != MAGIC or layout != LAYOUT:
                 self.damaged = self.damaged or data != b"\xff" * SLOT_SIZE
             elif not found or _newer(counter, self._slot_counter):

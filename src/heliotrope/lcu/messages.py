@@ -57,6 +57,11 @@ MESSAGES = (
     (0x0C, "HERE", NODE, "IHH", "serial firmware address"),
     # Result of a command.
     (0x0D, "ACK", NODE, "HBB", "sequence_of type_of result"),
+    # Ask for what a signed session needs.
+    (0x0E, "QUERY_BUS", ASK, "", ""),
+    # A number drawn by the local controller, over which the next SESSION to its address must be
+    # signed, and the fingerprints of the keys of the bus that it has (0: none).
+    (0x0F, "BUS", NODE, "IIII", "number_high number_low key old_key"),
     # GPS time.
     (0x10, "TIME", CLUSTER, "HIB", "week time_of_week_ms quality"),
     # Unit vector to the sun at a GPS second, in 2^-30, and its rate, in 2^-28 a second (the
@@ -127,6 +132,9 @@ MESSAGES = (
     # rough from the start, motions that follow the sun end on full steps, and the drivers are off
     # between them.
     (0x5A, "SET_STEPPING", KEY, "HHB", "microsteps_primary microsteps_secondary rests"),
+    # Key of the bus, encrypted under the key of the local controller; it needs no session and no
+    # clock. The present key again ends the one before; zeros end both.
+    (0x5B, "SET_BUS_KEY", KEY, "4I", "key"),
 )  # fmt: skip
 
 NUMBER_OF = {row[1]: row[0] for row in MESSAGES}

@@ -65,7 +65,8 @@ def transitions() -> list[tuple[int, str, int, str]]:
 #: Bits of the flags.
 FLAGS = ("MOVING", "SUN_FRESH", "CLOCK_SET", "CONFIGURED", "READY", "AT_STOW", "AIM_LOCKED",
          "ROUGH", "COUNTS_DOUBTFUL", "COUNTS_UNKNOWN", "UNREACHABLE", "CUT", "CLOCK_JUMPED",
-         "TICKS_JUMPED", "FAULT_PRESENT", "DIAGNOSING", "SUN_JUMPED", "LOCAL_SWITCH")  # fmt: skip
+         "TICKS_JUMPED", "FAULT_PRESENT", "DIAGNOSING", "SUN_JUMPED", "LOCAL_SWITCH",
+         "BUS_KEY", "SESSION_WANTED")  # fmt: skip
 
 #: Faults.
 FAULTS = ("none", "primary drive stuck", "secondary drive stuck", "limit switch", "supply",

@@ -39,6 +39,7 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
     from typing import Any, Protocol
 
     from .journal import Storage
+    from .signing import BusKeys
 
     class StepTimer(Protocol):
         """Hardware that makes the steps of two axes."""
@@ -57,6 +58,7 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
 #: Slots in which HERE answers DISCOVER: their number, and the length of each (ms).
 HERE_SLOTS, HERE_SLOT_MS = 32, 20
 ACK, HERE, STORED = 0x0D, 0x0C, 0x0A
+QUERY_BUS, BUS, SET_BUS_KEY = 0x0E, 0x0F, 0x5B
 #: An action of the node itself, in addition to those of the controller.
 HEALTHY = -1
 
@@ -103,7 +105,7 @@ class Node:
 
     Attributes
     ----------
-    controller, journal, reader, timer
+    controller, gate, journal, reader, timer
         The parts.
     trouble
         The error of flash that has failed, "" if it has not.
@@ -130,8 +132,8 @@ class Node:
         config.serial, config.firmware = serial, firmware
         good = config.load(journal.load()) and not journal.damaged
         edition = journal.numbers("edition")
-        gate = wire.Gate(sha256, key, edition[0] if edition else 0)
-        self.controller = Controller(config, now_ms, gate, sensor)
+        self.gate = wire.Gate(sha256, key, edition[0] if edition else 0)
+        self.controller = Controller(config, now_ms, self.gate, sensor)
         self._address = self._sequence = 0  # of the answers to the frame in hand
         self._here: tuple[Any, ...] = ()  # a HERE that waits for its slot
         self._slot, self._well = ticks.Deadline(), ticks.Deadline()
@@ -142,6 +144,11 @@ class Node:
             journal.boot()
         except OSError as error:
             self.trouble, doubt = str(error), -1
+        self._sha256, self._key = sha256, key
+        stored = journal.items.get("bus_keys")
+        self._bus: BusKeys | None = None
+        if stored is not None and sha256 is not None:
+            self._begin_bus(sha256).take(stored)
         self._chance = (serial * 0x9E3779B1 + journal.boots) & 0xFFFFFFFF or 1
         actions = self.controller.boot(
             journal.primary,
@@ -168,6 +175,10 @@ class Node:
         own = self.controller
         # A new address takes effect after the answer.
         self._address, self._sequence = own.config.address, frame.sequence
+        if frame.number in (QUERY_BUS, SET_BUS_KEY):
+            if frame.to == self._address:
+                self._on_bus_key(frame, now_ms)
+            return
         self._obey(own.on_frame(frame, now_ms), now_ms)
 
     def on_tick(self, now_ms: int) -> None:
@@ -219,6 +230,41 @@ class Node:
         """Set the supply voltage and temperature reported in STATUS."""
         self.controller.supply_mv = min(max(supply_mv, 0), 0xFFFF)
         self.controller.temperature_degc = min(max(temperature_degc, -128), 127)
+
+    # The key of the bus.
+
+    def _begin_bus(self, sha256: "Callable[[bytes], bytes]") -> "BusKeys":
+        """Return the keys of the bus, whose module is loaded when it is first needed."""
+        from .signing import BusKeys
+
+        if self._bus is None:
+            serial = self.controller.config.serial
+            self._bus = self.gate.bus = BusKeys(sha256, self._key, serial, self.journal.boots)
+        return self._bus
+
+    def _on_bus_key(self, frame: "wire.Frame", now_ms: int) -> None:
+        own = self.controller
+        values = frame.values()
+        if values is None or not self._key or self._sha256 is None:
+            return
+        bus = self._begin_bus(self._sha256)
+        if frame.number == QUERY_BUS:
+            self._send(self._address, self._sequence, BUS, bus.told())
+            return
+        result = self.gate.judge_key(frame, values[2])
+        if result == messages.DONE and own.state not in controller.HARMLESS:
+            result = messages.REFUSED_STATE
+        if result == messages.DONE:
+            keyed, stored = bus.keyed, bus.with_key(frame.payload)
+            items = {"bus_keys": stored, "edition": frame.payload[8:12]}
+            if self._keep(controller.STORE, (controller.STORE, items)):
+                self.gate.edition = values[2]
+                bus.take(stored)
+                if not keyed:
+                    self.gate.replay.epoch = -1  # anybody may have set it
+            else:
+                result = messages.NOT_STORED
+        self._answer(ACK, (self._sequence, frame.number, result), True, now_ms)
 
     # The controller's actions.
 

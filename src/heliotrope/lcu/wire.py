@@ -39,9 +39,22 @@ from . import messages, ticks
 TYPE_CHECKING = False
 if TYPE_CHECKING:  # for the type checker only: a microcontroller has neither module
     from collections.abc import Callable
-    from typing import Any
+    from typing import Any, Protocol
+
+    class Signatures(Protocol):
+        """Keys of the bus; see ``signing``."""
+
+        @property
+        def keyed(self) -> bool:
+            """Whether there is a key."""
+
+        def judge(self, frame: "Frame", values: "tuple[Any, ...]", replay: "Replay") -> int:
+            """Return DONE if a frame is signed as it must be."""
+
 
 VERSION = 2
+#: Version of a frame that is signed with the key of the bus; see ``signing``.
+SIGNED = 3
 CLUSTER_ADDRESS = 0
 SESSION = 0x12
 BROADCAST = 0xFFFF
@@ -220,11 +233,20 @@ class Frame:
         Bytes with the head, without the MAC. A known message has a length that fits; in an
         unknown one it is everything before the CRC.
     mac
-        8 bytes in messages of class KEY, else b"".
+        8 bytes in messages of class KEY and in signed frames, else b"".
+    version
+        ``VERSION`` or ``SIGNED``.
     """
 
     def __init__(
-        self, to: int, sender: int, sequence: int, number: int, payload: bytes, mac: bytes = b""
+        self,
+        to: int,
+        sender: int,
+        sequence: int,
+        number: int,
+        payload: bytes,
+        mac: bytes = b"",
+        version: int = VERSION,
     ) -> None:
         self.to = to
         self.sender = sender
@@ -232,6 +254,7 @@ class Frame:
         self.number = number
         self.payload = payload
         self.mac = mac
+        self.version = version
         self._values: tuple[Any, ...] | None = None
 
     @property
@@ -248,7 +271,7 @@ class Frame:
     def body(self) -> bytes:
         """Return the bytes that the MAC covers: header and payload."""
         return (
-            struct.pack(HEADER, VERSION, self.to, self.sender, self.sequence, self.number)
+            struct.pack(HEADER, self.version, self.to, self.sender, self.sequence, self.number)
             + self.payload
         )
 
@@ -280,16 +303,20 @@ def authenticate(sha256: "Callable[[bytes], bytes]", key: bytes, frame: Frame) -
 
 
 def verify(sha256: "Callable[[bytes], bytes]", key: bytes, frame: Frame) -> bool:
-    """Return whether a frame carries the MAC of ``key``; never with an empty key.
+    """Return whether a frame carries the MAC of ``key``; never with an empty key."""
+    return bool(key) and same(authenticate(sha256, key, frame), frame.mac)
+
+
+def same(expected: bytes, mac: bytes) -> bool:
+    """Return whether two MACs are the same.
 
     All bytes are compared whatever the first ones say, so timing reveals nothing.
     """
-    if not key or len(frame.mac) != MAC_SIZE:
+    if len(mac) != MAC_SIZE:
         return False
-    expected = authenticate(sha256, key, frame)
     differ = 0
     for place in range(MAC_SIZE):
-        differ |= expected[place] ^ frame.mac[place]
+        differ |= expected[place] ^ mac[place]
     return differ == 0
 
 
@@ -310,7 +337,8 @@ def encode(frame: Frame) -> bytes:
             raise ValueError(f"{what}: {title}: {refusal}")
     if frame.name and not fits(frame.number, len(frame.payload)):
         raise ValueError(f"{what}: a payload of {len(frame.payload)} bytes does not fit it")
-    needs = MAC_SIZE if messages.who_of(frame.number) == messages.KEY else 0
+    keyed = frame.version == SIGNED or messages.who_of(frame.number) == messages.KEY
+    needs = MAC_SIZE if keyed else 0
     if len(frame.mac) != needs:
         raise ValueError(f"{what}: a MAC of {len(frame.mac)} bytes, {needs} needed")
     if len(frame.payload) + needs > PAYLOAD_LIMIT:
@@ -391,12 +419,12 @@ class Reader:
             self.crc += 1
             return None
         version, to, sender, sequence, number = struct.unpack(HEADER, data[:HEADER_SIZE])
-        if version != VERSION:
+        if version not in (VERSION, SIGNED):
             self.version += 1
             return None
         mac = b""
         who = messages.who_of(number)
-        if who == messages.KEY:
+        if who == messages.KEY or version == SIGNED:
             end = max(HEADER_SIZE, end - MAC_SIZE)
             mac = data[end:-CRC_SIZE]
         payload = data[HEADER_SIZE:end]
@@ -404,7 +432,7 @@ class Reader:
             self.length += 1
             return None
         self.good += 1
-        return Frame(to, sender, sequence, number, payload, mac)
+        return Frame(to, sender, sequence, number, payload, mac, version)
 
 
 def expired(expires_s: int, now_s: "int | None") -> bool:
@@ -465,6 +493,10 @@ class Replay:
         """Return whether the sender was heard recently; see ``ticks.Deadline`` for how often."""
         return not self._heard.over(tick)
 
+    def silent(self) -> bool:
+        """Return whether the sender was silent too long at the last look."""
+        return self._heard.left == 0
+
     def fresh(self, sequence: int, tick: int) -> bool:
         """Return whether any other frame is new, and if it is, record it."""
         if not self.look(tick):
@@ -493,6 +525,8 @@ class Gate:
 
     Attributes
     ----------
+    bus
+        Keys of the bus; None: there are none, and no frame needs to be signed.
     token
         Of the one authority, 0 if nobody has it.
     edition
@@ -507,6 +541,7 @@ class Gate:
         sender: int = CLUSTER_ADDRESS,
     ) -> None:
         self.replay = Replay()
+        self.bus: Signatures | None = None
         self.token = 0
         self.edition = edition
         self._sha256 = sha256
@@ -526,6 +561,7 @@ class Gate:
             The present GPS second, or None if not known.
         """
         who = messages.who_of(frame.number)
+        self.replay.look(tick)
         if who in (messages.ANYONE, messages.ASK):
             return messages.DONE
         values = frame.values()
@@ -533,6 +569,14 @@ class Gate:
             return messages.BAD_VALUE
         if frame.sender != self._sender:
             return messages.REFUSED_AUTHORITY
+        # A frame that anybody can have made must not count as the last one.
+        refusal = messages.DONE
+        if who == messages.KEY:
+            refusal = self.judge_key(frame, values[2])
+        elif self.bus is not None:
+            refusal = self.bus.judge(frame, values, self.replay)
+        if refusal != messages.DONE:
+            return refusal
         if frame.number == SESSION:
             if not self.replay.session(values[0], values[1], frame.sequence, tick):
                 return messages.DUPLICATE
@@ -546,72 +590,22 @@ class Gate:
             return messages.REFUSED_AUTHORITY
         if expired(values[1], now_s):
             return messages.EXPIRED
-        return self._judge_key(frame, values[2]) if who == messages.KEY else messages.DONE
+        if who == messages.KEY:
+            self.edition = values[2]
+        return messages.DONE
 
-    def _judge_key(self, frame: Frame, edition: int) -> int:
+    def keyed(self) -> bool:
+        """Return whether frames must be signed."""
+        return self.bus is not None and self.bus.keyed
+
+    def waits(self) -> bool:
+        """Return whether a SESSION signed over a number drawn here is needed."""
+        return self.keyed() and (self.replay.epoch < 0 or self.replay.silent())
+
+    def judge_key(self, frame: Frame, edition: int) -> int:
+        """Return DONE if a frame carries the MAC of the own key and a new edition."""
         if self._sha256 is None or not verify(self._sha256, self._key, frame):
             return messages.REFUSED_KEY
         if edition <= self.edition:
             return messages.DUPLICATE
-        self.edition = edition
         return messages.DONE
-
-
-class Sender:
-    """Numbers and frames the messages of one sender: the counterpart of ``Gate``.
-
-    Parameters
-    ----------
-    address
-        Of the sender.
-    epoch
-        Greater than at any earlier start: the GPS second of the start.
-    sha256
-        The hash, for messages of class KEY.
-
-    Attributes
-    ----------
-    epoch, count
-        Of the last frame made.
-    """
-
-    def __init__(
-        self,
-        address: int,
-        epoch: int,
-        sha256: "Callable[[bytes], bytes] | None" = None,
-    ) -> None:
-        self.address = address
-        self.epoch = epoch
-        self.count = 0
-        self._sha256 = sha256
-
-    def frame(self, to: int, name: str, *values: "Any", key: bytes = b"") -> bytes:
-        """Return the next frame's bytes; ``key`` is the receiver's, for class KEY.
-
-        Raises
-        ------
-        ValueError
-            See ``pack`` and ``encode``.
-        """
-        return self._make(to, name, pack(name, *values), key)
-
-    def session(self, token: int) -> bytes:
-        """Return a SESSION for all, to be sent once a second; ``token`` 0: no authority.
-
-        Within the last 65536 numbers of an epoch the next one is begun.
-        """
-        if self.count >= 0xFFFF0000:
-            self.epoch = (self.epoch + 1) & 0xFFFFFFFF
-            self.count = 0
-        upper = (self.count + 1) >> 16
-        return self._make(BROADCAST, "SESSION", pack("SESSION", self.epoch, upper, token), b"")
-
-    def _make(self, to: int, name: str, payload: bytes, key: bytes) -> bytes:
-        number = messages.NUMBER_OF[name]
-        frame = Frame(to, self.address, (self.count + 1) & 0xFFFF, number, payload)
-        if messages.who_of(number) == messages.KEY and self._sha256 is not None:
-            frame.mac = authenticate(self._sha256, key, frame)
-        data = encode(frame)
-        self.count += 1
-        return data

@@ -8,6 +8,7 @@ time.
 import random
 
 from heliotrope.lcu import messages, wire
+from heliotrope.lcu.sender import Sender
 from heliotrope.twin.boards.outfit import sha256
 from heliotrope.twin.invariants.ledger import FrameLedger
 
@@ -67,7 +68,7 @@ class Intruder:
         token, edition = chance.getrandbits(32) | 1, chance.randrange(1, 2**31)
         last = self._frames.last.get("SESSION")
         epoch = int(last.values[0]) if last is not None else 0
-        sender = wire.Sender(chance.choice([0, 0, 99]), epoch, sha256)
+        sender = Sender(chance.choice([0, 0, 99]), epoch, sha256)
         # As if the intruder had counted along with the cluster.
         sender.count = chance.choice([len(self._frames), chance.randrange(1 << 16)])
         time = self._frames.last.get("SUN")
@@ -86,7 +87,7 @@ class Intruder:
         """Return DEFOCUS or STOW for one heliostat or all, after a zero that ends any noise."""
         chance = random.Random(f"safe {size}")
         to = chance.choice([self._addresses[target], wire.BROADCAST])
-        sender = wire.Sender(chance.choice([0, 77]), chance.getrandbits(16))
+        sender = Sender(chance.choice([0, 77]), chance.getrandbits(16))
         return b"\0" + sender.frame(to, chance.choice(["DEFOCUS", "STOW"]))
 
     def noise(self, size: float) -> bytes:

@@ -1,0 +1,157 @@
+"""Signed frames of a bus: the keys of a local controller, and what makes an old frame worthless.
+
+A bus may have a key that its cluster and its local controllers share. A signed frame is one of
+version 3: its last 8 bytes before the CRC are a tag, HMAC-SHA256 over a freshness value, header and
+payload, truncated. The freshness value is not on the wire, because both ends know it:
+
+- of SESSION to one address: the number that the receiver drew (BUS tells it), good for one use;
+- of SESSION to all: epoch and count of its own payload and header;
+- of every other frame: the epoch of the last SESSION, and the 32-bit count of the frame, which the
+  receiver completes from the 16 bits of its sequence.
+
+So a recorded frame is refused: its count has passed. After a start a receiver holds neither epoch
+nor count, and a recorded SESSION would bring old ones back. It therefore takes its first SESSION
+only with a tag over its own number, which nobody can have recorded. That number is itself a tag,
+over the serial number, the count of boots and a count of the numbers drawn: it never comes twice,
+and nobody without the key can predict it, so no board needs a source of chance.
+
+Inputs of HMAC under one key differ in length or begin: a frame has 16 bytes or more, a number is
+drawn from 8, a fingerprint is made of 2.
+
+A board imports this module only when it has a key, or is given one.
+"""
+
+import struct
+
+from . import messages, wire
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such modules
+    from collections.abc import Callable
+    from typing import Any
+
+    Hash = Callable[[bytes], bytes]
+    Pads = tuple[bytes, bytes]
+
+KEY_SIZE = 16
+NO_KEY = bytes(KEY_SIZE)
+
+
+def pads_of(key: bytes) -> "Pads":
+    """Return the two padded keys of HMAC; they are kept, which saves half of its time here."""
+    key += bytes(64 - len(key))
+    return bytes([byte ^ 0x36 for byte in key]), bytes([byte ^ 0x5C for byte in key])
+
+
+def tag(sha256: "Hash", pads: "Pads", data: bytes) -> bytes:
+    """Return HMAC-SHA256, its first 8 bytes."""
+    return sha256(pads[1] + sha256(pads[0] + data))[: wire.MAC_SIZE]
+
+
+def counted(epoch: int, count: int) -> bytes:
+    """Return the freshness value of a frame by its place among those of its sender."""
+    return struct.pack("<II", epoch, count & 0xFFFFFFFF)
+
+
+def fingerprint(sha256: "Hash", pads: "Pads") -> int:
+    """Return a number by which a key is recognised and which tells nothing about it; 0 is none."""
+    return int(struct.unpack("<I", tag(sha256, pads, b"id")[:4])[0]) or 1
+
+
+def wrapped(sha256: "Hash", own_key: bytes, edition: int, key: bytes) -> bytes:
+    """Return the bus's key as SET_BUS_KEY carries it, or undo that.
+
+    It is added, modulo 2, to HMAC-SHA256 of the edition under the key of the one local controller.
+    An edition is used once, so this is a one-time pad; the MAC of the message protects it.
+    """
+    pad = wire.hmac_sha256(sha256, own_key, struct.pack("<I", edition))
+    return bytes([key[place] ^ pad[place] for place in range(KEY_SIZE)])
+
+
+class BusKeys:
+    """The keys of the bus at a local controller: the newest, and while it is replaced an old one.
+
+    Parameters
+    ----------
+    sha256
+        The hash.
+    own_key
+        Of the local controller, under which it is given keys of the bus.
+    serial, boots
+        Of the local controller, for the numbers that it draws.
+
+    Attributes
+    ----------
+    stored
+        Both keys, the newest first, zeros for none.
+    nonce
+        The number over which the next SESSION to this address must be signed.
+    """
+
+    def __init__(self, sha256: "Hash", own_key: bytes, serial: int, boots: int) -> None:
+        self._sha256, self._own_key = sha256, own_key
+        self._serial, self._boots = serial, boots
+        self._drawn = 0
+        self._pads: list[Pads] = []
+        self.stored = NO_KEY + NO_KEY
+        self.nonce = b""
+
+    def take(self, stored: bytes) -> None:
+        """Use these keys from now on."""
+        self.stored = stored
+        self._pads = [
+            pads_of(key) for key in (stored[:KEY_SIZE], stored[KEY_SIZE:]) if key != NO_KEY
+        ]
+        self._draw()
+
+    def with_key(self, payload: bytes) -> bytes:
+        """Return what to store after a SET_BUS_KEY.
+
+        A new key comes before the present one, the present one again ends an old one, and zeros
+        end all.
+        """
+        edition = struct.unpack("<I", payload[8:12])[0]
+        key = wrapped(self._sha256, self._own_key, edition, payload[12:])
+        newest = self.stored[:KEY_SIZE]
+        return key + (NO_KEY if key in (newest, NO_KEY) else newest)
+
+    @property
+    def keyed(self) -> bool:
+        """Whether there is a key."""
+        return len(self._pads) > 0
+
+    def told(self) -> "tuple[int, ...]":
+        """Return the numbers of BUS: the number drawn, in two halves, and both fingerprints."""
+        prints = [fingerprint(self._sha256, pads) for pads in self._pads] + [0, 0]
+        high, low = struct.unpack("<II", self.nonce or bytes(8))
+        return high, low, prints[0], prints[1]
+
+    def judge(self, frame: "wire.Frame", values: "tuple[Any, ...]", replay: "wire.Replay") -> int:
+        """Return DONE if a frame is signed as it must be; without a key every frame is."""
+        if not self._pads:
+            return messages.DONE
+        alone = frame.number == wire.SESSION and frame.to != wire.BROADCAST
+        if frame.version != wire.SIGNED:
+            return messages.REFUSED_KEY
+        if alone:
+            fresh = self.nonce
+        elif replay.epoch < 0:
+            return messages.DUPLICATE
+        elif frame.number == wire.SESSION:
+            fresh = counted(values[0], values[1] << 16 | frame.sequence)
+        else:
+            fresh = counted(replay.epoch, replay.count + (frame.sequence - replay.count & 0xFFFF))
+        data = fresh + frame.body()
+        for pads in self._pads:
+            if wire.same(tag(self._sha256, pads, data), frame.mac):
+                if alone:
+                    replay.epoch = -1
+                    self._draw()
+                return messages.DONE
+        return messages.REFUSED_KEY
+
+    def _draw(self) -> None:
+        if self._pads:
+            self._drawn = self._drawn + 1 & 0xFFFF
+            data = struct.pack("<IHH", self._serial, self._boots, self._drawn)
+            self.nonce = tag(self._sha256, self._pads[0], data)
