@@ -15,7 +15,7 @@ from benchmarks._run import BUSY, BenchmarkError, Neighbours, keep, machine
 #: The registry: each is a module of this package with ``run(quick: bool) -> Result``.
 NAMES = (
     "tracking", "calibration", "imaging", "sun", "field", "startup", "bus", "frames", "clusters",
-    "control", "plant", "airborne", "console", "day", "learning",
+    "control", "plant", "airborne", "console", "day", "learning", "signing",
 )  # fmt: skip
 #: Width of a table that goes to a file or a pipe, characters.
 WIDTH = 180

@@ -51,7 +51,7 @@ All except the MAC prevents accidents; it does not stop a person at the bus. Sig
 
 ## Signed frames
 
-A bus may have a key of {signing.KEY_SIZE} bytes, which its cluster and its local controllers share ([why so](../decisions/0027-signed-frames.md)). The cluster then signs everything of the classes *cluster* and *the authority*: version {wire.SIGNED}, and a tag of {wire.MAC_SIZE} bytes before the CRC, HMAC-SHA256 under the key of the bus over a freshness value of 8 bytes, header and payload, truncated. The freshness value is not sent:
+A bus may have a key of {signing.KEY_SIZE} bytes, which its cluster and its local controllers share ([how to](../how-to/bus-keys.md), [why so](../decisions/0027-signed-frames.md)). The cluster then signs everything of the classes *cluster* and *the authority*: version {wire.SIGNED}, and a tag of {wire.MAC_SIZE} bytes before the CRC, HMAC-SHA256 under the key of the bus over a freshness value of 8 bytes, header and payload, truncated. The freshness value is not sent:
 
 | frame | freshness value |
 |---|---|

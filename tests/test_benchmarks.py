@@ -29,6 +29,9 @@ COLUMNS = {
     "frames": {
         "format", "way", "trials", "refused", "survived", "unhurt", "false", "one_false_in",
     },
+    "signing": {
+        "frame", "plain_bytes", "signed_bytes", "more_ms_at_19200_baud", "more_ms_at_115200_baud",
+    },
     "clusters": {
         "clusters", "heliostats", "frames_per_cluster_second", "heard", "cores_for_all",
         "processor_ms_per_cluster_second",

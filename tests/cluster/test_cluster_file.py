@@ -19,6 +19,7 @@ from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.program import line_of, time_of
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.lcu import messages, wire
+from heliotrope.links.bus_key_file import BusKeyFile
 from heliotrope.links.clock import SystemClock, VirtualClock
 from heliotrope.links.papers import Papers
 from support.clusters import SITE, config_of
@@ -137,6 +138,24 @@ def test_keys_that_others_may_read_are_refused(folder: Path) -> None:
     (folder / "C1.keys.toml").chmod(0o644)
     with pytest.raises(FormatError, match=r"others may read it \(mode 644\); run chmod 600"):
         read_cluster(folder / "C1.toml")
+
+
+def test_the_key_of_the_bus_is_read_and_read_again(folder: Path) -> None:
+    path = folder / "C1.toml"
+    assert read_cluster(path).bus_keys is None
+    path.write_text(path.read_text().replace("[site]", 'bus_key = "C1.bus.toml"\n\n[site]', 1))
+    with pytest.raises(FormatError, match=r"C1\.bus\.toml"):
+        read_cluster(path)
+    file = BusKeyFile(folder / "C1.bus.toml")
+    file.new()
+    found = read_cluster(path)
+    assert found.bus_keys is not None
+    assert found.bus_keys.keys == file.keys
+    assert file.keys[0].hex() not in repr(found)
+    file.rotate()
+    found.take_bus_keys()
+    assert found.bus_keys.keys == file.keys
+    assert len(file.keys) == 2
 
 
 def test_the_reference_names_every_setting() -> None:

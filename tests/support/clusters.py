@@ -19,6 +19,7 @@ from heliotrope.lcu.node import Node
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.in_process import memory_pair
+from heliotrope.links.keys import KeyRing
 from heliotrope.links.link import Bus, received, running
 from heliotrope.links.messages import (
     ClusterStatus,
@@ -193,6 +194,7 @@ class Field:
         seed: int = 0,
         kept: Kept | None = None,
         line: Callable[[], bool] | None = None,
+        bus_keys: KeyRing | None = None,
         **changes: Any,
     ) -> None:
         self.clock = clock
@@ -214,7 +216,14 @@ class Field:
         self.time = SystemTime(clock)
         self.kept = kept or Kept(None)
         self.cluster = Cluster(
-            self.config, self.bus, self.link, clock, self.time, self.kept, line=line
+            self.config,
+            self.bus,
+            self.link,
+            clock,
+            self.time,
+            self.kept,
+            line=line,
+            bus_keys=bus_keys,
         )
 
     async def _tick(self) -> None:

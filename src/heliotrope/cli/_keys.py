@@ -8,6 +8,7 @@ import typer
 from heliotrope.cli._common import print_json, print_table
 
 if TYPE_CHECKING:
+    from heliotrope.links.bus_key_file import BusKeyFile
     from heliotrope.links.keys import KeyFile
 
 app = typer.Typer(
@@ -21,6 +22,14 @@ FolderOption = Annotated[
     Path,
     typer.Option("--to", help="Folder for the files that carry the new keys to the clusters."),
 ]
+
+
+bus_app = typer.Typer(
+    help="Make and replace the key that signs the frames of a bus.", no_args_is_help=True
+)
+app.add_typer(bus_app, name="bus")
+
+BusFile = Annotated[Path, typer.Argument(help="File of the key, as the cluster file names it.")]
 
 
 @app.callback()
@@ -108,6 +117,68 @@ def list_(
         print_json(shown)
         return
     print_table(["name", "key", "old key"], [[n, k[0], *k[1:], ""][:3] for n, k in shown.items()])
+
+
+def _bus(path: Path) -> "BusKeyFile":
+    from heliotrope.errors import InputError
+
+    try:
+        from heliotrope.links.bus_key_file import BusKeyFile
+    except ImportError as error:
+        raise InputError(
+            f"keys: {error.name} is not installed; say pip install 'heliotrope[control]'"
+        ) from None
+    return BusKeyFile(path)
+
+
+@bus_app.command(name="new")
+def bus_new(file: BusFile) -> None:
+    """Make the key of a bus; the cluster gives it to its local controllers."""
+    found = _bus(file)
+    found.new()
+    _show(found)
+
+
+@bus_app.command(name="rotate")
+def bus_rotate(file: BusFile) -> None:
+    """Make a second key beside the present one; the cluster keeps running."""
+    found = _bus(file)
+    found.rotate()
+    _show(found)
+
+
+@bus_app.command(name="end")
+def bus_end(file: BusFile) -> None:
+    """Remove the old key, once the new one signs."""
+    found = _bus(file)
+    found.end()
+    _show(found)
+
+
+@bus_app.command(name="off")
+def bus_off(file: BusFile) -> None:
+    """Remove all keys; the cluster takes them from its local controllers, while these stand."""
+    found = _bus(file)
+    found.off()
+    print(f"{file}: no key; local controllers lose theirs while their mirrors stand")
+
+
+@bus_app.command(name="list")
+def bus_list(file: BusFile) -> None:
+    """Print the keys by fingerprints that reveal nothing, the newest first."""
+    from heliotrope.errors import InputError
+
+    if not file.exists():
+        raise InputError(f"{file}: there is no such file; heliotrope keys bus new makes it")
+    _show(_bus(file))
+
+
+def _show(found: "BusKeyFile") -> None:
+    from heliotrope.links.keys import fingerprint
+
+    keys = [fingerprint(key) for key in found.keys]
+    told = f"key {keys[0]}" if keys else "no key"
+    print(f"{found.path}: {told}" + (f", old key {keys[1]}" if len(keys) > 1 else ""))
 
 
 def _carry(folder: Path, keys: dict[str, bytes]) -> None:

@@ -70,6 +70,8 @@ async def _run(installation: "Installation", every: float) -> None:
     link, time = _link(installation, clock, papers), time_of(installation, clock)
     if installation.key_file is not None:
         papers.renew("key file", [installation.key_file], installation.take_keys)
+    if installation.bus_key_file is not None:
+        papers.renew("key of the bus", [installation.bus_key_file], installation.take_bus_keys)
     kept = Kept(installation.state, disk=DiskThread())
     cluster = Cluster(
         installation.config,
@@ -79,6 +81,7 @@ async def _run(installation: "Installation", every: float) -> None:
         time,
         kept,
         line_of(installation.emergency_line),
+        installation.bus_keys,
     )
     ending = asyncio.Event()
     loop = asyncio.get_running_loop()

@@ -1,10 +1,12 @@
 """The broadcasts at the start of each second: SESSION, TIME and SUN.
 
-SESSION goes first: a local controller that has just started accepts nothing before it. SUN is sent
-only while the plant's lease (and the autonomy it grants) lasts, the time is sound, and no row of
-the safety table demands DEFOCUS or STOW. Without SUN each local controller defocuses by itself.
+SESSION goes first: a local controller that has just started accepts nothing before it; one with a
+key of the bus is sent its own (`_bus_keys`). SUN is sent only while the plant's lease (and the
+autonomy it grants) lasts, the time is sound, and no row of the safety table demands DEFOCUS or
+STOW. Without SUN each local controller defocuses by itself.
 """
 
+from heliotrope.cluster._bus_keys import BusKeys
 from heliotrope.cluster._epoch import Epoch
 from heliotrope.cluster._exchange import Exchange
 from heliotrope.cluster._watch import Watch
@@ -26,10 +28,11 @@ class Broadcast:
         exchange: Exchange,
         watch: Watch,
         epoch: Epoch,
+        keys: BusKeys,
         clock: Clock,
     ) -> None:
         self._config, self._exchange, self._watch = config, exchange, watch
-        self._epoch, self._clock = epoch, clock
+        self._epoch, self._keys, self._clock = epoch, keys, clock
         self._offset: float | None = None  # GPS minus monotonic time, as told
 
     def bus_time(self) -> float | None:
@@ -43,6 +46,7 @@ class Broadcast:
         if sound:
             self._epoch.time_known(present)
         await exchange.broadcast_session(self._watch.token)
+        await self._keys.meet(self._watch.token)
         if not sound:
             return
         gps = present.gps_s + self._clock.monotonic() - now

@@ -16,6 +16,8 @@ from heliotrope.links.link import Bus, SendOutcome
 
 #: The share of bad frames is computed over this many seconds.
 _WINDOW = 10
+#: Returns the tag of bytes under a key of the bus.
+Sign = Callable[[bytes], bytes]
 
 
 def sha256(data: bytes) -> bytes:
@@ -54,6 +56,7 @@ class Exchange:
     def __init__(self, bus: Bus, clock: Clock, answer: float, stored_answer: float) -> None:
         self.sender = Sender(wire.CLUSTER_ADDRESS, 0, sha256)
         self._bus, self._clock = bus, clock
+        self._sign: Sign | None = None
         self._answer, self._stored_answer = answer, stored_answer
         self._hurry = False
         self.now = clock.monotonic()
@@ -69,6 +72,11 @@ class Exchange:
     def begin_epoch(self, epoch: int) -> None:
         """Restart the numbering of frames, in an epoch above all earlier ones (see `lcu.wire`)."""
         self.sender = Sender(wire.CLUSTER_ADDRESS, epoch, sha256)
+        self.sender.sign = self._sign
+
+    def sign(self, sign: Sign | None) -> None:
+        """Sign frames from now on (see `lcu.signing`); None: sign nothing."""
+        self._sign = self.sender.sign = sign
 
     def token(self, token: int) -> int:
         """Return the wire's token for a token of the command authority.
@@ -91,6 +99,10 @@ class Exchange:
     async def broadcast_session(self, token: int) -> None:
         """Broadcast the token of the command authority."""
         await self.transmit(self.sender.session(self.token(token)))
+
+    async def send_session(self, address: int, token: int, number: bytes, sign: Sign) -> None:
+        """Begin a signed session with one local controller, over the number that it has drawn."""
+        await self.transmit(self.sender.session_to(address, self.token(token), number, sign))
 
     async def transmit(self, frame: bytes, *, life: float = 0.5, urgent: bool = False) -> bool:
         """Send a frame that is not answered, within ``life`` s; return whether it went out."""

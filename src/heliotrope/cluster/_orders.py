@@ -497,7 +497,7 @@ def _steps_of_items(node: ClusterNode, message: Parameters) -> tuple[Step, ...]:
         raise OrderRefusedError("no items; name at least one")
     sets, checks = [], []
     for item, data in items.items():
-        if item not in SIZE_OF or item in ("key_id", "edition", "address"):
+        if item not in SIZE_OF or item in ("key_id", "edition", "address", "bus_keys"):
             raise OrderRefusedError(f"item {item!r} cannot be set by parameters")
         if len(data) != SIZE_OF[item]:
             raise OrderRefusedError(f"item {item}: {len(data)} bytes, {SIZE_OF[item]} needed")

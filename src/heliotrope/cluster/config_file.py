@@ -13,6 +13,7 @@ from heliotrope.cluster.serial_bus import BusSettings
 from heliotrope.errors import FormatError, InputError
 from heliotrope.files.documents import read_document, read_toml
 from heliotrope.links.addresses import Table, check_encryption, url_parts
+from heliotrope.links.bus_key_file import read_bus_keys
 from heliotrope.links.keys import HELIOSTATS, KeyRing, Keys
 from heliotrope.sun import Site
 
@@ -138,6 +139,9 @@ class ClusterDocument(Table):
     version: Literal[1]
     name: str = Field(min_length=1, description="Name of the cluster, as the plant knows it.")
     keys: str = Field("", description="Key file, beside this one.")
+    bus_key: str = Field(
+        "", description="File of the key of the bus, beside this one; default: nothing is signed."
+    )
     state: str = Field(
         "", description="File for epoch and editions, beside this one; default NAME.state.json."
     )
@@ -173,6 +177,9 @@ class Installation:
         Of the plant's URL; ``prefix`` of MQTT topics.
     key_file
         File of the keys; None: there is none.
+    bus_key_file, bus_keys
+        File of the keys of the bus, and the keys, replaced by `take_bus_keys`; None: no frame is
+        signed.
     plant_keys, password
         Of the link, replaced by `take_keys`; of the MQTT broker.
     error
@@ -194,6 +201,8 @@ class Installation:
     port: int
     prefix: str
     key_file: Path | None
+    bus_key_file: Path | None
+    bus_keys: KeyRing | None = field(repr=False)
     plant_keys: KeyRing = field(repr=False)
     password: str = field(repr=False)
     error: float | None
@@ -213,6 +222,17 @@ class Installation:
         if not found.plant:
             raise FormatError(self.key_file, "its key is gone; the link needs it", "plant")
         self.plant_keys.keys = found.plant
+
+    def take_bus_keys(self) -> None:
+        """Read the file of the bus's keys again.
+
+        Raises
+        ------
+        FormatError
+            If it cannot be used.
+        """
+        if self.bus_key_file is not None and self.bus_keys is not None:
+            self.bus_keys.keys = read_bus_keys(self.bus_key_file)
 
 
 def read_cluster(path: str | Path) -> Installation:
@@ -272,6 +292,7 @@ def _install(
         phase=polling.phase_s,
         longest_autonomy=document.safety.longest_autonomy_s,
     )
+    bus_key_file = path.parent / document.bus_key if document.bus_key else None
     line = document.safety.emergency_line
     scheme, host, port, prefix = url_parts(path, document.plant.url, "plant.url")
     encrypted = scheme == "mqtts" or (scheme == "tcp" and document.plant.authority is not None)
@@ -286,6 +307,8 @@ def _install(
         port=port,
         prefix=prefix,
         key_file=key_file,
+        bus_key_file=bus_key_file,
+        bus_keys=None if bus_key_file is None else KeyRing(*read_bus_keys(bus_key_file)),
         plant_keys=KeyRing(*secrets.plant),
         password=secrets.password,
         error=document.time.error_s,

@@ -24,6 +24,7 @@ import contextlib
 from collections.abc import Callable
 
 from heliotrope.cluster._broadcast import Broadcast
+from heliotrope.cluster._bus_keys import BusKeys
 from heliotrope.cluster._emergencies import Emergencies
 from heliotrope.cluster._epoch import Epoch
 from heliotrope.cluster._exchange import Exchange
@@ -41,6 +42,7 @@ from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.timekeeping import Time, TimeKeeper
 from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
+from heliotrope.links.keys import KeyRing
 from heliotrope.links.link import Bus, Link, LinkClosedError, LinkError
 from heliotrope.safety import Alarm
 from heliotrope.sun import broadcast_values
@@ -68,6 +70,8 @@ class Cluster:
         Epoch and editions; None: nothing outlasts this object.
     line
         Returns whether current flows in the hard-wired emergency line; None: there is no line.
+    bus_keys
+        Keys that sign the frames of the bus; None: they are not signed.
 
     Attributes
     ----------
@@ -86,6 +90,7 @@ class Cluster:
         time: TimeKeeper,
         kept: Kept | None = None,
         line: Callable[[], bool] | None = None,
+        bus_keys: KeyRing | None = None,
     ) -> None:
         self.config, self._clock, self._time = config, clock, time
         kept = kept or Kept(None)
@@ -97,7 +102,12 @@ class Cluster:
         self._watch = Watch(config.name, config.longest_autonomy, reports, now, line)
         epoch = Epoch(kept, self._exchange, reports, present)
         emergencies = Emergencies(self.nodes, self._exchange, goals, reports, clock.monotonic)
-        self._broadcast = Broadcast(config, self._exchange, self._watch, epoch, clock)
+        self._bus_keys = BusKeys(
+            config.name, bus_keys, self.nodes, self._exchange, reports, kept, clock.monotonic
+        )
+        self._broadcast = Broadcast(
+            config, self._exchange, self._watch, epoch, self._bus_keys, clock
+        )
         self._polling = Polling(
             config, self.nodes, self._exchange, goals, reports, self._watch, emergencies, clock
         )
@@ -213,6 +223,7 @@ class Cluster:
             await self._broadcast.second(self._time.time())
             self._work.resume()
             await self._polling.round(begin + _ROUND, self._work, self._closing)
+            await self._bus_keys.supply()
         self._polling.end_second(begin)
         self.cycle = self._clock.monotonic() - begin
         self._plant.report(self._time.time(), begin)

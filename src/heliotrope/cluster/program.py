@@ -76,6 +76,8 @@ class LocalCluster:
         Bus, time and both ends of the link, to be run.
     cluster
         To be run within them.
+    installation
+        Of the cluster file.
 
     Raises
     ------
@@ -84,7 +86,7 @@ class LocalCluster:
     """
 
     def __init__(self, path: Path, name: str, members: tuple[str, ...], clock: Clock) -> None:
-        installation = read_cluster(path)
+        installation = self.installation = read_cluster(path)
         config = installation.config
         found = {member.name for member in config.heliostats}
         if config.name != name:
@@ -105,5 +107,6 @@ class LocalCluster:
             time,
             Kept(installation.state, disk=DiskThread()),
             line_of(installation.emergency_line),
+            installation.bus_keys,
         )
         self.parts: tuple[Any, ...] = (near, far, bus, time)

@@ -111,9 +111,7 @@ class Keys:
         # An empty file has no keys; members without a key are refused later.
         empty = path.is_file() and path.stat().st_size == 0
         raw = {} if empty else read_toml(path, "a key file")
-        if path.stat().st_mode & _OTHERS:
-            mode = path.stat().st_mode & 0o777
-            raise FormatError(path, f"others may read it (mode {mode:o}); run chmod 600 on it")
+        refuse_others(path)
         for key in raw:
             if key not in ("plant", "password", table):
                 raise FormatError(path, f"{key!r} is not known; give plant, password, {table}")
@@ -157,6 +155,19 @@ class Keys:
                 raise FormatError(
                     self._path, f"{_MISSING[self._table]}{hint}", f"{self._table}.{name}"
                 )
+
+
+def refuse_others(path: Path) -> None:
+    """Refuse a file that others may read.
+
+    Raises
+    ------
+    FormatError
+        If others may read it.
+    """
+    if path.stat().st_mode & _OTHERS:
+        mode = path.stat().st_mode & 0o777
+        raise FormatError(path, f"others may read it (mode {mode:o}); run chmod 600 on it")
 
 
 def fingerprint(key: bytes) -> str:

@@ -38,7 +38,7 @@ DRIVE_NUMBERS = (
 )
 _ENDS = ("primary", "secondary")
 #: Items that belong to the local controller itself: the plant neither pushes nor compares them.
-OWN = frozenset({"address", "key_id", "edition"})
+OWN = frozenset({"address", "key_id", "edition", "bus_keys"})
 #: Items that a local controller accepts at stow, at standby and defocused too; the others only
 #: locked, at rest, in FAULT, or before it is configured.
 CALIBRATION_ITEMS = frozenset({"armature", "biases", "location", "defocus"})

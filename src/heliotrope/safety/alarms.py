@@ -375,6 +375,29 @@ TWO_PLANTS = AlarmKind(
     "Switch the second plant off; a run is named after the UTC time at which its plant started.",
     over="the second plant has not asked for a minute",
 )
+BUS_KEY_MISSING = AlarmKind(
+    "bus_key_missing",
+    _CLUSTER,
+    Severity.ALARM,
+    "Local controllers have a key of the bus, and their cluster has none.",
+    "cluster {cluster} has no key of its bus, and {heliostats} obey signed frames only",
+    "They get no sun from it: they defocus and stow by themselves. DEFOCUS and STOW still reach "
+    "them.",
+    "Name the file of the key in the cluster file (bus_key), and start the cluster again; to give "
+    "signed frames up, name one that heliotrope keys bus off has made.",
+    over="cluster {cluster}: no local controller obeys signed frames only",
+)
+BUS_UNSIGNED = AlarmKind(
+    "bus_unsigned",
+    _CLUSTER,
+    Severity.WARNING,
+    "A cluster signs its frames, and local controllers have not the key of the bus.",
+    "cluster {cluster} signs its frames, and {heliostats} have not the key of its bus: {why}",
+    "The cluster gives them the key as soon as it can. Until then they obey a stranger on the wire "
+    "too, or, with another key or older firmware, get no sun.",
+    "Stow them; if the alarm stays, check their keys in the cluster's key file and their firmware.",
+    over="cluster {cluster}: all local controllers that answer have the key of the bus",
+)
 TIME_SOURCE = AlarmKind(
     "time_source",
     _CLUSTER,

@@ -174,5 +174,10 @@ async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outsid
         if live.plant.unwatched:
             print(f"no readings for: {', '.join(live.plant.unwatched)}", flush=True)
         papers = _papers(outside, shown)
+        for each in outside.local:
+            file = each.installation.bus_key_file
+            if file is not None:
+                name = f"key of the bus of {each.installation.config.name}"
+                papers.renew(name, [file], each.installation.take_bus_keys)
         async with papers.watched(live.logbook.take_alarm):
             await at_work(live, keeper, shown, folder, ending)

@@ -1,0 +1,258 @@
+"""The key of the bus: local controllers meet the cluster in a signed session, and are given keys.
+
+A local controller shows in its STATUS whether it has a key, and whether it wants a session signed
+over a number that it has drawn (`lcu.signing`). The cluster asks for that number and for the
+fingerprints of its keys, and sends the session (`meet`). Each second it also gives one local
+controller the key that it lacks, or ends an old one (`supply`): encrypted under the key of that
+local controller, and only while its mirror stands.
+
+While a key is replaced, the cluster signs with the old one until every local controller that
+answers has the new one. So no order of events costs a lease.
+"""
+
+import struct
+from collections.abc import Callable
+from functools import partial
+
+from heliotrope.cluster._exchange import Exchange, sha256
+from heliotrope.cluster._nodes import ClusterNode, Nodes
+from heliotrope.cluster._orders import stored
+from heliotrope.cluster._reports import Reports
+from heliotrope.cluster.memory import Kept
+from heliotrope.lcu import messages, names
+from heliotrope.lcu.controller import HARMLESS
+from heliotrope.lcu.signing import NO_KEY, fingerprint, pads_of, tag, wrapped
+from heliotrope.links.keys import KeyRing
+from heliotrope.safety import alarms
+
+_KEYED = 1 << names.FLAGS.index("BUS_KEY")
+_WANTS = 1 << names.FLAGS.index("SESSION_WANTED")
+#: Time for meeting in one second, s: the sun goes out after it.
+_SHARE = 0.2
+#: A local controller that does not answer is asked again this often, then after a pause, s.
+_TRIES, _PAUSE = 3, 60.0
+#: What is wrong is reported after this time, s: a key is given within a few seconds.
+_PATIENCE = 15.0
+
+_MOVES = "they take the key when they stand (stowed, locked, idle or defocused)"
+_DEAF = "they do not answer QUERY_BUS: older firmware, or no key of their own"
+_OWN = "their own keys are not in the cluster's key file, or differ from it"
+
+
+class _Held:
+    """What is known of one local controller's keys of the bus."""
+
+    def __init__(self, boots: int) -> None:
+        self.boots = boots
+        self.prints: tuple[int, int] | None = None  # of the newest key and the old one
+        self.tries = 0
+        self.again = 0.0  # when to ask again, monotonic s
+        self.why = ""  # why it has not the keys that it should have
+
+
+class BusKeys:
+    """Meets the local controllers in signed sessions, and gives them keys.
+
+    Parameters
+    ----------
+    cluster
+        Name of the cluster.
+    ring
+        Keys of the bus, the newest first; empty: local controllers that have one lose it. None:
+        the cluster signs nothing, and changes no key.
+    nodes, exchange, reports, kept
+        Parts of the cluster.
+    clock
+        Returns monotonic s.
+    """
+
+    def __init__(
+        self,
+        cluster: str,
+        ring: KeyRing | None,
+        nodes: Nodes,
+        exchange: Exchange,
+        reports: Reports,
+        kept: Kept,
+        clock: Callable[[], float],
+    ) -> None:
+        self._cluster, self._ring = cluster, ring
+        self._nodes, self._exchange = nodes, exchange
+        self._reports, self._kept, self._clock = reports, kept, clock
+        self._keys: dict[int, bytes] = {}  # by fingerprint, the newest first
+        self._taken: tuple[bytes, ...] = ()
+        self._held: dict[int, _Held] = {}
+        self._next = 0
+        self._wrong: dict[int, float] = {}  # nodes that have not the keys, and since when
+        self._told: set[int] = set()
+        self._look()
+
+    # -- the keys ----------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        """Take keys that have changed, and decide which one signs."""
+        keys = () if self._ring is None else self._ring.keys
+        if keys != self._taken:
+            self._taken = keys
+            self._keys = {fingerprint(sha256, pads_of(key)): key for key in keys}
+        if not keys:
+            self._exchange.sign(None)
+            return
+        newest = next(iter(self._keys))
+        chosen = keys[0] if len(keys) == 1 or self._all_have(newest) else keys[-1]
+        self._exchange.sign(_signer(chosen))
+
+    def _all_have(self, newest: int) -> bool:
+        heard = [node for node in self._nodes if node.known and node.missed == 0]
+        held = [self._held.get(node.index) for node in heard if node.flags & _KEYED]
+        return bool(heard) and all(
+            each is not None and each.prints is not None and newest in each.prints for each in held
+        )
+
+    def _due(self, prints: tuple[int, int]) -> bytes | None:
+        """Return the key to be set where these are held; None: they are as they should be."""
+        newest, old = prints
+        if not self._keys:
+            return NO_KEY if newest else None
+        wanted = list(self._keys)
+        if newest not in wanted and old not in wanted:
+            return self._keys[wanted[-1]]  # the one that signs now
+        if newest != wanted[0] or (len(wanted) == 1 and old):
+            return self._keys[wanted[0]]
+        return None
+
+    # -- sessions ----------------------------------------------------------------------------
+
+    async def meet(self, token: int) -> None:
+        """Ask those whose keys are unknown, and send sessions to those that want one."""
+        self._look()
+        begin = self._clock()
+        count = len(self._nodes)
+        first, self._next = self._next, 0
+        for place in range(first, first + count):
+            if self._ring is None or not self._exchange.connected:
+                return
+            now = self._clock()
+            if now - begin > _SHARE:
+                self._next = place % count
+                return
+            node = self._nodes[place % count]
+            if node.known and node.missed == 0:
+                await self._meet(node, token, now)
+
+    async def _meet(self, node: ClusterNode, token: int, now: float) -> None:
+        held = self._held.get(node.index)
+        if held is None or held.boots != node.status[8]:
+            held = self._held[node.index] = _Held(node.status[8])
+        wants = bool(node.flags & _WANTS) and bool(self._keys)
+        known = held.prints is not None and bool(held.prints[0]) == bool(node.flags & _KEYED)
+        if (known and not wants) or now < held.again:
+            return
+        answer = await self._exchange.ask(node, "QUERY_BUS", expires=now + 1.0, numbers=("BUS",))
+        if answer is None:
+            held.tries += 1
+            if held.tries >= _TRIES:
+                held.tries, held.again, held.why = 0, now + _PAUSE, _DEAF
+            return
+        high, low, newest, old = answer.values
+        held.prints, held.tries, held.why = (newest, old), 0, ""
+        key = self._keys.get(newest) or self._keys.get(old)
+        if wants and key is not None:
+            number = struct.pack("<II", high, low)
+            await self._exchange.send_session(node.address, token, number, _signer(key))
+
+    # -- keys for local controllers ----------------------------------------------------------
+
+    async def supply(self) -> None:
+        """Give one local controller the key that is due, and report those that have not theirs."""
+        if self._ring is not None and self._exchange.connected:
+            for node in sorted(self._nodes, key=lambda node: self._waited(node.index)):
+                held = self._held.get(node.index)
+                if held is None or held.prints is None or not node.known or node.missed:
+                    continue
+                key = self._due(held.prints)
+                if key is not None and self._may(node, held):
+                    held.again = self._clock()
+                    await self._give(node, held, key)
+                    break
+        self._report()
+
+    def _waited(self, index: int) -> float:
+        held = self._held.get(index)
+        return 0.0 if held is None else held.again
+
+    def _may(self, node: ClusterNode, held: _Held) -> bool:
+        if not node.member.key:
+            held.why = _OWN
+        elif node.state not in HARMLESS:
+            held.why = _MOVES
+        else:
+            return True
+        return False
+
+    async def _give(self, node: ClusterNode, held: _Held, key: bytes) -> None:
+        now = self._clock()
+        data = await stored(self._exchange, node, "edition", now + 0.5)
+        if data is None:
+            return
+        try:
+            edition = self._kept.next_edition(struct.unpack("<I", data)[0] if data else 0)
+        except OSError:
+            return  # the epoch's alarm tells it; the next second tries again
+        if edition is None:
+            return
+        carried = wrapped(sha256, node.member.key, edition, key)
+        answer = await self._exchange.ask(
+            node,
+            "SET_BUS_KEY",
+            0,
+            0,
+            edition,
+            *struct.unpack("<4I", carried),
+            key=node.member.key,
+            expires=self._clock() + 1.0,
+            stored=True,
+        )
+        if answer is None:
+            return
+        result = answer.values[2]
+        if result == messages.DONE:
+            held.prints = None  # they are asked for
+        elif result == messages.REFUSED_KEY:
+            held.why, held.again = _OWN, now + _PAUSE
+        elif result == messages.REFUSED_STATE:
+            held.why = _MOVES
+
+    # -- reports -----------------------------------------------------------------------------
+
+    def _report(self) -> None:
+        now = self._clock()
+        wrong = {node.index for node in self._nodes if node.known and self._is_wrong(node)}
+        self._wrong = {index: self._wrong.get(index, now) for index in wrong}
+        late = {index for index, since in self._wrong.items() if now - since > _PATIENCE}
+        kind = alarms.BUS_KEY_MISSING if self._ring is None else alarms.BUS_UNSIGNED
+        if late - self._told:
+            if self._told:
+                self._reports.clear(kind.ended(cluster=self._cluster))
+            self._told = wrong
+            listed = ", ".join(self._nodes[index].name for index in sorted(wrong))
+            found = (self._held.get(index) for index in sorted(wrong))
+            why = next((each.why for each in found if each is not None and each.why), _MOVES)
+            self._reports.alarm(kind.raised(cluster=self._cluster, heliostats=listed, why=why))
+        elif self._told and not wrong:
+            self._told = set()
+            self._reports.clear(kind.ended(cluster=self._cluster))
+
+    def _is_wrong(self, node: ClusterNode) -> bool:
+        if self._ring is None:
+            return bool(node.flags & _KEYED)
+        if not self._keys:
+            return bool(node.flags & _KEYED)
+        held = self._held.get(node.index)
+        if held is None or held.prints is None:
+            return not node.flags & _KEYED
+        return not set(held.prints) & set(self._keys)
+
+
+def _signer(key: bytes) -> Callable[[bytes], bytes]:
+    return partial(tag, sha256, pads_of(key))

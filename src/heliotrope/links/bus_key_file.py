@@ -1,0 +1,128 @@
+"""The key of a bus in a file of its own, which its cluster reads (`lcu.signing`).
+
+``keys`` is a list: the key in hexadecimal text; while it is replaced, the new one and the one
+before; empty where signed frames are given up, so that the cluster takes the key from its local
+controllers.
+"""
+
+import secrets
+from pathlib import Path
+
+import tomli_w
+
+from heliotrope.errors import FormatError, InputError
+from heliotrope.files.documents import read_toml
+from heliotrope.lcu.signing import KEY_SIZE, NO_KEY
+from heliotrope.links.keys import LinkKeys, refuse_others, write_private
+
+_MOST = 2
+
+
+def read_bus_keys(path: Path) -> LinkKeys:
+    """Return the keys of a bus, the newest first.
+
+    Raises
+    ------
+    FormatError
+        If others may read the file, or its content is another.
+    """
+    raw = read_toml(path, "a file of a bus's key")
+    refuse_others(path)
+    values = raw.get("keys")
+    if set(raw) != {"keys"} or not isinstance(values, list) or len(values) > _MOST:
+        raise FormatError(path, f"give keys alone, a list of at most {_MOST}")
+    keys = tuple(_key(path, value) for value in values)
+    if len(set(keys)) < len(keys):
+        raise FormatError(path, "the same key twice; give each once", "keys")
+    return keys
+
+
+def _key(path: Path, value: object) -> bytes:
+    try:
+        key = bytes.fromhex(value) if isinstance(value, str) else b""
+    except ValueError:
+        key = b""
+    if len(key) != KEY_SIZE or key == NO_KEY:
+        # The value is not shown: it would end up in a log.
+        raise FormatError(
+            path,
+            f"not a key; give {KEY_SIZE} bytes in hexadecimal, as heliotrope keys bus new makes",
+            "keys",
+        )
+    return key
+
+
+class BusKeyFile:
+    """The file of a bus's key, to be changed; every change is written whole, or not at all.
+
+    Parameters
+    ----------
+    path
+        The file; it may be missing.
+
+    Attributes
+    ----------
+    keys
+        The newest first.
+
+    Raises
+    ------
+    FormatError
+        See `read_bus_keys`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.keys: LinkKeys = read_bus_keys(path) if path.exists() else ()
+
+    def new(self) -> None:
+        """Make the first key.
+
+        Raises
+        ------
+        InputError
+            If there is one.
+        """
+        if self.keys:
+            raise InputError(
+                f"{self.path}: it has a key already; to replace it while the cluster runs, say "
+                "heliotrope keys bus rotate"
+            )
+        self._write(secrets.token_bytes(KEY_SIZE))
+
+    def rotate(self) -> None:
+        """Make a new key beside the present one.
+
+        Raises
+        ------
+        InputError
+            If there is none, or two.
+        """
+        if not self.keys:
+            raise InputError(f"{self.path}: it has no key; say heliotrope keys bus new")
+        if len(self.keys) == _MOST:
+            raise InputError(
+                f"{self.path}: it has two keys already; say heliotrope keys bus end when all local "
+                "controllers have the new one"
+            )
+        self._write(secrets.token_bytes(KEY_SIZE), *self.keys)
+
+    def end(self) -> None:
+        """Remove the old key.
+
+        Raises
+        ------
+        InputError
+            If there is none.
+        """
+        if len(self.keys) < _MOST:
+            raise InputError(f"{self.path}: it has no old key beside a new one; nothing to end")
+        self._write(self.keys[0])
+
+    def off(self) -> None:
+        """Remove all keys: the cluster takes them from its local controllers too."""
+        self._write()
+
+    def _write(self, *keys: bytes) -> None:
+        write_private(self.path, tomli_w.dumps({"keys": [key.hex() for key in keys]}))
+        self.keys = keys
