@@ -149,6 +149,24 @@ def test_query_and_detail(field: LiveConsole, enter: Callable[[str], Any]) -> No
     page.wait_for_function("heliotrope.store.selection.size === 64")
 
 
+def test_calibrate_now_is_for_operators(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    name = field.live.names[20]
+    for role in ("viewer", "operator"):
+        page = enter(role)
+        page.evaluate("heliotrope.store.select([20], 20)")
+        page.click(".hx-tabs >> text=Heliostat")
+        page.wait_for_selector(".hx-heliostat >> text=Kept photographs")
+        button = page.locator(".hx-heliostat >> text=Calibrate now")
+        assert button.count() == (role == "operator")
+    button.click()
+    # Accepted, or refused by the plant with its reason.
+    page.wait_for_function(
+        """name => new RegExp(`calibrate ${name}: (done|calibration of ${name}: )`).test(
+        document.querySelector('.hx-bar .hx-said').textContent)""",
+        arg=name,
+    )
+
+
 def test_a_tablet_has_all_of_it(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page = enter("engineer")
     page.set_viewport_size({"width": 1024, "height": 768})
