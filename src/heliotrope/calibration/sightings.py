@@ -16,6 +16,7 @@ from heliotrope.errors import InputError
 from heliotrope.field.formats.measurements import Measurements
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.geometry import FloatArray, as_float, normalize
+from heliotrope.sun import Times, unix_seconds
 
 #: Largest deviation from 1 of the length of a normalised vector: a few roundings.
 _UNIT = 2e-15
@@ -78,7 +79,7 @@ def sightings(
     source: npt.ArrayLike,
     destination: npt.ArrayLike,
     *,
-    time: npt.ArrayLike = 0.0,
+    time: Times = 0.0,
     source_at_infinity: npt.ArrayLike = True,
     destination_at_infinity: npt.ArrayLike = False,
     sigma: npt.ArrayLike = 5e-4,
@@ -97,7 +98,7 @@ def sightings(
         Directions (of any length) or points (m), ENU, (M, 3). A direction of length 1 is
         kept to the last bit.
     time
-        Unix seconds, (M,).
+        See `heliotrope.sun.Times`, () or (M,); NaN: unknown.
     source_at_infinity, destination_at_infinity
         The sun is at infinity, the centroid on a target is not.
     sigma
@@ -143,7 +144,7 @@ def sightings(
         raise InputError("sightings: a heliostat's row is below 0")
     return Sightings(
         index,
-        spread(time, np.float64),
+        spread(unix_seconds(time, unknown=True), np.float64),
         table,
         ends[0],
         ends[1],
@@ -288,7 +289,7 @@ def camera_target(
     sun: npt.ArrayLike,
     centroid: npt.ArrayLike,
     *,
-    time: npt.ArrayLike = 0.0,
+    time: Times = 0.0,
     sigma: npt.ArrayLike = 5e-4,
     sun_covariance: npt.ArrayLike = 0.0,
     centroid_covariance: npt.ArrayLike = 0.0,
@@ -324,7 +325,7 @@ def drone(
     led: npt.ArrayLike,
     camera: npt.ArrayLike,
     *,
-    time: npt.ArrayLike = 0.0,
+    time: Times = 0.0,
     sigma: npt.ArrayLike = 5e-4,
     led_covariance: npt.ArrayLike = 0.0,
     camera_covariance: npt.ArrayLike = 0.0,
@@ -360,7 +361,7 @@ def sun_sensor(
     counts: npt.ArrayLike,
     sun: npt.ArrayLike,
     *,
-    time: npt.ArrayLike = 0.0,
+    time: Times = 0.0,
     normal_sigma: npt.ArrayLike = 2.5e-4,
     normal_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
@@ -396,7 +397,7 @@ def field_camera(
     sun: npt.ArrayLike,
     camera: npt.ArrayLike,
     *,
-    time: npt.ArrayLike = 0.0,
+    time: Times = 0.0,
     sigma: npt.ArrayLike = 5e-4,
     sun_covariance: npt.ArrayLike = 0.0,
     camera_covariance: npt.ArrayLike = 0.0,

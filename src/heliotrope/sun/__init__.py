@@ -1,8 +1,8 @@
 """The sun: its position as angles and as a vector, and when it rises and sets.
 
 Begin with `vector` (or `position` for the angles); `events` and `daylight` give the times of a day.
-These take any number of times. `vector_and_rate`, `fast_vector` and `broadcast_values` follow the
-sun of one site second by second, as cluster controllers broadcast it.
+These take any number of times, which `unix_seconds` reads. `vector_and_rate`, `fast_vector` and
+`broadcast_values` follow the sun of one site second by second, as cluster controllers broadcast it.
 """
 
 from heliotrope.sun.broadcast import (
@@ -20,6 +20,7 @@ from heliotrope.sun.ephemeris import (
     daylight,
     events,
     position,
+    unix_seconds,
     vector,
 )
 
@@ -35,6 +36,7 @@ __all__ = [
     "events",
     "fast_vector",
     "position",
+    "unix_seconds",
     "vector",
     "vector_and_rate",
 ]

@@ -213,7 +213,7 @@ def position(times: Times, site: Site, *, algorithm: str = "spa") -> SunPosition
     """
     if algorithm not in ALGORITHMS:
         raise UnknownNameError("sun algorithm", algorithm, ALGORITHMS)
-    seconds = _unix_seconds(times)
+    seconds = unix_seconds(times)
     _check_years(seconds, site)
     if algorithm == "grena2008":
         found = _grena(seconds.ravel(), site)
@@ -469,39 +469,66 @@ def _utc(seconds: float) -> datetime:
     return _EPOCH + timedelta(seconds=float(seconds))
 
 
-def _unix_seconds(times: Times) -> FloatArray:
-    """Return ``times`` as finite unix seconds of the same shape."""
+def unix_seconds(times: Times, *, unknown: bool = False) -> FloatArray:
+    """Return times as unix seconds (UTC) of the same shape: the one reader of times.
+
+    Parameters
+    ----------
+    times
+        Of any shape (...); see `Times`. Numbers are unix seconds (UTC).
+    unknown
+        Whether a NaN may stand for a time that is not known; NaT never may.
+
+    Raises
+    ------
+    TimeError
+        A value that is not a time, or has no time zone, by its place.
+    """
+    if isinstance(times, np.ndarray) and times.dtype.kind == "f":
+        seconds = as_float(times)  # without loading pandas
+    else:
+        seconds = _seconds_of(times)
+    wrong = np.isinf(seconds) if unknown else ~np.isfinite(seconds)
+    for index in np.argwhere(wrong)[:1]:
+        value = np.asarray(times, dtype=object)[tuple(index)]
+        raise _no_time(value, index)
+    return seconds
+
+
+def _no_time(value: Any, index: Sequence[int]) -> TimeError:
+    return TimeError(
+        f"{_label(index)}: {value} is not a time; give an aware datetime, an ISO 8601 "
+        "text with an offset, or unix seconds"
+    )
+
+
+def _seconds_of(times: Times) -> FloatArray:
+    """Return unix seconds, NaN where a number or a missing one is not finite."""
     import pandas as pd
 
     if isinstance(times, pd.Series | pd.Index) and isinstance(times.dtype, pd.DatetimeTZDtype):
-        seconds = as_float((pd.DatetimeIndex(times) - _EPOCH) / pd.Timedelta(seconds=1))
-    else:
-        try:
-            array = np.asarray(times)
-        except ValueError:
-            raise TimeError("times: the lists in it differ in length") from None
-        if array.dtype.kind == "M":
-            raise TimeError(
-                f"times: {array.dtype} has no time zone; say which one, for example "
-                "pandas.DatetimeIndex(times).tz_localize('UTC')"
-            )
-        if array.dtype.kind in "iuf":
-            seconds = as_float(array)
-        else:
-            seconds = np.empty(array.shape)
-            for index, value in np.ndenumerate(array):
-                seconds[index] = _one_time(value, index)
-    for index in np.argwhere(~np.isfinite(seconds))[:1]:
-        value = np.asarray(times, dtype=object)[tuple(index)]
+        for index in np.argwhere(np.asarray(times.isna()))[:1]:
+            raise _no_time(pd.NaT, index)
+        return as_float((pd.DatetimeIndex(times) - _EPOCH) / pd.Timedelta(seconds=1))
+    try:
+        array = np.asarray(times)
+    except ValueError:
+        raise TimeError("times: the lists in it differ in length") from None
+    if array.dtype.kind == "M":
         raise TimeError(
-            f"{_label(index)}: {value} is not a time; give an aware datetime, an ISO 8601 "
-            "text with an offset, or unix seconds"
+            f"times: {array.dtype} has no time zone; say which one, for example "
+            "pandas.DatetimeIndex(times).tz_localize('UTC')"
         )
+    if array.dtype.kind in "iuf":
+        return as_float(array)
+    seconds = np.empty(array.shape)
+    for index, value in np.ndenumerate(array):
+        seconds[index] = _one_time(value, index)
     return seconds
 
 
 def _one_time(value: Any, index: Sequence[int]) -> float:
-    """Return unix seconds, or NaN if the value is not a time."""
+    """Return unix seconds; NaN only for a NaN."""
     import pandas as pd
 
     time = value
@@ -514,7 +541,10 @@ def _one_time(value: Any, index: Sequence[int]) -> float:
                 "write it like 2024-06-21T12:00:00+02:00"
             ) from None
     if time is pd.NaT or not isinstance(time, datetime):
-        return _number(time)
+        number = _number(time)
+        if np.isnan(number) and not (isinstance(time, Real) and time != time):  # noqa: PLR0124
+            raise _no_time(value, index)
+        return number
     if time.utcoffset() is None:
         raise TimeError(
             f"{_label(index)}: {time} has no time zone; add one, for example "

@@ -25,6 +25,7 @@ from heliotrope.calibration.sightings import Sightings, drone, join
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, rotation
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.sun import Times, unix_seconds
 
 #: One sighting for each reflection, or for each orientation.
 Per = Literal["reflection", "orientation"]
@@ -41,7 +42,7 @@ def to_sightings(
     orientations: Orientations,
     counts: npt.ArrayLike,
     *,
-    time: npt.ArrayLike = np.nan,
+    time: Times = np.nan,
     per: Per = "reflection",
     systematic: bool = True,
 ) -> Sightings:
@@ -54,7 +55,7 @@ def to_sightings(
     counts
         Counts of their drives in this pose, (N, D).
     time
-        Unix seconds, () or (N,).
+        See `heliotrope.sun.Times`, () or (N,); NaN: unknown.
     per
         "reflection" makes a sighting of each reflection that is not an outlier, "orientation" of
         each orientation.
@@ -82,7 +83,7 @@ def to_sightings(
     table = np.atleast_2d(as_float(counts))
     if len(table) != n:
         raise InputError(f"to_sightings: counts of {len(table)} heliostats for {n} names")
-    times = np.broadcast_to(as_float(time), (n,))
+    times = np.broadcast_to(unix_seconds(time, unknown=True), (n,))
     make = _of_points if per == "reflection" else _of_mean
     return join(
         [

@@ -30,6 +30,7 @@ from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.parallel import threads
+from heliotrope.sun import Times, unix_seconds
 
 #: Fewest sightings of a heliostat from which the hyperparameters are learnt.
 FEWEST = 8
@@ -136,9 +137,7 @@ class Learned:
         rows = self.rows[heliostat]
         return regime_at(self.sightings.time[rows], self.regime[rows], when)
 
-    def parameters_at(
-        self, heliostat: npt.ArrayLike, time: npt.ArrayLike
-    ) -> tuple[FloatArray, FloatArray]:
+    def parameters_at(self, heliostat: npt.ArrayLike, time: Times) -> tuple[FloatArray, FloatArray]:
         """Return deviations (M, P) at Unix times (M,) and their covariance (M, P, P).
 
         Parameters
@@ -146,10 +145,15 @@ class Learned:
         heliostat
             Rows, (M,).
         time
-            Unix seconds, (M,); NaN: at an unknown time.
+            See `heliotrope.sun.Times`, () or (M,); NaN: at an unknown time.
+
+        Raises
+        ------
+        TimeError
+            Something that is not a time, or has no time zone.
         """
         rows = np.asarray(heliostat, dtype=np.intp)
-        when = np.broadcast_to(np.asarray(time, dtype=np.float64), rows.shape)
+        when = np.broadcast_to(unix_seconds(time, unknown=True), rows.shape)
         size = len(self.names)
         values, spread = np.empty((len(rows), size)), np.empty((len(rows), size, size))
         with threadpool_limits(1, "blas"):
@@ -162,7 +166,7 @@ class Learned:
                     values[some], spread[some] = self.members[i].at(when[some] / DAY, label)
         return values, spread
 
-    def mechanism_at(self, heliostat: npt.ArrayLike, time: npt.ArrayLike) -> Mechanism:
+    def mechanism_at(self, heliostat: npt.ArrayLike, time: Times) -> Mechanism:
         """Return the mechanisms expected of ``heliostat`` (M,) at ``time`` (M,)."""
         values, _ = self.parameters_at(heliostat, time)
         return moved_by(self.mechanism, heliostat, self.names, values)

@@ -22,7 +22,7 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, angle_between, as_float
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
-from heliotrope.sun import Site
+from heliotrope.sun import Site, Times
 
 Criterion = Literal["d", "v"]
 #: Most rounds of exchange; two or three are usual.
@@ -170,7 +170,7 @@ def candidate_sightings(
     mechanism: Mechanism,
     site: Site,
     targets: tuple[Target, ...],
-    times: npt.ArrayLike,
+    times: Times,
     names: tuple[str, ...],
     *,
     sigma: npt.ArrayLike = 5e-4,
@@ -187,7 +187,7 @@ def candidate_sightings(
     targets
         Targets with cameras; beams are sent to their centres.
     times
-        Unix seconds (UTC), (T,); see `time_grid`.
+        (T,), see `heliotrope.sun.Times`; `time_grid` makes them.
     names
         P parameters of the table.
     sigma
@@ -209,7 +209,7 @@ def candidate_sightings(
     if len(mechanism.shape) != 1:
         raise InputError(f"mechanisms of shape {mechanism.shape}; give one batch axis (N,)")
     bounds = limits or SightingLimits()
-    moments = np.atleast_1d(as_float(times))
+    moments = np.atleast_1d(solar.unix_seconds(times))
     above = solar.position(moments, site)
     up = above.elevation >= bounds.min_elevation
     moments, suns = moments[up], above.vector[up]
