@@ -287,6 +287,30 @@ def test_defocus_turns_the_beam_away_and_refocus_brings_it_back() -> None:
     assert bench.miss(AIM) < 0.01
 
 
+@pytest.mark.parametrize("kind", ["DEFOCUS", "the plant is gone"])
+def test_from_standby_a_defocus_turns_away_from_the_aim_and_not_onto_it(kind: str) -> None:
+    bench = standing_by()
+    # An aim where the usual turn, by 0.1 and 0.05 rad, would lead the beam.
+    turned = bench.machine.drives.angles(np.array(bench.made)) + [0.1, 0.05]
+    normal, vertex = bench.machine.armature.pose(turned)
+    sun = bench.sun(bench.gps_ms() / 1000)
+    east, north, up = vertex + 100.0 * (2.0 * (normal @ sun) * normal - sun)
+    aim = (float(east), float(north), float(up))
+    assert bench.order("AIM", *aim) == DONE
+    assert bench.miss(aim) > OFF
+    if kind == "DEFOCUS":
+        assert bench.order("DEFOCUS") == DONE
+    else:
+        bench.sends_sun = bench.sends_time = False
+    nearest = math.inf
+    for _ in range(40):
+        bench.run(0.5)
+        nearest = min(nearest, bench.miss(aim))
+    assert bench.state == "DEFOCUSED"
+    assert nearest > OFF
+    assert "UNREACHABLE" not in flags(bench)
+
+
 @pytest.mark.parametrize("near", [0, 1])
 def test_between_stops_too_near_for_a_defocus_it_goes_to_the_farther_one(near: int) -> None:
     """0.1 rad fit neither way between stops 0.03 and 0.06 rad off."""

@@ -379,6 +379,9 @@ def test_a_defocus_turns_the_other_way_before_a_stop() -> None:
     for at, wide, expected in ((0.5, False, 0.6), (0.95, False, 0.85), (0.4, True, 1.0)):
         found = turned_away(np.array([at, at]), narrow if wide else machine, drives)
         assert np.allclose(found, expected, atol=1e-3)
+    # From standby it turns away from the aim.
+    aimed, at = np.array([0.6, 0.4]), np.array([0.5, 0.5])
+    assert np.allclose(turned_away(at, machine, drives, aimed), [0.4, 0.6])
 
 
 @pytest.mark.parametrize("field", [False, True])

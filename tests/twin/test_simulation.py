@@ -75,10 +75,14 @@ def test_what_was_found_once_stays_mended(seed: int, seconds: float) -> None:
         (200254, 35.0, "swarm frozen disk place sensors parameters calibrations"),
         (200095, 28.0, "calm held frozen sensors parameters calibrations"),
         (200184, 75.0, "swarm held frozen disk place sensors parameters calibrations"),
+        (400007, 103.0, "place calibrations"),
+        (500152, 84.0, "calm held disk place sensors calibrations twice"),
     ],
 )
 def test_what_any_world_found_once_stays_mended(seed: int, seconds: float, worlds: str) -> None:
-    """An approach over the receiver; a scene; parameters not compared; a proof of DEFOCUS."""
+    """An approach over the receiver; a scene; parameters not compared; two proofs of DEFOCUS;
+    a defocus onto the receiver.
+    """
     outcome = run(RunPlan(seed, seconds, 4, pause=12.0, worlds=tuple(worlds.split())))
     assert outcome.good, f"{outcome.text}; {outcome.command}"
 

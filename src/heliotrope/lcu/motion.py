@@ -259,6 +259,22 @@ class Motion:
             return angle - offset
         return low if angle - low > high - angle else high
 
+    def _turn(self) -> tuple[float, float]:
+        """Return by how much a defocus turns: from standby, and on the way there, off the aim.
+
+        The usual sense may lead from standby onto the receiver, where the aim is.
+        """
+        one, two = self.config.defocus
+        if self.kind not in (APPROACH, STANDBY) or self.aim is None:
+            return one, two
+        unreachable = self.unreachable
+        pose = self.pose(self.aim, 0)
+        self.unreachable = unreachable
+        if pose is None:
+            return one, two
+        first, second = [self._near[i] - pose.angles[i] for i in (0, 1)]
+        return math.copysign(one, first), math.copysign(two, second)
+
     # Actions of the state table.
 
     def hold(self) -> None:
@@ -286,7 +302,7 @@ class Motion:
             self.declare((first.low + first.high) // 2, (second.low + second.high) // 2, False)
             self.blind, self._turns = 0, sense
             self.kind = HOLD
-        self._base, self._offset = self.kind, self.config.defocus
+        self._base, self._offset = self.kind, self._turn()
         self.kind = DEFOCUS
         self._knot_ms = self._renew_ms = 0
         angles = [0.0, 0.0]

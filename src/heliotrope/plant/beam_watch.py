@@ -29,6 +29,8 @@ Rows = npt.NDArray[np.intp]
 LOOK_PERIOD = 1.0
 #: A heliostat moves if its counts and goals differ by more steps than this.
 _MOVES = 200
+#: States from which a mirror turns away from its aim.
+_AT_STANDBY = (states.APPROACHING, states.IDLE)
 #: States whose motions were commanded: the whole way is looked at. Of every other state the present
 #: pose and the end of the motion are, as a way to safety is never held up.
 _COMMANDED = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)
@@ -309,7 +311,8 @@ class BeamWatch:
         if node["state"] == states.STOWING or (again and stands):
             return Act.STOW
         machine = self._machines.get(name)
-        return way_out(self._check, machine, row, self._field.posed[row], self._sun(0.0))
+        aim = self.points.aims[row] if node["state"] in _AT_STANDBY else None
+        return way_out(self._check, machine, row, self._field.posed[row], self._sun(0.0), aim)
 
     def _look(self, now: float) -> None:
         field = self._field

@@ -19,7 +19,12 @@ _PIECE = 0.02
 
 
 def way_out(
-    check: BeamCheck, machine: Machine | None, row: int, counts: FloatArray, sun: FloatArray
+    check: BeamCheck,
+    machine: Machine | None,
+    row: int,
+    counts: FloatArray,
+    sun: FloatArray,
+    aim: FloatArray | None = None,
 ) -> Act:
     """Return DEFOCUS or STOW: the one whose way ends outside, and is inside for the smaller turn.
 
@@ -33,6 +38,8 @@ def way_out(
         Row of the heliostat, and where its axes stand, steps, (2,).
     sun
         Unit vector to the sun, (3,).
+    aim
+        Aim of a heliostat at standby or on its way there, m, (3,), from which it turns away.
     """
     if machine is None:
         return Act.DEFOCUS
@@ -41,21 +48,30 @@ def way_out(
     end = as_float(drives.angles(np.asarray(machine.stow, dtype=np.float64)))
     corner = end.copy()
     corner[machine.azimuth_axis] = begin[machine.azimuth_axis]
+    aimed = None
+    if aim is not None and np.isfinite(aim).all():
+        found = check.poses(np.array([row]), aim[None], sun, counts[None])
+        aimed = as_float(found.chosen(found.angles)[0])
     ways = {
-        Act.DEFOCUS: np.stack([begin, turned_away(begin, machine, drives)]),
+        Act.DEFOCUS: np.stack([begin, turned_away(begin, machine, drives, aimed)]),
         Act.STOW: np.stack([begin, corner, end]),
     }
     costs = {act: _cost(check, row, path, sun) for act, path in ways.items()}
     return min(ways, key=lambda act: (costs[act], act))
 
 
-def turned_away(begin: FloatArray, machine: Machine | None, drives: Drive) -> FloatArray:
+def turned_away(
+    begin: FloatArray, machine: Machine | None, drives: Drive, aimed: FloatArray | None = None
+) -> FloatArray:
     """Return the angles (2,) of the defocus from some angles, as a local controller chooses them.
 
-    The angle is turned the other way where a stop is near, as in `lcu.motion`.
+    From standby, and on the way there, it turns away from the angles of the aim (``aimed``). The
+    angle is turned the other way where a stop is near, as in `lcu.motion`.
     """
-    offsets = Config().defocus if machine is None else machine.defocus
-    found = begin + as_float(offsets)
+    offsets = as_float(Config().defocus if machine is None else machine.defocus)
+    if aimed is not None and np.isfinite(aimed).all():
+        offsets = np.copysign(offsets, begin - aimed)
+    found = begin + offsets
     if machine is None:
         return found
     limits = np.array([(axis.low, axis.high) for axis in machine.axes], dtype=np.float64)

@@ -133,6 +133,7 @@ class Field:
         self.journals = Journals(mechanism if believed is None else believed, machine)
         self._stow = np.zeros((count, 2), dtype=np.int64)
         self._defocus = np.zeros((count, 2))
+        self._senses = np.ones((count, 2))
         self.axes = np.zeros((count, 2), dtype=AXIS)
         for one, rows in self.journals.machines():
             self._stow[rows], self._defocus[rows] = one.stow, one.defocus
@@ -217,7 +218,8 @@ class Field:
     def _away(self, rows: Rows, angles: FloatArray) -> FloatArray:
         """Angles turned away by the defocus; the other way where a stop is near."""
         low, high = self._low[rows], self._high[rows]
-        one, other = angles + self._defocus[rows], angles - self._defocus[rows]
+        turn = self._senses[rows] * self._defocus[rows]
+        one, other = angles + turn, angles - turn
         stop = np.where(angles - low > high - angles, low, high)
         inside = (low <= other) & (other <= high)
         back = np.where(inside, other, stop)
@@ -260,11 +262,23 @@ class Field:
         if not len(rows):
             return
         rows = rows[~among(self.kind[rows], DEFOCUS, STOW) & ~self.at_stow(rows)]
+        self._sense(rows)
         self._base[rows] = self.kind[rows]
         self.kind[rows] = DEFOCUS
         self._knot[rows] = self._renew[rows] = 0
         angles = self._away(rows, self._angles_at(self.axes["count"][rows], rows))
         self._go(rows, angles, np.full(len(rows), kernels.BOTH))
+
+    def _sense(self, rows: Rows) -> None:
+        """Choose in which sense heliostats turn away: `Motion._turn`."""
+        self._senses[rows] = 1.0
+        able = among(self.kind[rows], APPROACH, STANDBY) & np.isfinite(self.aim[rows, 0])
+        rows = rows[able]
+        if len(rows):
+            angles, good = self._pose(rows, self.aim[rows], 0)
+            rows, angles = rows[good], angles[good]
+            off = self._angles_at(self.axes["count"][rows], rows) - angles
+            self._senses[rows] = np.copysign(1.0, off * self._defocus[rows])
 
     def _stow_directly(self, rows: Rows) -> None:
         if not len(rows):
