@@ -36,7 +36,7 @@ NEEDED = {
     ("POST", "session"): "",
     **{("GET", path): "viewer" for path in (
         "alarms", "authority", "calibration", "clusters", "commands", "commands/{identity}",
-        "emergency", "events", "field", "heliostats/{name}", "holds", "packets",
+        "emergency", "events", "field", "flights", "heliostats/{name}", "holds", "packets",
         "receivers/{name}/flux", "schedule", "session", "summary", "sun", "targets/{name}",
         "targets/{name}/photograph", "tokens", "photographs", "photographs/{identity}")},
     ("POST", "emergency"): "viewer",
@@ -55,6 +55,7 @@ NEEDED = {
     **{(method, "session/factor"): "viewer" for method in ("POST", "PUT", "DELETE")},
     ("DELETE", "accounts/{name}/factor"): "engineer",
     ("POST", "accounts/{name}/password"): "engineer",
+    ("POST", "flights"): "engineer",
     ("GET", "accounts"): "engineer",
     ("POST", "accounts"): "engineer",
     ("PATCH", "accounts/{name}"): "engineer",

@@ -175,6 +175,7 @@ def test_heliostats_in_doubt_are_visited_before_others(
                 book,
                 silent,
                 unknown,  # type: ignore[arg-type]
+                lambda: (),
             )
             ready = np.ones(len(plant.field), dtype=np.bool_)
             assert await calibrating.visit("target", ready, ENGINEER, 1) == first

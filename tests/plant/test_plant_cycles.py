@@ -17,7 +17,9 @@ import pytest
 
 from heliotrope import sun
 from heliotrope.calibration.fit import fit
+from heliotrope.calibration.flights import Flight
 from heliotrope.calibration.record import CalibrationOutcome
+from heliotrope.calibration.sightings import drone
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.example import example_plant
 from heliotrope.field.plant import Plant
@@ -30,6 +32,7 @@ from heliotrope.links.messages import Parameters
 from heliotrope.mechanism.board_items import items_of, packed
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.flights import TakenFlight
 from heliotrope.plant.visits.calibration_cycle import (
     CalibrationCycle,
     CycleResult,
@@ -165,6 +168,40 @@ def test_two_visits_make_one_fit_and_the_second_changes_nothing_more(tmp_path: P
 def prototype_machine(bench: Bench) -> Any:
     group, row = bench.design.find(NAME)
     return group.mechanism[row]
+
+
+def test_a_visit_fits_the_rows_of_a_flight_with_its_photographs(tmp_path: Path) -> None:
+    results: list[CycleResult] = []
+    error = {"azimuth_bias": 3e-3, "elevation_bias": -2e-3}
+
+    async def scene(bench: Bench, whole: CalibrationCycle, eye: Eye, token: int) -> None:
+        group, row = bench.design.find(NAME)
+        counts = np.array([[20_000.0 + 4_000.0 * k, 6_000.0 + 3_000.0 * k] for k in range(4)])
+        pose = group.mechanism[[row] * 4].with_parameters(error).pose(counts)
+        place = pose.vertex + 100.0 * pose.normal
+        made = drone(np.zeros(4, int), counts, place, place, time=1.7e9, sigma=1e-4)
+        shift = np.tile(np.eye(3), (4, 1, 1))
+        flight = Flight(
+            "one", (NAME,), made, np.array([1e-4]), ("e", "n", "u"), 1e-4 * np.eye(3), shift
+        )
+        numbers = np.array([7, 8, 9, 10])
+        beliefs = bench.plant.beliefs
+        beliefs.flights = beliefs.flights.adding(TakenFlight(flight, numbers, 1.8e9, "Egon"))
+        results.append(await whole.run(ENGINEER, token, NAME, "target"))
+        # What the visit revealed of the flight's errors counts for all other mirrors.
+        mean, covariance = beliefs.flights.shared()
+        assert np.abs(mean).max() < 0.01
+        assert np.trace(covariance) < 0.999 * 3e-4
+
+    cycle(tmp_path, scene, **error)
+    (result,) = results
+    assert (result.outcome, result.known, result.new) == (CalibrationOutcome.CALIBRATED, 6, 2)
+    assert result.record is not None
+    assert result.record.sightings.tolist()[2:] == [7, 8, 9, 10]
+    found = result.record.parameters
+    sigma = dict(zip(result.record.names, result.record.sigma, strict=True))
+    assert sigma["azimuth_bias"] < 1e-3
+    assert abs(found["azimuth_bias"] - 3e-3) < 3.0 * sigma["azimuth_bias"]
 
 
 @pytest.mark.parametrize(

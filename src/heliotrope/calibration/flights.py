@@ -7,12 +7,13 @@ and a wrong focal length displaces each mirror away from the middle of the fligh
 """
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from heliotrope.calibration.sightings import Sightings, drone, is_covariance
@@ -195,11 +196,12 @@ class Flight:
             np.array([row.shift for row in rows]).reshape(len(rows), 3, count),
         )
 
-    def rows_of(self, heliostats: Iterable[str]) -> np.ndarray:
-        """Return the rows of the sightings of some heliostats, (m,)."""
-        wanted = set(heliostats)
-        known = np.array([name in wanted for name in self.heliostats], dtype=np.bool_)
-        return np.flatnonzero(known[self.sightings.heliostat])
+    def rows_by_heliostat(self) -> dict[str, npt.NDArray[np.intp]]:
+        """Return the rows of the sightings of each heliostat."""
+        order = np.argsort(self.sightings.heliostat, kind="stable")
+        count = np.bincount(self.sightings.heliostat, minlength=len(self.heliostats))
+        parts = np.split(order, np.cumsum(count)[:-1])
+        return dict(zip(self.heliostats, parts, strict=True))
 
 
 def parse_flight(data: bytes | str) -> FlightDocument:

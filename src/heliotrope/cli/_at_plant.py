@@ -4,6 +4,7 @@ It needs no console, and EMERGENCY, DEFOCUS and STOW take the plant's own socket
 heavy is imported: an emergency starts at once.
 """
 
+import json
 from array import array
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,8 +16,8 @@ from heliotrope.errors import InputError
 from heliotrope.local import EMERGENCY, ORDINARY, ask_once, socket_folder
 
 _VIEWS = (
-    "alarms", "authority", "calibration", "clusters", "emergency", "events", "field", "holds",
-    "packets", "schedule", "summary", "sun",
+    "alarms", "authority", "calibration", "clusters", "emergency", "events", "field", "flights",
+    "holds", "packets", "schedule", "summary", "sun",
 )  # fmt: skip
 #: Calls of the socket for emergencies.
 _URGENT = ("order_emergency", "stow", "defocus")
@@ -34,6 +35,7 @@ _CALLS = {
     ("DELETE", "authority"): "release_authority",
     ("POST", "alarms/acknowledge"): "acknowledge",
     ("PUT", "calibration"): "switch_calibration",
+    ("POST", "flights"): "take_flight",
     ("POST", "holds"): "hold",
     ("POST", "holds/release"): "unhold",
     ("POST", "automatic/resume"): "resume",
@@ -88,6 +90,8 @@ class AtPlant:
             points = given.pop("points", {})
             given["points"] = list(points)
             blob = array("d", [x for point in points.values() for x in point]).tobytes()
+        if call == "take_flight":
+            given, blob = {}, json.dumps(given).encode()
         socket = EMERGENCY if call in _URGENT else ORDINARY
         return ask_once(self._folder / socket, self._hello, call, given, blob)
 

@@ -227,7 +227,7 @@ def show(
     what: Annotated[
         str,
         typer.Argument(
-            help="alarms, events, packets, clusters, calibration, schedule, holds, "
+            help="alarms, events, packets, clusters, calibration, flights, schedule, holds, "
             "emergency, sun, accounts, tokens, or the name of a heliostat."
         ),
     ],
@@ -241,6 +241,7 @@ def show(
         "packets",
         "clusters",
         "calibration",
+        "flights",
         "schedule",
         "holds",
         "emergency",
@@ -398,6 +399,32 @@ def photographs(
         for one in found
     ]
     print_table(("number", "time", "target", "outcome", ""), rows)
+
+
+@app.command()
+def flight(
+    context: typer.Context,
+    file: Annotated[Path, typer.Argument(help="flight.json of `heliotrope drone evaluate`.")],
+    name: Annotated[str, typer.Option(help="Another name for the flight.")] = "",
+) -> None:
+    """Give a drone's flight to the plant, which fits all its mirrors together; nothing moves."""
+    from heliotrope.calibration.flights import read_flight
+
+    document = read_flight(file).model_dump()
+    with _client(context) as client:
+        found = client.ask("POST", "flights", {**document, "name": name or document["name"]})
+    print(
+        f"flight {found['name']}: {found['orientations']} orientations of {found['heliostats']} "
+        f"heliostats"
+    )
+    print(
+        f"new parameters: {found['in_use']} in use, {found['at_stow']} when next at stow, "
+        f"{found['at_target']} after a photograph on a target; {found['unchanged']} unchanged"
+    )
+    rows = [(word, f"{value:+.2g}", f"{sigma:.2g}") for word, value, sigma in found["shared"]]
+    print_table(("shared error", "found", "σ"), rows)
+    for line in found["problems"]:
+        print(line)
 
 
 @app.command("out-of-service")

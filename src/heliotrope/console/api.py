@@ -212,6 +212,13 @@ async def schedule(console: Here, request: Request, who: Anyone, limit: Limit = 
     return await shared(console, request, "schedule", limit=limit)
 
 
+@router.get("/flights", response_model=models.many(models.FlightView), tags=["calibration"])
+async def flights(console: Here, request: Request, who: Anyone) -> Response:
+    """Return the flights of a drone that the plant has taken, the last first."""
+    del who
+    return await shared(console, request, "flights")
+
+
 @router.get("/holds", response_model=models.many(models.Lockout), tags=["calibration"])
 async def holds(console: Here, who: Anyone) -> JSONResponse:
     """Return the heliostats that are out of service."""

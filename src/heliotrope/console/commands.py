@@ -8,9 +8,10 @@ open to everybody who is signed in; everything else needs an operator.
 from fastapi import APIRouter, HTTPException, Request
 from fastapi.responses import JSONResponse
 
+from heliotrope.calibration.flights import LARGEST, FlightDocument
 from heliotrope.console import models
 from heliotrope.console.api import REFUSALS, Named, answer
-from heliotrope.console.auth import Anyone, Here, Operator, refused, settle
+from heliotrope.console.auth import Anyone, Engineer, Here, Operator, refused, settle
 from heliotrope.errors import InputError
 from heliotrope.plant.authority import OPERATOR_COMMANDS, Role
 from heliotrope.plant.interface import orders
@@ -163,6 +164,16 @@ async def calibrate(console: Here, who: Operator, order: orders.OneCalibration) 
 async def take_photograph(console: Here, who: Operator, name: Named) -> JSONResponse:
     """Photograph a target now, with whatever beam is on it."""
     return answer(await console.plant.ask("take_photograph", who.person, name=name))
+
+
+@router.post("/flights", response_model=models.FlightView, tags=["calibration"])
+async def take_flight(console: Here, who: Engineer, document: FlightDocument) -> JSONResponse:
+    """Take a flight of a drone: the flight.json of `heliotrope drone evaluate`; nothing moves."""
+    text = document.model_dump_json().encode()
+    if len(text) > LARGEST:
+        raise HTTPException(413, f"the flight is longer than {LARGEST >> 20} MiB; divide it")
+    value, _ = await console.plant.fetch("take_flight", who.person, text)
+    return answer(value)
 
 
 @router.post("/holds", response_model=models.many(models.Lockout), tags=["commands"])

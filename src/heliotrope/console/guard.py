@@ -28,7 +28,7 @@ from heliotrope.console.auth import (
     settle,
 )
 from heliotrope.console.edge import Edge
-from heliotrope.console.routes import EACH, FORM, READ, TINY, Found, Routes
+from heliotrope.console.routes import FORM, READ, TINY, Found, Routes
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.plant.operations.security import SecurityEvent
 
@@ -123,7 +123,7 @@ class Guard:
         length = bodies.length_of(headers, found.largest)
         if length > FORM:
             # What is longer than names and points of the whole field would only cost time.
-            length = bodies.length_of(headers, FORM + EACH * await console.heliostats())
+            length = bodies.length_of(headers, FORM + found.each * await console.heliostats())
         with contextlib.ExitStack() as stack:
             if length > FORM and who is not None:
                 stack.enter_context(self._edge.large(who))

@@ -13,6 +13,7 @@ from fastapi.routing import APIRoute
 from starlette.routing import BaseRoute, Match
 from starlette.types import Scope
 
+from heliotrope.calibration.flights import FlightDocument
 from heliotrope.console.auth import AtLeast, caller
 from heliotrope.plant.authority import Role
 
@@ -21,6 +22,8 @@ from heliotrope.plant.authority import Role
 TINY, FORM, LARGEST = 4096, 1 << 14, 16 << 20
 #: The same for each heliostat of a plant, bytes: the longest name, and a point with all its digits.
 EACH = 160
+#: The same of a drone's flight: 20 orientations with the errors that they share.
+EACH_FLOWN = 1 << 14
 READ = ("GET", "HEAD")
 
 
@@ -34,8 +37,8 @@ class Found:
         200, or 404 or 405 if there is none.
     role
         Least role; None: open to all.
-    largest
-        Largest body, bytes.
+    largest, each
+        Largest body, and how much of it for each heliostat of the plant, bytes.
     allow
         Methods that the path has.
     """
@@ -43,6 +46,7 @@ class Found:
     status: int
     role: Role | None = None
     largest: int = TINY
+    each: int = EACH
     allow: tuple[str, ...] = ()
 
 
@@ -87,7 +91,8 @@ def _of(route: BaseRoute) -> Found:
     field = route.body_field
     model = None if field is None else field.field_info.annotation
     role = _role(route.dependant)
-    return Found(200, role, TINY if model is None or role is None else _largest(model))
+    largest = TINY if model is None or role is None else _largest(model)
+    return Found(200, role, largest, EACH_FLOWN if model is FlightDocument else EACH)
 
 
 def _role(dependant: Any) -> Role | None:

@@ -16,6 +16,7 @@ from heliotrope.calibration.sightings import Sightings, join
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.plant.flights import Flights
 
 #: Stores sightings of a heliostat on a target; returns their numbers, (M,), 0 where it failed.
 Numbering = Callable[[str, str, Sightings], Identities]
@@ -54,10 +55,17 @@ class Beliefs:
     ----------
     design
         The plant.
+
+    Attributes
+    ----------
+    design
+        The plant.
+    flights
+        Flights of a drone; a new one replaces the object.
     """
 
     def __init__(self, design: Plant) -> None:
-        self._design = design
+        self.design, self.flights = design, Flights()
         self._records: dict[str, HeliostatCalibration] = {}
         self._seen: dict[str, Seen] = {}
         self._subscribers: list[Subscriber] = []
@@ -77,7 +85,7 @@ class Beliefs:
 
     def nominal(self, heliostat: str) -> Mechanism:
         """Return the mechanism of the design, batch shape (1,)."""
-        group, row = self._design.find(heliostat)
+        group, row = self.design.find(heliostat)
         return group.mechanism[np.array([row])]
 
     def present(self, heliostat: str) -> Mechanism:
@@ -88,7 +96,7 @@ class Beliefs:
         record = self._records.get(heliostat)
         if record is not None:
             return record.mechanism(self.nominal(heliostat))
-        group, row = self._design.find(heliostat)
+        group, row = self.design.find(heliostat)
         values = {name: float(v[row]) for name, v in group.parameters.items()}
         return self.nominal(heliostat).with_parameters(values)
 
@@ -99,6 +107,11 @@ class Beliefs:
     def seen(self, heliostat: str) -> Seen | None:
         """Return the known sightings; None if there are none."""
         return self._seen.get(heliostat)
+
+    def count(self, heliostat: str) -> int:
+        """Return the number of known sightings of a heliostat, by photograph and from the air."""
+        seen = self._seen.get(heliostat)
+        return (0 if seen is None else len(seen)) + self.flights.count(heliostat)
 
     def __len__(self) -> int:
         return len(self._records)

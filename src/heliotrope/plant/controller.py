@@ -427,7 +427,7 @@ class PlantController:
         before = self.authority.token
         grant = self.authority.take(person)
         if grant.token != before:
-            self._note(person, "AUTHORITY", "taken")
+            self.note(person, "AUTHORITY", "taken")
         return grant
 
     def seize_authority(self, person: Person, reason: str) -> Grant:
@@ -441,7 +441,7 @@ class PlantController:
         before = self.authority.grant
         grant = self.authority.seize(person, reason)
         holder = "nobody" if before is None else before.holder.name
-        self._note(person, "AUTHORITY", f"broken, from {holder}: {reason}")
+        self.note(person, "AUTHORITY", f"broken, from {holder}: {reason}")
         return grant
 
     def release_authority(self, person: Person, token: int) -> None:
@@ -453,7 +453,7 @@ class PlantController:
             If the authority is another person's.
         """
         self.authority.release(person, token)
-        self._note(person, "AUTHORITY", "released")
+        self.note(person, "AUTHORITY", "released")
 
     def withdraw_emergency(self, person: Person) -> None:
         """Withdraw an emergency order; the rows that it tripped wait for `acknowledge`.
@@ -465,7 +465,7 @@ class PlantController:
         """
         person.must_be(Role.OPERATOR, "emergency")
         self._sentinel.withdraw()
-        self._note(person, "WITHDRAW", "emergency order")
+        self.note(person, "WITHDRAW", "emergency order")
 
     def acknowledge(self, person: Person, condition: str, subject: str = "") -> None:
         """Acknowledge a row of the safety table that waits for it.
@@ -496,9 +496,10 @@ class PlantController:
             identity = self._clusters.number("acknowledge")
             message = Acknowledge(identity, condition, person.name, role.name.lower())
             self._clusters.ends[subject].post(message, QUESTION_LIFE)
-        self._note(person, "ACKNOWLEDGE", f"{condition} {subject}".strip())
+        self.note(person, "ACKNOWLEDGE", f"{condition} {subject}".strip())
 
-    def _note(self, person: Person, what: str, note: str) -> None:
+    def note(self, person: Person, what: str, note: str) -> None:
+        """Record what a person did that moves nothing, in the audit."""
         self._orders.note(person.name, person.role.title, what, note)
 
     # -- commands --------------------------------------------------------------------------

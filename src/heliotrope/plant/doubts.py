@@ -4,7 +4,8 @@ A power cut in motion may leave the step counts of a local controller wrong by u
 which it reports as COUNTS_DOUBTFUL until ZERO. Its beam may then stand beside its place without
 any other sign. Such a heliostat is named, and kept off the receiver until a photograph on a target
 or a person has confirmed its place. A confirmation holds for one boot: it says nothing of the next
-cut. One that stores new parameters which a calibration has yet to verify stays off in the same way.
+cut. One that stores new parameters which a calibration has yet to verify stays off in the same way,
+and one whose parameters a flight of a drone contradicts.
 """
 
 import contextlib
@@ -53,6 +54,8 @@ class Doubts:
         self._reach = np.array([np.hypot(each.width, each.height) for each in design.targets])
         #: Rows whose new parameters are being verified.
         self._unverified: set[int] = set()
+        #: Rows that a flight sees far from where their parameters say.
+        self._astray: frozenset[int] = frozenset()
         #: Boots of each local controller when its place was confirmed, -1 before.
         self._confirmed = np.full(len(field), -1, dtype=np.int64)
         self.standing: Mask = np.zeros(len(field), dtype=np.bool_)
@@ -85,6 +88,13 @@ class Doubts:
         finally:
             self._unverified.discard(row)
 
+    def astray(self, heliostats: Iterable[str]) -> None:
+        """Keep heliostats off the receiver that a flight sees far from where they should be.
+
+        The others that were named before may join it again.
+        """
+        self._astray = frozenset(self._field.place(name) for name in heliostats)
+
     def _judge(self, rows: list[int]) -> None:
         found = self._field.rows[rows]
         doubtful = found["flags"] & (_DOUBTFUL | _UNKNOWN) == _DOUBTFUL
@@ -99,13 +109,19 @@ class Doubts:
         """Return which heliostats may not join their aims, or points (K, 3), and why."""
         names = tuple(heliostats)
         rows = [self._field.place(name) for name in names]
-        unverified = np.isin(rows, list(self._unverified))
-        doubted = self.standing[rows] | unverified
+        unverified, astray = (np.isin(rows, list(s)) for s in (self._unverified, self._astray))
+        doubted = self.standing[rows] | unverified | astray
         if not doubted.any():
             return {}
         on_target = self._on_target(self._aims[rows] if points is None else points)
-        why = {True: refusals.NOT_VERIFIED.text, False: refusals.COUNTS_DOUBTFUL.text}
-        return {names[i]: why[bool(unverified[i])] for i in np.flatnonzero(doubted & ~on_target)}
+        found = {}
+        for i in np.flatnonzero(doubted & ~on_target):
+            found[names[i]] = refusals.COUNTS_DOUBTFUL.text
+            if astray[i]:
+                found[names[i]] = refusals.SEEN_ASTRAY.text
+            if unverified[i]:
+                found[names[i]] = refusals.NOT_VERIFIED.text
+        return found
 
     def _on_target(self, points: FloatArray) -> Mask:
         """Return which points (K, 3) are at a target, and nearer to it than to a receiver."""

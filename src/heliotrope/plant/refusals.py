@@ -177,6 +177,13 @@ NOT_VERIFIED = Refusal(
     "a calibration has yet to verify its new parameters by a photograph",
     "Wait until the visit has ended; DEFOCUS, STOW and LOCK end it at once.",
 )
+SEEN_ASTRAY = Refusal(
+    "seen astray from the air",
+    "A heliostat is sent to the receiver that a flight of a drone sees far from where its "
+    "parameters say.",
+    "a flight sees it far from where its parameters say, and no photograph has settled that yet",
+    "Let automatic control calibrate it: it goes to a target before all others.",
+)
 PARAMETERS_NOT_HERE = Refusal(
     "parameters not here",
     "Parameters that change a pose are given where the beam would move or is not proven free.",
@@ -195,6 +202,25 @@ NO_ANSWER = Refusal(
     "A local controller does not report its stored parameters.",
     "{heliostat}: its stored parameters cannot be read: {problem}",
     "Check that the heliostat is live, and ask again.",
+)
+FLIGHT_KNOWN = Refusal(
+    "flight taken before",
+    "The plant has taken a flight of that name already.",
+    "flight {name}: {person} gave it on {at}; its orientations count already",
+    "Give another flight; the same photographs evaluated again are no new measurement.",
+)
+FLIGHT_CONTRADICTS = Refusal(
+    "flight contradicts the field",
+    "The orientations of most mirrors of a flight cannot be theirs.",
+    "flight {name}: {wrong} of {all} mirrors cannot stand so, first {first}; nothing was taken",
+    "Check that the flight is of this field, its times and counts, and the position of the RTK "
+    "base.",
+)
+FLIGHT_BUSY = Refusal(
+    "another flight is being fitted",
+    "The plant fits one flight at a time.",
+    "flight {name}: the plant is still fitting flight {other}",
+    "Give it again in a minute.",
 )
 
 #: All kinds of refusal, in the order of the reference.

@@ -27,6 +27,7 @@ from heliotrope.store.records import (
     AlarmEntry,
     CampaignEntry,
     Event,
+    FlightEntry,
     Hold,
     KeptSightings,
     PlannedVisit,
@@ -272,6 +273,15 @@ class Keeper:
         """Record a campaign; it replaces the one of the same name."""
         row = rows.row_of(tables.campaign, campaign)
         self.writer.put(lambda c: rows.replace(c, tables.campaign, [row]))
+
+    def record_flight(self, flight: FlightEntry) -> None:
+        """Record a flight that was taken."""
+        row = rows.row_of(tables.flight, flight)
+        self.writer.put(lambda c: rows.insert(c, tables.flight, [row]))
+
+    def flights(self) -> list[FlightEntry]:
+        """Return the flights, the first taken first."""
+        return self._records(FlightEntry, select(tables.flight).order_by(tables.flight.c.at))
 
     def visits(self, limit: int = 100, heliostat: str = "") -> list[VisitEntry]:
         """Return the measurements, the latest first."""

@@ -241,6 +241,28 @@ class CampaignEntry:
 
 
 @dataclass(frozen=True)
+class FlightEntry:
+    """A flight of a drone that the plant has taken.
+
+    Attributes
+    ----------
+    name
+        Unique.
+    at
+        When it was taken, POSIX s.
+    person
+        Who gave it.
+    document
+        Text of its file; see `calibration.flights`.
+    """
+
+    name: str
+    at: float
+    person: str
+    document: str
+
+
+@dataclass(frozen=True)
 class AuditEntry:
     """One accepted command, as `plant.audit.Record`; times are ISO 8601."""
 
@@ -311,6 +333,10 @@ class Records(Protocol):
 
     def record_campaign(self, campaign: CampaignEntry) -> None:
         """Record a campaign; it replaces the one of the same name."""
+        ...
+
+    def record_flight(self, flight: FlightEntry) -> None:
+        """Record a flight that was taken."""
         ...
 
     def record_event(self, event: Event) -> None:
@@ -397,6 +423,10 @@ class Records(Protocol):
 
     def campaigns(self) -> list[CampaignEntry]:
         """Return the campaigns, the latest first."""
+        ...
+
+    def flights(self) -> list[FlightEntry]:
+        """Return the flights, the first taken first."""
         ...
 
     def events(

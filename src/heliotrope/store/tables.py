@@ -260,6 +260,17 @@ campaign = Table(
     Column("found", FiguresByName, nullable=False),
 )
 
+#: Flights that were taken: the document as its file has it. Their sightings stand among the others,
+#: with the flight as their campaign.
+flight = Table(
+    "flight",
+    metadata,
+    _text("name", key=True),
+    _real("at", needed=True),
+    _text("person"),
+    _text("document"),
+)
+
 visit = Table(
     "visit",
     metadata,

@@ -50,7 +50,14 @@ class OwnModel:
 
         The values are deviations from ``nominal``, so that they alone make the mechanism.
         """
-        fitted = fit(periodic.with_ratios(nominal, self.errors), sightings, self.parameters)
+        return self.completed(fit(self.start(nominal), sightings, self.parameters))
+
+    def start(self, nominal: Mechanism) -> Mechanism:
+        """Return the mechanism from which the parameters are fitted."""
+        return periodic.with_ratios(nominal, self.errors)
+
+    def completed(self, fitted: FieldFit) -> FieldFit:
+        """Return a fit from `start` with the ratios among the values."""
         if not self.errors:
             return fitted
         count, ratios = len(fitted.names), np.array([e.ratio for e in self.errors])

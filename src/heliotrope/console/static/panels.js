@@ -148,9 +148,39 @@ export function targets(box) {
   return () => off.forEach((end) => end());
 }
 
+// Flights of a drone: what became of each, and the errors that its rows share.
+function flights(box) {
+  const body = h("div"), file = h("input", { type: "file", accept: ".json,application/json", hidden: true });
+  box.append(body, file);
+  const shown = async () => {
+    const rows = await api("GET", "flights");
+    const shared = (r) => r.shared.map(([word, value, sigma]) => (word.endsWith(", m")
+      ? `${word.slice(0, -3)} ${number(1e3 * value, 1)} ± ${number(1e3 * sigma, 1)} mm` : `${word.split(",")[0]} ${number(1e6 * value, 0)} ± ${number(1e6 * sigma, 0)} ppm`));
+    body.replaceChildren(
+      h("div", { className: "hx-row" }, h("h3", {}, "Flights of a drone"),
+        me.role === "engineer" ? h("button", { className: "hx-button", onclick: () => file.click() }, "Take a flight…") : ""),
+      rows.length ? table([["Taken", (r) => clock(r.at)], ["Flight", (r) => h("span", { title: shared(r).join("\n") }, r.name)], ["By", (r) => r.person],
+        ["Heliostats", (r) => count(r.heliostats), "num"], ["In use", (r) => count(r.in_use), "num"],
+        ["At stow", (r) => h("span", { title: "Small changes, taken when the heliostat next stands at stow" }, count(r.at_stow)), "num"],
+        ["Photograph", (r) => h("span", { title: "Large changes and first calibrations, verified on a target first" }, count(r.at_target)), "num"],
+        ["Unchanged", (r) => h("span", { className: r.unchanged ? "warn" : "", title: r.problems.join("\n") }, count(r.unchanged)), "num"],
+        ["Shared errors", (r) => shared(r).slice(0, 3).join(", ")]], rows)
+        : h("p", { className: "hx-hint" }, "No flight has been taken."));
+  };
+  file.onchange = () => act(async () => {
+    const chosen = file.files[0];
+    file.value = "";
+    let document;
+    try { document = JSON.parse(await chosen.text()); } catch { throw new Error(`${chosen.name} is not a flight.json of drone evaluate`); }
+    await api("POST", "flights", document);
+    await shown();
+  }, "flight");
+  return refreshed(shown, { every: 5 });
+}
+
 export function calibration(box) {
-  const body = h("div"), lines = h("canvas", { className: "hx-chart" });
-  box.append(body);
+  const body = h("div"), lines = h("canvas", { className: "hx-chart" }), air = h("div");
+  box.append(body, air);
   let view = null;
   const draw = () => {
     if (!view) return;
@@ -175,8 +205,8 @@ export function calibration(box) {
   };
   const end = refreshed(async () => { view = await api("GET", "calibration"); draw(); },
     { key: () => JSON.stringify([store.head?.calibration, store.head?.measuring]) });
-  const off = store.on("theme", draw);
-  return () => { end(); off(); };
+  const off = store.on("theme", draw), landed = flights(air);
+  return () => { end(); off(); landed(); };
 }
 
 export function clusters(box) {

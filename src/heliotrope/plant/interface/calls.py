@@ -147,6 +147,7 @@ _VIEWS = {
     "clusters": _see(lambda desk: desk.operations.cluster_rows()),
     "alarms": _see(lambda desk: desk.operations.alarms()),
     "calibration": _see(lambda desk: desk.operations.calibration()),
+    "flights": _see(lambda desk: desk.operations.flights()),
     "holds": _see(lambda desk: desk.operations.holds()),
     "emergency": _see(lambda desk: desk.operations.emergency_view()),
     "commands": _see(lambda desk: desk.tickets.last()),
@@ -213,6 +214,9 @@ _ORDERS = {
     "calibrate": Call(Role.OPERATOR, orders.OneCalibration, _calibrate),
     "take_photograph": Call(
         Role.OPERATOR, orders.Named, lambda _d, _who, given, _b: given.name, Desk.photographed
+    ),
+    "take_flight": Call(
+        Role.ENGINEER, orders.Nothing, lambda _, __, ___, blob: blob, Desk.take_flight
     ),
     "hold": Call(Role.OPERATOR, orders.HoldOrder, _hold),
     "unhold": Call(Role.OPERATOR, orders.GivenBack, _unhold),

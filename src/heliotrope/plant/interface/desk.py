@@ -19,7 +19,7 @@ from heliotrope.plant.authority import Person
 from heliotrope.plant.interface import orders
 from heliotrope.plant.interface.tickets import Tickets, state_of
 from heliotrope.plant.operations.operations import Operations
-from heliotrope.plant.operations.views import CameraView, PictureRow
+from heliotrope.plant.operations.views import CameraView, FlightView, PictureRow
 from heliotrope.plant.orders import RECORDING
 from heliotrope.plant.tickets import Ticket
 
@@ -162,6 +162,12 @@ class Desk:
         if pictures is None:
             raise UnknownNameError("kept photograph", str(identity), ())
         return await _answer(lambda then: pictures.read(identity, then))
+
+    # -- flights --------------------------------------------------------------------------
+
+    async def take_flight(self, person: Person, text: bytes) -> FlightView:
+        """Take a flight of a drone, the text of its file."""
+        return await self.operations.take_flight(person, text)
 
     # -- views -----------------------------------------------------------------------------
 

@@ -23,6 +23,7 @@ from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, TrueErrors
 from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.plant.operations.flights import FlightIntake
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.losses import Losses
@@ -31,6 +32,7 @@ from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.operations.service import Service
 from heliotrope.plant.operations.views import CalibrationView, Planned
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
+from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.safety import alarms
 from heliotrope.store.records import Records
 
@@ -107,6 +109,8 @@ class AutomaticControl:
         True errors, known to a twin only.
     service
         Heliostats out of service.
+    flights
+        Takes flights of a drone.
     installed
         Tracking error that the priors allow an uncalibrated heliostat, rad.
     """
@@ -143,14 +147,26 @@ class AutomaticControl:
             wanted=settings.wanted,
         )
         self._losses = Losses(plant, logbook, settings.losses, records, self.give_way)
+        self.flights = FlightIntake(
+            plant, logbook, self._keeping, CycleSettings() if cycle is None else cycle.settings
+        )
         self._calibrating: Calibrating | None = None
         if cycle is not None and scheduler is not None:
             self._calibrating = Calibrating(
-                plant, logbook, cycle, scheduler, self.book, self._keeping, self.truth, pictures
+                plant,
+                logbook,
+                cycle,
+                scheduler,
+                self.book,
+                self._keeping,
+                self.truth,
+                self.flights.first,
+                pictures,
             )
         self._stopped = False
         if cycle is not None:
             self._keeping.recall()
+            self.flights.recall()
 
     # -- people's requests -----------------------------------------------------------------
 
@@ -373,6 +389,7 @@ class AutomaticControl:
         """Update predicted errors and the field's quality; check the records."""
         self.book.refresh()
         self.book.point(self._utc(), self.truth.all())
+        self.flights.look()
         self._keeping.forget(self._utc(), self._settings.events)
         self._log.check_records(self._keeping.problem)
         await self._sleep(_LOOK_EVERY)

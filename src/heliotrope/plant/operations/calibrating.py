@@ -1,7 +1,7 @@
 """Calibrating the field: one visit after another to each target, as the schedule says."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Protocol
 
@@ -86,6 +86,8 @@ class Calibrating:
         Take the results.
     truth
         True errors, known to a twin only.
+    first
+        Returns the heliostats to be visited first, after those in doubt.
     pictures
         Keeps the photographs with the results; None: they are not kept.
     """
@@ -99,8 +101,10 @@ class Calibrating:
         book: CalibrationBook,
         keeping: Keeping,
         truth: TrueErrors,
+        first: Callable[[], Collection[str]],
         pictures: Pictures | None = None,
     ) -> None:
+        self._first = first
         self._plant, self._log, self._cycle, self._scheduler = plant, log, cycle, scheduler
         self._book, self._keeping, self._truth = book, keeping, truth
         self._pictures = pictures
@@ -136,7 +140,8 @@ class Calibrating:
         """Calibrate the next of the ready heliostats (N,); return its name, "" if none is due.
 
         Those that persons asked for come first, then those whose step counts are in doubt: a
-        photograph ends it.
+        photograph ends it. Then those for which a flight has brought a large change, which a
+        photograph confirms.
         """
         name = self._chosen(target, ready)
         if not name:
@@ -168,10 +173,12 @@ class Calibrating:
             if where in ("", target) and ready[self._plant.field.place(name)]:
                 del self._asked[name]
                 return name
-        doubtful = ready & self._plant.doubts.standing
-        chosen = self._scheduler.next(target, doubtful) if doubtful.any() else None
-        chosen = chosen or self._scheduler.next(target, ready)
-        return "" if chosen is None else chosen.heliostat
+        changed = np.isin(self._plant.field.names, list(self._first()))
+        for rows in (ready & self._plant.doubts.standing, ready & changed, ready):
+            chosen = self._scheduler.next(target, rows) if rows.any() else None
+            if chosen is not None:
+                return chosen.heliostat
+        return ""
 
     def _now(self) -> float:
         return self._plant.clock.utc().timestamp()
@@ -180,7 +187,6 @@ class Calibrating:
         self, target: str, result: CycleResult, truth: float, begun: float, sigma: float
     ) -> None:
         row, good = self._plant.field.place(result.heliostat), result.outcome.calibrated
-        seen = self._plant.beliefs.seen(result.heliostat)
         record = result.record
         entry = CalibrationEntry(
             self._now(),
@@ -193,7 +199,7 @@ class Calibrating:
             float(self._book.error[row]),
             truth,
             self._truth.now(row) if good else math.nan,
-            0 if seen is None else len(seen),
+            self._plant.beliefs.count(result.heliostat),
             result.new,
             "; ".join((result.text, *result.rejected[:2])),
             0 if record is None else record.version,

@@ -66,9 +66,8 @@ class CalibrationBook:
 
     def _believe(self, record: HeliostatCalibration) -> None:
         row = self._plant.field.place(record.heliostat)
-        seen = self._plant.beliefs.seen(record.heliostat)
         self.calibrated_at[row] = record.at
-        self.sightings[row] = 0 if seen is None else len(seen)
+        self.sightings[row] = self._plant.beliefs.count(record.heliostat)
         self._predict([record])
 
     def conclude(self, entry: CalibrationEntry) -> None:

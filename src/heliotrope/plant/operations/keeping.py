@@ -2,16 +2,26 @@
 
 import functools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+import numpy.typing as npt
 
+from heliotrope.calibration.flights import Flight, parse_flight
 from heliotrope.calibration.record import HeliostatCalibration, Identities
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.plant.beliefs import Beliefs
+from heliotrope.plant.flights import TakenFlight
 from heliotrope.plant.lockouts import Lockout
 from heliotrope.plant.operations.views import CalibrationEntry
-from heliotrope.store.records import Records, StoreError, VisitEntry
+from heliotrope.store.records import (
+    FlightEntry,
+    KeptSightings,
+    Records,
+    StoreError,
+    VisitEntry,
+)
 
 #: Time between removals of old events, s.
 _DAY = 86_400.0
@@ -62,14 +72,48 @@ class Keeping:
         if records is None:
             return
         kept = records.sightings(self._names)
+        flown = np.array([kind == "drone" for kind in kept.kinds], dtype=np.bool_)
+        # Flights first: calibrations are predictions of all that is known.
+        self._recall_flights(records, kept, flown)
         for name, record in records.latest_calibrations(self._names).items():
             rows = np.zeros(0, np.intp)
             if name in kept.names:
-                rows = np.flatnonzero(kept.sightings.heliostat == kept.names.index(name))
+                mine = kept.sightings.heliostat == kept.names.index(name)
+                rows = np.flatnonzero(mine & ~flown)
             targets = [kept.targets[row] for row in rows]
-            self._beliefs.recall(record, kept.of(name), kept.identities[rows], targets)
+            seen = replace(kept.sightings.take(rows), heliostat=np.zeros(len(rows), np.intp))
+            self._beliefs.recall(record, seen, kept.identities[rows], targets)
         self._beliefs.number_with(self._number)
         self._beliefs.subscribe(functools.partial(self._keep, records), held=False)
+
+    def _recall_flights(
+        self, records: Records, kept: KeptSightings, flown: npt.NDArray[np.bool_]
+    ) -> None:
+        for entry in records.flights():
+            flight = Flight.of(parse_flight(entry.document))
+            if not set(flight.heliostats) <= set(self._names):
+                continue  # the plant file has changed; the store still has it
+            there = np.array([name == entry.name for name in kept.campaigns], dtype=np.bool_)
+            numbers = np.sort(kept.identities[flown & there])
+            if len(numbers) != len(flight.sightings):
+                numbers = np.zeros(len(flight.sightings), np.int64)
+            taken = TakenFlight(flight, numbers, entry.at, entry.person)
+            self._beliefs.flights = self._beliefs.flights.adding(taken)
+
+    def keep_flight(self, flight: Flight, entry: FlightEntry) -> Identities:
+        """Keep a flight; return the numbers of its sightings, 0 without a store.
+
+        Raises
+        ------
+        StoreError
+            If it cannot be kept.
+        """
+        if self._records is None:
+            return np.zeros(len(flight.sightings), np.int64)
+        self._records.record_flight(entry)
+        return self._records.record_sightings(
+            flight.heliostats, flight.sightings, kind="drone", campaign=flight.name
+        )
 
     def _number(self, name: str, target: str, new: Sightings) -> Identities:
         """Keep sightings; return their numbers, 0 where they could not be kept."""

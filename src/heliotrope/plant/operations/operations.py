@@ -19,6 +19,7 @@ from typing import Any, Protocol
 import numpy.typing as npt
 
 from heliotrope import sun
+from heliotrope.calibration.flights import parse_flight
 from heliotrope.errors import UnknownNameError
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
@@ -43,6 +44,7 @@ from heliotrope.plant.operations.views import (
     EmergencyView,
     EventRow,
     FieldFrame,
+    FlightView,
     HeliostatView,
     PacketRow,
     Planned,
@@ -355,6 +357,15 @@ class Operations:
             self.pictures.keep(view, shot, person.name)
         self._tell(person, f"photographed {target}")
         return view
+
+    def flights(self) -> tuple[FlightView, ...]:
+        """Return the flights of a drone that the plant has taken, the last first."""
+        return self.automatic.flights.views()
+
+    async def take_flight(self, person: Person, text: bytes) -> FlightView:
+        """Take a flight of a drone, the text of its file; see `FlightIntake.take`."""
+        document = await asyncio.to_thread(parse_flight, text)
+        return await self.automatic.flights.take(person, document, text.decode())
 
     def camera(self, target: str) -> CameraView:
         """Return the last photograph of a target.

@@ -444,6 +444,39 @@ class PictureRow:
 
 
 @dataclass(frozen=True)
+class FlightView:
+    """A flight of a drone that the plant has taken.
+
+    Attributes
+    ----------
+    name, at, person
+        Name, when it was taken (POSIX s), and who gave it.
+    orientations, heliostats
+        Number of its orientations, and of its heliostats.
+    in_use, at_stow, at_target, unchanged
+        Heliostats whose parameters count it, those that get new ones when they next stand at stow,
+        those whose large change waits for a photograph on a target, and those whose fit was
+        rejected or became no better.
+    shared
+        The errors that its rows share: name, value and standard deviation.
+    problems
+        Why fits were rejected: a line for each heliostat, the first ten.
+    """
+
+    name: str
+    at: float
+    person: str
+    orientations: int
+    heliostats: int
+    in_use: int
+    at_stow: int
+    at_target: int
+    unchanged: int
+    shared: tuple[tuple[str, float, float], ...]
+    problems: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class CameraView:
     """The last photograph of a target.
 

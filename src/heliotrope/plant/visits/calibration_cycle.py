@@ -16,19 +16,19 @@ import numpy as np
 
 from heliotrope import sun
 from heliotrope.calibration.evaluation import beam_errors
-from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome
 from heliotrope.calibration.record import (
     CalibrationOutcome,
     HeliostatCalibration,
     root_mean_square,
 )
 from heliotrope.calibration.sightings import Sightings, camera_target, join
-from heliotrope.geometry import FloatArray, angle_between
+from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.visits.fitting import JudgedFit, change_of, fit_heliostat
 from heliotrope.plant.visits.model_of_each import ModelOfEach
 from heliotrope.plant.visits.photographs import (
     Centred,
@@ -83,23 +83,6 @@ class CycleResult:
     before: float = float("nan")
     after: float = float("nan")
     record: HeliostatCalibration | None = None
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """A fit beside the present belief: beam errors, rad RMS, and why it is rejected, "" if not."""
-
-    model: str
-    fitted: FieldFit
-    nominal: Mechanism
-    before: float
-    after: float
-    outcome: CalibrationOutcome
-    problem: str
-
-    @property
-    def mechanism(self) -> Mechanism:
-        return self.nominal.with_parameters(self.fitted.parameters)
 
 
 class CalibrationCycle:
@@ -211,23 +194,25 @@ class CalibrationCycle:
             return CycleResult(name, outcome, text, rejected, 0 if known is None else len(known))
         here = join(new)
         every = join([*old, here])
+        count = len(every) + beliefs.flights.count(name)
         measured = root_mean_square(beam_errors(beliefs.present(name), here).beam)
-        if len(every) < self.settings.least:
+        if count < self.settings.least:
             beliefs.note(name, visit.target.name, here)
             return CycleResult(
                 name,
                 CalibrationOutcome.TOO_FEW_SIGHTINGS,
-                f"unchanged: {len(every)} sightings, {self.settings.least} are needed",
+                f"unchanged: {count} sightings, {self.settings.least} are needed",
                 rejected,
-                len(every),
+                count,
                 len(here),
                 measured,
             )
-        found = await self._fit(name, every)
+        model = await self._models.of(name, beliefs.nominal(name), every)
+        found = fit_heliostat(beliefs, self.settings, model, name, every)
         pushed: tuple[str, ...] = ()
         if not found.problem:
             with self._plant.doubts.unverified(name):
-                found, pushed = await self._try(visit, found, every, taken, tell)
+                found, pushed = await self._try(visit, found, taken, tell)
         if found.problem and (not old or found.outcome is CalibrationOutcome.NOT_VERIFIED):
             # No earlier sighting supports these, or a later photograph contradicts them: drop them.
             text = f"unchanged: {found.problem}"
@@ -236,16 +221,16 @@ class CalibrationCycle:
                 name, found.outcome, text, rejected, count, 0, np.nan, found.before, found.after
             )
         beliefs.note(name, visit.target.name, here)
-        record = None if found.problem else self._take(visit, found, every, pushed)
+        record = None if found.problem else self._take(visit, found, pushed)
         better = f"beam error {1e3 * found.before:.2f} to {1e3 * found.after:.2f} mrad RMS"
         return CycleResult(
             name,
             found.outcome,
             f"unchanged: {found.problem}"
             if found.problem
-            else f"calibrated: {better} over {len(every)} sightings",
+            else f"calibrated: {better} over {count} sightings",
             rejected,
-            len(every),
+            count,
             len(here),
             measured,
             found.before,
@@ -253,54 +238,15 @@ class CalibrationCycle:
             record,
         )
 
-    async def _fit(self, name: str, every: Sightings) -> _Fit:
-        beliefs = self._plant.beliefs
-        nominal, present = beliefs.nominal(name), beliefs.present(name)
-        model = await self._models.of(name, nominal, every)
-        fitted = model.fit(nominal, every)
-        new = nominal.with_parameters(fitted.parameters)
-        before, after = (root_mean_square(beam_errors(m, every).beam) for m in (present, new))
-        outcome, problem = self._judge(fitted, before, after)
-        return _Fit(model.name, fitted, nominal, before, after, outcome, problem)
-
-    def _judge(
-        self, fitted: FieldFit, before: float, after: float
-    ) -> tuple[CalibrationOutcome, str]:
-        """Return the outcome of a fit, and why it is rejected, "" if it is not."""
-        settings = self.settings
-        ending = FitOutcome(int(fitted.outcome[0]))
-        if ending is not FitOutcome.CONVERGED:
-            return CalibrationOutcome.FIT_FAILED, ending.text
-        # The ratio of a worm is searched; its significance has been tested there.
-        fits = np.array([not name.endswith("_worm_ratio") for name in fitted.names])
-        far = fits * np.abs(fitted.values[0]) / fitted.prior[0]
-        if far.max() > settings.most:
-            p = int(np.argmax(far))
-            return CalibrationOutcome.IMPLAUSIBLE, (
-                f"{fitted.names[p]} would be {far[p]:.1f} standard deviations of its prior, "
-                f"above {settings.most:g}; look at the photographs and the installation"
-            )
-        if not after <= settings.left:
-            return CalibrationOutcome.POOR_FIT, (
-                f"the fit leaves {1e3 * after:.1f} mrad RMS, above {1e3 * settings.left:g} mrad; "
-                "look at the photographs: is it this heliostat's beam?"
-            )
-        if not after <= settings.gain * before:
-            return CalibrationOutcome.NO_BETTER, (
-                f"the fit misses by {1e3 * after:.2f} mrad RMS, not below {settings.gain:g} times "
-                f"the {1e3 * before:.2f} mrad before"
-            )
-        return CalibrationOutcome.CALIBRATED, ""
-
     async def _try(
-        self, visit: Visit, found: _Fit, every: Sightings, taken: Photographs, tell: Tell
-    ) -> tuple[_Fit, tuple[str, ...]]:
+        self, visit: Visit, found: JudgedFit, taken: Photographs, tell: Tell
+    ) -> tuple[JudgedFit, tuple[str, ...]]:
         """Push a fit and verify it; return it, with why it was withdrawn, and the items pushed."""
         name, plant = visit.heliostat, self._plant
         present, new = plant.beliefs.present(name), found.mechanism
-        large = _moved(present, new, every) > self.settings.large
+        large = change_of(present, new, found.seen) > self.settings.large
         try:
-            pushed = await self._push(visit, new[0], f"fit of {len(every)} sightings")
+            pushed = await self._push(visit, new[0], f"fit of {len(found.seen)} sightings")
             if not (large or plant.beliefs.record(name) is None):
                 return found, pushed
             plant.want(name, new[0])
@@ -320,25 +266,18 @@ class CalibrationCycle:
         return replace(found, outcome=CalibrationOutcome.NOT_VERIFIED, problem=said), ()
 
     def _take(
-        self, visit: Visit, found: _Fit, every: Sightings, pushed: tuple[str, ...]
+        self, visit: Visit, found: JudgedFit, pushed: tuple[str, ...]
     ) -> HeliostatCalibration:
         """Make the record of a fit that is stored, and let the plant believe it."""
-        name, plant = visit.heliostat, self._plant
-        known, last = plant.beliefs.seen(name), plant.beliefs.record(name)
-        assert known is not None
-        record = HeliostatCalibration.from_fit(
-            name,
-            plant.clock.utc().timestamp(),
-            found.fitted,
-            found.nominal,
-            every,
-            known.identities,
-            model=found.model,
+        record = found.record(
+            self._plant.beliefs,
+            self._plant.clock.utc().timestamp(),
             person=visit.person.name,
             pushed=pushed,
-            version=1 if last is None else last.version + 1,
         )
-        plant.beliefs.take(record)
+        if found.revealed is not None:
+            self._plant.beliefs.flights.learn(visit.heliostat, *found.revealed)
+        self._plant.beliefs.take(record)
         return record
 
     async def _push(self, visit: Visit, mechanism: Mechanism, why: str) -> tuple[str, ...]:
@@ -361,12 +300,6 @@ class CalibrationCycle:
         await visit.command("UNLOCK")
         await visit.command("IDLE")
         return missing
-
-
-def _moved(present: Mechanism, new: Mechanism, made: Sightings) -> float:
-    """Return the largest change of the beam by new parameters at the counts of sightings, rad."""
-    normals = [m[made.heliostat].pose(made.counts).normal for m in (present, new)]
-    return 2.0 * float(angle_between(*normals).max())
 
 
 def _nobody(stage: str) -> None:

@@ -1,0 +1,200 @@
+"""Flights of a drone that the plant has taken, and what its mirrors reveal of their shared errors.
+
+A heliostat's fit needs what all others say of the errors that it shares with them, but not its own
+word a second time. So the sum is kept in parts, one for each heliostat (`CommonFit.information`).
+"""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration.fit.common import CommonErrors
+from heliotrope.calibration.flights import Flight
+from heliotrope.calibration.record import Identities
+from heliotrope.calibration.sightings import Sightings, join
+from heliotrope.geometry import FloatArray
+
+#: Most flights in the fits, the last ones: each adds its shared errors to every heliostat's part.
+MOST = 8
+
+
+@dataclass(frozen=True)
+class TakenFlight:
+    """A flight that the plant has taken.
+
+    Attributes
+    ----------
+    flight
+        The flight.
+    identities
+        Numbers of its sightings in the store, 0 without one, (M,).
+    at
+        When it was taken, POSIX s.
+    person
+        Who gave it.
+    left_out
+        Heliostats whose rows cannot be theirs, and are in no fit.
+    """
+
+    flight: Flight
+    identities: Identities
+    at: float
+    person: str
+    left_out: frozenset[str] = frozenset()
+
+
+class Flights:
+    """The flights of a plant; a new one makes a new object.
+
+    Parameters
+    ----------
+    taken
+        In the order in which they were taken.
+    parts
+        What each heliostat reveals of the shared errors of ``taken``: information and pull.
+    """
+
+    def __init__(
+        self,
+        taken: Sequence[TakenFlight] = (),
+        parts: Mapping[str, tuple[FloatArray, FloatArray]] | None = None,
+    ) -> None:
+        self._parts = dict(parts or {})
+        self._set(tuple(taken))
+
+    def _set(self, taken: tuple[TakenFlight, ...]) -> None:
+        self._taken = taken
+        sizes = [len(each.flight.shared) for each in taken]
+        self._edges = np.concatenate([[0], np.cumsum(sizes, dtype=np.intp)])
+        empty = np.zeros(0, np.intp)
+        self._rows: dict[str, list[npt.NDArray[np.intp]]] = {}
+        for k, each in enumerate(taken):
+            for name, rows in each.flight.rows_by_heliostat().items():
+                if name not in each.left_out:
+                    self._rows.setdefault(name, [empty] * len(taken))[k] = rows
+
+    def __len__(self) -> int:
+        return len(self._taken)
+
+    def __iter__(self) -> Iterator[TakenFlight]:
+        """Iterate over the flights, the first taken first."""
+        return iter(self._taken)
+
+    def __contains__(self, heliostat: str) -> bool:
+        return heliostat in self._rows
+
+    def count(self, heliostat: str) -> int:
+        """Return the number of a heliostat's rows."""
+        return sum(map(len, self._rows.get(heliostat, ())))
+
+    def adding(self, new: TakenFlight) -> "Flights":
+        """Return the flights with one more; beyond `MOST` the oldest are left out."""
+        taken = (*self._taken, new)
+        gone = len(taken) - MOST if len(taken) > MOST else 0
+        first, size = self._edges[gone], len(new.flight.shared)
+        parts = {
+            name: (
+                np.pad(information[first:, first:], ((0, size), (0, size))),
+                np.pad(pull[first:], (0, size)),
+            )
+            for name, (information, pull) in self._parts.items()
+        }
+        return Flights(taken[gone:], parts)
+
+    def learn(self, heliostat: str, information: FloatArray, pull: FloatArray) -> None:
+        """Keep what the last fit of a heliostat revealed of the shared errors.
+
+        A fit that began before the last flight was taken knows nothing of its errors, and is left
+        out.
+        """
+        if heliostat in self._rows and len(pull) == self._edges[-1]:
+            self._parts[heliostat] = information, pull
+
+    def leave_out(self, heliostats: Collection[str]) -> None:
+        """Leave rows of the last flight out of all fits: they cannot be of these heliostats."""
+        last = replace(self._taken[-1], left_out=frozenset(heliostats))
+        self._set((*self._taken[:-1], last))
+
+    def number(self, flight: str, identities: Identities) -> None:
+        """Keep the numbers that the store gave to the sightings of a flight, (M,)."""
+        self._set(
+            tuple(
+                replace(each, identities=identities) if each.flight.name == flight else each
+                for each in self._taken
+            )
+        )
+
+    def shared(self, but: Collection[str] = ()) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of all shared errors, (K,) and (K, K).
+
+        Parameters
+        ----------
+        but
+            Heliostats whose word does not count.
+        """
+        count = int(self._edges[-1])
+        known, drawn = np.zeros((count, count)), np.zeros(count)
+        for each, first, last in zip(self._taken, self._edges[:-1], self._edges[1:], strict=True):
+            known[first:last, first:last] = np.linalg.inv(each.flight.covariance)
+        for name, (information, pull) in self._parts.items():
+            if name not in but:
+                known += information
+                drawn += pull
+        covariance = np.linalg.inv(known)
+        return covariance @ drawn, 0.5 * (covariance + covariance.T)
+
+    def of_flight(self, number: int) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of the shared errors of one flight, counted from 0."""
+        mean, covariance = self.shared()
+        part = slice(self._edges[number], self._edges[number + 1])
+        return mean[part], covariance[part, part]
+
+    def identities(self, heliostat: str) -> Identities:
+        """Return the numbers of a heliostat's rows, in the order of `common`."""
+        rows = self._rows.get(heliostat, [])
+        parts = [each.identities[r] for each, r in zip(self._taken, rows, strict=bool(rows))]
+        return np.concatenate([np.zeros(0, np.int64), *parts])
+
+    def common(
+        self, heliostats: Sequence[str], photographed: Sequence[Sightings | None]
+    ) -> tuple[Sightings, CommonErrors]:
+        """Return all sightings of some heliostats, photographs first, and their common errors.
+
+        Parameters
+        ----------
+        heliostats
+            N names; the sightings count them from 0.
+        photographed
+            The sightings of each by photograph, rows 0; None without any.
+        """
+        parts: list[Sightings] = []
+        shifts: list[FloatArray] = []
+        turned: list[npt.NDArray[np.bool_]] = []
+        turn, count = np.zeros(len(heliostats)), int(self._edges[-1])
+        for i, (name, photographs) in enumerate(zip(heliostats, photographed, strict=True)):
+            if photographs is not None and len(photographs):
+                parts.append(_as_row(photographs, i))
+                shifts.append(np.zeros((len(photographs), 3, count)))
+                turned.append(np.zeros(len(photographs), np.bool_))
+            rows_of = self._rows.get(name) or [np.zeros(0, np.intp)] * len(self._taken)
+            for k, (each, rows) in enumerate(zip(self._taken, rows_of, strict=True)):
+                if not len(rows):
+                    continue
+                flight = each.flight
+                parts.append(_as_row(flight.sightings.take(rows), i))
+                shift = np.zeros((len(rows), 3, count))
+                shift[:, :, self._edges[k] : self._edges[k + 1]] = flight.shift[rows]
+                shifts.append(shift)
+                turned.append(np.ones(len(rows), np.bool_))
+                turn[i] = max(turn[i], flight.turn_sigma[flight.heliostats.index(name)])
+        mean, covariance = self.shared(set(heliostats))
+        errors = CommonErrors(
+            np.concatenate(shifts), mean, covariance, np.concatenate(turned), turn
+        )
+        return join(parts), errors
+
+
+def _as_row(sightings: Sightings, row: int) -> Sightings:
+    return replace(sightings, heliostat=np.full(len(sightings), row, dtype=np.intp))

@@ -1,0 +1,289 @@
+"""Flights of a drone taken into the plant: all mirrors fitted together, new parameters in safety.
+
+A flight never moves a beam. A small change is taken while the heliostat stands at stow or locked,
+where its local controller may be written. A large change, and a first calibration, wait for a visit
+to a target, which fits the flight's rows with its photographs and verifies the result by one more;
+until then a heliostat that the flight sees far from where it should be stays off the receiver.
+"""
+
+import asyncio
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from enum import Enum
+
+import numpy as np
+
+from heliotrope.calibration.flights import Flight, FlightDocument
+from heliotrope.calibration.record import Provenance
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.plant import refusals
+from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.flights import Flights, TakenFlight
+from heliotrope.plant.operations.keeping import Keeping
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.views import FlightView
+from heliotrope.plant.parameters import TAKES_POSE
+from heliotrope.plant.visits.fitting import WRONG, JudgedFit, change_of, fit_flights
+from heliotrope.plant.visits.settings import CycleSettings
+from heliotrope.store.records import FlightEntry
+
+#: Largest share of a flight's mirrors whose fit may be wrong.
+_MOST_WRONG = 0.5
+#: A photograph may be this much later than the plant's time, s.
+_LATE = 300.0
+_LINES = 10
+
+
+class _Way(Enum):
+    """How a heliostat of a flight stands to it."""
+
+    IN_USE = "in use"
+    AT_STOW = "at stow"
+    AT_TARGET = "at a target"
+    UNCHANGED = "unchanged"
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    """A heliostat with the fit that a flight brought, and the version that it was judged beside.
+
+    ``astray``: the flight sees it far from where its parameters say.
+    """
+
+    way: _Way
+    fit: JudgedFit
+    version: int
+    astray: bool = False
+
+
+class FlightIntake:
+    """Takes flights into the beliefs of a plant.
+
+    Parameters
+    ----------
+    plant, log, keeping
+        The controller, the logbook for events, and the memory.
+    settings
+        Model and limits of fits.
+    """
+
+    def __init__(
+        self, plant: PlantController, log: Logbook, keeping: Keeping, settings: CycleSettings
+    ) -> None:
+        self._plant, self._log, self._keeping = plant, log, keeping
+        self._settings = settings
+        self._waiting: dict[str, _Waiting] = {}
+        self._busy = ""
+
+    # -- taking ----------------------------------------------------------------------------
+
+    async def take(self, person: Person, document: FlightDocument, text: str) -> FlightView:
+        """Take a flight; the fits are made in a thread.
+
+        Parameters
+        ----------
+        person
+            An engineer.
+        document, text
+            The flight, and the text of its file for the store.
+
+        Raises
+        ------
+        RefusedError
+            If the role is too low, the flight is known, or it contradicts the field.
+        InputError, UnknownNameError
+            If it is not of this plant.
+        StoreError
+            If it cannot be kept.
+        """
+        flight = self._checked(person, document)
+        self._busy = flight.name
+        try:
+            taken = TakenFlight(
+                flight, np.zeros(len(flight.sightings), np.int64), self._utc(), person.name
+            )
+            flights = self._plant.beliefs.flights.adding(taken)
+            fits = await asyncio.to_thread(self._fitted, flights, flight)
+        finally:
+            self._busy = ""
+        return self._conclude(taken, flights, fits, text)
+
+    def take_now(self, person: Person, document: FlightDocument, text: str) -> FlightView:
+        """Take a flight within the caller's thread, as `take` does."""
+        flight = self._checked(person, document)
+        taken = TakenFlight(
+            flight, np.zeros(len(flight.sightings), np.int64), self._utc(), person.name
+        )
+        flights = self._plant.beliefs.flights.adding(taken)
+        return self._conclude(taken, flights, self._fitted(flights, flight), text)
+
+    def _checked(self, person: Person, document: FlightDocument) -> Flight:
+        """Return a flight that this plant can take."""
+        person.must_be(Role.ENGINEER, "flight")
+        flight, beliefs = Flight.of(document), self._plant.beliefs
+        for each in beliefs.flights:
+            if each.flight.name == flight.name:
+                raise refusals.FLIGHT_KNOWN.error(
+                    name=flight.name, person=each.person, at=_day(each.at)
+                )
+        if self._busy:
+            raise refusals.FLIGHT_BUSY.error(name=flight.name, other=self._busy)
+        for name in flight.heliostats:
+            if name not in self._plant.field.index:
+                raise UnknownNameError("heliostat", name, self._plant.field.names)
+            group, _ = beliefs.design.find(name)
+            drives = len(group.mechanism.driven)
+            if drives != flight.sightings.counts.shape[1]:
+                raise InputError(
+                    f"flight {flight.name}: {flight.sightings.counts.shape[1]} counts a row; "
+                    f"{name} has {drives} drives"
+                )
+        latest = float(flight.sightings.time.max())
+        if latest > self._utc() + _LATE:
+            raise InputError(
+                f"flight {flight.name}: a photograph is of {_day(latest)}, and it is now "
+                f"{_day(self._utc())}; set the clock of the drone"
+            )
+        return flight
+
+    def _fitted(self, flights: Flights, flight: Flight) -> dict[str, JudgedFit]:
+        return fit_flights(self._plant.beliefs, flights, self._settings, flight.heliostats)
+
+    def _conclude(
+        self, taken: TakenFlight, flights: Flights, fits: Mapping[str, JudgedFit], text: str
+    ) -> FlightView:
+        """Believe a flight that does not contradict the field; sort its heliostats."""
+        flight, wrong = taken.flight, [n for n, f in fits.items() if f.outcome in WRONG]
+        if len(wrong) > _MOST_WRONG * len(fits):
+            first = f"{wrong[0]}: {fits[wrong[0]].problem}"
+            raise refusals.FLIGHT_CONTRADICTS.error(
+                name=flight.name, wrong=len(wrong), all=len(fits), first=first
+            )
+        entry = FlightEntry(flight.name, taken.at, taken.person, text)
+        numbers = self._keeping.keep_flight(flight, entry)
+        flights.number(flight.name, numbers)
+        flights.leave_out(wrong)
+        self._plant.beliefs.flights = flights
+        named = {name: replace(fit, flown=flights.identities(name)) for name, fit in fits.items()}
+        self._waiting.update({name: self._sorted(fit) for name, fit in named.items()})
+        self.look()
+        view = next(v for v in self.views() if v.name == flight.name)
+        self._log.event(
+            "calibration",
+            taken.person,
+            f"flight {flight.name}: {view.orientations} orientations of {view.heliostats} "
+            f"heliostats; new parameters for {view.in_use} now, {view.at_stow} at stow, "
+            f"{view.at_target} after a photograph; {view.unchanged} unchanged",
+        )
+        self._plant.note(
+            Person(taken.person, Role.ENGINEER), "FLIGHT", f"{flight.name}: {view.heliostats}"
+        )
+        return view
+
+    def _sorted(self, fit: JudgedFit) -> _Waiting:
+        beliefs = self._plant.beliefs
+        record = beliefs.record(fit.name)
+        version = 0 if record is None else record.version
+        if fit.problem:
+            return _Waiting(_Way.UNCHANGED, fit, version)
+        change = change_of(beliefs.present(fit.name), fit.mechanism, fit.seen)
+        large = change > self._settings.large
+        # A visit fits each heliostat with a model of its own, which may be a larger one.
+        other = record is None or set(record.names) != set(fit.fitted.names)
+        way = _Way.AT_TARGET if large or other else _Way.AT_STOW
+        return _Waiting(way, fit, version, large and record is not None)
+
+    # -- afterwards ------------------------------------------------------------------------
+
+    def recall(self) -> None:
+        """Fit the flights from before a restart again: what waited then, waits again."""
+        beliefs, fits = self._plant.beliefs, dict[str, JudgedFit]()
+        known, beliefs.flights = tuple(beliefs.flights), Flights()
+        for taken in known:
+            flights = beliefs.flights.adding(taken)
+            found = self._fitted(flights, taken.flight)
+            flights.leave_out([n for n, fit in found.items() if fit.outcome in WRONG])
+            beliefs.flights = flights
+            fits.update(found)
+        for name, fit in fits.items():
+            record = beliefs.record(name)
+            last = max(f.at for f in known if name in f.flight.heliostats)
+            done = record is not None and record.at >= last
+            waiting = self._sorted(fit)
+            self._waiting[name] = replace(waiting, way=_Way.IN_USE) if done else waiting
+        self.look()
+
+    def look(self) -> None:
+        """Take what waits for a heliostat that now stands where its parameters may be written."""
+        field, beliefs = self._plant.field, self._plant.beliefs
+        resting = field.among(TAKES_POSE, self._plant.now())
+        for name, waiting in list(self._waiting.items()):
+            if waiting.way not in (_Way.AT_STOW, _Way.AT_TARGET):
+                continue
+            record = beliefs.record(name)
+            if record is not None and record.version > waiting.version:
+                # A visit has fitted the flight's rows together with its photographs.
+                self._waiting[name] = replace(waiting, way=_Way.IN_USE)
+            elif waiting.way is _Way.AT_STOW and resting[field.place(name)]:
+                self._waiting[name] = replace(waiting, way=_Way.IN_USE)
+                last = [f for f in beliefs.flights if name in f.flight.heliostats][-1]
+                beliefs.take(
+                    waiting.fit.record(
+                        beliefs,
+                        self._utc(),
+                        person=last.person,
+                        provenance=Provenance.DRONE,
+                        campaign=last.flight.name,
+                    )
+                )
+
+        self._plant.doubts.astray(
+            name
+            for name, waiting in self._waiting.items()
+            if waiting.way is _Way.AT_TARGET and waiting.astray
+        )
+
+    def first(self) -> frozenset[str]:
+        """Return the heliostats whose large change waits for a photograph."""
+        return frozenset(n for n, w in self._waiting.items() if w.way is _Way.AT_TARGET)
+
+    def views(self) -> tuple[FlightView, ...]:
+        """Return the flights, the last taken first."""
+        flights = self._plant.beliefs.flights
+        return tuple(self._view(k, each) for k, each in enumerate(flights))[::-1]
+
+    def _view(self, number: int, taken: TakenFlight) -> FlightView:
+        flight = taken.flight
+        mine = {n: self._waiting[n] for n in flight.heliostats if n in self._waiting}
+        ways = Counter(w.way for w in mine.values())
+        mean, covariance = self._plant.beliefs.flights.of_flight(number)
+        sigma = np.sqrt(np.diagonal(covariance))
+        rejected = [
+            f"{name}: {w.fit.problem}" for name, w in mine.items() if w.way is _Way.UNCHANGED
+        ]
+        return FlightView(
+            flight.name,
+            taken.at,
+            taken.person,
+            len(flight.sightings),
+            len(flight.heliostats),
+            ways[_Way.IN_USE],
+            ways[_Way.AT_STOW],
+            ways[_Way.AT_TARGET],
+            ways[_Way.UNCHANGED],
+            tuple(
+                (word, float(m), float(s))
+                for word, m, s in zip(flight.shared, mean, sigma, strict=True)
+            ),
+            tuple(rejected[:_LINES]),
+        )
+
+    def _utc(self) -> float:
+        return self._plant.clock.utc().timestamp()
+
+
+def _day(at: float) -> str:
+    return datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M UTC")

@@ -1,0 +1,285 @@
+"""Fits of what the plant has seen of its heliostats, and their judgement.
+
+One heliostat is fitted after a visit, many after a flight. Both use all that is known of a mirror:
+its photographs, and its rows of flights with the errors that they share with other mirrors.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.fit.common import CommonFit, fit_common
+from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome
+from heliotrope.calibration.learn.own_model import OwnModel
+from heliotrope.calibration.record import (
+    CalibrationOutcome,
+    HeliostatCalibration,
+    Identities,
+    Provenance,
+    root_mean_square,
+)
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.geometry import FloatArray, angle_between
+from heliotrope.mechanism import parameters as parameter_table
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.plant.beliefs import Beliefs
+from heliotrope.plant.flights import Flights
+from heliotrope.plant.visits.settings import CycleSettings
+
+#: Outcomes of fits whose sightings contradict each other or the installation.
+WRONG = frozenset(
+    {
+        CalibrationOutcome.FIT_FAILED,
+        CalibrationOutcome.IMPLAUSIBLE,
+        CalibrationOutcome.POOR_FIT,
+    }
+)
+
+
+@dataclass(frozen=True)
+class JudgedFit:
+    """A fit of one heliostat beside the present belief.
+
+    Attributes
+    ----------
+    model
+        Name of the model.
+    fitted
+        Of batch shape (1,).
+    nominal
+        The mechanism that it starts from, batch shape (1,).
+    seen
+        The sightings, photographs first, without the errors that flights share.
+    before, after
+        Beam errors under the present and the fitted mechanism, weighted by the sightings, rad RMS.
+    outcome, problem
+        Why the fit is rejected, "" if it is not.
+    name
+        Of the heliostat.
+    flown
+        Numbers of its rows of flights in the store, the last of ``seen``.
+    revealed
+        What it reveals of the shared errors of the flights; None without rows of flights.
+    """
+
+    model: str
+    fitted: FieldFit
+    nominal: Mechanism
+    seen: Sightings
+    before: float
+    after: float
+    outcome: CalibrationOutcome
+    problem: str
+    name: str
+    flown: Identities
+    revealed: tuple[FloatArray, FloatArray] | None = None
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """The fitted mechanism, batch shape (1,)."""
+        return self.nominal.with_parameters(self.fitted.parameters)
+
+    def record(
+        self,
+        beliefs: Beliefs,
+        at: float,
+        *,
+        person: str,
+        pushed: tuple[str, ...] = (),
+        provenance: Provenance = Provenance.CAMERA,
+        campaign: str = "",
+    ) -> HeliostatCalibration:
+        """Return the record of this fit, whose photographs the beliefs know already; see there."""
+        known, last = beliefs.seen(self.name), beliefs.record(self.name)
+        photographs = np.zeros(0, np.int64) if known is None else known.identities
+        return HeliostatCalibration.from_fit(
+            self.name,
+            at,
+            self.fitted,
+            self.nominal,
+            self.seen,
+            np.concatenate([photographs, self.flown]),
+            model=self.model,
+            provenance=provenance,
+            person=person,
+            campaign=campaign,
+            pushed=pushed,
+            version=1 if last is None else last.version + 1,
+        )
+
+
+def fit_heliostat(
+    beliefs: Beliefs, settings: CycleSettings, model: OwnModel, name: str, photographed: Sightings
+) -> JudgedFit:
+    """Return the fit of one heliostat, by a model, to its photographs and its rows of flights."""
+    nominal, nothing = beliefs.nominal(name), np.zeros(0, np.int64)
+    if name in beliefs.flights:
+        return _fit_group(
+            beliefs, beliefs.flights, settings, model, (name,), nominal, (photographed,)
+        )[0]
+    fitted = model.fit(nominal, photographed)
+    return _judged(beliefs, settings, model, name, nominal, fitted, photographed, nothing)
+
+
+def fit_flights(
+    beliefs: Beliefs, flights: Flights, settings: CycleSettings, names: Sequence[str]
+) -> dict[str, JudgedFit]:
+    """Return the fits of many heliostats, which share the errors of flights, by name.
+
+    All are fitted with the model of few sightings; a visit chooses for each one.
+    A mirror whose fit is wrong says nothing of the shared errors: the others are fitted again
+    without it.
+    """
+    found: dict[str, JudgedFit] = {}
+    groups: dict[int, list[str]] = {}
+    for name in names:
+        groups.setdefault(id(beliefs.design.find(name)[0]), []).append(name)
+    # With several groups, each is fitted by what the others said last.
+    for _ in range(2 if len(groups) > 1 else 1):
+        for members in groups.values():
+            good = members
+            for _ in range(2):
+                fits = _fit_names(beliefs, flights, settings, good)
+                found.update(zip(good, fits, strict=True))
+                wrong = {n for n, f in zip(good, fits, strict=True) if f.outcome in WRONG}
+                for name, one in zip(good, fits, strict=True):
+                    size = len(flights.shared()[0])
+                    nothing = np.zeros((size, size)), np.zeros(size)
+                    flights.learn(name, *(nothing if name in wrong else one.revealed or nothing))
+                if not wrong or len(wrong) == len(good):
+                    break
+                good = [name for name in good if name not in wrong]
+    return found
+
+
+def _fit_names(
+    beliefs: Beliefs, flights: Flights, settings: CycleSettings, names: Sequence[str]
+) -> list[JudgedFit]:
+    group = beliefs.design.find(names[0])[0]
+    rows = np.array([group.index(name) for name in names], dtype=np.intp)
+    seen = [beliefs.seen(name) for name in names]
+    photographed = [None if one is None else one.sightings for one in seen]
+    first = settings.first_model
+    word = first if isinstance(first, str) else "+".join(first)
+    known = group.mechanism.parameters
+    model = OwnModel(word, parameter_table.model(first, known) if word == first else tuple(first))
+    return _fit_group(beliefs, flights, settings, model, names, group.mechanism[rows], photographed)
+
+
+def _fit_group(
+    beliefs: Beliefs,
+    flights: Flights,
+    settings: CycleSettings,
+    model: OwnModel,
+    names: Sequence[str],
+    mechanism: Mechanism,
+    photographed: Sequence[Sightings | None],
+) -> list[JudgedFit]:
+    seen, common = flights.common(names, photographed)
+    found = fit_common(model.start(mechanism), seen, model.parameters, common)
+    return [
+        _of_one(
+            beliefs,
+            settings,
+            model,
+            name,
+            mechanism[np.array([i])],
+            found,
+            i,
+            flights.identities(name),
+        )
+        for i, name in enumerate(names)
+    ]
+
+
+def _of_one(
+    beliefs: Beliefs,
+    settings: CycleSettings,
+    model: OwnModel,
+    name: str,
+    nominal: Mechanism,
+    found: CommonFit,
+    i: int,
+    flown: Identities,
+) -> JudgedFit:
+    whole, mine = found.fitted, found.seen.heliostat == i
+    here = slice(i, i + 1)
+    fitted = replace(
+        whole,
+        values=whole.values[here],
+        covariance=whole.covariance[here],
+        prior=whole.prior[here],
+        scale=whole.scale[here],
+        lengths=whole.lengths[mine],
+        count=whole.count[here],
+        iterations=whole.iterations[here],
+        outcome=whole.outcome[here],
+        centre=whole.centre[here],
+    )
+    fitted = model.completed(fitted)
+    judged = _judged(beliefs, settings, model, name, nominal, fitted, found.seen.of(i), flown)
+    return replace(judged, revealed=(found.information[i], found.pull[i]))
+
+
+def _judged(
+    beliefs: Beliefs,
+    settings: CycleSettings,
+    model: OwnModel,
+    name: str,
+    nominal: Mechanism,
+    fitted: FieldFit,
+    seen: Sightings,
+    flown: Identities,
+) -> JudgedFit:
+    new = nominal.with_parameters(fitted.parameters)
+    before, after = (
+        _weighted(beam_errors(m, seen).beam, seen) for m in (beliefs.present(name), new)
+    )
+    outcome, problem = _judge(settings, fitted, before, after)
+    return JudgedFit(
+        model.name, fitted, nominal, seen, before, after, outcome, problem, name, flown
+    )
+
+
+def _weighted(errors: FloatArray, seen: Sightings) -> float:
+    """Return the RMS of errors, each with the weight of its sighting."""
+    # Photographs all have the same sigma; a row of a flight may weigh a hundred times as much.
+    weight = seen.sigma**-2.0 / np.mean(seen.sigma**-2.0)
+    return root_mean_square(errors * np.sqrt(weight))
+
+
+def _judge(
+    settings: CycleSettings, fitted: FieldFit, before: float, after: float
+) -> tuple[CalibrationOutcome, str]:
+    """Return the outcome of a fit, and why it is rejected, "" if it is not."""
+    ending = FitOutcome(int(fitted.outcome[0]))
+    if ending is not FitOutcome.CONVERGED:
+        return CalibrationOutcome.FIT_FAILED, ending.text
+    # The ratio of a worm is searched; its significance has been tested there.
+    fits = np.array([not name.endswith("_worm_ratio") for name in fitted.names])
+    far = fits * np.abs(fitted.values[0]) / fitted.prior[0]
+    if far.max() > settings.most:
+        p = int(np.argmax(far))
+        return CalibrationOutcome.IMPLAUSIBLE, (
+            f"{fitted.names[p]} would be {far[p]:.1f} standard deviations of its prior, "
+            f"above {settings.most:g}; look at the photographs and the installation"
+        )
+    if not after <= settings.left:
+        return CalibrationOutcome.POOR_FIT, (
+            f"the fit leaves {1e3 * after:.1f} mrad RMS, above {1e3 * settings.left:g} mrad; "
+            "look at the photographs: is it this heliostat's beam?"
+        )
+    if not after <= settings.gain * before:
+        return CalibrationOutcome.NO_BETTER, (
+            f"the fit misses by {1e3 * after:.2f} mrad RMS, not below {settings.gain:g} times "
+            f"the {1e3 * before:.2f} mrad before"
+        )
+    return CalibrationOutcome.CALIBRATED, ""
+
+
+def change_of(present: Mechanism, new: Mechanism, made: Sightings) -> float:
+    """Return the largest change of the beam by new parameters at the counts of sightings, rad."""
+    normals = [m[made.heliostat].pose(made.counts).normal for m in (present, new)]
+    return 2.0 * float(angle_between(*normals).max())
