@@ -7,12 +7,22 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.fit.residuals import frame
+from heliotrope.calibration.paint_splits import KINDS, paint_split
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, angle_between, bisector, reflect
 from heliotrope.mechanism.chain import Mechanism
 
-Split = Literal["random", "chronological", "neighbour", "sequential"]
+Split = Literal[
+    "random",
+    "chronological",
+    "neighbour",
+    "sequential",
+    "azimuth",
+    "solstice",
+    "balanced",
+    "high-variance",
+]
 #: Share of the sightings that a held-out neighbourhood has; at least three sightings.
 NEIGHBOURHOOD = 0.1
 
@@ -78,7 +88,8 @@ def split(
         "random"; "chronological" and "sequential" (the earliest are for training; the second
         then learns on from each held-out sighting after predicting it); or "neighbour" (whole
         neighbourhoods of source directions are held out). A random choice flatters: it
-        leaves sightings of ten minutes earlier in the training part.
+        leaves sightings of ten minutes earlier in the training part. The others are PAINT's; see
+        `heliotrope.calibration.paint_splits`, which sets their counts.
     fraction
         Between 0 and 1.
     seed
@@ -91,7 +102,9 @@ def split(
     """
     check_fraction(fraction)
     if kind not in get_args(Split):
-        raise InputError(f"split {kind!r}: give random, chronological, neighbour or sequential")
+        raise InputError(f"split {kind!r}: give one of {', '.join(get_args(Split))}")
+    if kind in KINDS:
+        return paint_split(sightings, kind, seed)[0]
     chosen = np.zeros(len(sightings), dtype=np.bool_)
     for heliostat in np.unique(sightings.heliostat):
         rows = np.flatnonzero(sightings.heliostat == heliostat)
@@ -103,6 +116,19 @@ def split(
             rows = rows[np.argsort(sightings.time[rows], kind="stable")]
         chosen[rows[: round(fraction * len(rows))]] = True
     return chosen
+
+
+def partition(
+    sightings: Sightings, kind: Split = "random", fraction: float = 0.7, seed: int = 0
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Return the masks (M,) of the training part and of the tested part, as `split`.
+
+    PAINT's splits have a part for validation, which belongs to neither.
+    """
+    if kind in KINDS:
+        return paint_split(sightings, kind, seed)
+    training = split(sightings, kind, fraction, seed)
+    return training, ~training
 
 
 def check_fraction(fraction: float) -> None:

@@ -272,7 +272,7 @@ def evaluate(
     InputError
         If the fraction is not between 0 and 1 or the split is unknown.
     """
-    training = evaluation.split(sightings, split, fraction, seed)
+    training, tested = evaluation.partition(sightings, split, fraction, seed)
     choice = None
     if model == "auto":
         choice = find_model(mechanism, sightings, training, steps)
@@ -293,7 +293,7 @@ def evaluate(
             found = predict_by_stream(learned, progress=step)
         else:
             found = predict_in_turn(learned, priors=priors, runner=runner, progress=step)
-    return HeldOutEvaluation(learned, assess(names, learned, found), choice)
+    return HeldOutEvaluation(learned, assess(names, learned, found, tested), choice)
 
 
 def calibrate(

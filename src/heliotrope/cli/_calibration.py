@@ -33,10 +33,19 @@ PriorOption = Annotated[
     list[str] | None, typer.Option(help="NAME=SIGMA in rad, m or 1; may be repeated.")
 ]
 SplitOption = Annotated[
-    Literal["random", "chronological", "neighbour", "sequential"],
+    Literal[
+        "random",
+        "chronological",
+        "neighbour",
+        "sequential",
+        "azimuth",
+        "solstice",
+        "balanced",
+        "high-variance",
+    ],
     typer.Option(
         help="Held-out sightings: random, the latest, whole neighbourhoods of the sun, or the "
-        "latest, each predicted from all before it."
+        "latest, each predicted from all before it; or one of PAINT's four splits."
     ),
 ]
 SeedOption = Annotated[int, typer.Option(help="Seed of the random choice.")]

@@ -15,7 +15,7 @@ from heliotrope.calibration.learn.learning import (
     predict,
     squared_distance,
 )
-from heliotrope.calibration.sightings import ray_directions
+from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.axis_accuracy import AxisAccuracy, axis_accuracy
@@ -153,7 +153,12 @@ class Assessment:
 BLUNDER = 5.3
 
 
-def assess(names: tuple[str, ...], learned: Learned, found: Prediction | None = None) -> Assessment:
+def assess(
+    names: tuple[str, ...],
+    learned: Learned,
+    found: Prediction | None = None,
+    tested: npt.NDArray[np.bool_] | None = None,
+) -> Assessment:
     """Return the errors of the sightings that were not used in learning.
 
     Parameters
@@ -163,9 +168,11 @@ def assess(names: tuple[str, ...], learned: Learned, found: Prediction | None = 
     learned
         Learnt from a part of its sightings.
     found
-        Prediction of the others, in their order, if it was made in another way.
+        Prediction of the tested ones, in their order, if it was made in another way.
+    tested
+        Mask of the sightings to test on, (M,); default: all that were not used.
     """
-    rows = np.flatnonzero(~learned.used)
+    rows = np.flatnonzero(~learned.used if tested is None else tested)
     seen = learned.sightings.take(rows)
     if found is None:
         found = predict(learned, seen)
@@ -178,12 +185,13 @@ def assess(names: tuple[str, ...], learned: Learned, found: Prediction | None = 
             learned,
             found,
             np.flatnonzero((seen.heliostat == i) & found.usable),
+            seen,
         )
         for i in np.flatnonzero(counts)
     ]
-    tested = [h for h in figures if h.beam.count]
-    fewest = ENOUGH if any(h.count >= ENOUGH for h in tested) else 0
-    enough = [h for h in tested if h.count >= fewest]
+    judged = [h for h in figures if h.beam.count]
+    fewest = ENOUGH if any(h.count >= ENOUGH for h in judged) else 0
+    enough = [h for h in judged if h.count >= fewest]
     inside = found.usable & np.isin(seen.heliostat, [names.index(h.name) for h in enough])
     far = squared_distance(found.plane, found.covariance) > BLUNDER**2
     strange = inside & far & (found.errors.beam > ELSEWHERE)
@@ -215,6 +223,7 @@ def _one(
     learned: Learned,
     found: Prediction,
     rows: npt.NDArray[np.intp],
+    seen: Sightings,
 ) -> HeliostatFigures:
     mine = learned.sightings.heliostat == i
     beam = found.errors.beam[rows]
@@ -225,22 +234,21 @@ def _one(
         normal=summarise(found.errors.normal[rows]),
         mean=float(beam.mean()) if len(rows) else np.nan,
         coverage=float(found.inside[rows].mean()) if len(rows) else np.nan,
-        axes=_axes(learned, found.values[rows], rows) if len(rows) > 1 else None,
+        axes=_axes(learned, found.values[rows], seen.take(rows)) if len(rows) > 1 else None,
         outliers=int(learned.outlier[mine].sum()),
         regimes=len(np.unique(learned.regime[mine & (learned.regime >= 0)])),
         steps=len(learned.members[i].data.steps),
     )
 
 
-def _axes(learned: Learned, values: FloatArray, rows: npt.NDArray[np.intp]) -> AxisAccuracy | None:
-    """Return the zeros before the fit and the scatter after it, of held-out sightings ``rows``.
+def _axes(learned: Learned, values: FloatArray, seen: Sightings) -> AxisAccuracy | None:
+    """Return the zeros before the fit and the scatter after it, of held-out sightings.
 
     Guo's γ', α' are the drives' angles: those of the nominal drives for the zeros, (44) and
     (46), so that a zero is found as such and not what the fit leaves of it; those of the
     learnt drives for the scatter, (45) and (47). His γ, α, (43), are the angles at which the
     learnt mechanism sends the source to the destination that was seen.
     """
-    seen = learned.sightings.take(np.flatnonzero(~learned.used)[rows])
     learnt = moved_by(learned.mechanism, seen.heliostat, learned.names, values)
     vertex = learnt.pose(seen.counts).vertex
     source, way = ray_directions(seen, vertex)
