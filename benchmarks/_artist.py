@@ -1,83 +1,98 @@
-"""ARTIST's kinematic reconstruction on its own PAINT data, where both are available.
+"""ARTIST's kinematic reconstruction on the sightings that Heliotrope learns from, where it runs.
 
-ARTIST (github.com/ARTIST-Association/ARTIST) reads PAINT measurements and a scenario of its own,
-not the benchmark's synthetic field, so only the time for a heliostat can be compared.
-benchmarks/README.md explains the setup. The calls are those of ARTIST's tutorial on kinematic
-reconstruction; they have not been run here.
+ARTIST (github.com/ARTIST-Association/ARTIST, ``artist-csp`` on the package index) needs PyTorch and
+an environment of its own; `_artist_worker` runs there. It fits four tilts of a heliostat by
+the angle between normals (its ``alignment``), and the errors of the held-out sightings are computed
+here from its tilts, with its chain. benchmarks/README.md explains the setup.
 """
 
-import importlib.util
+import csv
+import json
 import os
-import time
+import subprocess
+import tempfile
 from pathlib import Path
+from typing import Any
 
-#: Environment: the scenario (.h5), the folder of PAINT data, heliostats, epochs.
-SCENARIO, DATA = "HELIOTROPE_ARTIST_SCENARIO", "HELIOTROPE_ARTIST_DATA"
-HELIOSTATS, EPOCHS = "HELIOTROPE_ARTIST_HELIOSTATS", "HELIOTROPE_ARTIST_EPOCHS"
-SIGHTINGS = 30
+import numpy as np
+
+from heliotrope.calibration.sightings import Sightings, ray_directions
+from heliotrope.geometry import angle_between, reflect
+
+#: Environment: ARTIST's interpreter, and the epochs (default: `EPOCHS`).
+PYTHON, TURNS = "HELIOTROPE_ARTIST_PYTHON", "HELIOTROPE_ARTIST_EPOCHS"
+EPOCHS, RATE = 1000, 1e-3
+#: Centre of the concentrator in the mirror's frame, m, as in Jülich's properties.
+CENTRE = np.array([0.0, 0.175, 0.0])
+WORKER = Path(__file__).with_name("_artist_worker.py")
 
 
 def why_skipped() -> str | None:
     """Return why ARTIST is missing from the contenders, None if it is among them."""
-    try:
-        found = importlib.util.find_spec("artist.core.kinematics_reconstructor")
-    except ImportError:
-        found = None
-    if found is None:
-        # The package index has an unrelated package called artist.
-        return "the package artist of ARTIST-Association cannot be imported"
-    missing = [name for name in (SCENARIO, DATA, HELIOSTATS) if not os.environ.get(name)]
-    return f"not set: {', '.join(missing)}" if missing else None
+    python = os.environ.get(PYTHON)
+    if not python:
+        return f"not set: {PYTHON}"
+    asked = [python, "-c", "import artist, torch"]
+    if subprocess.run(asked, capture_output=True, check=False).returncode:
+        return f"{python} cannot import artist and torch"
+    return None
 
 
-def seconds_per_heliostat() -> float:
-    """Reconstruct the heliostats named in the environment; loading is not counted."""
-    import h5py
-    import torch
-    from artist.core.kinematics_reconstructor import KinematicsReconstructor
-    from artist.core.loss_functions import FocalSpotLoss
-    from artist.data_parser import paint_scenario_parser
-    from artist.data_parser.paint_calibration_parser import PaintCalibrationDataParser
-    from artist.scenario.scenario import Scenario
-    from artist.util import config_dictionary as key
-    from artist.util.environment_setup import setup_distributed_environment
+def reconstruct(data: Path, jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the tilts and seconds of each job; see `_artist_worker`."""
+    with tempfile.TemporaryDirectory() as folder:
+        given, out = Path(folder) / "jobs.json", Path(folder) / "out.json"
+        given.write_text(json.dumps(jobs), encoding="utf-8")
+        command = [os.environ[PYTHON], str(WORKER), str(data), str(given), str(out)]
+        subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+        found: list[dict[str, Any]] = json.loads(out.read_text(encoding="utf-8"))
+    return found
 
-    device, path = torch.device("cpu"), Path(os.environ[SCENARIO])
-    names = os.environ[HELIOSTATS].split(",")
-    mapping = paint_scenario_parser.build_heliostat_data_mapping(
-        base_path=os.environ[DATA],
-        heliostat_names=names,
-        number_of_measurements=SIGHTINGS,
-        image_variant="flux",
-        randomize=False,
-    )
-    optimiser = {
-        key.initial_learning_rate: 5e-4, key.tolerance: 0.0, key.batch_size: 50,
-        key.max_epoch: int(os.environ.get(EPOCHS, "100")), key.log_step: 0,
-        key.early_stopping_delta: 1e-4, key.early_stopping_patience: 10,
-        key.early_stopping_window: 20,
-    }  # fmt: skip
-    schedule = {
-        key.scheduler_type: key.reduce_on_plateau, key.gamma: 0.9, key.min: 1e-6, key.max: 1e-3,
-        key.step_size_up: 500, key.reduce_factor: 1e-4, key.patience: 50, key.threshold: 1e-3,
-        key.cooldown: 10,
-    }  # fmt: skip
-    groups = Scenario.get_number_of_heliostat_groups_from_hdf5(scenario_path=path)
-    with setup_distributed_environment(number_of_heliostat_groups=groups, device=device) as setup:
-        with h5py.File(path, "r") as file:
-            scenario = Scenario.load_scenario_from_hdf5(scenario_file=file, device=device)
-        reconstructor = KinematicsReconstructor(
-            ddp_setup=setup,
-            scenario=scenario,
-            data={
-                key.data_parser: PaintCalibrationDataParser(sample_limit=SIGHTINGS),
-                key.heliostat_data_mapping: mapping,
-            },
-            optimization_configuration={key.optimization: optimiser, key.scheduler: schedule},
-            reconstruction_method=key.kinematics_reconstruction_raytracing,
-        )
-        start = time.perf_counter()
-        reconstructor.reconstruct_kinematics(
-            loss_definition=FocalSpotLoss(scenario=scenario), device=device
-        )
-        return (time.perf_counter() - start) / len(names)
+
+def job(data: Path, name: str, heliostat: str, ids: list[str], seen: Sightings) -> dict[str, Any]:
+    """Return the job of one heliostat with the training sightings ``seen`` named ``ids``."""
+    with (data / "measurements.csv").open(encoding="utf-8") as file:
+        rows = {(r["heliostat"], r["id"]): r for r in csv.DictReader(file)}
+    mine = [rows[heliostat, number] for number in ids]
+    return {
+        "job": name,
+        "heliostat": heliostat,
+        "epochs": int(os.environ.get(TURNS, EPOCHS)),
+        "rate": RATE,
+        "sightings": [
+            {
+                "motors": seen.counts[k].tolist(),
+                "sun": seen.source[k].tolist(),
+                "spot": [float(row[f"utis_{axis}"]) for axis in ("lat", "lon", "alt")],
+                "target": row["target"],
+            }
+            for k, row in enumerate(mine)
+        ],
+    }
+
+
+def _turn(axis: int, angle: np.ndarray) -> np.ndarray:
+    """Right-handed turns about an axis of the frame by angles (M,), (M, 3, 3)."""
+    angle = np.atleast_1d(angle)
+    out = np.zeros((len(angle), 3, 3))
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    out[:, axis, axis] = 1.0
+    out[:, i, i] = out[:, j, j] = np.cos(angle)
+    out[:, i, j], out[:, j, i] = -np.sin(angle), np.sin(angle)
+    return out
+
+
+def beam_errors(mechanism: Any, seen: Sightings, tilts: list[float]) -> np.ndarray:
+    """Return the beam errors (M,) of sightings of one heliostat under ARTIST's tilts, rad.
+
+    ARTIST's turns about north are left-handed; the nominal drives (1,) give the joint angles.
+    """
+    north_1, up_1, east_2, north_2 = tilts
+    angles = mechanism[seen.heliostat].drives.angles(seen.counts)
+    base = _turn(1, np.array(-north_1)) @ _turn(2, np.array(up_1)) @ _turn(0, angles[:, 0])
+    turned = base @ _turn(0, np.array(east_2)) @ _turn(1, np.array(-north_2))
+    turned = turned @ _turn(2, angles[:, 1])
+    normal = turned @ np.array([0.0, -1.0, 0.0])
+    vertex = mechanism.position[seen.heliostat] + turned @ CENTRE
+    source, way = ray_directions(seen, vertex)
+    return np.asarray(angle_between(reflect(source, normal), way))

@@ -1,6 +1,6 @@
-"""The estimator beside SciPy's least squares and Nelder-Mead, and ARTIST where it is installed.
+"""The estimator beside SciPy's least squares and Nelder-Mead.
 
-All but ARTIST minimise the same cost, square loss and prior, from the same start. SciPy fits one
+All minimise the same cost, square loss and prior, from the same start. SciPy fits one
 heliostat after another, with Heliotrope's kinematics and its own finite differences. Heliotrope
 also returns covariances.
 """
@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares, minimize
 
-from benchmarks import _artist
-from benchmarks._run import BenchmarkError, Result, Row, agree, peak_bytes, timed
+from benchmarks._run import Result, Row, agree, peak_bytes, timed
 from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.sightings import ray_directions, sightings
 from heliotrope.geometry import direction, reflect, tangent_axes
@@ -168,13 +167,6 @@ def run(quick: bool) -> Result:
     size = 30 if quick else BUDGET_SIZE
     rows += _peers(quick, size)
     squares, simplex = (row["ms_per_heliostat"] for row in rows[-2:])
-    skipped = _artist.why_skipped()
-    if skipped is None:
-        try:
-            each = _artist.seconds_per_heliostat()
-        except Exception as error:
-            raise BenchmarkError(f"ARTIST: {error!r}; see benchmarks/README.md") from error
-        rows.append(_row("ARTIST", 1, each, each))
     for row in rows:
         row["scipy_ratio"] = squares / row["ms_per_heliostat"]
         row["nelder_mead_ratio"] = simplex / row["ms_per_heliostat"]
@@ -194,7 +186,6 @@ def run(quick: bool) -> Result:
             "budget_median_s": BUDGET_S,
             "budget_of": "Heliotrope, square",
             "nelder_mead_evaluations": 500 if quick else EVALUATIONS,
-            "artist": f"skipped: {skipped}" if skipped else "run on its own data",
         },
         None if quick else shown["median_seconds"] <= BUDGET_S,
     )

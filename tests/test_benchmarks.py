@@ -50,6 +50,10 @@ COLUMNS = {
         "work", "heliostats", "calibrated", "visits", "median_mrad", "predicted_mrad", "within_90",
         "cpu_s_per_h", "memory_mib",
     },
+    "splits": {
+        "split", "contender", "heliostats", "tested", "median_of_medians_mrad",
+        "mean_of_medians_mrad", "processor_s_per_heliostat",
+    },
     "learning": {
         "sightings_before", "stream_us", "batch_ms", "ratio", "difference_sigma", "hypotheses",
         "state_kB",
@@ -105,6 +109,30 @@ def test_quick_run_gives_json(name: str) -> None:
     assert result["rows"]
     for row in result["rows"]:
         assert set(row) >= COLUMNS[name]
+
+
+def test_the_chain_of_artist_is_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without tilts, with its third, the zero of the elevation, and its fourth, left-handed."""
+    from tests.support.machines import jacks
+
+    from heliotrope.calibration.evaluation import beam_errors
+    from heliotrope.calibration.sightings import sightings
+    from heliotrope.mechanism import kinds
+
+    artist = _module(monkeypatch, "_artist")
+    nominal = kinds.two_jacks(
+        np.array([[20.0, 90.0, 1.8]]), drives=jacks(), concentrator_translation=artist.CENTRE
+    )
+    counts = np.random.default_rng(0).uniform(20_000, 60_000, (20, 2))
+    seen = sightings(np.zeros(20, np.intp), counts, [0.1, -0.8, 0.6], [0.0, -3.0, 40.0])
+    found = artist.beam_errors(nominal, seen, [0.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(found, beam_errors(nominal, seen).beam, atol=1e-9)
+    for name, place, sign in (("elevation_initial_angle", 2, 1.0), ("non_orthogonality", 3, -1.0)):
+        tilts = [0.0, 0.0, 0.0, 0.0]
+        tilts[place] = sign * 4e-3
+        moved = beam_errors(nominal.with_parameters({name: 4e-3}), seen).beam
+        found = artist.beam_errors(nominal, seen, tilts)
+        np.testing.assert_allclose(found, moved, atol=1e-9)
 
 
 def test_tracking_covers_what_is_claimed() -> None:
