@@ -7,7 +7,7 @@
 - `mirror_image`: the flux of one heliostat on a target, for photographs and their simulation.
 - `coverage`: the share of a grid's cells that polygons cover (a function of the same name, so it
   stays there).
-- `keep_out` and `glare`: beams that enter forbidden volumes, and the hazard to eyes.
+- `keep_out`: beams that enter forbidden volumes; `glare`: the hazard to eyes, for information only.
 
 Begin with `image_offsets` for a tracking error, `predict_flux` for a receiver.
 """

@@ -12,10 +12,13 @@ from heliotrope.geometry import FloatArray, as_float, as_vectors
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import Tracking, TrackingStatus, track
-from heliotrope.optics import Hazard, MirrorOptics, beams, crossing, find_entries, glare_at, sweep
+from heliotrope.optics import MirrorOptics, beams, crossing, find_entries, sweep
 
 #: Length over which an unobstructed beam is followed, m.
 FAR = 3000.0
+#: Most light of all resting beams together at an eye, in suns: a look there is then no worse than a
+#: look at the sun, whatever the eye's limits are. No formula of glare is asked.
+MOST_SUNS = 1.0
 _ON_ITS_WAY = "on its way there"
 #: Room that the middle of a beam leaves about a receiver in an approach, m.
 ROOM = 0.5
@@ -210,10 +213,10 @@ class BeamCheck:
     def glare(
         self, rows: npt.NDArray[np.intp], points: FloatArray, standbys: FloatArray, sun: FloatArray
     ) -> dict[str, str]:
-        """Return the heliostats whose resting beams would burn an eye, with the reason.
+        """Return the heliostats whose resting beams would shine into an eye too brightly, and why.
 
-        All resting beams count together; a heliostat is named if it shines into an eye that they
-        burn.
+        All resting beams together must stay below `MOST_SUNS` there; a heliostat is named if it
+        shines into an eye where they do not.
 
         Parameters
         ----------
@@ -234,16 +237,16 @@ class BeamCheck:
         rest = beams(
             solved.chosen(solved.vertex), after[known], part, reach=np.full(len(known), FAR)
         )
-        seen = glare_at(rest, self.eyes)
+        seen = crossing(rest, self.eyes, dni=1.0)
         found: dict[str, str] = {}
-        for eye in np.flatnonzero(seen.hazard == Hazard.DAMAGE):
-            lit = crossing(rest, self.eyes[eye : eye + 1]).concentration[0] > 0.0
+        for eye in np.flatnonzero(~(seen.irradiance <= MOST_SUNS)):
+            lit = seen.concentration[eye] > 0.0
             for row in np.intersect1d(known[lit], rows):
                 found.setdefault(
                     self.names[row],
                     f"at rest its beam shines on the place {_point(self.eyes[eye])} m, where the "
-                    f"light of all beams is {seen.burn[eye]:.2g} times the limit for eye burns; "
-                    "choose another standby point",
+                    f"light of all beams together is {seen.irradiance[eye]:.2f} suns (limit "
+                    f"{MOST_SUNS:g}); choose another standby point",
                 )
         return found
 

@@ -95,8 +95,8 @@ NOT_RECORDED = Refusal(
 )
 BEAM_REFUSED = Refusal(
     "beam",
-    "A beam would enter a keep-out volume, burn an eye, cross a receiver on its way from stow, or "
-    "it cannot reach the point.",
+    "A beam would enter a keep-out volume, shine into an eye, cross a receiver on its way from "
+    "stow, or it cannot reach the point.",
     "{what} {heliostat}{more}: {reason}",
     "Choose another point, or leave out the heliostat that the text names.",
 )
