@@ -95,6 +95,32 @@ def test_malan_chapter_6(tmp_path: Path) -> None:
     assert imread(tmp_path / "malan-chapter-6.png")[..., :3].std() > 0.02
 
 
+def test_malan_radio() -> None:
+    """Times on the air as published, the channel's own loss, and what the study concludes."""
+    radio = _load("malan_radio")
+    ieee, lora = radio.RADIOS
+    # The longest frame of 802.15.4 is 133 bytes, 127 without what precedes them: 4.256 ms.
+    assert ieee.airtime(127 - radio.MAC_BYTES) == pytest.approx(4.256e-3)
+    # Twelve bytes at a spreading factor of 9: 144.384 ms (Semtech's formula; lora-modulation).
+    assert radio.lora_airtime(12, 9) == pytest.approx(144.384e-3)
+    rng = np.random.default_rng(3)
+    channel = radio.Channel(20_000, rng)
+    lost = [1.0 - channel.heard(0.1).mean() for _ in range(50)]
+    wanted = radio.BURSTS * radio.LOSS_IN_BURST + (1.0 - radio.BURSTS) * radio.LOSS
+    assert np.mean(lost) == pytest.approx(wanted, rel=0.05)
+    # A burst outlasts 0.1 s: who lost one frame loses the next far more often than others.
+    first = channel.heard(0.1)
+    assert (~channel.heard(0.1))[~first].mean() > 10.0 * wanted
+    found = radio.study(trials=8)
+    for name in (ieee.name, lora.name):
+        assert found[f"{name}, 3 calls, unheard"] > 10.0
+        assert found[f"{name}, 1 sender, unheard"] == found[f"{name}, 2 senders, unheard"] == 0.0
+        assert found[f"{name}, 2 senders, last, s"] < found[f"{name}, 1 sender, last, s"]
+        assert found[f"{name}, slots, s"] < found[f"{name}, polling, s"]
+    assert found[f"{ieee.name}, 1 sender, 99.99 %, s"] < 1.5
+    assert found[f"{ieee.name}, polling, s"] < 3.0 < 60.0 < found[f"{lora.name}, polling, s"]
+
+
 def test_malan_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = imread(_load("malan_noise").main(tmp_path))
     assert picture[..., :3].std() > 0.02
