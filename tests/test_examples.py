@@ -121,6 +121,19 @@ def test_malan_radio() -> None:
     assert found[f"{ieee.name}, polling, s"] < 3.0 < 60.0 < found[f"{lora.name}, polling, s"]
 
 
+def test_malan_noise_as_he_normalises_it() -> None:
+    """Figure 4.11: no error without noise, more with more, several times more between seasons."""
+    normalised = _load("malan_noise").normalised
+    clean, some, more = (normalised(level) for level in (0.0, 0.2, 0.8))
+    for season in ("summer", "winter"):
+        assert clean[season].mean() < 1e-3 < some[season].mean() < more[season].mean()
+        assert 0.0 < some[season].std() < some[season].mean()
+    # His figure: about four times worse. Ours: more without priors, less with them.
+    assert some["winter"].mean() > 4.0 * some["summer"].mean()
+    held = normalised(0.2, wide=1.0)
+    assert 1.0 < held["winter"].mean() / held["summer"].mean() < 4.0
+
+
 def test_malan_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = imread(_load("malan_noise").main(tmp_path))
     assert picture[..., :3].std() > 0.02
