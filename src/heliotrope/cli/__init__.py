@@ -10,6 +10,7 @@ import typer
 
 from heliotrope import __version__
 from heliotrope.cli._ctl import app as ctl_app
+from heliotrope.cli._extras import missing
 from heliotrope.cli._field_layout import layout
 from heliotrope.cli._keys import app as keys_app
 from heliotrope.cli._store import app as store_app
@@ -86,6 +87,13 @@ def main() -> None:
         app()
     except HeliotropeError as error:
         print(f"heliotrope: {error}", file=sys.stderr)
+        sys.exit(2)
+    except ModuleNotFoundError as error:
+        words = [word for word in sys.argv[1:] if not word.startswith("-")]
+        refusal = missing(error, words[0] if words else "")
+        if refusal is None:
+            raise
+        print(f"heliotrope: {refusal}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("heliotrope: interrupted", file=sys.stderr)

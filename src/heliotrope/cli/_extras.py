@@ -1,0 +1,33 @@
+"""Packages that a plain installation leaves out, and the extras that bring them."""
+
+from heliotrope.errors import InputError
+
+#: Name to import: extra of `pyproject.toml`.
+EXTRAS = {
+    "aiomqtt": "control", "alembic": "store", "argon2": "console", "cryptography": "control",
+    "dask": "cluster", "distributed": "cluster", "duckdb": "store", "fastapi": "console",
+    "nicegui": "console", "plotly": "notebook", "psycopg": "postgresql", "pyotp": "console",
+    "segno": "console", "serialx": "control", "sqlalchemy": "store", "starlette": "console",
+    "uvicorn": "console",
+}  # fmt: skip
+#: The extra with everything that a command needs, where that is more than one package.
+_WHOLE = {"run": "console", "ctl": "console", "store": "store"}
+
+
+def missing(error: ModuleNotFoundError, command: str) -> InputError | None:
+    """Return the refusal for a package that is not installed; None: no extra brings it.
+
+    Parameters
+    ----------
+    error
+        What the import raised.
+    command
+        Name of the command, "" if unknown.
+    """
+    package = (error.name or "").partition(".")[0]
+    extra = EXTRAS.get(package)
+    if extra is None:
+        return None
+    extra = extra if extra == "postgresql" else _WHOLE.get(command, extra)
+    where = f"{command}: " if command else ""
+    return InputError(f"{where}{package} is not installed; say pip install 'heliotrope[{extra}]'")
