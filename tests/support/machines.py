@@ -80,6 +80,7 @@ def imperfect(mechanism: Mechanism, seed: int = 0, size: float = 0.01) -> Mechan
         * scale[row.unit]
         * (0.1 if "worm" in name or row.name.endswith(("offset", "radius")) else 1.0)
         for name, row in mechanism.parameters.items()
+        if not name.endswith("worm_ratio")  # it is searched and no imperfection of a machine
     }
     return mechanism.with_parameters(values)
 
