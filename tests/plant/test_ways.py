@@ -37,8 +37,8 @@ from heliotrope.sun import broadcast_values, vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, Outfit, outfits, own_items
 from heliotrope.twin.field.field import Field
+from heliotrope.twin.world.design import design_of
 from heliotrope.twin.world.scene import TARGETS, scene_of
-from heliotrope.twin.world.simulation import design_of
 from support.live import LiveOptions, LivePlant
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 

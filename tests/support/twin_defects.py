@@ -27,7 +27,7 @@ from heliotrope.safety import evaluation
 from heliotrope.twin.boards import outfit
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.simulation import RunPlan
-from support import plant_defects
+from support import plant_defects, quiet_defects
 
 #: The plant stands still for a minute when mirrors track.
 STILL = (Fault("plant_silent", 110.0, 60.0, 0, 0.5),)
@@ -390,4 +390,6 @@ DEFECTS = (
            first=2, worlds=("visits",)),
     *(Defect(numbers, name, defect, only, pause, first=first)
       for numbers, name, defect, only, pause, first in plant_defects.ROWS),
+    *(Defect((16,), name, defect, faults=(), worlds=worlds, slow=slow)
+      for name, defect, worlds, slow in quiet_defects.ROWS),
 )  # fmt: skip

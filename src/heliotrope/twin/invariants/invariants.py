@@ -31,9 +31,10 @@ number    check
 13        In no state does a beam stay on the receiver unsent, or in a keep-out volume, for 30 s.
 14        After a loss that took every mirror off, only a person's command brings one back.
 15        A mirror proven to be done is off the receiver, or at stow.
+16        In quiet stretches what was ordered is done; a kept sighting is the mirror's own.
 ========  ============================================================================
 
-`twin.invariants.beams` checks 12 to 15.
+`twin.invariants.beams` checks 12 to 15, `twin.invariants.quiet` and `.visits` 16.
 """
 
 from collections import Counter, deque
@@ -156,7 +157,7 @@ class Violation:
     Attributes
     ----------
     number
-        1 to 15.
+        1 to 16.
     at
         Time since the start, s.
     subject

@@ -91,6 +91,8 @@ class FrameLedger:
         The last frame of each name.
     commands
         Indices of the frames that need authority.
+    safe
+        When DEFOCUS or STOW was last sent to each address, s.
     """
 
     def __init__(self) -> None:
@@ -98,6 +100,7 @@ class FrameLedger:
         self._order: list[bytes] = []
         self.last: dict[str, Sent] = {}
         self.commands: list[int] = []
+        self.safe: dict[int, float] = {}
 
     def __len__(self) -> int:
         return len(self._order)
@@ -106,6 +109,8 @@ class FrameLedger:
         """Keep a frame; return None if the bytes hold none."""
         found = self._frames.get(data)
         if found is not None:
+            if found.who == messages.ANYONE:
+                self.safe[found.to] = now
             return found
         frames = wire.Reader().feed(data)
         if not frames:
@@ -124,6 +129,8 @@ class FrameLedger:
         self._order.append(data)
         if sent.who in (messages.AUTHORITY, messages.KEY):
             self.commands.append(sent.index)
+        elif sent.who == messages.ANYONE:
+            self.safe[sent.to] = now
         return sent
 
     def of(self, data: bytes) -> Sent | None:

@@ -4,8 +4,9 @@ Begin with `run` and a `RunPlan`; `run_many` runs many seeds, and `shrink` reduc
 the faults that matter. `KINDS` lists everything that can go wrong.
 """
 
+from heliotrope.twin.world.design import design_of
 from heliotrope.twin.world.faults import KINDS, Fault
-from heliotrope.twin.world.simulation import RunPlan, RunResult, Simulation, design_of, run, shrink
+from heliotrope.twin.world.simulation import RunPlan, RunResult, Simulation, run, shrink
 from heliotrope.twin.world.soak import SoakResult, run_many
 
 __all__ = [

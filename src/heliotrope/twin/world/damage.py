@@ -19,6 +19,11 @@ from heliotrope.twin.world.instruments import READINGS, Instruments
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import Pod
 
+#: Faults of one heliostat, and of one cluster; every other one concerns them all. A cluster belongs
+#: to another run of a plant some time after it has begun, s.
+_OF_BOARD = ("power_cut", "brown_out", "flash_cut", "tick_jump")
+_NEW_RUN, _RUN_WITHIN = ("plant_crash", "plant_twice"), 15.0
+_OF_CLUSTER = ("line", "bus", "cluster", "time", "replay", "forgery", "stranger_safe", "noise")
 #: An order need not be carried out while a fault of these kinds lasts.
 _HINDERS = ("line", "bus", "plant", "cluster_frozen")
 
@@ -78,6 +83,8 @@ class Damage:
         self._left = deque(sorted(faults, key=lambda fault: fault.at))
         self._active: list[tuple[float, Fault]] = []
         self._off: dict[int, float] = {}  # boards without power, and when it returns
+        #: When the last fault of a heliostat, of a cluster, or of all ended, s.
+        self._rest: dict[str, float] = {}
         self._pause = 1.0  # until a board that died during a write restarts
         self.next = -math.inf
 
@@ -88,6 +95,31 @@ class Damage:
             or (fault.kind.startswith(_HINDERS) and self._of.pod_of(fault) is pod)
             for _, fault in self._active
         )
+
+    @property
+    def rest(self) -> dict[str, float]:
+        """When the last fault that concerns each heliostat ended, or will end, s."""
+        return {
+            board.outfit.name: max(
+                self._rest.get(key, -math.inf) for key in ("", pod.name, board.outfit.name)
+            )
+            for pod in self._of.pods
+            for board in pod.boards
+        }
+
+    def _concerns(self, fault: Fault, now: float) -> None:
+        """Note whom a fault concerns, and until when: a wrong time until the end of the run."""
+        key = ""
+        if fault.kind in _OF_BOARD:
+            key = self._of.boards[fault.target].outfit.name
+        elif fault.kind.startswith(_OF_CLUSTER):
+            key = self._of.pod_of(fault).name
+        until = now + fault.lasts
+        if fault.kind == "time_jump":
+            until = math.inf
+        elif fault.kind in _NEW_RUN:
+            until += _RUN_WITHIN
+        self._rest[key] = max(self._rest.get(key, -math.inf), until)
 
     def look(self, now: float, group: asyncio.TaskGroup) -> None:
         """Begin and end the faults that are due."""
@@ -111,6 +143,7 @@ class Damage:
 
     def _begins(self, fault: Fault, now: float) -> None:
         of, board, pod = self._of, self._of.boards[fault.target], self._of.pod_of(fault)
+        self._concerns(fault, now)
         if fault.lasts > 0.0:
             self._active.append((now + fault.lasts, fault))
         if fault.kind in ("power_cut", "brown_out"):

@@ -36,6 +36,7 @@ from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.invariants import Observer
 from heliotrope.twin.invariants.ledger import PlantCommand
 from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.invariants.quiet import QuietObserver
 from heliotrope.twin.world.intruder import Intruder
 from heliotrope.twin.world.worlds import PodErrors
 
@@ -231,10 +232,18 @@ class PlantEar:
         Observer of the plant.
     beams
         Observer of the beams.
+    quiet
+        Observer of what is done; None: it is not judged.
     """
 
-    def __init__(self, pod: Pod, plant: PlantObserver, beams: BeamObserver) -> None:
-        self._pod, self._plant, self._beams = pod, plant, beams
+    def __init__(
+        self,
+        pod: Pod,
+        plant: PlantObserver,
+        beams: BeamObserver,
+        quiet: QuietObserver | None = None,
+    ) -> None:
+        self._pod, self._plant, self._beams, self._quiet = pod, plant, beams, quiet
         self._addresses = pod.addresses
         self._names: tuple[str, ...] = ()
         self._goes = asyncio.Event()
@@ -261,10 +270,14 @@ class PlantEar:
         message, observer = decode(data), self._pod.observer
         if isinstance(message, Lease):
             observer.leased(now)
+            if self._quiet is not None:
+                self._quiet.leased(message.token, now)
         elif isinstance(message, Emergency):
             whom = message.heliostats or tuple(self._addresses)
             observer.emergency(message.name, now, carried=self._pod.carried(now), heliostats=whom)
             self._beams.ordered_off(whom, now)
+            if self._quiet is not None:
+                self._quiet.ordered_off(message.name, whom, now)
         elif isinstance(message, Acknowledge) and message.condition == "clock_jump":
             observer.time_acknowledged()
         elif isinstance(message, Command | Parameters):
@@ -273,7 +286,10 @@ class PlantEar:
                 one, two = struct.unpack(CODES_OF["stow"], stow)
                 observer.given_stow(message.heliostat, (one, two))
             if isinstance(message, Command):
-                self._beams.sent(message, message.heliostats or tuple(self._addresses), now)
+                whom = message.heliostats or tuple(self._addresses)
+                self._beams.sent(message, whom, now)
+                if self._quiet is not None:
+                    self._quiet.sent(message, whom, now)
 
     def order(self, message: Command | Parameters, now: float, *, known: bool) -> PlantCommand:
         """Return an order for the ledger; ``known``: its token was once issued."""
@@ -298,5 +314,7 @@ class PlantEar:
             counts[f"progress {message.stage.value}"] += 1
             observer.progress(message, now)
             self._beams.progress(message)
+            if self._quiet is not None:
+                self._quiet.progress(message)
         elif isinstance(message, Alarm):
             counts["alarms"] += 1

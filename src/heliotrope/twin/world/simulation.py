@@ -11,22 +11,18 @@ import contextlib
 import random
 import traceback
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from heliotrope.errors import InputError
-from heliotrope.field.heliostats import Heliostats
-from heliotrope.field.plant import Plant
-from heliotrope.field.target import Receiver
-from heliotrope.field.volumes import Sphere
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import ticks
 from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of
 from heliotrope.links.tapped import TappedLink
-from heliotrope.mechanism.board_items import Wanted, items_of
+from heliotrope.mechanism.board_items import Wanted
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import FLUX_READING, Alarm, conditions
@@ -34,27 +30,27 @@ from heliotrope.sun import vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.clocks import TickCounter
 from heliotrope.twin.boards.outfit import (
-    MACHINE,
     RECEIVER,
     STANDBY,
     Outfit,
-    mechanisms,
     outfits,
 )
 from heliotrope.twin.cameras import FieldSnapshot, mirrors_of
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.invariants.quiet import QuietObserver
 from heliotrope.twin.invariants.sensors import SensorObserver
 from heliotrope.twin.invariants.visits import VisitObserver
 from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.damage import Damage
+from heliotrope.twin.world.design import design_of, wanted_of
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.instruments import READINGS, Instruments
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
-from heliotrope.twin.world.scene import Scene, scene_of
+from heliotrope.twin.world.scene import scene_of
 from heliotrope.twin.world.shift import Shift, Working
 from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
 from heliotrope.twin.world.twice import SecondPlant
@@ -67,6 +63,8 @@ LOOK, JUDGE = 0.2, 0.5
 _SUN_EVERY = 30.0
 #: The plant's program, for freezing it.
 _PLANT = "plant"
+#: Worlds in which a cluster is wrong from the start, so that its mirrors may do nothing.
+_WRONG = ("addresses", "clock", "site")
 #: Longest run: the sun must stay up.
 MOST_HOURS = 8.0
 #: With this few mirrors they join one at a time.
@@ -75,47 +73,6 @@ SETTINGS = PlantSettings(join_rate=0.5, join_burst=1, sensors=frozenset({FLUX_RE
 MEASURED = replace(SETTINGS, sensors=frozenset(READINGS))
 #: Without the rows on the share of failed nodes, which one of three or four already exceeds.
 TABLE = tuple(row for row in conditions() if row.reading != "node_fault_share")
-
-
-def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], scene: Scene) -> Plant:
-    """Return a plant of some heliostats, calibrated to the truth.
-
-    Parameters
-    ----------
-    fits
-        Heliostats.
-    homes
-        Names of the heliostats of each cluster.
-    scene
-        Site, targets and keep-out volumes.
-    """
-    home = {name: cluster for cluster, names in homes.items() for name in names}
-    names = tuple(each.name for each in fits)
-    size = np.full(len(fits), 2.0)
-    group = Heliostats(
-        names, mechanisms(fits), size, size, cluster=tuple(home[name] for name in names)
-    )
-    receiver = Receiver(
-        "receiver", "planar", np.array(RECEIVER), np.array([0.0, 1.0, 0.0]), 6.0, 6.0
-    )
-    balls = tuple(Sphere(f"house {i}", *ball) for i, ball in enumerate(scene.keep_outs, 1))
-    groups = {"all": group}
-    return Plant(
-        "simulation",
-        scene.site,
-        groups,
-        targets=scene.targets,
-        receivers=(receiver,),
-        keep_outs=balls,
-    )
-
-
-def wanted_of(fits: Sequence[Outfit]) -> Wanted:
-    """Return what the boards of heliostats should store."""
-    wanted = Wanted()
-    for fit in fits:
-        wanted.set(fit.name, items_of(fit.mechanism, MACHINE))
-    return Wanted(wanted.items)
 
 
 @dataclass(frozen=True)
@@ -290,6 +247,7 @@ class Simulation:
             self.begin, boards, self.sun, scene.keep_outs, held="held" in plan.worlds
         )
         self.readings = SensorObserver(self.begin, boards)
+        self.quiet = self._quiet_observer()
         self.instruments = Instruments(self._clock, plan.seed, self._flux, self.readings)
         self._measured = "sensors" in plan.worlds
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
@@ -325,6 +283,14 @@ class Simulation:
         self._program: list[asyncio.Task[None]] = []
         for pod in self.pods:
             pod.plant = self.observer
+
+    def _quiet_observer(self) -> QuietObserver | None:
+        """Return the observer of work; None: what is wrong from the start hinders it."""
+        if not set(_WRONG).isdisjoint(self.plan.worlds):
+            return None
+        observers = {pod.name: pod.observer for pod in self.pods}
+        reaches = "place" not in self.plan.worlds
+        return QuietObserver(self.begin, observers, self.sun, reaches=reaches)
 
     def _new_work(self) -> Working:
         """Return automatic control with its persons and its observer."""
@@ -398,7 +364,7 @@ class Simulation:
         for pod in self.pods:
             seed = self._chance.getrandbits(31)
             link = pod.line.end(0, pod.name, self._clock, seed=seed)
-            pod.ear = PlantEar(pod, self.observer, self.beams)
+            pod.ear = PlantEar(pod, self.observer, self.beams, self.quiet)
             pod.tap = TappedLink(link, self._clock, pod.ear)
             links[pod.name] = pod.tap
         audit = self._audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
@@ -455,6 +421,8 @@ class Simulation:
             self._work.control.take_alarm(alarm)
         self.beams.alarmed(alarm, self._clock.monotonic())
         self.readings.alarmed(alarm)
+        if self.quiet is not None:
+            self.quiet.alarmed(alarm)
 
     def crash_plant(self, now: float) -> None:
         """Kill the plant's program wherever it is; the network tells the clusters."""
@@ -473,6 +441,8 @@ class Simulation:
         self.instruments.plant = None
         self.observer.ended(now)
         self.beams.ended()
+        if self.quiet is not None:
+            self.quiet.ended()
         for pod in self.pods:
             pod.tap = pod.ear = None
             pod.line.drop()
@@ -551,6 +521,9 @@ class Simulation:
                 self.observer.look(self.plant, now)
                 carried = {pod.name for pod in self.pods if pod.carried(now)}
                 self.beams.look(self.plant, carried, now)
+                if self.quiet is not None:
+                    going = None if self.operator.waits else self.plant
+                    self.quiet.look(going, carried, damage.rest, now)
                 if self._work is not None:
                     self._work.observer.look(self.plant, self.sun(now), now)
                 if self._measured:
@@ -586,8 +559,9 @@ def run(plan: RunPlan) -> RunResult:
         (pod.observer.checks for pod in simulation.pods),
         simulation.observer.checks + simulation.beams.checks + simulation.readings.checks,
     )
-    if (extra := simulation.visits) is not None:
-        outcome.checks += extra.checks
+    for extra in (simulation.visits, simulation.quiet):
+        if extra is not None:
+            outcome.checks += extra.checks
     outcome.faults = simulation.faults
     outcome.counts = sum((pod.counts for pod in simulation.pods), simulation.operator.counts)
     outcome.states = sum((pod.observer.entered for pod in simulation.pods), Counter())

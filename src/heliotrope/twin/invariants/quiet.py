@@ -1,0 +1,389 @@
+"""The observer of work: in a quiet stretch, what was ordered is done.
+
+A field that does less, or later, breaks no invariant of safety. Where nothing has failed near a
+heliostat for a while, and no alarm names it, this observer expects that SUN and STATUS come at
+their rates, that an order which the plant has sent leads to the state that it asks for, that the
+beam is on its point to within what the steps allow, that no mirror leaves its work by itself, and
+that the plant is told so (invariant 16). It knows the orders from the line, the boards, and the
+faults of the run; its times are its own.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Set
+from dataclasses import dataclass, field
+from math import inf
+
+import numpy as np
+
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states, wire
+from heliotrope.lcu.node import Node
+from heliotrope.links.messages import Command, Progress, Stage
+from heliotrope.mechanism.board_items import items_of
+from heliotrope.plant.controller import PlantController
+from heliotrope.safety import Act, Alarm
+from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STANDBY
+from heliotrope.twin.invariants._account import HeliostatAccount
+from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
+
+#: A stretch is quiet this long after the last fault, a board's boot, and the end of the last alarm
+#: that names a heliostat or its cluster, s.
+SETTLED = 15.0
+#: Greatest age of the last SUN that has reached a board, and of the last STATUS of it that has
+#: reached the cluster, s: both are sent every second.
+SUN_EVERY, STATUS_EVERY = 3.0, 5.0
+#: Time from an order that the plant sends to the state that it asks for, s; for APPROACH and STOW
+#: the slew of both axes, one after the other, at 8000 steps/s: a turn takes 50 s.
+SOON, APPROACH_WITHIN, STOW_WITHIN = 5.0, 100.0, 120.0
+#: From the state to the plant's knowledge of it, and to the proof of an emergency, s.
+TOLD_WITHIN, PROVEN_WITHIN = 8.0, 20.0
+#: Time for a beam to come to its point after an order or a change of state, s.
+ON_POINT_WITHIN = 12.0
+#: A beam is this near its point: share of its length, rad, and m. Backlash is 0.6 mrad of the
+#: mirror, rough stepping 0.25 mrad, pushed biases 0.1 mrad; beams turn by twice as much.
+NEAR, NEAR_M = 4e-3, 0.1
+#: An authority counts once the clusters have it, and orders given one after another cross, s.
+GRANTED, CROSSING = 4.0, 3.0
+
+#: States from which each order must be carried out, and those that it asks for.
+ORDERS = {
+    "APPROACH": ((states.STOWED,), (states.IDLE,), APPROACH_WITHIN),
+    "TRACK": ((states.IDLE, states.DEFOCUSED, states.SEARCHING), (states.TRACKING,), SOON),
+    "REFOCUS": ((states.DEFOCUSED,), (states.TRACKING,), SOON),
+    "IDLE": ((states.TRACKING, states.SEARCHING, states.DEFOCUSED), (states.IDLE,), SOON),
+    "LOCK": (
+        (states.STOWED, states.IDLE, states.TRACKING, states.DEFOCUSED), (states.LOCKED,), SOON,
+    ),
+    "SEARCH": ((states.IDLE, states.TRACKING), (states.SEARCHING,), SOON),
+}  # fmt: skip
+#: The same for orders that anybody may give.
+SAFE_ORDERS = {
+    "DEFOCUS": (
+        (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING),
+        (states.DEFOCUSED, states.STOWING, states.STOWED),
+        SOON,
+    ),
+    "STOW": (
+        (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING, states.DEFOCUSED),
+        (states.STOWED,),
+        STOW_WITHIN,
+    ),
+}
+#: Orders that need the way from stow, and those that change neither state nor motion.
+_BY_WAY = ("TRACK", "REFOCUS", "SEARCH")
+_ASIDE = ("AIM", "STANDBY", "ROUGH", "LOCK_AIM")
+#: Orders after which a mirror that is IDLE does not stand at its standby point.
+_ELSEWHERE = ("JOG", "GOTO", "DIAGNOSE", "UNLOCK", "CLEAR_FAULT", "LOCK", "ZERO")
+#: States in which a mirror works until it is told otherwise, and those that it must not fall into.
+_WORKS = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)
+_FALLS = (states.DEFOCUSED, states.STOWING, states.STOWED, states.FAULT)
+#: Items of a board that must be the mirror's own, if its work is to be judged.
+_OWN = ("location", "armature", "drives", "limits_primary", "limits_secondary")
+
+
+@dataclass
+class _Order:
+    """An order that must be carried out: where it leads, by when, and whether it has been seen."""
+
+    identity: str
+    name: str
+    at: float
+    ends: tuple[int, ...]
+    within: float
+    done_at: float | None = None
+
+
+@dataclass
+class _Mirror:
+    """One mirror: its account, what is expected of it, and when it last changed."""
+
+    account: HeliostatAccount
+    cluster: str
+    order: _Order | None = None
+    ordered_at: float = -inf
+    aim: tuple[float, ...] | None = None
+    standby: tuple[float, ...] | None = STANDBY
+    pointed_at: float = -inf
+    state: int = -1
+    since: float = -inf
+    node: Node | None = None
+    booted_at: float = -inf
+    elsewhere: bool = False
+    own: dict[str, bytes] = field(default_factory=dict)
+    off_since: float | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the heliostat."""
+        return self.account.name
+
+
+class QuietObserver:
+    """Observes what is done in quiet stretches; see the module.
+
+    Parameters
+    ----------
+    start
+        Zero of the times that it reports, s.
+    clusters
+        Observers of the clusters, by name.
+    sun
+        Returns the true direction to the sun, (3,), at a time in s.
+    reaches
+        Whether every mirror reaches its points at every hour of the run.
+
+    Attributes
+    ----------
+    checks
+        Number of checks of each invariant.
+    """
+
+    def __init__(
+        self,
+        start: float,
+        clusters: Mapping[str, Observer],
+        sun: Callable[[float], FloatArray],
+        *,
+        reaches: bool,
+    ) -> None:
+        self.checks: Counter[int] = Counter()
+        self._start, self._sun, self._reaches = start, sun, reaches
+        self._clusters = clusters
+        self._mirrors = {
+            account.name: _Mirror(account, cluster)
+            for cluster, observer in clusters.items()
+            for account in observer.accounts
+        }
+        for mirror in self._mirrors.values():
+            items = items_of(mirror.account.board.outfit.mechanism, MACHINE)
+            mirror.own = {name: items[name] for name in _OWN if name in items}
+        self._quiet: frozenset[str] = frozenset()
+        self._alarms: dict[tuple[str, str], str] = {}
+        self._named_at: dict[str, float] = {}
+        self._token, self._token_at = 0, -inf
+
+    def _check(self, good: bool, now: float, mirror: _Mirror, saw: str) -> None:
+        self.checks[16] += 1
+        if not good:
+            state = states.STATES[mirror.state]
+            raise InvariantError(
+                Violation(16, now - self._start, mirror.name, f"{state} in a quiet stretch: {saw}")
+            )
+
+    # -- orders and reports ------------------------------------------------------------------
+
+    def leased(self, token: int, now: float) -> None:
+        """Note a lease that has left the plant."""
+        if token != self._token:
+            self._token, self._token_at = token, now
+
+    def sent(self, message: Command, heliostats: Iterable[str], now: float) -> None:
+        """Note a command that has left the plant."""
+        for name in heliostats:
+            mirror = self._mirrors[name]
+            if message.name in ("AIM", "STANDBY"):
+                self._pointed(mirror, message, now)
+            if message.name in _ASIDE:
+                continue
+            begins, ends, within = ORDERS.get(message.name, ((), (), 0.0))
+            may = mirror.state in begins and self._commands(message, now)
+            if message.name in _BY_WAY:
+                may &= mirror.account.by_way and mirror.aim is not None
+            mirror.elsewhere |= message.name in _ELSEWHERE
+            # What is refused by the state table leaves an approach alone.
+            if mirror.state == states.APPROACHING and message.name in ("APPROACH", *_BY_WAY):
+                continue
+            self._expect(mirror, may, _Order(message.identity, message.name, now, ends, within))
+
+    def _commands(self, message: Command, now: float) -> bool:
+        """Whether the clusters must have the authority by which a command is given."""
+        return message.token == self._token != 0 and now - self._token_at > GRANTED
+
+    def ordered_off(self, name: str, heliostats: Iterable[str], now: float) -> None:
+        """Note DEFOCUS or STOW from the plant."""
+        begins, ends, within = SAFE_ORDERS[name]
+        for each in heliostats:
+            mirror = self._mirrors[each]
+            before = mirror.order
+            if name == "DEFOCUS" and before is not None and before.name == "STOW":
+                continue  # a stow is not undone by a defocus
+            self._expect(mirror, mirror.state in begins, _Order("", name, now, ends, within))
+
+    def _expect(self, mirror: _Mirror, may: bool, order: _Order) -> None:
+        crosses = order.at - mirror.ordered_at < CROSSING
+        mirror.ordered_at = order.at
+        known = mirror.account.board.node
+        able = known is not None and known.controller.motion.known and known.journal.doubt == 0
+        may &= able and not crosses and mirror.name in self._quiet and self._is_own(mirror)
+        mirror.order = order if may else None
+
+    def _pointed(self, mirror: _Mirror, message: Command, now: float) -> None:
+        """Note a new point; what the cluster or the board may refuse is not known until then."""
+        mirror.pointed_at = now
+        taken = mirror.name in self._quiet and mirror.state not in (
+            states.APPROACHING, states.SEARCHING, states.STOWING,
+        )  # fmt: skip
+        point = message.values if taken and self._commands(message, now) else None
+        if message.name == "AIM":
+            mirror.aim = point
+        else:
+            mirror.standby = point
+
+    def progress(self, message: Progress) -> None:
+        """Note that the plant is told that orders are done."""
+        if message.stage is Stage.DONE:
+            for name in message.heliostats:
+                order = self._mirrors[name].order if name in self._mirrors else None
+                if order is not None and order.identity == message.identity:
+                    order.identity = ""
+
+    def alarmed(self, alarm: Alarm) -> None:
+        """Note an alarm of the plant: whom it names need not work."""
+        key = alarm.condition, alarm.subject
+        if alarm.active:
+            self._alarms[key] = alarm.subject
+        else:
+            self._alarms.pop(key, None)
+
+    def ended(self) -> None:
+        """Note that the plant's program has ended, and its alarms with it."""
+        self._alarms.clear()
+
+    # -- judgement ---------------------------------------------------------------------------
+
+    def look(
+        self,
+        plant: PlantController | None,
+        carried: Set[str],
+        rest: Mapping[str, float],
+        now: float,
+    ) -> None:
+        """Judge all work.
+
+        Parameters
+        ----------
+        plant
+            None: it does not run.
+        carried
+            Clusters that the plant reaches.
+        rest
+            When the last fault that concerns each heliostat ended, s.
+        now
+            s.
+        """
+        sun = self._sun(now)
+        quiet = set()
+        self._named_at.update(dict.fromkeys(self._alarms.values(), now))
+        for mirror in self._mirrors.values():
+            before = mirror.state
+            self._notes(mirror, now)
+            named = (self._named_at.get(each, -inf) for each in (mirror.name, mirror.cluster))
+            calm = now - max(rest[mirror.name], mirror.booted_at, *named) > SETTLED
+            if plant is None or mirror.cluster not in carried or mirror.state < 0 or not calm:
+                mirror.order = mirror.off_since = None
+                continue
+            if mirror.name in self._quiet:
+                self._served(mirror, now)
+                self._carried_out(mirror, now)
+                self._stays(mirror, before, now)
+                self._on_point(mirror, sun, now)
+                self._proven(mirror, plant, sun, now)
+            quiet.add(mirror.name)
+        self._quiet = frozenset(quiet)
+
+    def _notes(self, mirror: _Mirror, now: float) -> None:
+        board = mirror.account.board
+        if board.node is not mirror.node:
+            mirror.node, mirror.booted_at, mirror.aim = board.node, now, None
+        if board.state != mirror.state:
+            mirror.state, mirror.since = board.state, now
+        if mirror.state not in (states.IDLE, states.FAULT, states.LOCKED):
+            mirror.elsewhere = False
+
+    def _is_own(self, mirror: _Mirror) -> bool:
+        node = mirror.account.board.node
+        held = {} if node is None else node.journal.items
+        return all(held.get(name) == value for name, value in mirror.own.items())
+
+    def _served(self, mirror: _Mirror, now: float) -> None:
+        """Check that SUN and STATUS come at their rates."""
+        account = mirror.account
+        age = now - account.sun_at
+        saw = f"the last sun has reached it {age:.1f} s ago, limit {SUN_EVERY:g} s"
+        self._check(age <= SUN_EVERY, now, mirror, saw)
+        age = now - (account.told[-1][0] if account.told else -inf)
+        saw = f"its cluster has last heard its state {age:.1f} s ago, limit {STATUS_EVERY:g} s"
+        self._check(age <= STATUS_EVERY, now, mirror, saw)
+
+    def _told_off(self, mirror: _Mirror) -> float:
+        """Return when the cluster last sent DEFOCUS or STOW to it, s."""
+        safe = self._clusters[mirror.cluster].frames.safe
+        never = -inf
+        return max(safe.get(mirror.account.address, never), safe.get(wire.BROADCAST, never))
+
+    def _carried_out(self, mirror: _Mirror, now: float) -> None:
+        """Check that an order leads to its state in time, and that the plant is told."""
+        order = mirror.order
+        if order is None:
+            return
+        ordinary = order.name in ORDERS
+        # A mirror that turned away without following the sun stows by itself, whoever commands.
+        void = ordinary and order.name != "APPROACH" and mirror.state == states.STOWING
+        void |= ordinary and now - self._token_at < GRANTED
+        if void or (ordinary and self._told_off(mirror) >= order.at):
+            mirror.order = None
+            return
+        if order.done_at is None:
+            if mirror.state in order.ends:
+                order.done_at = now
+            passed = now - order.at
+            saw = f"{order.name} was ordered {passed:.1f} s ago, limit {order.within:g} s"
+            self._check(passed <= order.within, now, mirror, saw)
+            return
+        if mirror.state not in order.ends:
+            mirror.order = None
+            return
+        passed = now - order.done_at
+        saw = f"{order.name} was done {passed:.1f} s ago, and the plant has not been told"
+        self._check(not order.identity or passed <= TOLD_WITHIN, now, mirror, saw)
+
+    def _stays(self, mirror: _Mirror, before: int, now: float) -> None:
+        """Check that a mirror does not leave its work by itself."""
+        falls = before in _WORKS and mirror.state in _FALLS
+        if falls and self._reaches and self._is_own(mirror):
+            passed = now - self._told_off(mirror)
+            saw = f"it has left {states.STATES[before]} by itself"
+            self._check(passed <= CROSSING, now, mirror, saw)
+
+    def _on_point(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
+        """Check that the beam is on its aim, or at standby, by the steps that were made."""
+        tracks = mirror.state == states.TRACKING
+        point = mirror.aim if tracks else mirror.standby
+        stands = mirror.state == states.IDLE and mirror.account.by_way and not mirror.elsewhere
+        settled = now - max(mirror.pointed_at, mirror.since, mirror.ordered_at) > ON_POINT_WITHIN
+        if not (tracks or stands) or point is None or not settled or not self._is_own(mirror):
+            return
+        board = mirror.account.board
+        goal = (point[0], point[1], point[2])
+        miss = board.miss(sun, goal, believed=True)
+        far = float(np.linalg.norm(np.subtract(goal, board.outfit.mechanism.position)))
+        limit = NEAR * far + NEAR_M
+        saw = f"its beam is {miss:.2f} m beside its point, limit {limit:.2f} m"
+        self._check(miss <= limit, now, mirror, saw)
+
+    def _proven(self, mirror: _Mirror, plant: PlantController, sun: FloatArray, now: float) -> None:
+        """Check that an emergency that has been carried out is proven."""
+        order = plant.emergency
+        if order is None or not self._is_own(mirror):
+            mirror.off_since = None
+            return
+        off = mirror.state == states.DEFOCUSED and mirror.account.board.miss(sun, RECEIVER) > OFF
+        if order.act is Act.STOW:
+            off = mirror.state == states.STOWED
+        if not off:
+            mirror.off_since = None
+            return
+        mirror.off_since = now if mirror.off_since is None else mirror.off_since
+        passed = now - max(mirror.off_since, order.at)
+        saw = f"{order.act.name} was done {passed:.1f} s ago, and is not proven for it"
+        self._check(passed <= PROVEN_WITHIN or order.is_done(mirror.name), now, mirror, saw)

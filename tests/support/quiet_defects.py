@@ -1,0 +1,87 @@
+"""Defects by which a field does less, or later, and nothing is unsafe: for `twin_defects`."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from heliotrope.cluster import _goals
+from heliotrope.cluster._broadcast import Broadcast
+from heliotrope.cluster._exchange import Exchange
+from heliotrope.lcu import messages
+from heliotrope.lcu.controller import Controller
+from heliotrope.lcu.lease import SunLease
+from heliotrope.links.messages import Stage
+from heliotrope.plant.emergency.order import EmergencyOrder
+
+Plant = Callable[[pytest.MonkeyPatch], None]
+
+
+def _accepted_and_forgotten(name: str) -> Plant:
+    """A local controller acknowledges a command, and does not carry it out."""
+
+    def plant(patch: pytest.MonkeyPatch) -> None:
+        command = Controller._command
+
+        def forgetful(self: Any, what: str, *rest: Any) -> int:
+            return messages.DONE if what == name else command(self, what, *rest)
+
+        patch.setattr(Controller, "_command", forgetful)
+
+    return plant
+
+
+def _seldom_sun(patch: pytest.MonkeyPatch) -> None:
+    """A cluster sends SUN every fifth second: no lease of 6 s ends."""
+    second, broadcast, count = Broadcast.second, Exchange.broadcast, [0]
+
+    async def counted(self: Any, present: Any) -> None:
+        count[0] += 1
+        await second(self, present)
+
+    async def seldom(self: Any, name: str, *values: Any) -> Any:
+        if name == "SUN" and count[0] % 5:
+            return None
+        return await broadcast(self, name, *values)
+
+    patch.setattr(Broadcast, "second", counted)
+    patch.setattr(Exchange, "broadcast", seldom)
+
+
+def _lease_too_short(patch: pytest.MonkeyPatch) -> None:
+    """Now and then a mirror that is served takes its lease for over."""
+    look = SunLease.look
+
+    def hasty(self: Any, now: int, elapsed: int) -> bool:
+        if self._second % 50 == 0:
+            self.end()
+        return bool(look(self, now, elapsed))
+
+    patch.setattr(SunLease, "look", hasty)
+
+
+def _never_told(patch: pytest.MonkeyPatch) -> None:
+    """A cluster sees that a command is done, and tells nobody."""
+    add = _goals.Reports.add
+
+    def silent(self: Any, identity: str, stage: Stage, *rest: Any) -> None:
+        if stage is not Stage.DONE:
+            add(self, identity, stage, *rest)
+
+    patch.setattr(_goals.Reports, "add", silent)
+
+
+def _never_proven(patch: pytest.MonkeyPatch) -> None:
+    """No emergency is ever proven."""
+    patch.setattr(EmergencyOrder, "is_done", lambda self, name: False)
+
+
+#: Name, defect, worlds, and whether the normal tests leave it to the slow ones.
+ROWS: tuple[tuple[str, Plant, tuple[str, ...], bool], ...] = (
+    ("TRACK acknowledged and forgotten", _accepted_and_forgotten("TRACK"), ("calm",), False),
+    ("IDLE acknowledged and forgotten", _accepted_and_forgotten("IDLE"), ("calm",), True),
+    ("SUN every fifth second", _seldom_sun, ("calm",), True),
+    ("a lease that ends by itself", _lease_too_short, ("calm",), False),
+    ("nobody is told that a command is done", _never_told, ("calm",), True),
+    ("no emergency is ever proven", _never_proven, (), True),
+)
