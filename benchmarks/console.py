@@ -67,11 +67,12 @@ def serve(pipe: Connection, folder: str, heliostats: int) -> None:
 
 async def _serve(pipe: Connection, folder: Path, heliostats: int) -> None:
     from heliotrope.console import _secrets
+    from heliotrope.console.beside import ConsoleProcesses
     from heliotrope.console.settings import ConsoleSettings
     from heliotrope.field.layouts import malan_plant
     from heliotrope.links.clock import VirtualClock
     from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
-    from heliotrope.plant.interface import ConsoleProcess, PlantInterface
+    from heliotrope.plant.interface import PlantInterface
     from heliotrope.plant.operations.automatic import AutomaticSettings
     from heliotrope.store.keeper import Keeper
     from heliotrope.twin.field.field_bus import FieldBus
@@ -109,8 +110,7 @@ async def _serve(pipe: Connection, folder: Path, heliostats: int) -> None:
         loop.call_soon_threadsafe(address.set_result, where)
 
     interface = PlantInterface(live.operations, people, folder)
-    settings_of = ConsoleSettings(port=0).given
-    console = ConsoleProcess(interface, settings_of, live.logbook.take_alarm, tell)
+    console = ConsoleProcesses(interface, ConsoleSettings(port=0), live.logbook.take_alarm, tell)
     longest, acknowledged = _Longest(), _acknowledged(live.plant)
     async with (
         live.running(),

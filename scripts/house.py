@@ -20,7 +20,7 @@ NAME = "heliotrope"
 #: Started by name and not by an import: the command line, `python -m heliotrope.warm`, the
 #: console's process, Alembic.
 STARTED = re.compile(
-    rf"{NAME}(\.cli|\.warm|\.console\.__main__|\.store\.migrations(\..*)?|\.lcu\.node)?$"
+    rf"{NAME}(\.cli|\.warm|\.console\.(__main__|urgent_process)|\.store\.migrations(\..*)?|\.lcu\.node)?$"
 )
 
 

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from heliotrope.console import _secrets
+from heliotrope.console.beside import ConsoleProcesses
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.links.clock import VirtualClock
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
-from heliotrope.plant.interface import ConsoleProcess, PlantInterface
+from heliotrope.plant.interface import PlantInterface
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.store.keeper import Keeper
 from heliotrope.twin.live import CYCLE, PacedLoop, World
@@ -68,8 +69,9 @@ class Shown:
             self.address = address
             self._ready.set()
 
-        given = ConsoleSettings(port=0).given
-        console = ConsoleProcess(interface, given, live.logbook.take_alarm, tell)
+        console = ConsoleProcesses(
+            interface, ConsoleSettings(port=0), live.logbook.take_alarm, tell
+        )
         async with live.running(), interface.running(console.run):
             while not self._over.is_set():
                 await asyncio.sleep(0.2)

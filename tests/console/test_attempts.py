@@ -9,7 +9,7 @@ import pytest
 from starlette.requests import HTTPConnection
 
 from heliotrope.console._attempts import AN_HOUR, SPAN, Attempts
-from heliotrope.console.auth import address_of
+from heliotrope.console.headers import address_of
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import InputError
 from support.live_console import PASSWORD, LiveConsole
@@ -152,7 +152,7 @@ def test_only_a_proxy_names_the_caller(other: str, headers: list[str], address: 
     console: Any = SimpleNamespace(settings=ConsoleSettings(proxies=(PROXY,)))
     raw = [(b"x-forwarded-for", text.encode()) for text in headers]
     found = HTTPConnection({"type": "http", "client": (other, 1), "headers": raw})
-    assert address_of(console, found) == address
+    assert address_of(console.settings, found) == address
 
 
 def test_a_proxy_needs_an_address() -> None:

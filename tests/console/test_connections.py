@@ -21,7 +21,7 @@ Ask = Callable[..., httpx.Response]
 @pytest.fixture
 def listener(console: LiveConsole) -> Iterator[Listener]:
     """Return the console's listener; its limits are put back afterwards."""
-    found = console.server._doors.listeners[0]
+    found = console.server.listener
     limits = found.limits
     yield found
     found.limits = limits

@@ -12,7 +12,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from heliotrope.console import bodies, routes
-from heliotrope.console.edge import network_of
+from heliotrope.console.headers import network_of
 from heliotrope.errors import InputError
 from heliotrope.local import Buckets
 from support.live_console import PASSWORD, LiveConsole

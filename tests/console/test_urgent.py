@@ -1,5 +1,6 @@
 """EMERGENCY by a way of its own: the second listener."""
 
+import asyncio
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -9,8 +10,11 @@ from typing import Any
 import httpx
 import pytest
 
+from heliotrope.console.lines import Lines
 from heliotrope.console.settings import ConsoleSettings
-from heliotrope.errors import InputError
+from heliotrope.console.urgent import EmergencyWay
+from heliotrope.errors import HeliotropeError, InputError
+from heliotrope.local import AwayError, Buckets, CallError
 from support.live_console import LiveConsole
 
 Ask = Callable[..., httpx.Response]
@@ -113,17 +117,92 @@ def test_the_page_may_reach_it(console: LiveConsole, signed_in: httpx.Client) ->
     assert 'csrf" content=""' in httpx.get(f"{console.address}emergency", trust_env=False).text
 
 
-def test_its_port(console: LiveConsole, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The next one; another if that is taken, unless it was asked for."""
+def test_its_port() -> None:
+    """The next one; another if that is taken, unless it was asked for. The page's is given back."""
     with socket.create_server(("127.0.0.1", 0)) as line:
         taken = line.getsockname()[1]
-        monkeypatch.setattr(console.server, "settings", ConsoleSettings(port=taken - 1))
-        with console.server._listen_urgent(taken - 1) as other:
-            assert other.getsockname()[1] != taken
-        settings = ConsoleSettings(port=0, page=False, emergency_port=taken)
-        monkeypatch.setattr(console.server, "settings", settings)
+        lines = Lines(ConsoleSettings(port=0, emergency_port=taken))
         with pytest.raises(InputError, match="choose another with --emergency-port"):
-            console.server._listen_urgent(taken - 1)
+            lines.open()
+        with pytest.raises(InputError, match="choose another with --port"):
+            Lines(ConsoleSettings(port=taken)).open()
+    lines = Lines(ConsoleSettings(port=0))
+    assert [one.getsockname()[1] for one in lines.open()] == [
+        lines.settings.port,
+        lines.settings.emergency_port,
+    ]
+    assert lines.open() is lines.open()
+    lines.close()
+
+
+def test_its_port_where_the_next_one_is_taken() -> None:
+    for _ in range(100):
+        with socket.create_server(("127.0.0.1", 0)) as line:
+            taken = line.getsockname()[1]
+            lines = Lines(ConsoleSettings(port=taken - 1))
+            try:
+                lines.open()
+            except InputError:
+                continue  # another program has the port before it
+            assert lines.settings.emergency_port not in (None, taken - 1, taken)
+            lines.close()
+            break
+    else:
+        pytest.fail("no two free ports side by side")
     with pytest.raises(InputError, match="port 70000"):
         ConsoleSettings(emergency_port=70_000)
-    assert ConsoleSettings.of(settings.given) == settings
+    assert ConsoleSettings.of(lines.settings.given) == lines.settings
+
+
+class Plant:
+    """Answers the calls of the way; ``away`` is what it says instead to the store's."""
+
+    def __init__(self) -> None:
+        self.away: HeliotropeError | None = None
+        self.orders = 0
+
+    async def ask(self, call: str, given: dict[str, Any], **_: Any) -> tuple[Any, bytes]:
+        if call == "order_emergency":
+            self.orders += 1
+            return {"on": True}, b""
+        if self.away is not None:
+            raise self.away
+        known = given["secret"] == "good" * 16
+        return {"name": "ada", "role": "viewer", "expires": None} if known else None, b""
+
+
+def by_token(way: EmergencyWay, word: str, times: int = 1) -> list[int]:
+    """Return the statuses of some orders by token."""
+
+    async def main() -> list[int]:
+        transport = httpx.ASGITransport(app=way)
+        headers = {"Authorization": f"Bearer {word * 16}"}
+        async with httpx.AsyncClient(
+            transport=transport, base_url="http://127.0.0.1", headers=headers
+        ) as client:
+            url = "/api/v1/emergency"
+            return [(await client.post(url, json={})).status_code for _ in range(times)]
+
+    return asyncio.run(main())
+
+
+@pytest.mark.parametrize("away", [AwayError("no answer"), CallError("store", "it is full")])
+def test_it_knows_a_caller_whom_the_store_knew_lately(away: HeliotropeError) -> None:
+    plant = Plant()
+    way = EmergencyWay(plant.ask, ConsoleSettings())
+    assert by_token(way, "good") == [200]
+    plant.away = away
+    assert by_token(way, "good") == [200]
+    assert by_token(way, "evil") == [503]
+    plant.away = None
+    assert by_token(way, "evil") == [401]
+    assert plant.orders == 2
+
+
+def test_strangers_are_counted_and_people_are_not() -> None:
+    plant = Plant()
+    way = EmergencyWay(plant.ask, ConsoleSettings())
+    way._stranger = Buckets(1.0, 10.0, lambda: 0.0)
+    assert by_token(way, "good") == [200]
+    assert by_token(way, "evil", 12) == [401] * 9 + [429] * 3
+    assert by_token(way, "good", 30) == [200] * 30

@@ -16,16 +16,21 @@ from typing import Any, TypeVar
 from nicegui import core
 
 from heliotrope.console import _secrets
+from heliotrope.console.beside import ConsoleProcesses
+from heliotrope.console.lines import Lines
+from heliotrope.console.process import Given
 from heliotrope.console.remote import RemotePlant
 from heliotrope.console.serve import ConsoleServer
 from heliotrope.console.settings import ConsoleSettings
+from heliotrope.console.urgent_process import server_of
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.volumes import Box
 from heliotrope.links.clock import VirtualClock
 from heliotrope.links.link import running
+from heliotrope.local import EMERGENCY, LocalConnection
 from heliotrope.plant.audit import JsonLines
 from heliotrope.plant.authority import Person, RefusedError, Role
-from heliotrope.plant.interface import ConsoleProcess, PlantInterface
+from heliotrope.plant.interface import PlantInterface
 from heliotrope.plant.interface.console_process import Patience
 from heliotrope.store.keeper import Keeper
 from heliotrope.twin.live.loop import PacedLoop
@@ -43,14 +48,21 @@ async def serving(
     interface: PlantInterface, settings: ConsoleSettings
 ) -> AsyncIterator[tuple[ConsoleServer, str]]:
     """Serve a console of a plant during a block; yield it with its address."""
+    lines = Lines(settings)
+    page, way = lines.open()
     plant = RemotePlant(interface.folder, interface.key)
-    server = ConsoleServer(plant, settings)
+    server = ConsoleServer(plant, lines.settings, page)
+    urgent = LocalConnection(interface.folder / EMERGENCY, {"key": interface.key}, 10.0)
+    beside = server_of(urgent, Given(interface.folder, interface.key, lines.settings, way))
     async with asyncio.TaskGroup() as group:
-        connecting = group.create_task(plant.run())
-        async with running(server):
+        connecting = [group.create_task(one.run()) for one in (plant, urgent)]
+        async with running(server), running(beside):
             await plant.up()
+            while not urgent.up:
+                await asyncio.sleep(0.02)
             yield server, await server.address()
-        connecting.cancel()
+        for one in connecting:
+            one.cancel()
 
 
 class LiveConsole:
@@ -60,8 +72,8 @@ class LiveConsole:
     ----------
     address
         Of the console.
-    process
-        The console's process, with ``child``.
+    process, way, beside
+        The console's processes, with ``child``, and what starts them.
     live, interface
         The plant and its interface; touch them with `call` only.
     server
@@ -78,22 +90,24 @@ class LiveConsole:
         rendered: bool = False,
         boards: bool = False,
         child: Patience | None = None,
+        settings: ConsoleSettings | None = None,
         keep_outs: tuple[Box, ...] = (GATE,),
     ) -> None:
         self.folder, self.address = folder, ""
-        self._made, self._child = (heliostats, page, speed), child
+        self._made, self._child = (heliostats, speed), child
+        self._settings = settings or ConsoleSettings(port=0, page=page)
         self._keep_outs = keep_outs
         self._options = LiveOptions(rendered=rendered, boards=boards)
         self._ready, self._over = threading.Event(), threading.Event()
         self._problem: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="plant")
         self._thread.start()
-        self._ready.wait(60.0)
+        self._ready.wait(300.0)
         if not self.address:
             self.close()
 
     def _run(self) -> None:
-        speed = self._made[2]
+        speed = self._made[1]
         try:
             with asyncio.Runner(loop_factory=lambda: PacedLoop(speed)) as runner:
                 runner.run(self._main())
@@ -102,7 +116,7 @@ class LiveConsole:
         self._ready.set()
 
     async def _main(self) -> None:
-        heliostats, page, speed = self._made
+        heliostats, speed = self._made
         self._loop = asyncio.get_running_loop()
         clock = VirtualClock(self._loop.time)
         self.keeper = Keeper(self.folder / "store.sqlite")
@@ -119,21 +133,30 @@ class LiveConsole:
             extra=lambda: {"speed": speed},
         )
         self.interface = PlantInterface(self.live.operations, self.keeper.people, self.folder)
-        settings = ConsoleSettings(port=0, page=page)
+        settings = self._settings
         if self._child is None:
             async with self.live.running(), self.interface.running():
                 await asyncio.to_thread(self._serve, settings)
         else:
-            self.process = ConsoleProcess(
+            beside = ConsoleProcesses(
                 self.interface,
-                settings.given,
+                settings,
                 self.live.assembly.logbook.take_alarm,
                 self._tell,
                 self._child,
             )
-            async with self.live.running(), self.interface.running(self.process.run):
+            self.process, self.way, self.beside = beside.page, beside.way, beside
+            async with self.live.running(), self.interface.running(beside.run):
                 await asyncio.to_thread(self._over.wait)
         self.keeper.close()
+
+    @property
+    def emergency_port(self) -> int:
+        """Port of the page's second way for EMERGENCY."""
+        settings = self.server.app.state.console.settings if self._child is None else None
+        found = (settings or self.beside.settings).emergency_port
+        assert found is not None
+        return int(found)
 
     def _tell(self, address: str) -> None:
         self.address = address

@@ -1,7 +1,5 @@
-"""Passwords, kept as argon2id hashes, and the CSRF word that protects a session."""
+"""Passwords, kept as argon2id hashes."""
 
-import hashlib
-import hmac
 import secrets
 
 import argon2
@@ -47,13 +45,3 @@ def new_password() -> str:
     letters = "abcdefghjkmnpqrstuvwxyz23456789"
     groups = ("".join(secrets.choice(letters) for _ in range(5)) for _ in range(4))
     return "-".join(groups)
-
-
-def csrf_of(session: str) -> str:
-    """Return the CSRF word that a page must send with every change in a session."""
-    return hmac.new(session.encode(), b"heliotrope csrf", hashlib.sha256).hexdigest()
-
-
-def same(one: str, other: str) -> bool:
-    """Return whether two words are equal, in constant time."""
-    return hmac.compare_digest(one.encode(), other.encode())

@@ -8,7 +8,6 @@ from fastapi import APIRouter, HTTPException, Request, Response
 from heliotrope.console import _secrets, models
 from heliotrope.console.api import REFUSALS, Named
 from heliotrope.console.auth import (
-    COOKIE,
     Anyone,
     Caller,
     Console,
@@ -18,6 +17,7 @@ from heliotrope.console.auth import (
     same_origin,
     signed_in,
 )
+from heliotrope.console.headers import COOKIE
 from heliotrope.console.people import ROLES
 from heliotrope.console.sign_in import confirm, log_in, set_cookie
 from heliotrope.plant.authority import Role

@@ -18,10 +18,10 @@ from heliotrope import __version__
 from heliotrope.console import accounts, api, commands, factor
 from heliotrope.console._attempts import Attempts
 from heliotrope.console._files import KEPT, PLAIN, STATIC, Files
-from heliotrope.console.auth import FOUND, Caller, Console, introduced
+from heliotrope.console.auth import Caller, Console, introduced
 from heliotrope.console.by_proxy import ByProxy
+from heliotrope.console.connections import FOUND
 from heliotrope.console.edge import Edge
-from heliotrope.console.emergencies import EmergencyOrders
 from heliotrope.console.guard import Guard
 from heliotrope.console.live import Stream
 from heliotrope.console.remote import RemotePeople, RemotePlant
@@ -60,7 +60,7 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
     chosen = settings or ConsoleSettings()
     people, stream = RemotePeople(plant), Stream(plant, chosen.period)
     attempts = Attempts(time.monotonic, chosen.proxies)
-    console = Console(plant, people, chosen, stream, attempts, EmergencyOrders())
+    console = Console(plant, people, chosen, stream, attempts)
     if chosen.people_by_proxy is not None:
         console.by_proxy = ByProxy.read(chosen.people_by_proxy)
 

@@ -7,7 +7,6 @@ elsewhere cannot read. Programs have a token (``Authorization: Bearer``).
 
 import asyncio
 import contextlib
-import ipaddress
 import time
 from collections import deque
 from collections.abc import Callable
@@ -19,10 +18,11 @@ from urllib.parse import urlsplit
 from fastapi import Depends, HTTPException
 from starlette.requests import HTTPConnection
 
-from heliotrope.console import _secrets
+from heliotrope.console import _words
 from heliotrope.console._attempts import Attempts
 from heliotrope.console.by_proxy import ByProxy, Introduced
-from heliotrope.console.emergencies import EmergencyOrders
+from heliotrope.console.connections import FOUND
+from heliotrope.console.headers import address_of, host_known, secret_of
 from heliotrope.console.live import Stream
 from heliotrope.console.people import ROLES, person_of
 from heliotrope.console.remote import RemotePeople, RemotePlant
@@ -33,16 +33,11 @@ from heliotrope.plant.operations.security import SPAN, SecurityEvent, plain
 from heliotrope.store.people import Account, ApiToken, Session
 
 T = TypeVar("T")
-COOKIE = "heliotrope_session"
 #: A session that was found valid is trusted for this long without asking the store, s.
 TRUSTED = 5.0
 #: The same for EMERGENCY alone, s.
 LONG_TRUSTED = 3600.0
 MOST_KNOWN = 2000
-#: A longer word is no session's or token's secret, characters.
-LONGEST_SECRET = 200
-#: Key of the caller in the scope of a request: the guard looks each up once.
-FOUND = "heliotrope.caller"
 #: Security events of one kind that are sent to the plant within a minute.
 MOST_NOTED = 100
 #: The shared answer that never changes.
@@ -74,15 +69,11 @@ class Console:
     settings: ConsoleSettings
     stream: Stream
     attempts: Attempts
-    emergencies: EmergencyOrders
     #: Concurrent password checks: each takes 50 ms of a core and 64 MiB.
     hashing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
 
     #: How a trusted proxy names people; None: it does not.
     by_proxy: ByProxy | None = None
-
-    #: Port of the way for EMERGENCY alone; 0: none.
-    emergency_port: int = 0
 
     #: Number of heliostats; 0 before it is known, see `heliostats`.
     size: int = 0
@@ -124,7 +115,7 @@ class Console:
         now = time.monotonic()
         if len(times) < MOST_NOTED or now - times[0] >= SPAN:
             times.append(now)
-            await self.plant.note(kind, who, address_of(self, connection), plain(detail))
+            await self.plant.note(kind, who, address_of(self.settings, connection), plain(detail))
 
     async def heliostats(self) -> int:
         """Return the number of heliostats of the plant."""
@@ -145,6 +136,11 @@ class Console:
         The threads have no other work: those that hang must not take the place of others.
         """
         return await asyncio.get_running_loop().run_in_executor(self.threads, work)
+
+    @property
+    def emergency_port(self) -> int:
+        """Port of the way for EMERGENCY alone; 0: none."""
+        return self.settings.emergency_port or 0
 
     def now(self) -> float:
         """Return the machine's time, POSIX s: sessions end by it, whatever the plant's time."""
@@ -184,7 +180,7 @@ class Caller:
     @property
     def csrf(self) -> str:
         """The word that must be sent with every change; "" for a token."""
-        return _secrets.csrf_of(self.secret) if self.by == "session" else ""
+        return _words.csrf_of(self.secret) if self.by == "session" else ""
 
 
 async def here(connection: HTTPConnection) -> Console:
@@ -195,25 +191,6 @@ async def here(connection: HTTPConnection) -> Console:
 def console_of(connection: HTTPConnection) -> Console:
     """Return the console of an application."""
     return cast("Console", connection.app.state.console)
-
-
-def address_of(console: Console, connection: HTTPConnection) -> str:
-    """Return the address that a request comes from: what a trusted proxy says, or the other end's.
-
-    Each proxy adds the address that it saw at the end of ``X-Forwarded-For``, so the last one that
-    is no proxy's counts; what a caller writes there itself stands before.
-    """
-    address = connection.client.host if connection.client else ""
-    proxies = console.settings.proxies
-    if address in proxies:
-        for text in reversed(",".join(connection.headers.getlist("x-forwarded-for")).split(",")):
-            try:
-                said = str(ipaddress.ip_address(text.strip()))
-            except ValueError:
-                break
-            if said not in proxies:
-                return said
-    return address
 
 
 Here = Annotated[Console, Depends(here)]
@@ -259,20 +236,6 @@ def _as_introduced(console: Console, connection: HTTPConnection, who: Caller) ->
     return who.by_proxy and (found.name, found.role) == (who.person.name, who.person.role.title)
 
 
-def secret_of(connection: HTTPConnection) -> tuple[str, str] | None:
-    """Return kind and secret of the caller's token or session, whether valid or not; None for none.
-
-    A request with a token is never taken for one of a session.
-    """
-    bearer = connection.headers.get("authorization", "")
-    if bearer:
-        kind, _, word = bearer.partition(" ")
-        by, secret = "token", word.strip() if kind.lower() == "bearer" else ""
-    else:
-        by, secret = "session", connection.cookies.get(COOKIE, "")
-    return (by, secret) if 0 < len(secret) <= LONGEST_SECRET else None
-
-
 async def _look_up(console: Console, by: str, secret: str) -> tuple[float, Caller] | None:
     """Ask the store for the owner of a secret."""
     now = console.now()
@@ -314,13 +277,9 @@ def same_origin(console: Console, connection: HTTPConnection) -> bool:
     if origin is None:
         return True
     there = urlsplit(origin)
-    return there.netloc == connection.headers.get("host") and host_known(console, there.netloc)
-
-
-def host_known(console: Console, netloc: str) -> bool:
-    """Whether a request names this machine by a known name."""
-    host = netloc.rpartition(":")[0] if netloc.rpartition(":")[2].isdigit() else netloc
-    return host.lower() in console.settings.hosts
+    return there.netloc == connection.headers.get("host") and host_known(
+        console.settings, there.netloc
+    )
 
 
 async def caller(connection: HTTPConnection, console: Here) -> Caller:
@@ -346,7 +305,7 @@ async def caller(connection: HTTPConnection, console: Here) -> Caller:
         console.forget()
     if found.by == "session" and changes:
         word = connection.headers.get("x-csrf-token", "")
-        if not same_origin(console, connection) or not _secrets.same(word, found.csrf):
+        if not same_origin(console, connection) or not _words.same(word, found.csrf):
             await console.note(SecurityEvent.ORIGIN_REFUSED, connection, found.person.name)
             raise HTTPException(403, "the header X-CSRF-Token is missing or not this session's")
     if (connection.scope.get("method", "GET"), connection.scope["path"]) not in _ALWAYS:

@@ -3,8 +3,8 @@
 import asyncio
 import re
 
-from fastapi import HTTPException
 from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
 from starlette.types import Message, Receive
 
 from heliotrope.errors import InputError

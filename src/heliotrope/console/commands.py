@@ -25,7 +25,7 @@ async def call_emergency(
 ) -> JSONResponse:
     """Order DEFOCUS (or STOW) of the whole field, with proof; open to everybody signed in."""
     call = order or orders.EmergencyCall()
-    return answer(await console.emergencies.give(console.plant, who.person, call))
+    return answer(await console.plant.ask("order_emergency", who.person, **call.model_dump()))
 
 
 @router.delete("/emergency", response_model=models.EmergencyView, tags=["safety"])

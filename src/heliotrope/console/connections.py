@@ -1,7 +1,7 @@
 """The connections of the console: counted, timed, and closed in favour of known callers.
 
-`Listener` accepts the connections of one address; `Doors` is the application in front of all of
-them, which notes how far each connection's request is. A connection that has never completed a
+`Listener` accepts the connections of one address; `Doors` is the application in front of its own,
+which notes how far each connection's request is. A connection that has never completed a
 request of a known caller is a stranger's. Strangers have few places and short deadlines, and lose
 the longest-held place to the next connection, so they shut nobody out.
 """
@@ -23,14 +23,13 @@ from typing import Any
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from heliotrope.console.auth import FOUND
 from heliotrope.links.tls import TlsSource, context_of
 
 logger = logging.getLogger("heliotrope.console")
 #: Descriptors asked of the system, and those kept for files, the plant and the store.
 WANTED, RESERVE = 16_384, 128
-#: Connections accepted in one turn of the loop, and those that may wait in the system.
-_BURST, _BACKLOG = 32, 2048
+#: Connections accepted in one turn of the loop.
+_BURST = 32
 #: Time between two looks at the deadlines, and pause after a failure to accept, s.
 _LOOK, _PAUSE = 0.25, 0.25
 #: Least time between two looks for places that have become free, s.
@@ -38,6 +37,8 @@ _SOON = 0.02
 #: Least rate of a known caller's body, bytes/s.
 _SLOWEST = 200_000.0
 _FULL = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
+#: Key of the caller in the scope of a request: each is looked up once.
+FOUND = "heliotrope.caller"
 Key = tuple[Any, int]
 Protocols = Callable[[], asyncio.Protocol]
 
@@ -349,29 +350,24 @@ def _rank(one: Connection) -> tuple[bool, float, int, float]:
 
 
 class Doors:
-    """The application in front of all listeners.
+    """The application in front of a listener's, which notes how far each request is.
 
     Parameters
     ----------
-    app
-        The application of the first listener.
+    listener
+        The listener.
     """
 
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-        self.listeners: list[Listener] = []
+    def __init__(self, listener: Listener) -> None:
+        self._listener = listener
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on to the application of the listener that it came to."""
+        """Pass a request on."""
+        app = self._listener.app
         if scope["type"] == "lifespan":
-            await self.app(scope, receive, send)
+            await app(scope, receive, send)
             return
-        port = (scope.get("server") or ("", 0))[1]
-        listener = next((one for one in self.listeners if one.port == port), None)
-        if listener is None:
-            await self.app(scope, receive, send)
-            return
-        with listener.request(scope) as whole:
+        with self._listener.request(scope) as whole:
 
             async def take() -> Message:
                 message = await receive()
@@ -379,13 +375,7 @@ class Doors:
                     whole()
                 return message
 
-            await listener.app(scope, take if scope["type"] == "http" else receive, send)
-
-
-def listening(host: str, port: int) -> socket.socket:
-    """Return a listening socket."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    return socket.create_server((host, port), family=family, backlog=_BACKLOG)
+            await app(scope, take if scope["type"] == "http" else receive, send)
 
 
 def raise_descriptors() -> int:

@@ -1,6 +1,5 @@
 """How often callers may send requests: strangers by address, known callers by session or token."""
 
-import ipaddress
 import math
 import time
 from collections import OrderedDict
@@ -10,11 +9,10 @@ from contextlib import contextmanager
 from fastapi import HTTPException
 from starlette.requests import HTTPConnection
 
-from heliotrope.console.auth import Caller, Console, address_of, find_caller, secret_of
+from heliotrope.console.auth import Caller, Console, find_caller
+from heliotrope.console.headers import STRANGER, STRANGERS, address_of, network_of, secret_of
 from heliotrope.local import Buckets
 
-#: Requests of strangers: from one address, and from all; 1/s, and at once.
-STRANGER, STRANGERS = (50.0, 200.0), (300.0, 600.0)
 #: Requests of one session or token; 1/s, and at once.
 KNOWN = (200.0, 1000.0)
 #: Large bodies at the same time: from all, and of one session or token.
@@ -64,7 +62,7 @@ class Edge:
         return found
 
     def _count_stranger(self, console: Console, connection: HTTPConnection) -> None:
-        address = network_of(address_of(console, connection))
+        address = network_of(address_of(console.settings, connection))
         _refuse(self._stranger.take(address) or self._strangers.take(""))
 
     def count(self, who: Caller) -> None:
@@ -96,19 +94,6 @@ class Edge:
             yield
         finally:
             self._large.remove(key)
-
-
-def network_of(address: str) -> str:
-    """Return the address that is counted: of IPv6 the /64, of which one machine has all."""
-    try:
-        found = ipaddress.ip_address(address)
-    except ValueError:
-        return address
-    if isinstance(found, ipaddress.IPv4Address):
-        return str(found)
-    if found.ipv4_mapped is not None:
-        return str(found.ipv4_mapped)
-    return str(ipaddress.IPv6Network((int(found) >> 64 << 64, 64)))
 
 
 def _refuse(wait: float) -> None:

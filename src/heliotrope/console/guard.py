@@ -9,25 +9,25 @@ from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlsplit
 
-from fastapi import HTTPException
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.responses import JSONResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from heliotrope.console import bodies
 from heliotrope.console.auth import (
-    FOUND,
     AtLeast,
     Caller,
     Console,
     caller,
-    host_known,
     refused,
     same_origin,
     settle,
 )
+from heliotrope.console.connections import FOUND
 from heliotrope.console.edge import Edge
+from heliotrope.console.headers import host_known
 from heliotrope.console.routes import FORM, READ, TINY, Found, Routes
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.plant.operations.security import SecurityEvent
@@ -100,7 +100,7 @@ class Guard:
             If it is not allowed.
         """
         connection, headers = HTTPConnection(scope), Headers(scope=scope)
-        if not host_known(console, headers.get("host", "")):
+        if not host_known(console.settings, headers.get("host", "")):
             host = headers.get("host", "")
             await console.note(SecurityEvent.HOST_REFUSED, connection, detail=host)
             raise HTTPException(421, "this machine is not known here by that name; see --name")
@@ -174,7 +174,7 @@ class Guard:
 def _urgent(console: Console, scope: Scope) -> str:
     """Return the origin of the way for EMERGENCY alone, as the page reaches it."""
     host = urlsplit(f"//{Headers(scope=scope).get('host', '')}").hostname or ""
-    if not console.emergency_port or not host_known(console, host):
+    if not console.emergency_port or not host_known(console.settings, host):
         return ""
     scheme = "https" if console.settings.tls or console.settings.plain else scope["scheme"]
     return f"{scheme}://{host}:{console.emergency_port}"

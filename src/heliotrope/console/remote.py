@@ -18,8 +18,6 @@ from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.factors import Used
 from heliotrope.store.people import Account, ApiToken, Expired, Session
 
-#: Time between two signs of life, s.
-BEAT = 1.0
 #: Limit of an answer about people, s: the store may have to write.
 _STORE = 20.0
 

@@ -8,9 +8,9 @@ from starlette.requests import HTTPConnection
 from starlette.responses import Response
 
 from heliotrope.console import _secrets
-from heliotrope.console.auth import COOKIE, Caller, Console, address_of
+from heliotrope.console.auth import Caller, Console
 from heliotrope.console.by_proxy import Introduced, check_account
-from heliotrope.console.edge import network_of
+from heliotrope.console.headers import COOKIE, address_of, network_of
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.people import BY_PROXY, Account
 
@@ -37,7 +37,7 @@ async def log_in(
     now, lifetime = console.now(), console.settings.session_s
     secret = await console.ask(
         lambda: console.people.open_session(
-            account.name, now, lifetime, address_of(console, connection)
+            account.name, now, lifetime, address_of(console.settings, connection)
         )
     )
     await console.note(SecurityEvent.SIGNED_IN, connection, name)
@@ -65,7 +65,7 @@ async def enter(console: Console, found: Introduced, connection: HTTPConnection)
         await console.ask(lambda: people.change(name, now, role=role))
         detail = f"{name}, role {role}, as the proxy says"
         await console.note(SecurityEvent.ACCOUNT_CHANGED, connection, name, detail)
-    lifetime, address = console.settings.session_s, address_of(console, connection)
+    lifetime, address = console.settings.session_s, address_of(console.settings, connection)
     secret = await console.ask(lambda: people.open_session(name, now, lifetime, address))
     await console.note(SecurityEvent.SIGNED_IN, connection, name, "by the proxy")
     return secret
@@ -108,7 +108,7 @@ async def checked(
         401 if name, password or code is wrong; 428 if a code is needed; 429 after too many
         failures.
     """
-    keys = (name, network_of(address_of(console, connection)))
+    keys = (name, network_of(address_of(console.settings, connection)))
     if (wait := console.attempts.wait(*keys)) > 0.0:
         seconds = math.ceil(wait)
         await console.note(SecurityEvent.LOCKED_OUT, connection, await _known(console, name))

@@ -1,26 +1,38 @@
-"""EMERGENCY by a way of its own: a second listener that serves nothing else.
+"""EMERGENCY by a way of its own: a second listener, in a process of its own, that serves only that.
 
 The page sends its order by the ordinary way and by this one at the same time. Both carry the same
-word, so the plant gets one order.
+word, so the plant gives the order once. This process needs little of the house, holds nothing but
+the callers that it has met, and asks the plant by the socket for emergencies alone: whatever holds
+the console up, or ends it, does not reach it.
 """
 
-from collections.abc import Callable
+import hashlib
+import json
+import math
+import time
+from collections.abc import Awaitable, Callable
 from typing import Any
 from urllib.parse import urlsplit
 
-from fastapi import HTTPException
-from pydantic import Field, ValidationError
 from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.responses import JSONResponse
 from starlette.types import Receive, Scope, Send
 
-from heliotrope.console import _secrets, bodies
-from heliotrope.console.auth import FOUND, Caller, Console, host_known
-from heliotrope.console.connections import Limits
-from heliotrope.console.edge import Edge
+from heliotrope.console import _words, bodies
+from heliotrope.console.connections import FOUND, Limits
+from heliotrope.console.headers import (
+    STRANGER,
+    STRANGERS,
+    address_of,
+    host_known,
+    network_of,
+    secret_of,
+)
+from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError
-from heliotrope.plant.interface import orders
+from heliotrope.local import AwayError, Buckets, CallError
 
 PATH = "/api/v1/emergency"
 #: Few connections with short deadlines: nothing but an order comes here.
@@ -28,14 +40,18 @@ LIMITS = Limits(
     most=64, strangers=48, address=32, handshake=2.0, header=2.0, body=2.0, idle=2.0, answer=12.0,
     idle_known=30.0, answer_known=12.0,
 )  # fmt: skip
+#: Time for the store to find a caller, and how long one that it found is good if it cannot, s.
+_STORE, _TRUSTED = 1.0, 3600.0
+#: Callers that are remembered.
+_MOST_KNOWN = 2000
 #: Largest body, bytes.
 _LARGEST = 2048
-
-
-class UrgentCall(orders.EmergencyCall):
-    """The order of a page: with the session's word, so that the browser asks nothing before it."""
-
-    csrf: str = Field("", max_length=128)
+#: What an order may say; the plant checks each.
+_SAID = frozenset({"act", "reason", "call", "csrf"})
+#: Statuses of refusals by the plant.
+_STATUS = {"input": 422, "refused": 409}
+#: Makes a call in the plant; returns value and blob.
+Ask = Callable[..., Awaitable[tuple[Any, bytes]]]
 
 
 class EmergencyWay:
@@ -43,15 +59,18 @@ class EmergencyWay:
 
     Parameters
     ----------
-    console
-        State of the console.
-    page_port
-        Returns the port of the page, the only one from which a browser may send an order.
+    ask
+        Makes a call by the plant's socket for emergencies, as `LocalConnection.ask`.
+    settings
+        Settings of the console; only from the page at its port may a browser send an order.
     """
 
-    def __init__(self, console: Console, page_port: Callable[[], int]) -> None:
-        self._console, self._page_port = console, page_port
-        self._edge = Edge()
+    def __init__(self, ask: Ask, settings: ConsoleSettings) -> None:
+        self._ask, self._settings = ask, settings
+        self._stranger, self._strangers = (
+            Buckets(*limits, time.monotonic) for limits in (STRANGER, STRANGERS)
+        )
+        self._known: dict[str, tuple[float, dict[str, Any]]] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
@@ -65,6 +84,8 @@ class EmergencyWay:
         except HTTPException as refusal:
             status, text = refusal.status_code, {"detail": refusal.detail}
             headers |= {"Connection": "close", **(refusal.headers or {})}
+        except CallError as error:
+            status, text = _STATUS.get(error.kind, 503), {"detail": str(error)}
         except HeliotropeError as error:
             status, text = 503, {"detail": str(error)}
         await JSONResponse(text, status, headers)(scope, receive, send)
@@ -72,7 +93,7 @@ class EmergencyWay:
     async def _take(self, scope: Scope, receive: Receive, answer: dict[str, str]) -> Any:
         """Give the order; return its view, and what the answer needs for the page's origin."""
         connection, headers = HTTPConnection(scope), Headers(scope=scope)
-        if not host_known(self._console, headers.get("host", "")):
+        if not host_known(self._settings, headers.get("host", "")):
             raise HTTPException(421, "this machine is not known here by that name; see --name")
         if (scope["method"], scope["path"]) != ("POST", PATH):
             raise HTTPException(404, f"only POST {PATH} is served here")
@@ -82,14 +103,56 @@ class EmergencyWay:
             answer["Access-Control-Allow-Origin"] = origin
             answer["Access-Control-Allow-Credentials"] = "true"
             answer["Vary"] = "Origin"
-        who = scope[FOUND] = await self._edge.find(self._console, connection)
+        by, secret = secret_of(connection) or ("", "")
+        who = scope[FOUND] = await self._caller(connection, by, secret)
         if who is None:
             raise HTTPException(401, "sign in, or send a valid token")
         call = await _read(headers, receive)
-        if not allowed or not _meant(who, call, headers):
+        word = headers.get("x-csrf-token") or str(call.pop("csrf", ""))
+        meant = by == "token" or _words.same(word, _words.csrf_of(secret))
+        if not allowed or not meant:
             raise HTTPException(403, "this is not an order of this session's page")
-        given = orders.EmergencyCall(act=call.act, reason=call.reason, call=call.call)
-        return await self._console.emergencies.give(self._console.plant, who.person, given)
+        behalf = {"name": who["name"], "role": who["role"]}
+        call.pop("csrf", None)
+        return (await self._ask("order_emergency", call, on_behalf=behalf))[0]
+
+    async def _caller(
+        self, connection: HTTPConnection, by: str, secret: str
+    ) -> dict[str, Any] | None:
+        """Return the caller, None for a stranger; one known lately also if the store cannot say.
+
+        Raises
+        ------
+        HTTPException
+            429 if strangers ask too often; 503 if the store cannot say who an unknown caller is.
+        """
+        key = hashlib.sha256(f"{by} {secret}".encode()).hexdigest()
+        at, known = self._known.get(key, (-math.inf, None))
+        if known is None:
+            self._count(connection)
+        if not secret:
+            return None
+        now = time.time()
+        given = {"secret": secret, "now": now}
+        try:
+            found, _ = await self._ask(f"people.{by}", given, within=_STORE)
+        except (AwayError, CallError):
+            if known is None or time.monotonic() - at > _TRUSTED:
+                raise HTTPException(503, "the store cannot say who this is; try again") from None
+            expires = known["expires"]
+            return known if expires is None or expires > now else None
+        self._known.pop(key, None)
+        if found is not None:
+            if len(self._known) >= _MOST_KNOWN:
+                self._known.pop(next(iter(self._known)))
+            self._known[key] = time.monotonic(), found
+        return dict(found) if found is not None else None
+
+    def _count(self, connection: HTTPConnection) -> None:
+        address = network_of(address_of(self._settings, connection))
+        wait = self._stranger.take(address) or self._strangers.take("")
+        if wait > 0.0:
+            raise HTTPException(429, "too many requests", {"Retry-After": str(math.ceil(wait))})
 
     def _from_page(self, origin: str, host: str) -> bool:
         """Whether an origin is the page of this console, at the name that the request names."""
@@ -99,23 +162,22 @@ class EmergencyWay:
         except ValueError:
             return False
         # Behind a proxy the page has the proxy's port.
-        behind = self._console.settings.plain and port is None
-        return name is not None and name == here.hostname and (behind or port == self._page_port())
+        behind = self._settings.plain and port is None
+        return (
+            name is not None and name == here.hostname and (behind or port == self._settings.port)
+        )
 
 
-async def _read(headers: Headers, receive: Receive) -> UrgentCall:
+async def _read(headers: Headers, receive: Receive) -> dict[str, Any]:
     """Return the order in a body; raises `HTTPException` if there is none."""
     body = await bodies.read_body(receive, bodies.length_of(headers, _LARGEST))
     if body is None:
         raise HTTPException(400, "the order is incomplete")
     try:
         bodies.check_json(body)
-        return UrgentCall.model_validate_json(body or b"{}")
-    except (HeliotropeError, ValidationError):
-        raise HTTPException(422, "the order cannot be read") from None
-
-
-def _meant(who: Caller, call: UrgentCall, headers: Headers) -> bool:
-    """Whether a session's order carries its word; a token needs none."""
-    word = headers.get("x-csrf-token") or call.csrf
-    return who.by == "token" or _secrets.same(word, who.csrf)
+        call = json.loads(body or b"{}")
+    except (HeliotropeError, ValueError):
+        call = None
+    if not isinstance(call, dict) or not _SAID.issuperset(call):
+        raise HTTPException(422, "the order cannot be read")
+    return call

@@ -107,9 +107,15 @@ class LocalConnection:
         return self._writer is not None
 
     async def ask(
-        self, call: str, arguments: dict[str, Any], blob: bytes = b"", *, on_behalf: Any = None
+        self,
+        call: str,
+        arguments: dict[str, Any],
+        blob: bytes = b"",
+        *,
+        on_behalf: Any = None,
+        within: float | None = None,
     ) -> tuple[Any, bytes]:
-        """Make a call; return value and blob of the answer.
+        """Make a call; return value and blob of the answer, within a limit of its own if given, s.
 
         Raises
         ------
@@ -131,14 +137,15 @@ class LocalConnection:
         lengths(data[:PREFIX], REQUEST_HEAD, REQUEST_BLOB)
         future = asyncio.get_running_loop().create_future()
         self._waiting[number] = future
+        limit = self._timeout if within is None else within
         try:
-            async with asyncio.timeout(self._timeout):
+            async with asyncio.timeout(limit):
                 async with self._turn:
                     writer.write(data)
                     await writer.drain()
                 answer = await future
         except TimeoutError:
-            raise self._away(f"no answer within {self._timeout:g} s") from None
+            raise self._away(f"no answer within {limit:g} s") from None
         except OSError:
             raise self._away("the connection has ended") from None
         finally:

@@ -149,6 +149,16 @@ CONSOLE = AlarmKind(
     "Use heliotrope ctl on the plant's computer meanwhile; if it returns, look at its messages.",
     over="the console answers again",
 )
+EMERGENCY_WAY = AlarmKind(
+    "emergency_way",
+    _PLANT,
+    Severity.WARNING,
+    "The process of the page's second way for EMERGENCY has ended, or gives no sign of life.",
+    "the second way for EMERGENCY {problem}",
+    "EMERGENCY goes on by the console alone; the process is started again after a pause.",
+    "Use heliotrope ctl on the plant's computer if the console does not answer either.",
+    over="the second way for EMERGENCY answers again",
+)
 COUNTS_DOUBTFUL = AlarmKind(
     "counts_doubtful",
     _PLANT,

@@ -25,7 +25,7 @@ from heliotrope.files.disk import DiskBusyError, DiskThread
 from heliotrope.geometry import as_float
 from heliotrope.lcu import states
 from heliotrope.plant.assembly import PlantAssembly
-from heliotrope.plant.interface import ConsoleProcess, PlantInterface
+from heliotrope.plant.interface import PlantInterface
 from heliotrope.plant.operations.pictures import Pictures, PictureSettings
 from heliotrope.store.database import make_private, tighten
 from heliotrope.store.keeper import Keeper
@@ -274,6 +274,7 @@ async def interface(
         async with served.running():
             yield
         return
+    from heliotrope.console.beside import ConsoleProcesses
     from heliotrope.console.people import FIRST
 
     def tell(address: str) -> None:
@@ -283,7 +284,7 @@ async def interface(
         if shown.browser and sys.stdout.isatty():
             webbrowser.open(address)
 
-    console = ConsoleProcess(served, shown.settings().given, live.logbook.take_alarm, tell)
+    console = ConsoleProcesses(served, shown.settings(), live.logbook.take_alarm, tell)
     async with served.running(console.run):
         yield
 

@@ -3,18 +3,20 @@
 `PlantInterface` serves two sockets in the plant's data folder: one for all calls, and one for
 EMERGENCY, DEFOCUS and STOW alone. Connections, keys, reading and writing have a thread of their
 own; only the call itself runs in the plant's loop. `calls` is the table of the calls.
-`ConsoleProcess` runs the console beside the plant and starts it again.
+`ConsoleProcess` runs a part of the console beside the plant and starts it again.
 """
 
 from heliotrope.plant.interface.admission import BusyError
 from heliotrope.plant.interface.calls import CALLS, Call
-from heliotrope.plant.interface.console_process import ConsoleProcess
+from heliotrope.plant.interface.console_process import CONSOLE, EMERGENCY_WAY, ConsoleProcess
 from heliotrope.plant.interface.encoding import frame_of, frame_parts, plain
 from heliotrope.plant.interface.errors import kind_of, remade
 from heliotrope.plant.interface.service import PlantInterface
 
 __all__ = [
     "CALLS",
+    "CONSOLE",
+    "EMERGENCY_WAY",
     "BusyError",
     "Call",
     "ConsoleProcess",

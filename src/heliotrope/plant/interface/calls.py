@@ -78,11 +78,6 @@ async def _kept_one(desk: Desk, _: Person, identity: int) -> WithBlob:
     return WithBlob({"identity": identity}, await desk.kept_picture(identity))
 
 
-def _emergency(desk: Desk, who: Person, given: orders.EmergencyCall, _: bytes) -> Any:
-    desk.operations.emergency(who, given.act, given.reason)
-    return desk.operations.emergency_view()
-
-
 def _withdraw(desk: Desk, who: Person, *_: Any) -> Any:
     desk.operations.withdraw(who)
     return desk.operations.emergency_view()
@@ -172,7 +167,12 @@ _VIEWS = {
     "schedule": Call(Role.VIEWER, orders.Some, lambda d, _, a, __: d.operations.schedule(a.limit)),
 }
 _URGENT = {
-    "order_emergency": Call(Role.VIEWER, orders.EmergencyCall, _emergency, urgent=True),
+    "order_emergency": Call(
+        Role.VIEWER,
+        orders.EmergencyCall,
+        lambda d, who, a, _: d.order_emergency(who, a),
+        urgent=True,
+    ),
     "stow": Call(
         Role.OPERATOR,
         orders.SomeHeliostats,

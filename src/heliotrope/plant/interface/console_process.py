@@ -1,12 +1,14 @@
-"""The console's process: started beside the plant, watched, and started again.
+"""The processes of a console: started beside the plant, watched, and started again.
 
-Nothing that happens to it reaches the plant: a console that ends, or gives no sign of life, is
+Nothing that happens to them reaches the plant: a process that ends, or gives no sign of life, is
 killed and started again after a pause that grows from one failure to the next.
 """
 
 import asyncio
 import contextlib
 import json
+import logging
+import socket
 import subprocess
 import sys
 import time
@@ -14,9 +16,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from heliotrope.errors import InputError
 from heliotrope.plant.interface.service import PlantInterface
-from heliotrope.safety import Alarm, alarms
+from heliotrope.safety import Alarm, AlarmKind, alarms
 
+_LOG = logging.getLogger(__name__)
 #: Time between two looks at the process, s.
 _LOOK = 0.2
 #: Time for the process to end by itself, s.
@@ -24,8 +28,32 @@ _END = 3.0
 
 
 @dataclass(frozen=True)
+class Part:
+    """A part of a console, in a process of its own.
+
+    Attributes
+    ----------
+    name
+        In its signs of life.
+    module
+        The program.
+    alarm
+        Stands while there is none.
+    """
+
+    name: str
+    module: str
+    alarm: AlarmKind
+
+
+#: Page and API; and the way for EMERGENCY alone.
+CONSOLE = Part("console", "heliotrope.console", alarms.CONSOLE)
+EMERGENCY_WAY = Part("emergency", "heliotrope.console.urgent_process", alarms.EMERGENCY_WAY)
+
+
+@dataclass(frozen=True)
 class Patience:
-    """How long the console may take, s.
+    """How long a process may take, s.
 
     Attributes
     ----------
@@ -47,14 +75,17 @@ class Patience:
 
 
 class ConsoleProcess:
-    """The console of a plant in a process of its own.
+    """A part of a plant's console in a process of its own.
 
     Parameters
     ----------
     interface
         The plant's interface, through which it gives its signs of life.
-    settings
-        Settings of the console, as JSON values.
+    part
+        The part.
+    listen
+        Returns its listening socket, the same each time, and the settings of the console as JSON
+        values; called in threads, raises `InputError` if the address is not available.
     on_alarm
         Takes the alarm in the plant's loop.
     on_address
@@ -73,12 +104,13 @@ class ConsoleProcess:
     def __init__(
         self,
         interface: PlantInterface,
-        settings: Mapping[str, Any],
+        part: Part,
+        listen: Callable[[], tuple[socket.socket, Mapping[str, Any]]],
         on_alarm: Callable[[Alarm], None],
         on_address: Callable[[str], None],
         patience: Patience | None = None,
     ) -> None:
-        self._interface, self._settings = interface, dict(settings)
+        self._interface, self._part, self._listen = interface, part, listen
         self._on_alarm, self._on_address = on_alarm, on_address
         self._patience = patience or Patience()
         self._told = self._alarmed = False
@@ -93,13 +125,17 @@ class ConsoleProcess:
             if time.monotonic() - begun > self._patience.well:
                 pause = self._patience.pause
             self._alarmed = True
-            self._alarm(alarms.CONSOLE.raised(problem=problem))
+            self._alarm(self._part.alarm.raised(problem=problem))
             await asyncio.sleep(pause)
             pause = min(2.0 * pause, self._patience.longest)
 
     async def _one(self) -> str:
         """Run the process; return why it has to be started again."""
-        process = await asyncio.to_thread(self._start)
+        try:
+            process = await asyncio.to_thread(self._start)
+        except InputError as error:
+            _LOG.warning("%s", error)
+            return f"cannot begin ({error})"
         try:
             problem = await self._watch(process)
             process.kill()  # nothing, if it has ended
@@ -109,9 +145,11 @@ class ConsoleProcess:
             await asyncio.to_thread(_end, process)
 
     def _start(self) -> "subprocess.Popen[bytes]":
-        process = subprocess.Popen(
-            [sys.executable, "-m", "heliotrope.console"],
+        line, settings = self._listen()
+        process = subprocess.Popen(  # noqa: S603  # programs of ours
+            [sys.executable, "-m", self._part.module],
             stdin=subprocess.PIPE,
+            pass_fds=[line.fileno()],
             # Ctrl-C in the plant's terminal is the plant's: it stows the field first.
             start_new_session=True,
         )
@@ -120,7 +158,8 @@ class ConsoleProcess:
         given = {
             "folder": str(self._interface.folder.absolute()),
             "key": self._interface.key,
-            "settings": self._settings,
+            "line": line.fileno(),
+            "settings": dict(settings),
         }
         assert process.stdin is not None
         with contextlib.suppress(OSError):
@@ -134,7 +173,7 @@ class ConsoleProcess:
             await asyncio.sleep(_LOOK)
             if (code := process.poll()) is not None:
                 return f"has ended with {_words(code)}"
-            now, heard = time.monotonic(), self._interface.heard
+            now, heard = time.monotonic(), self._interface.heard.get(self._part.name, 0.0)
             if heard >= begun:
                 self._well()
                 if now - heard > self._patience.silent:
@@ -146,14 +185,10 @@ class ConsoleProcess:
         """Note a sign of life."""
         if not self._told:
             self._told = True
-            self._on_address(self._interface.address)
-            # The next one listens at the same port.
-            port = self._interface.address.rstrip("/").rpartition(":")[2]
-            if port.isdigit():
-                self._settings["port"] = int(port)
+            self._on_address(self._interface.addresses[self._part.name])
         if self._alarmed:
             self._alarmed = False
-            self._alarm(alarms.CONSOLE.ended())
+            self._alarm(self._part.alarm.ended())
 
     def _alarm(self, alarm: Alarm) -> None:
         self._interface.in_plant(lambda: self._on_alarm(alarm))

@@ -23,6 +23,8 @@ from heliotrope.plant.operations.views import CameraView, FlightView, PictureRow
 from heliotrope.plant.orders import RECORDING
 from heliotrope.plant.tickets import Ticket
 
+#: An emergency order with the word of an earlier one is that one for this long, s.
+SAME, _MOST_CALLED = 30.0, 100
 #: A holder of the authority counts as present for this long after renewing it, s.
 PRESENT = 8.0
 T = TypeVar("T")
@@ -46,6 +48,8 @@ class Desk:
         self.operations, self.tickets = operations, Tickets()
         #: When each holder of the authority was last present, monotonic time of the machine, s.
         self._present: dict[str, float] = {}
+        #: When emergencies were ordered, by person and word, monotonic time of the machine, s.
+        self._called: dict[tuple[str, str], float] = {}
 
     async def keep_authority(self) -> None:
         """Renew the authority for a holder who is present, until cancelled."""
@@ -127,6 +131,17 @@ class Desk:
         return self.authority_of(person)
 
     # -- commands --------------------------------------------------------------------------
+
+    def order_emergency(self, who: Person, given: orders.EmergencyCall) -> Any:
+        """Order an emergency, once for each word: the page sends its order by two ways."""
+        key, now = (who.name, given.call), time.monotonic()
+        if not given.call or now - self._called.get(key, -math.inf) >= SAME:
+            self.operations.emergency(who, given.act, given.reason)
+            if given.call:
+                while len(self._called) >= _MOST_CALLED:
+                    self._called.pop(next(iter(self._called)))
+                self._called[key] = now
+        return self.operations.emergency_view()
 
     async def recorded(self, _: Person, ticket: Ticket) -> dict[str, Any]:
         """Keep a ticket; return its progress once it is recorded, or once that has failed.

@@ -116,8 +116,9 @@ class Note(Strict):
 
 
 class Beat(Strict):
-    """A sign of life: the address at which a console listens."""
+    """A sign of life: the part of a console that gives it, and where it listens."""
 
+    part: Annotated[str, Field(pattern="^(console|emergency)$")]
     address: Annotated[str, Field(max_length=200)]
 
 

@@ -50,6 +50,8 @@ _STORE, _TRUSTED = 1.0, 3600.0
 #: Refused callers are noted at most this often, s.
 _NOTED = 10.0
 _MOST_KNOWN = 100
+#: Both processes of a console have a place in each socket, and so have those that replace them.
+_LIMITS = LocalLimits(reserved=4)
 #: Time for the threads to end, s.
 _END = 5.0
 
@@ -87,16 +89,16 @@ class PlantInterface:
     admission
         How many ordinary orders are admitted.
     heard
-        When a console last gave a sign of life, monotonic time of the machine, s.
-    address
-        Address at which it listens; "" before.
+        When each part of a console last gave a sign of life, monotonic time of the machine, s.
+    addresses
+        Addresses at which they listen.
     """
 
     def __init__(self, operations: Operations, people: People, data: Path) -> None:
         self._desk, self._people = Desk(operations), people
         self._factors = people.factors(data / KEY_FILE)
         self.folder, self.key = socket_folder(data), secrets.token_hex(32)
-        self.heard, self.address = -math.inf, ""
+        self.heard, self.addresses = dict[str, float](), dict[str, str]()
         self._known: dict[str, tuple[float, Person]] = {}
         self._noted = -math.inf
         self.admission = Admission()
@@ -200,7 +202,7 @@ class PlantInterface:
         async def answer(caller: LocalCaller, frame: Frame) -> tuple[Any, bytes]:
             return await self._answer(calls, turns, caller, frame)
 
-        return LocalServer(self.folder / name, self._caller, answer, kind_of, LocalLimits())
+        return LocalServer(self.folder / name, self._caller, answer, kind_of, _LIMITS)
 
     async def _answer(
         self, calls: dict[str, Call], turns: "_Turns", caller: LocalCaller, frame: Frame
@@ -210,7 +212,8 @@ class PlantInterface:
         if not isinstance(name, str) or not isinstance(given, dict):
             raise InputError("local interface: a request needs a call and its arguments")
         if caller.person is None and name == "heartbeat":
-            self.heard, self.address = time.monotonic(), _checked(Beat, given).address
+            beat = _checked(Beat, given)
+            self.heard[beat.part], self.addresses[beat.part] = time.monotonic(), beat.address
             return None, b""
         people = _people_calls(self._people, self._factors)
         if caller.person is None and name in people:

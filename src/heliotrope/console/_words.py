@@ -1,0 +1,14 @@
+"""The word that protects a session's changes, and comparison of secrets in constant time."""
+
+import hashlib
+import hmac
+
+
+def csrf_of(session: str) -> str:
+    """Return the CSRF word that a page must send with every change in a session."""
+    return hmac.new(session.encode(), b"heliotrope csrf", hashlib.sha256).hexdigest()
+
+
+def same(one: str, other: str) -> bool:
+    """Return whether two words are equal, in constant time."""
+    return hmac.compare_digest(one.encode(), other.encode())

@@ -1,0 +1,66 @@
+"""The two processes of a console beside the plant: page and API, and the way for EMERGENCY."""
+
+import asyncio
+import socket
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from heliotrope.console.lines import Lines
+from heliotrope.console.settings import ConsoleSettings
+from heliotrope.plant.interface import CONSOLE, EMERGENCY_WAY, ConsoleProcess, PlantInterface
+from heliotrope.plant.interface.console_process import Patience
+from heliotrope.safety import Alarm
+
+
+class ConsoleProcesses:
+    """Starts both processes, watches them, and starts each again without the other.
+
+    Parameters
+    ----------
+    interface, on_alarm, on_address, patience
+        As for `ConsoleProcess`.
+    settings
+        Settings of the console.
+
+    Attributes
+    ----------
+    page, way
+        The processes.
+    """
+
+    def __init__(
+        self,
+        interface: PlantInterface,
+        settings: ConsoleSettings,
+        on_alarm: Callable[[Alarm], None],
+        on_address: Callable[[str], None],
+        patience: Patience | None = None,
+    ) -> None:
+        self._lines = Lines(settings)
+        self.page = ConsoleProcess(
+            interface, CONSOLE, self._listen(0), on_alarm, on_address, patience
+        )
+        self.way = ConsoleProcess(
+            interface, EMERGENCY_WAY, self._listen(1), on_alarm, lambda _: None, patience
+        )
+
+    def _listen(self, which: int) -> Callable[[], tuple[socket.socket, Mapping[str, Any]]]:
+        def listen() -> tuple[socket.socket, Mapping[str, Any]]:
+            line = self._lines.open()[which]
+            return line, self._lines.settings.given
+
+        return listen
+
+    @property
+    def settings(self) -> ConsoleSettings:
+        """The settings, with the ports that are used once a process has begun."""
+        return self._lines.settings
+
+    async def run(self) -> None:
+        """Keep both running until cancelled."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self.way.run())
+                group.create_task(self.page.run())
+        finally:
+            self._lines.close()

@@ -1,0 +1,95 @@
+"""The listening sockets of a console: opened once, kept while its processes are started again.
+
+The plant's process holds them and passes them on, so that connections wait while a process starts,
+and no other program can take a port meanwhile.
+"""
+
+import socket
+import threading
+from dataclasses import replace
+
+from heliotrope.console.settings import ConsoleSettings
+from heliotrope.errors import InputError
+
+#: Connections that may wait in the system.
+_BACKLOG = 2048
+
+
+class Lines:
+    """The sockets of the page and of the way for EMERGENCY alone.
+
+    Parameters
+    ----------
+    settings
+        Settings of the console.
+
+    Attributes
+    ----------
+    settings
+        The same, with the ports that are used once `open` has found them.
+    """
+
+    def __init__(self, settings: ConsoleSettings) -> None:
+        self.settings = settings
+        self._turn = threading.Lock()
+        self._found: tuple[socket.socket, socket.socket] | None = None
+
+    def open(self) -> tuple[socket.socket, socket.socket]:
+        """Return the sockets, those of the first call; from any thread.
+
+        Raises
+        ------
+        InputError
+            If a port is not available; the next call tries again.
+        """
+        with self._turn:
+            if self._found is None:
+                self._found = self._open()
+            return self._found
+
+    def _open(self) -> tuple[socket.socket, socket.socket]:
+        chosen = self.settings
+        page = _taken(chosen.host, chosen.port, "--port")
+        port = int(page.getsockname()[1])
+        try:
+            way = self._open_way(port)
+        except BaseException:
+            page.close()
+            raise
+        self.settings = replace(chosen, port=port, emergency_port=int(way.getsockname()[1]))
+        return page, way
+
+    def _open_way(self, page: int) -> socket.socket:
+        """Open the next port, or a free one if that is taken; the one that was asked for."""
+        host, given = self.settings.host, self.settings.emergency_port
+        if given is not None:
+            return _taken(host, given, "--emergency-port")
+        try:
+            if self.settings.port and page < 65_535:
+                return listening(host, page + 1)
+        except OSError:
+            pass
+        return listening(host, 0)
+
+    def close(self) -> None:
+        """Listen no more."""
+        with self._turn:
+            for line in self._found or ():
+                line.close()
+            self._found = None
+
+
+def listening(host: str, port: int) -> socket.socket:
+    """Return a listening socket."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    return socket.create_server((host, port), family=family, backlog=_BACKLOG)
+
+
+def _taken(host: str, port: int, option: str) -> socket.socket:
+    try:
+        return listening(host, port)
+    except OSError:
+        raise InputError(
+            f"console: {host} port {port} is not available; another program may use it, choose "
+            f"another with {option}"
+        ) from None

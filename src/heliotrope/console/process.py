@@ -1,0 +1,119 @@
+"""A process of the console: started by the plant's, watched by it, and ended with it.
+
+It reads one line of JSON from standard input: the folder of the plant's sockets, the key, the
+settings, and the descriptor of its listening socket. When standard input ends, the plant has ended,
+and so does the process.
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Awaitable, Callable, Coroutine
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from heliotrope.console.settings import ConsoleSettings
+from heliotrope.errors import HeliotropeError
+
+#: Time between two signs of life, s.
+BEAT = 1.0
+#: Time for the server to end, s.
+_END = 3.0
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a process is given: see the module."""
+
+    folder: Path
+    key: str
+    settings: ConsoleSettings
+    line: socket.socket
+
+
+class Served(Protocol):
+    """A server that runs until it is closed."""
+
+    async def run(self) -> None:
+        """Serve until closed."""
+
+    async def close(self) -> None:
+        """Stop serving."""
+
+    async def address(self) -> str:
+        """Wait until it listens; return its address."""
+        ...
+
+
+def main(work: Callable[[Given], Coroutine[Any, Any, None]]) -> int:
+    """Do the work of a process until standard input ends; return the exit code."""
+    # The plant stows its field after Ctrl-C, and people watch that here.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    read = json.loads(sys.stdin.buffer.readline())
+    line = socket.socket(fileno=read["line"])
+    settings = ConsoleSettings.of(read["settings"])
+    try:
+        asyncio.run(work(Given(Path(read["folder"]), read["key"], settings, line)))
+    except ExceptionGroup as group:
+        known, _ = group.split(HeliotropeError)
+        if known is None:
+            raise
+        sys.stderr.write(f"heliotrope: {_first(known)}\n")
+        return 2
+    return 0
+
+
+def _first(error: Exception) -> Exception:
+    while isinstance(error, ExceptionGroup):
+        error = error.exceptions[0]
+    return error
+
+
+async def serve(
+    server: Served,
+    connect: Callable[[], Coroutine[Any, Any, None]],
+    beat: Callable[[str], Awaitable[Any]],
+) -> None:
+    """Run a server until standard input ends.
+
+    Parameters
+    ----------
+    server
+        The server.
+    connect
+        Keeps the connections to the plant up.
+    beat
+        Gives a sign of life, with the address of the server.
+    """
+    loop = asyncio.get_running_loop()
+    threading.Thread(target=_wait_for_the_end, args=(loop, server), daemon=True).start()
+    async with asyncio.TaskGroup() as group:
+        works = [group.create_task(connect()), group.create_task(_beat(server, beat))]
+        await server.run()
+        for work in works:
+            work.cancel()
+
+
+def _wait_for_the_end(loop: asyncio.AbstractEventLoop, server: Served) -> None:
+    """Close the server when standard input ends; end the process if that takes too long."""
+    while sys.stdin.buffer.read(4096):
+        pass
+    with contextlib.suppress(RuntimeError):
+        asyncio.run_coroutine_threadsafe(server.close(), loop)
+    threading.Event().wait(_END)
+    os._exit(0)
+
+
+async def _beat(server: Served, beat: Callable[[str], Awaitable[Any]]) -> None:
+    """Give a sign of life every second, with the address."""
+    address = await server.address()
+    while True:
+        with contextlib.suppress(HeliotropeError):
+            await beat(address)
+        await asyncio.sleep(BEAT)

@@ -1,0 +1,45 @@
+"""The process of the way for EMERGENCY alone, started by `heliotrope run`; see `urgent`.
+
+``python -m heliotrope.console.urgent_process``
+"""
+
+import asyncio
+import sys
+import time
+from typing import Any
+
+from heliotrope.console.process import Given, main, serve
+from heliotrope.console.server import Server
+from heliotrope.console.urgent import LIMITS, EmergencyWay
+from heliotrope.local import EMERGENCY, LocalConnection
+
+#: Limit of an answer of the plant, s.
+_ANSWER = 10.0
+#: Time for the connection to the plant, s: it is made anew where it has ended.
+_CONNECT = 5.0
+
+
+def server_of(plant: LocalConnection, given: Given) -> Server:
+    """Return the server of the way; an order that comes before the plant is connected waits."""
+
+    async def ask(call: str, arguments: dict[str, Any], **named: Any) -> tuple[Any, bytes]:
+        until = time.monotonic() + _CONNECT
+        while not plant.up and time.monotonic() < until:
+            await asyncio.sleep(0.02)
+        return await plant.ask(call, arguments, **named)
+
+    way = EmergencyWay(ask, given.settings)
+    return Server(way, given.line, LIMITS, given.settings, page=False)
+
+
+async def _run(given: Given) -> None:
+    plant = LocalConnection(given.folder / EMERGENCY, {"key": given.key}, _ANSWER)
+    await serve(
+        server_of(plant, given),
+        plant.run,
+        lambda address: plant.ask("heartbeat", {"part": "emergency", "address": address}),
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main(_run))
