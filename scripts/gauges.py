@@ -2,20 +2,27 @@
 
 Each 50 ms a line is added to the file: the time, the longest wait of the plant's loop since the
 line before, the longest time since a cluster's last lease, and the time since which every one of
-the ``COUNT`` simulated local controllers has heard DEFOCUS; POSIX s and s.
+the ``COUNT`` simulated local controllers has heard DEFOCUS; POSIX s and s. Where ``FILE.withdraw``
+appears, the emergency is withdrawn, past all interfaces, and the file removed.
 """
 
+import contextlib
 import sys
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from heliotrope.cli import main
+from heliotrope.errors import HeliotropeError
+from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.clusters import ClusterEnd
+from heliotrope.plant.interface import PlantInterface
+from heliotrope.plant.operations import Operations
 from heliotrope.twin.field.field_bus import FieldBus
 from heliotrope.twin.live.loop import PacedLoop
 
@@ -31,6 +38,7 @@ class Gauges:
         self._leases: dict[str, float] = {}
         self._gap = 0.0
         self.loop: PacedLoop | None = None
+        self.operations: Operations | None = None
 
     def lease(self, cluster: str) -> None:
         """Note a lease for a cluster."""
@@ -48,12 +56,32 @@ class Gauges:
         with self._file.open("w", encoding="ascii", buffering=1) as out:
             while True:
                 lag, until = 0.0, time.monotonic() + _LINE
+                self._withdraw()
                 while time.monotonic() < until:
                     lag = max(lag, self._look())
                     time.sleep(_LOOK)
                 now, self._gap, gap = time.monotonic(), 0.0, self._gap
                 gap = max([gap, *(now - at for at in self._leases.values())])
                 out.write(f"{time.time()} {lag} {gap} {self._heard.min()}\n")
+
+    def _withdraw(self) -> None:
+        """Withdraw the emergency if that is asked for, and acknowledge the alarms that it left."""
+        asked = self._file.with_name(f"{self._file.name}.withdraw")
+        if self.loop is None or self.operations is None or not asked.exists():
+            return
+        who, operations, over = Person("gauges", Role.ENGINEER), self.operations, Future[bool]()
+
+        def work() -> None:
+            operations.withdraw(who)
+            for alarm in operations.alarms():
+                if not alarm.acknowledged_by:
+                    with contextlib.suppress(HeliotropeError):
+                        operations.acknowledge(who, alarm.condition, alarm.subject)
+            over.set_result(not operations.emergency_view().on)
+
+        self.loop.call_soon_threadsafe(work)
+        if over.result(60.0):
+            asked.unlink()
 
     def _look(self) -> float:
         """Return how long the plant's loop takes to do something, s."""
@@ -71,10 +99,15 @@ class Gauges:
 def attach(gauges: Gauges) -> None:
     """Let the classes of the plant tell the gauges."""
     make, keep, tell = PacedLoop.__init__, ClusterEnd.keep, FieldBus._tell  # noqa: SLF001
+    serve = PlantInterface.__init__
 
     def made(self: PacedLoop, *given: Any, **named: Any) -> None:
         make(self, *given, **named)
         gauges.loop = self
+
+    def served(self: PlantInterface, operations: Operations, *given: Any) -> None:
+        serve(self, operations, *given)
+        gauges.operations = operations
 
     async def kept(self: ClusterEnd, lease: Callable[[], Any], *given: Any) -> None:
         def noted() -> Any:
@@ -88,6 +121,7 @@ def attach(gauges: Gauges) -> None:
         tell(self, name, rows)
 
     PacedLoop.__init__ = made  # type: ignore[method-assign]
+    PlantInterface.__init__ = served  # type: ignore[method-assign]
     ClusterEnd.keep = kept  # type: ignore[method-assign]
     FieldBus._tell = told  # type: ignore[method-assign]  # noqa: SLF001
     threading.Thread(target=gauges.run, daemon=True).start()
