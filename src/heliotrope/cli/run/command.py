@@ -237,14 +237,7 @@ def run(
     from heliotrope.errors import InputError
     from heliotrope.plant.operations.pictures import PictureSettings
 
-    if not 0.0 < speed <= 1000.0:
-        raise InputError(f"run: --speed {speed:g}; give above 0 to 1000")
-    if prototype and (field is not None or heliostats is not None):
-        raise InputError(
-            "run: --prototype is a plant of its own; leave out the field and --heliostats"
-        )
-    if field is not None and heliostats is not None:
-        raise InputError("run: --heliostats is for the default plant; leave it out with a field")
+    _one_plant(field, heliostats, speed, prototype=prototype)
     shown = Shown(
         host=host,
         port=port,
@@ -296,6 +289,22 @@ def run(
     folder = field if field.is_dir() else field.parent
     real = RealChoice(folder, clusters, idle is not False, configure, check)
     run_real(design, real, shown)
+
+
+def _one_plant(
+    field: Path | None, heliostats: int | None, speed: float, *, prototype: bool
+) -> None:
+    """Refuse several plants at once, and a speed without sense."""
+    from heliotrope.errors import InputError
+
+    if not 0.0 < speed <= 1000.0:
+        raise InputError(f"run: --speed {speed:g}; give above 0 to 1000")
+    if prototype and (field is not None or heliostats is not None):
+        raise InputError(
+            "run: --prototype is a plant of its own; leave out the field and --heliostats"
+        )
+    if field is not None and heliostats is not None:
+        raise InputError("run: --heliostats is for the default plant; leave it out with a field")
 
 
 def _design(field: Path | None, heliostats: int | None, *, prototype: bool) -> "Plant":

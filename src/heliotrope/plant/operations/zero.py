@@ -4,6 +4,7 @@ ZERO takes step counts. LOCK POSITION (Malan, table D.1, 0xD4) takes the aim at 
 sees the beam: the counts become those that the calibrated mirror would have now, its beam there.
 """
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -91,25 +92,24 @@ def lock_position(
         raise refusals.ONE_HELIOSTAT.error(what=what, count=len(heliostats) or "all")
     (name,) = heliostats
     row = plant.field.place(name)
-    problem = refusals.NO_POSITION
+    refused = functools.partial(refusals.NO_POSITION.error, heliostat=name)
     if not plant.field.among((states.LOCKED,), plant.now())[row]:
-        raise problem.error(heliostat=name, why="it is not locked, or has not reported lately")
+        raise refused(why="it is not locked, or has not reported lately")
     aim, sun = plant.aims[row], plant.sun_vector()
     if not np.isfinite(aim).all():
-        raise problem.error(heliostat=name, why="it has no aim")
+        raise refused(why="it has no aim")
     if sun[2] <= 0.0:
-        raise problem.error(heliostat=name, why="the sun is below the horizon")
+        raise refused(why="the sun is below the horizon")
     here = plant.field.rows[row]
     counts = np.array([float(here["primary"]), float(here["secondary"])])
     mechanism = plant.beliefs.present(name)[0]
     found = track(mechanism, sun, aim, current=counts)
     if TrackingStatus(int(found.chosen(found.status))) is not TrackingStatus.OK:
-        raise problem.error(heliostat=name, why="its axes cannot turn the beam to its aim now")
+        raise refused(why="its axes cannot turn the beam to its aim now")
     wanted = np.round(found.chosen(found.counts))
     turn = float(angle_between(mechanism.pose(counts).normal, mechanism.pose(wanted).normal))
     if turn > MOST_TURN:
-        raise problem.error(
-            heliostat=name,
+        raise refused(
             why=f"its counts would change by {1e3 * turn:.0f} mrad of the mirror, above "
             f"{1e3 * MOST_TURN:.0f} mrad: is it this heliostat's beam, and this its aim?",
         )
