@@ -1,10 +1,13 @@
 """The operator page in a browser."""
 
+import json
+import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from heliotrope.console._secrets import verify_password
@@ -334,3 +337,37 @@ def test_a_dead_cluster_is_shown_as_stale(field: LiveConsole, enter: Callable[[s
     finally:
         field.call(lambda: setattr(buses[3], "plugged", True))
     page.wait_for_function("heliotrope.store.state.every(s => s !== 255)")
+
+
+def test_a_flight_is_taken_and_shown(
+    field: LiveConsole, enter: Callable[[str], Any], tmp_path: Path
+) -> None:
+    name = field.live.operations.names[-1]
+    mechanism = field.live.operations.plant.beliefs.nominal(name)
+    counts = np.array([[1000.0 * k, 500.0 * k] for k in (1, 2, 3)])
+    pose = mechanism[[0, 0, 0]].pose(counts)
+    row = {"heliostat": name, "time": 1.7e9, "sigma_rad": 1e-4, "turn_rad": 1e-4}
+    flight = {
+        "format": "heliotrope-flight",
+        "version": 1,
+        "name": "from the page",
+        "shared": ["position east, m", "position north, m", "position up, m"],
+        "covariance": (1e-4 * np.eye(3)).tolist(),
+        "rows": [
+            {**row, "counts": c, "place_m": p, "covariance_m2": [[0.0] * 3] * 3,
+             "shift": np.eye(3).tolist()}
+            for c, p in zip(
+                counts.tolist(), (pose.vertex + 100.0 * pose.normal).tolist(), strict=True
+            )
+        ],
+    }  # fmt: skip
+    place = tmp_path / "flight.json"
+    place.write_text(json.dumps(flight))
+    page = enter("engineer")
+    page.click(".hx-tabs >> text=Calibration")
+    page.wait_for_selector(".hx-calibration >> text=Take a flight", timeout=60_000)
+    page.set_input_files(".hx-calibration input[type=file]", place)
+    shown = page.wait_for_selector(
+        ".hx-calibration tr:has-text('from the page')", timeout=60_000
+    ).inner_text()
+    assert re.search(r"engineer\s+1\s+\d\s+\d\s+\d\s+\d\s+position east", shown), shown
