@@ -134,7 +134,30 @@ def test_uneven_sampling_is_named() -> None:
     assert sum("it may be canted off, dirty or shaded" in w for w in told) == 2
     few = measure(s.reflections.take([3]), SHAPE, s.expected_rotation, s.expected_vertex)
     assert few.warnings[0].startswith("only 1 reflections")
-    assert np.isnan(few.sigma_mean).all()
+    assert (few.sigma_mean > 0.8 * MRAD).all()
+
+
+def test_a_mirror_with_few_reflections_is_taken_to_scatter_like_the_others() -> None:
+    rough = [
+        trial_mirror(SHAPE, replace(EXACT, slope=2.5e-3, columns=6, rows=5), k) for k in range(7)
+    ]
+    parts = [
+        replace(s.reflections, heliostat=np.full(len(s.reflections), k))
+        for k, s in enumerate(rough)
+    ]
+    parts[6] = parts[6].take([5, 20])
+    found = measure_field(
+        join(parts),
+        [str(k) for k in range(7)],
+        lambda _: SHAPE,
+        [s.expected_rotation for s in rough],
+        [s.expected_vertex for s in rough],
+    )
+    alone = measure(parts[6], SHAPE, rough[6].expected_rotation, rough[6].expected_vertex)
+    typical = np.median([o.sigma.mean() for o in found.found[:6]])
+    assert found.found[6].count == 2
+    assert found.found[6].sigma_mean.mean() > 1.5 * alone.sigma_mean.mean()
+    assert found.found[6].sigma_mean.mean() > 0.7 * typical / np.sqrt(2.0)
 
 
 def test_differences_that_are_not_normal_are_named() -> None:

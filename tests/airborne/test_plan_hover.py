@@ -217,7 +217,7 @@ def test_directions_are_apart_and_within_their_elevations() -> None:
 
 
 def test_choice_tells_more_than_chance() -> None:
-    selection = PointSelection(points=12)
+    selection = PointSelection(points=12, scatter=0.0, least=0.0)
     best = _chosen(selection)
     assert len(best) == 12
     assert best.facing.able.all()
@@ -246,7 +246,7 @@ def test_choice_tells_more_than_chance() -> None:
 
 
 def test_jacobian_of_candidates_against_finite_differences() -> None:
-    found = _chosen(PointSelection(points=10)).plan.chosen
+    found = _chosen(PointSelection(points=10, sigma=3e-4, scatter=0.0)).plan.chosen
     plant = staggered(80)
     middle = plant.groups["azel"].calibrated[np.array([40])]
     points = plant.position[:80].mean(axis=0) + np.array([0.0, 0.0, 0.0])
@@ -278,6 +278,8 @@ def test_no_room_in_the_air() -> None:
     fence = np.array([[-300.0, -300.0], [300.0, -300.0], [300.0, 10.0], [-300.0, 10.0]])
     with pytest.raises(InputError, match=r"C1: \d+ directions are possible for 60 calibration"):
         _chosen(PointSelection(points=60), Airspace(fence=fence))
+    with pytest.raises(InputError, match="and 0 of these show 60 reflections on the median mirror"):
+        _chosen(PointSelection(points=9, least=60.0))
 
 
 def test_pattern_keeps_off_the_limits() -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from heliotrope.airborne.evaluate.statistics import (
+    few_sigma,
     matern,
     normality,
     plain_sigma,
@@ -185,7 +186,8 @@ def test_few_points_say_nothing_about_a_field() -> None:
     found = spread_mean(
         np.zeros((3, 2)) + [[1.0], [2.0], [4.0]], SHAPE, [0, 1, 2], np.zeros((3, 2))
     )
-    np.testing.assert_allclose(found.sigma, plain_sigma([[1.0], [2.0], [4.0]])[0])
+    np.testing.assert_array_equal(found.weights, np.full(3, 1.0 / 3.0))
+    np.testing.assert_array_equal(found.sigma, found.sigma_weighted)
     assert np.isnan(plain_sigma(np.zeros((1, 2)))).all()
     assert spread_mean(np.zeros((0, 2)), SHAPE, [], np.zeros((0, 2))).weights.shape == (0,)
 
@@ -193,3 +195,22 @@ def test_few_points_say_nothing_about_a_field() -> None:
 def test_the_correlation() -> None:
     assert matern(0.0) == 1.0
     np.testing.assert_allclose(matern(1.0), (1 + np.sqrt(3)) * np.exp(-np.sqrt(3)))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_sigma_of_a_few_is_honest(count: int) -> None:
+    rng = np.random.default_rng(count)
+    inside = []
+    for _ in range(400):
+        # Mirrors are not alike: the prior is right on average only.
+        true = 0.8e-3 * np.exp(0.25 * rng.standard_normal())
+        values = true * rng.standard_normal((count, 2))
+        sigma = few_sigma(values, 0.8e-3)
+        inside.append(np.sum((values.mean(axis=0) / sigma) ** 2) < -2.0 * np.log(0.1))
+    assert 0.85 < np.mean(inside) < 0.95
+
+
+def test_many_of_a_few_forget_the_prior() -> None:
+    values = np.random.default_rng(1).standard_normal((400, 2))
+    np.testing.assert_allclose(few_sigma(values, 5.0), plain_sigma(values), rtol=0.4)
+    np.testing.assert_allclose(few_sigma(values, 1.0), plain_sigma(values), rtol=0.03)

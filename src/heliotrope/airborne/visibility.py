@@ -17,6 +17,8 @@ Mask = npt.NDArray[np.bool_]
 
 #: Mirrors with a shorter side are not measured, px.
 SMALLEST = 12.0
+#: Fewer reflections of a mirror give no meaningful standard deviation.
+FEWEST = 5
 #: A spot is not searched this close to an edge, px: half its width, and the edge's own error.
 MARGIN = 2
 #: If more than this share of mirrors is hidden by more than `_TOUCHED`, their pictures merge.

@@ -25,12 +25,16 @@ from heliotrope.airborne.evaluate.budget import Budget
 from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.evaluate.statistics import (
     ALPHA,
+    FIELD,
+    SCATTER,
+    SCATTER_WITH_MAP,
     normality,
     plain_sigma,
     rosner,
     spread_mean,
 )
 from heliotrope.airborne.mirror import MirrorShape, measured_normal
+from heliotrope.airborne.visibility import FEWEST
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, azimuth_elevation, rotation
 
@@ -39,8 +43,8 @@ Mean = Literal["plain", "area"]
 
 #: Rounds of mean and correction before the test for outliers.
 ROUNDS = 2
-#: Fewer points than this give no meaningful standard deviation.
-FEWEST = 5
+# With as many well measured mirrors, the others are taken to scatter like them.
+_ENOUGH_MIRRORS = 5
 # Distance of the points' centre from the mirror's that raises a warning, in half widths.
 _OFF_CENTRE = 0.25
 # A facet is canted off if its mean differs this many standard errors, and this much (rad).
@@ -101,7 +105,8 @@ class Orientation:
     sigma_plain
         σ_mean as σ/√n, rad, (2,).
     sigma_mean
-        σ_mean with the slope deviations treated as the fixed field they are, rad, (2,).
+        σ_mean with the slope deviations treated as the fixed field they are, rad, (2,); of fewer
+        than 8 points see `heliotrope.airborne.evaluate.statistics.few_sigma`.
     systematic
         Error common to all points, rad, (2,).
     normality
@@ -243,6 +248,7 @@ def measure(
     budget: Budget | None = None,
     place: npt.ArrayLike | None = None,
     mean: Mean = "area",
+    scatter: float | None = None,
     alpha: float = ALPHA,
     rounds: int = ROUNDS,
 ) -> Orientation:
@@ -269,6 +275,9 @@ def measure(
         "area", weighted to represent the whole mirror, or "plain", equal weights, as in
         HelioPoint. Without a slope map the plain mean is worse: points crowd where the surface
         is flat.
+    scatter
+        Standard deviation of one difference as known before, rad: the σ of few reflections leans
+        on it. By default HelioPoint's, with or without a slope map.
     alpha, rounds
         Probability of a false alarm of the test for outliers, and number of corrections before it.
 
@@ -297,7 +306,9 @@ def measure(
     R = update(R, mean)
     found = differences(own, shape, R, where(R), slopes=slopes)
     known = budget or Budget()
-    return _result(own, shape, R, where(R), start, found, keep, known, mean, place)
+    usual = SCATTER_WITH_MAP if slopes and shape.slope is not None else SCATTER
+    prior = usual if scatter is None else scatter
+    return _result(own, shape, R, where(R), start, found, keep, known, mean, place, prior)
 
 
 def measure_field(
@@ -331,10 +342,25 @@ def measure_field(
 
     Notes
     -----
-    A heliostat that cannot be measured is listed with the reason; the others continue.
+    A heliostat that cannot be measured is listed with the reason; the others continue. Where a
+    mirror has few reflections, its σ leans on the scatter of the well measured mirrors.
     """
     turns, feet = as_float(rotation), as_float(vertex)
     seen = None if places is None else as_float(places)
+
+    def one(row: int, mine: Reflections, scatter: float | None) -> Orientation:
+        return measure(
+            mine,
+            shape(row),
+            turns[row],
+            feet[row],
+            slopes=slopes,
+            budget=budget,
+            mean=mean,
+            place=None if seen is None else seen[row],
+            scatter=scatter,
+        )
+
     found, left_out = [], {}
     for row in range(len(names)):
         mine = reflections.of(row)
@@ -342,21 +368,19 @@ def measure_field(
             left_out[names[row]] = "no reflection in any photograph"
             continue
         try:
-            one = measure(
-                mine,
-                shape(row),
-                turns[row],
-                feet[row],
-                slopes=slopes,
-                budget=budget,
-                mean=mean,
-                place=None if seen is None else seen[row],
-            )
+            found.append(one(row, mine, None))
         except InputError as error:
             left_out[names[row]] = str(error)
-            continue
-        found.append(one)
+    common = _common_scatter(found)
+    if common is not None:
+        found = [o if o.count >= FIELD else one(o.heliostat, o.reflections, common) for o in found]
     return Orientations(tuple(names), tuple(found), left_out)
+
+
+def _common_scatter(found: Sequence[Orientation]) -> float | None:
+    """Return the typical scatter of a flight's mirrors, rad; None if too few show it."""
+    known = [float(np.mean(o.sigma**2)) for o in found if o.count >= FEWEST]
+    return float(np.sqrt(np.median(known))) if len(known) >= _ENOUGH_MIRRORS else None
 
 
 def _checked(reflections: Reflections, shape: MirrorShape) -> Reflections:
@@ -400,10 +424,11 @@ def _result(
     budget: Budget,
     mean: Mean,
     place: npt.ArrayLike | None,
+    prior: float,
 ) -> Orientation:
     part, kept = own.take(keep), found[keep]
     uv = shape.along_facet(part.facet, part.xy)
-    known = spread_mean(kept, shape, part.facet, uv)
+    known = spread_mean(kept, shape, part.facet, uv, prior)
     every = vertex + shape.point_at(own.facet, own.xy) @ R.T
     point = every[keep]
     # A turn about x moves the normal towards −y, one about y towards x.
@@ -453,7 +478,10 @@ def _facet_means(
 def _warnings(o: Orientation, shape: MirrorShape, xy: FloatArray) -> list[str]:
     lines = []
     if o.count < FEWEST:
-        lines.append(f"only {o.count} reflections; fly more points, at least {FEWEST}")
+        lines.append(
+            f"only {o.count} reflections: its σ leans on the usual scatter of mirrors; fly more "
+            f"points, at least {FEWEST}"
+        )
     area = np.prod(shape.half_size, axis=-1)
     share = area / area.sum()
     corners = shape.corners[..., :2].reshape(-1, 2)

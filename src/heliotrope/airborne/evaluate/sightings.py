@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.evaluate.orientation import FEWEST, Orientation, Orientations, turned
+from heliotrope.airborne.evaluate.orientation import Orientation, Orientations, turned
 from heliotrope.airborne.mirror import measured_normal
 from heliotrope.calibration.fit.common import CommonErrors, fit_common
 from heliotrope.calibration.fit.estimator import FieldFit, fit
@@ -30,7 +30,7 @@ from heliotrope.sun import Times, unix_seconds
 #: One sighting for each reflection, or for each orientation.
 Per = Literal["reflection", "orientation"]
 
-# Standard deviation of a difference with too few points to estimate it, rad.
+# Standard deviation of the turn of a mirror that was not flown, rad.
 _UNTOLD = 1e-3
 # Degrees of freedom from which the scatter of the poses is estimated.
 _ENOUGH = 8
@@ -95,10 +95,7 @@ def to_sightings(
 
 def mean_sigma(o: Orientation, *, systematic: bool = False) -> float:
     """Return the standard deviation per axis of an orientation, rad."""
-    mean = o.sigma_mean
-    if o.count < FEWEST or not np.isfinite(mean).all():
-        mean = np.full(2, _UNTOLD / np.sqrt(o.count))
-    variance = mean**2 + (o.systematic**2 if systematic else 0.0)
+    variance = o.sigma_mean**2 + (o.systematic**2 if systematic else 0.0)
     return float(np.sqrt(variance.mean()))
 
 

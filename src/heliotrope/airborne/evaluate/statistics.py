@@ -33,6 +33,13 @@ if TYPE_CHECKING:
 ALPHA = 0.05
 #: Largest share of outliers.
 SHARE = 0.2
+#: Fewer points than this cannot show a field.
+FIELD = 8
+#: What is known of the scatter of a mirror's differences before it is measured, rad: with the
+#: designed surface and with a slope map, as in HelioPoint (0.8 expected, 0.2 in its figure 6).
+SCATTER, SCATTER_WITH_MAP = 0.8e-3, 0.2e-3
+#: That knowledge counts like this many degrees of freedom.
+PRIOR_FREEDOM = 8.0
 # Trial correlation lengths, as shares of a facet's diagonal, and trial ratios τ²/s².
 _LENGTHS = np.geomspace(0.04, 1.2, 8)
 _RATIOS = np.geomspace(1e-3, 1e2, 11)
@@ -123,6 +130,25 @@ def plain_sigma(values: npt.ArrayLike) -> FloatArray:
     return as_float(data.std(axis=0, ddof=1) / np.sqrt(len(data)))
 
 
+def few_sigma(values: npt.ArrayLike, prior: float) -> FloatArray:
+    """Return the standard deviation of the mean of a few values (n, c), n ≥ 1, (c,).
+
+    The variance of few values says little, so it is combined with a prior (scaled inverse χ² with
+    `PRIOR_FREEDOM` degrees of freedom about ``prior``², Gelman et al. 2013, *Bayesian Data
+    Analysis*, section 3.3). The mean then has Student's distribution; what is returned is the
+    standard deviation of the normal distribution with the same 90 % ellipse of two components.
+    """
+    from scipy.stats import f as fisher
+
+    data = as_float(values)
+    n = len(data)
+    freedom = PRIOR_FREEDOM + n - 1
+    squares = np.sum((data - data.mean(axis=0)) ** 2, axis=0)
+    variance = (PRIOR_FREEDOM * prior**2 + squares) / freedom
+    wider = 2.0 * fisher.ppf(0.9, 2, freedom) / (-2.0 * np.log(0.1))
+    return as_float(np.sqrt(wider * variance / n))
+
+
 @dataclass(frozen=True)
 class SpreadMean:
     """Means of c components over a mirror, from n points on it.
@@ -150,7 +176,11 @@ class SpreadMean:
 
 
 def spread_mean(
-    values: npt.ArrayLike, shape: MirrorShape, facet: npt.ArrayLike, uv: npt.ArrayLike
+    values: npt.ArrayLike,
+    shape: MirrorShape,
+    facet: npt.ArrayLike,
+    uv: npt.ArrayLike,
+    prior: float = SCATTER,
 ) -> SpreadMean:
     """Return the mean over the mirror as n points show it.
 
@@ -162,17 +192,18 @@ def spread_mean(
         Shape of the mirror.
     facet, uv
         Facet of each point, (n,), and its position along the facet's axes, m, (n, 2).
+    prior
+        Scatter of the values as known before, rad, see `few_sigma`.
 
     Returns
     -------
-    For fewer than 8 points the plain figures, as they cannot show a field.
+    For fewer than `FIELD` points, which cannot show a field, the plain mean and `few_sigma`.
     """
     data, k, place = as_float(values), np.asarray(facet, dtype=np.intp), as_float(uv)
     n = len(data)
-    if n < 8:
-        return SpreadMean(
-            plain_sigma(data), np.full(n, 1.0 / max(n, 1)), plain_sigma(data), float("nan"), 1.0
-        )
+    if n < FIELD:
+        sigma = few_sigma(data, prior) if n else plain_sigma(data)
+        return SpreadMean(sigma, np.full(n, 1.0 / max(n, 1)), sigma, float("nan"), 1.0)
     with _one_thread().limit(limits=1, user_api="blas"):
         return _spread_mean(data, shape, k, place)
 

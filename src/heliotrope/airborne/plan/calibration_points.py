@@ -14,6 +14,8 @@ import numpy.typing as npt
 from heliotrope.airborne.plan.airspace import Airspace
 from heliotrope.airborne.plan.clusters import tour
 from heliotrope.airborne.plan.hover import Facing, HoverMirrors, Sampling, face
+from heliotrope.airborne.plan.prospect import Prospect, prospect
+from heliotrope.airborne.visibility import SMALLEST
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.plan.planning import (
     CandidateSightings,
@@ -46,7 +48,12 @@ class PointSelection:
     criterion
         "d": most information; "v": smallest beam error over the year.
     sigma
-        Standard deviation of a measured normal in each of two directions, rad.
+        Standard deviation of a measured normal that all its reflections share, in each of two
+        directions, rad.
+    scatter
+        Standard deviation of the normal that one reflection shows, rad: the slope deviations.
+    least
+        Fewest reflections of the median mirror in a direction that is flown.
     min_elevation, max_elevation
         Least and greatest elevation of the drone as seen from the cluster, rad. At low ones mirrors
         hide each other.
@@ -58,17 +65,21 @@ class PointSelection:
 
     points: int = 20
     criterion: Criterion = "d"
-    sigma: float = 3e-4
+    sigma: float = 2e-4
     min_elevation: float = float(np.radians(20.0))
     max_elevation: float = float(np.radians(85.0))
     share: float = 0.95
     priors: Mapping[str, float] | None = None
+    scatter: float = 8e-4
+    least: float = 3.0
 
     def __post_init__(self) -> None:
         if self.points < 1:
             raise InputError(f"{self.points} calibration points: give 1 or more")
         if not (np.isfinite(self.sigma) and self.sigma > 0.0):
             raise InputError(f"sigma {self.sigma} rad of a normal must be above 0")
+        if not (np.isfinite(self.scatter) and self.scatter >= 0.0):
+            raise InputError(f"scatter {self.scatter} rad of a reflection must be 0 or more")
         if not 0.0 <= self.min_elevation < self.max_elevation <= 0.5 * np.pi:
             raise InputError(
                 f"elevations {np.degrees(self.min_elevation):g}° to "
@@ -100,12 +111,15 @@ class CalibrationPoints:
         Poses, batch shape (K, n).
     plan
         The choice for the mirror in the middle, with the expected errors.
+    prospect
+        What the photographs will show, (K, n).
     """
 
     direction: FloatArray
     point: FloatArray
     facing: Facing
     plan: SightingPlan
+    prospect: Prospect
 
     def __len__(self) -> int:
         return len(self.direction)
@@ -176,13 +190,28 @@ def calibration_points(
     facing = face(Armature(armature.table[some]), Drive(drives.table[some]), points[:, None])
     able = facing.able.mean(axis=1) >= selection.share
     there, there_points = towards[able], points[able]
-    found = _candidates(middle, there, there_points, names, selection.sigma)
+    shown = prospect(
+        mirrors, rows, face(armature, drives, there_points[:, None]), there_points, sampling
+    )
+    typical, side = (np.median(v, axis=1) for v in (shown.reflections, shown.side))
+    sharp = (side >= SMALLEST) & (typical >= selection.least)
+    found = _candidates(
+        middle,
+        there[sharp],
+        there_points[sharp],
+        names,
+        np.hypot(selection.sigma, selection.scatter / np.sqrt(np.maximum(typical[sharp], 1.0))),
+    )
     if len(found) < selection.points:
         raise InputError(
             f"{label}: {len(found)} directions are possible for {selection.points} calibration "
             f"points; {len(towards)} of {len(free)} lie in free air, {int(able.sum())} of them "
-            "within the stops; lower the distance, widen the elevations or ask for fewer points"
+            f"within the stops, and {int(sharp.sum())} of these show {selection.least:g} "
+            f"reflections on the median mirror, {SMALLEST:.0f} px or larger (at best "
+            f"{typical.max(initial=0.0):.1f}, {side.max(initial=0.0):.0f} px); lower the distance, "
+            "widen the elevations, sample more densely or ask for fewer points"
         )
+    there, there_points = there[sharp], there_points[sharp]
     information = precision(middle, names, priors=selection.priors)[0]
     form = error_form(middle, aim, suns, names)[0]
     chosen = plan_sightings(
@@ -203,7 +232,8 @@ def calibration_points(
         vertex.append(step.vertex)
         ok.append(step.able)
     flown = Facing(np.stack(counts), np.stack(normal), np.stack(vertex), np.stack(ok))
-    return CalibrationPoints(there[index], there_points[index], flown, chosen)
+    seen = shown.take(np.flatnonzero(sharp)[index])
+    return CalibrationPoints(there[index], there_points[index], flown, chosen, seen)
 
 
 def _free(
@@ -233,7 +263,7 @@ def _candidates(
     towards: FloatArray,
     points: FloatArray,
     names: tuple[str, ...],
-    sigma: float,
+    sigma: FloatArray,
 ) -> CandidateSightings:
     """Return sightings of the drone by one mirror; their "time" is the row of the direction."""
     facing = face(middle.armature, middle.drives, points[:, None])
@@ -242,7 +272,7 @@ def _candidates(
     # A normal that is off by σ turns the ray by 2 σ.
     zero = np.zeros(len(rows), dtype=np.intp)
     if len(rows):
-        seen = drone(zero, counts, points[rows], points[rows], sigma=2.0 * sigma)
+        seen = drone(zero, counts, points[rows], points[rows], sigma=2.0 * sigma[rows])
         jacobian = linearise(middle[zero], seen, names).jacobian
     else:
         jacobian = np.empty((0, 2, len(names)))

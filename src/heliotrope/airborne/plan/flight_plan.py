@@ -17,6 +17,7 @@ from heliotrope.airborne.plan.calibration_points import (
 from heliotrope.airborne.plan.clusters import HeliostatClusters, clusters, tour
 from heliotrope.airborne.plan.flight import CameraTarget, Craft, HoverStation, Sortie
 from heliotrope.airborne.plan.hover import HoverMirrors, Sampling, mirrors, pattern
+from heliotrope.airborne.visibility import FEWEST
 from heliotrope.calibration.uncertainty import suns_of_year
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
@@ -146,6 +147,7 @@ class FlightPlan:
         patterns = [s.pattern for s in self.stations]
         hours = self.seconds / 3600.0
         flown = [look.plan for look in self.points]
+        seen = np.concatenate([k.prospect.reflections[k.facing.able] for k in self.points])
         return {
             "heliostats": len(self.mirrors),
             "clusters": len(self.clusters),
@@ -157,6 +159,8 @@ class FlightPlan:
             "hover_points_of_a_pattern": [min(map(len, patterns)), max(map(len, patterns))],
             "spacing_m": [min(p.spacing for p in patterns), max(p.spacing for p in patterns)],
             "samples_of_a_facet": min(p.samples for p in patterns),
+            "reflections_of_a_mirror": np.quantile(seen, (0.1, 0.5)).tolist(),
+            "orientations_with_few_reflections": int(np.sum(seen < FEWEST)),
             "photographs": self.photos,
             "drones": len(self.homes),
             "sorties": len(self.sorties),

@@ -54,6 +54,8 @@ class Sampling:
         Lamp from the camera, in the camera's axes (right, down, forward), m, (3,).
     least_spacing
         Least distance between points of the pattern, m; Litchi refuses less than 0.6 m.
+    camera
+        Focal length of the camera, px.
     """
 
     distance: float = 150.0
@@ -62,9 +64,11 @@ class Sampling:
     focal: float = np.inf
     led_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     least_spacing: float = 0.6
+    camera: float = 3000.0
 
     def __post_init__(self) -> None:
-        for name, unit in (("distance", " m"), ("samples", ""), ("least_spacing", " m")):
+        units = {"distance": " m", "samples": "", "least_spacing": " m", "camera": " px"}
+        for name, unit in units.items():
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
                 raise InputError(f"{name} {value:g}{unit}: give a number above 0")

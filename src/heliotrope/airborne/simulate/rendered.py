@@ -120,7 +120,7 @@ def compare(
     return Compared(
         len(flight.taken),
         len(found.photos),
-        len(_visible(flight, exact)),
+        len(visible_reflections(flight, exact)),
         len(mine),
         right,
         as_float([o.count for o in kept]),
@@ -134,7 +134,7 @@ def compare(
     )
 
 
-def _visible(flight: Flight, exact: Reflections) -> Reflections:
+def visible_reflections(flight: Flight, exact: Reflections) -> Reflections:
     """Return the reflections that no nearer mirror hides, within the frame."""
     stand, camera, kept = flight.truth, flight.camera, []
     for k, photo in enumerate(flight.taken):

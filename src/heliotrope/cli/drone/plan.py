@@ -10,6 +10,7 @@ from heliotrope.cli._common import open_plant, parse_duration, parse_point, prin
 
 if TYPE_CHECKING:
     from heliotrope.airborne.plan.airspace import Airspace
+    from heliotrope.airborne.plan.calibration_points import PointSelection
     from heliotrope.field.plant import Plant
     from heliotrope.geometry import FloatArray
 
@@ -46,8 +47,12 @@ def plan(
         str, typer.Option(help="Lamp from the camera: right,down,forward in m.")
     ] = "0,0,0",
     sigma_mrad: Annotated[
-        float, typer.Option(help="Standard deviation of a measured normal.")
-    ] = 0.3,
+        float, typer.Option(help="Standard deviation that all reflections of a mirror share.")
+    ] = 0.2,
+    scatter_mrad: Annotated[
+        float, typer.Option(help="Standard deviation of the normal that one reflection shows.")
+    ] = 0.8,
+    focal_px: Annotated[float, typer.Option(help="Focal length of the camera, pixels.")] = 3000.0,
     elevations: Annotated[
         str, typer.Option(help="Lowest,highest elevation of the drone from the mirrors, degrees.")
     ] = "20,85",
@@ -80,7 +85,6 @@ def plan(
     """Plan a drone's campaign: clusters, hover patterns, commands of the mirrors, sorties."""
     import numpy as np
 
-    from heliotrope.airborne.plan.calibration_points import PointSelection
     from heliotrope.airborne.plan.flight import Craft
     from heliotrope.airborne.plan.flight_files import write_plan
     from heliotrope.airborne.plan.flight_map import flight_map
@@ -90,7 +94,6 @@ def plan(
 
     plant = open_plant(field)
     air, place = _airspace(plant, airspace, tower, (min_height, max_height))
-    low, high = np.radians(_numbers(elevations, 2, "--elevations"))
     wanted = _formats(formats)
     settings = PlanSettings(
         size=size,
@@ -104,8 +107,9 @@ def plan(
             focal=np.inf if facet_focal is None else facet_focal,
             led_offset=parse_point(led, "--led"),
             least_spacing=least_spacing,
+            camera=focal_px,
         ),
-        selection=PointSelection(points, criterion, 1e-3 * sigma_mrad, float(low), float(high)),
+        selection=_selection(points, criterion, sigma_mrad, scatter_mrad, elevations),
         craft=Craft(
             drones,
             speed,
@@ -132,6 +136,23 @@ def plan(
     print(f"plan: {into / 'plan.json'}, commands: {into / 'commands.csv'}, map: {into / 'map.png'}")
     if wanted:
         print(f"waypoints of {summary['sorties']} sorties: {into} ({', '.join(wanted)})")
+
+
+def _selection(
+    points: int,
+    criterion: Literal["d", "v"],
+    sigma_mrad: float,
+    scatter_mrad: float,
+    elevations: str,
+) -> "PointSelection":
+    import numpy as np
+
+    from heliotrope.airborne.plan.calibration_points import PointSelection
+
+    low, high = np.radians(_numbers(elevations, 2, "--elevations")).tolist()
+    return PointSelection(
+        points, criterion, 1e-3 * sigma_mrad, low, high, scatter=1e-3 * scatter_mrad
+    )
 
 
 def _check_aircraft(aircraft: str) -> None:
@@ -192,6 +213,7 @@ def _print(s: dict[str, Any]) -> None:
         ["hover points of a pattern", f"{patterns[0]} to {patterns[1]}"],
         ["their spacing, m", f"{spaces[0]:.2f} to {spaces[1]:.2f}"],
         ["reflections on a facet", f"{s['samples_of_a_facet']:.1f}"],
+        ["visible on the median mirror", f"{s['reflections_of_a_mirror'][1]:.1f}"],
         ["photographs", f"{s['photographs']:,}"],
         ["drones", f"{s['drones']}"],
         ["sorties", f"{s['sorties']:,}"],
@@ -203,6 +225,12 @@ def _print(s: dict[str, Any]) -> None:
         ["camera and target, months", f"{target['months']:.1f}"],
     ]
     print_table(["campaign", ""], rows)
+    if few := s["orientations_with_few_reflections"]:
+        print(
+            f"{few:,} of {s['orientations']:,} orientations will show fewer than 5 reflections: "
+            "mirrors are small for the pattern, or hidden by others; fly closer, or raise "
+            "--samples or the lower of --elevations"
+        )
     if s["drones"] > 1:
         print(f"least distance between drones in the air: {s['separation_m']:.0f} m")
     if s["fewest_points_of_a_heliostat"] < s["calibration_points"]:
