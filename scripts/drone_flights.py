@@ -7,7 +7,8 @@ could be used, how many reflections were found on the right mirrors, and true er
 FLIGHT is a station of the default radial field (``heliotrope field layout radial --heliostats 300
 --width 3.2 --height 2.54``, then ``drone plan``), such as C1-4, or ``paper``, in HelioPoint's
 geometry: mirrors of four facets, 3.2 m by 2.5 m, at 13.5° of elevation and 214° of azimuth, 150 m
-away. Without any, it is the paper's flight and those of the five lowest stations.
+away. Without any, it is the paper's flight and those of the five lowest stations. The flights have
+all errors of ``drone simulate`` by its defaults.
 """
 
 import sys
@@ -19,7 +20,8 @@ import numpy as np
 from heliotrope.airborne.photo import LedCamera
 from heliotrope.airborne.plan.flight_plan import FlightPlan, PlanSettings, plan_flight
 from heliotrope.airborne.simulate.rendered import Compared, fly_rendered, paper_flight
-from heliotrope.airborne.simulate.simulation import Errors, Flight, fly, install
+from heliotrope.airborne.simulate.rendering import Conditions
+from heliotrope.airborne.simulate.simulation import REAL, Flight, fly, install
 from heliotrope.field.layouts import HeliostatSize, lay_out
 from heliotrope.field.plant import Plant
 from heliotrope.sun import Site
@@ -27,6 +29,8 @@ from heliotrope.sun import Site
 SITE = Site(-28.5, 21.2, 830.0, name="field")
 #: The middle of a photograph of 4000 × 3000 px: focal length and size, px.
 FOCAL, SIZE = 3000.0, (1800, 1000)
+#: Thin clouds, and photographs while the drone moves.
+LIGHT = Conditions(clouds=0.1, speed=1.0)
 
 
 def lens() -> LedCamera:
@@ -43,7 +47,7 @@ def planned(plan: FlightPlan, name: str, most: int) -> tuple[Flight, Plant]:
     rows = plan.clusters.rows(station.cluster)
     facing = plan.points[station.cluster].facing
     rows, counts = (v[facing.able[station.point]] for v in (rows, facing.counts[station.point]))
-    errors = Errors()
+    errors = REAL
     flown = fly(
         group.take(rows),
         lens(),
@@ -89,12 +93,14 @@ def main() -> None:
     print(" σ_tot | in 90 % |\n|---|---|---|---|---|---|---|---|---|")
     for name in names:
         if name == "paper":
-            flown, plant = paper_flight(lens(), SITE)
+            flown, plant = paper_flight(lens(), SITE, REAL)
         else:
             assert plan is not None
             flown, plant = planned(plan, name, most)
         with tempfile.TemporaryDirectory() as folder:
-            print(line(name, fly_rendered(flown, plant, Path(folder))), flush=True)
+            print(
+                line(name, fly_rendered(flown, plant, Path(folder), conditions=LIGHT)), flush=True
+            )
 
 
 if __name__ == "__main__":

@@ -87,6 +87,8 @@ def flown(tmp_path_factory) -> Path:
         620,
         "--survey-mm",
         2,
+        "--kinematics-mm",
+        2,
     )
     assert done.exit_code == 0, done.output
     assert "8 photographs in 2 flights" in done.stdout

@@ -497,7 +497,7 @@ def _centroid(
     above = np.where(held, part - np.median(part[ring]), 0.0)
     # Where gaps between facets cross, or beside a hidden part, the surrounding mean is low; a true
     # spot is also brighter than the bright part of its surroundings.
-    if float(part[far < 1.2].mean() - np.quantile(part[ring], 0.9)) < 0.8 * raised:
+    if float(part[far < 1.2].mean() - np.quantile(part[ring], 0.97)) < 0.8 * raised:
         return None
     clipped = int(np.sum(bright[np.ix_(rows, columns)] & (far <= _WINDOW)))
     peak = float(above.max())

@@ -34,7 +34,7 @@ Image = npt.NDArray[np.float32]
 #: Side of a typical mirror in the reduced picture, px.
 _SIDE = 10.0
 #: Least correlation of drawing and photograph, and how far the best place must exceed any other.
-LEAST, MARGIN = 0.5, 0.06
+LEAST, MARGIN = 0.7, 0.06
 #: With this correlation of its light, the colour of a photograph is not tried.
 _CERTAIN = 0.9
 #: A place is another one if it is this far away, in mirrors' sides.

@@ -7,7 +7,7 @@ lens and motion is applied to all of it, then noise, clipping, the curve of sRGB
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -64,6 +64,11 @@ class Conditions:
         Electrons.
     quality
         Quality of JPEG, 1 to 100.
+    clouds
+        Relative standard deviation of the sky's light by clouds, which each facet shows as a
+        whole.
+    speed, exposure
+        Speed of the drone to the right, m/s, and exposure, s: the image moves meanwhile.
     """
 
     sky: float = 0.55
@@ -77,9 +82,13 @@ class Conditions:
     electrons: float = 9000.0
     read_noise: float = 6.0
     quality: int = 95
+    clouds: float = 0.0
+    speed: float = 0.0
+    exposure: float = 0.001
 
     def __post_init__(self) -> None:
-        for name in ("sky", "ground", "contrast", "led", "led_spread", "blur", "read_noise"):
+        lights = ("sky", "ground", "contrast", "led", "led_spread", "blur", "read_noise")
+        for name in (*lights, "clouds", "speed", "exposure"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise InputError(f"conditions: {name} {value} must be 0 or more")
@@ -152,8 +161,15 @@ def render(
 
 def sky_light(way: npt.ArrayLike, conditions: Conditions) -> FloatArray:
     """Return the sky's light (...) in unit directions (..., 3), brighter towards the horizon."""
-    up = np.clip(as_float(way)[..., 2], 0.0, 1.0)
-    return as_float(conditions.sky * (1.0 + 0.5 * (math.sqrt(0.5) - up)))
+    there = as_float(way)
+    up = np.clip(there[..., 2], 0.0, 1.0)
+    light = conditions.sky * (1.0 + 0.5 * (math.sqrt(0.5) - up))
+    if conditions.clouds > 0.0:
+        # A layer of clouds; its texture repeats every 0.5 rad overhead.
+        cell = there[..., :2] / np.maximum(up, 0.05)[..., None] * (2 * _TEXTURE)
+        i, j = np.moveaxis(np.floor(cell).astype(np.intp) % _TEXTURE, -1, 0)
+        light = light * np.clip(1.0 + conditions.clouds * _texture()[i, j], 0.2, 1.7)
+    return as_float(light)
 
 
 # -- parts of a picture ----------------------------------------------------------------
@@ -418,9 +434,14 @@ def render_flight(
     exact = exact_reflections(flight)
     ground = float(np.median(flight.heliostats.position[:, 2]))
     scene = FlightScene(flight.truth, flight.shapes, ground, light)
-    write_camera(place / "camera.toml", flight.camera)
+    write_camera(place / "camera.toml", flight.known_camera)
     write_commands(place / "commands.csv", flight.heliostats.names, flight.counts)
+    middle = flight.truth.vertex.mean(axis=0)
     for k, (taken, recorded) in enumerate(zip(flight.taken, flight.recorded, strict=True)):
+        if light.speed > 0.0:
+            away = float(np.linalg.norm(taken.position - middle))
+            moved = light.speed * light.exposure * flight.camera.focal / away
+            scene = replace(scene, conditions=replace(light, motion=(-moved, 0.0)))
         lamp = exact.take(np.flatnonzero(exact.photo == k))
         picture = render(scene, flight.camera, taken, lamp, seed + k)
         write_photo(place / recorded.name, picture, recorded, origin, light.quality)

@@ -56,6 +56,16 @@ class Errors:
         Error of the detected position of a reflection on the mirror, x and y, m.
     mechanism
         Errors of parameters of the mechanisms, rad.
+    kinematics
+        Error of each coordinate of a vertex in one pose, beside those of mechanism and survey, m.
+    canting
+        Error of each component of a facet's normal, rad; their mean over a mirror is 0.
+    map_error
+        RMS of each component of a slope map's deviation from the mirror, rad.
+    lens
+        Displacement of a corner of the frame by what the camera file states wrongly, px.
+    hover
+        Distance of the drone from its planned position along each axis, known to RTK, m.
     """
 
     rtk: tuple[float, float, float] = (0.008, 0.008, 0.008)
@@ -66,6 +76,21 @@ class Errors:
     slope_length: float = 0.3
     reflection: float = 0.015
     mechanism: Mapping[str, float] = field(default_factory=lambda: ADJUSTED)
+    kinematics: float = 0.0
+    canting: float = 0.0
+    map_error: float = 0.0
+    lens: float = 0.0
+    hover: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("kinematics", "canting", "map_error", "hover"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0.0):
+                raise InputError(f"errors: {name} {value} must be 0 or more")
+
+
+#: Those of a real flight: survey, kinematics and maps as HelioPoint states them, the rest is ours.
+REAL = Errors(survey=0.010, kinematics=0.030, canting=0.3e-3, map_error=0.1e-3, lens=0.5, hover=0.1)
 
 
 @dataclass(frozen=True)
@@ -88,6 +113,10 @@ class Flight:
         Photographs with their true exterior orientation.
     recorded
         The same, as recorded by the drone.
+    known_camera
+        The camera as its file states it.
+    maps
+        Slope maps as measured, (F, H, W, 2) each; None where a mirror has no slope deviations.
     """
 
     camera: LedCamera
@@ -97,6 +126,8 @@ class Flight:
     shapes: tuple[MirrorShape, ...]
     taken: tuple[Photo, ...]
     recorded: tuple[Photo, ...]
+    known_camera: LedCamera
+    maps: tuple[FloatArray | None, ...]
 
 
 @dataclass(frozen=True)
@@ -215,15 +246,41 @@ def fly(
         _photograph(f"DJI_{k + 1:04d}.JPG", time, place, as_float(focus), wrong, rng)
         for k, (time, place) in enumerate(zip(times, places, strict=True))
     ]
+    # Drawn last, so that a flight without these errors is the same as before they were thought of.
+    stand = standing(really, counts)
+    if wrong.kinematics > 0.0:
+        off = rng.normal(0.0, wrong.kinematics, stand.vertex.shape)
+        stand = replace(stand, vertex=stand.vertex + off)
+    own = np.random.default_rng([seed, 1])
     return Flight(
         camera,
         heliostats,
         as_float(counts),
-        standing(really, counts),
+        stand,
         shapes,
         tuple(p[0] for p in pairs),
         tuple(p[1] for p in pairs),
+        _miscalibrated(camera, wrong.lens),
+        tuple(_measured_map(shape, wrong, own) for shape in shapes),
     )
+
+
+def _miscalibrated(camera: LedCamera, lens: float) -> LedCamera:
+    """Return a camera whose first radial coefficient displaces a corner by ``lens`` px."""
+    radius = float(np.hypot(*camera.size)) / (2.0 * camera.focal)
+    distortion = camera.distortion.copy()
+    distortion[0] += lens / (camera.focal * radius**3)
+    return replace(camera, distortion=distortion)
+
+
+def _measured_map(shape: MirrorShape, wrong: Errors, rng: np.random.Generator) -> FloatArray | None:
+    """Return the slope map that deflectometry would find."""
+    if shape.slope is None or wrong.map_error <= 0.0:
+        return shape.slope
+    off = smooth_slopes(
+        shape, rng, wrong.map_error, length=wrong.slope_length, cells=shape.slope.shape[1]
+    )
+    return as_float(shape.slope + off)
 
 
 def install(
@@ -261,9 +318,17 @@ def _shape(
     rng: np.random.Generator,
 ) -> MirrorShape:
     shape = ideal(heliostats, row, focal)
-    if wrong.slope <= 0.0:
+    if wrong.slope <= 0.0 and wrong.canting <= 0.0:
         return shape
-    return shape.with_slopes(smooth_slopes(shape, rng, wrong.slope, length=wrong.slope_length))
+    slope = np.zeros((len(shape), 2, 2, 2))
+    if wrong.slope > 0.0:
+        slope = smooth_slopes(shape, rng, wrong.slope, length=wrong.slope_length)
+    if wrong.canting > 0.0:
+        # As a slope of the whole facet, so that a map shows it like deflectometry does.
+        turn = rng.normal(0.0, wrong.canting, (len(shape), 2))
+        area = np.prod(shape.half_size, axis=-1)
+        slope = slope + (turn - (area / area.sum()) @ turn)[:, None, None, :]
+    return shape.with_slopes(slope)
 
 
 def _installed(heliostats: Heliostats, wrong: Errors, rng: np.random.Generator) -> Heliostats:
@@ -285,6 +350,8 @@ def _photograph(
     rng: np.random.Generator,
 ) -> tuple[Photo, Photo]:
     """Return a photograph with its true orientation, and as the drone records it."""
+    if wrong.hover > 0.0:
+        place = place + rng.normal(0.0, wrong.hover, 3)
     # The drone steers by its own RTK, so it records the position that it was sent to.
     true = place - np.asarray(wrong.rtk_offset) + rng.normal(0.0, 1.0, 3) * wrong.rtk
     wanted = look_at(place, focus)

@@ -1,7 +1,7 @@
 """``heliotrope drone simulate``: photographs of a simulated flight, with the truth."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -45,7 +45,32 @@ def simulate(
     offset_mm: Annotated[str, typer.Option(help="RTK's common offset, E,N,U.")] = "0,0,0",
     survey_mm: Annotated[
         float, typer.Option(min=0.0, help="Survey error of the heliostats' positions.")
-    ] = 5.0,
+    ] = 10.0,
+    kinematics_mm: Annotated[
+        float, typer.Option(min=0.0, help="Error of vertices from the kinematic model.")
+    ] = 30.0,
+    canting_mrad: Annotated[
+        float, typer.Option(min=0.0, help="Canting error of facets, each of two directions.")
+    ] = 0.3,
+    map_mrad: Annotated[
+        float, typer.Option(min=0.0, help="Error of the slope maps that are written (RMS).")
+    ] = 0.1,
+    lens_px: Annotated[
+        float, typer.Option(help="Error of the camera file at the corner of the frame, pixels.")
+    ] = 0.5,
+    gimbal_deg: Annotated[
+        float, typer.Option(min=0.0, help="Error of the gimbal's angles, wobble included.")
+    ] = 0.5,
+    hover_mm: Annotated[
+        float, typer.Option(min=0.0, help="Deviation of the drone from its pattern.")
+    ] = 100.0,
+    speed: Annotated[
+        float, typer.Option(min=0.0, help="Speed while photographing, m/s; 0: it hovers.")
+    ] = 1.0,
+    exposure_ms: Annotated[float, typer.Option(min=0.0, help="Exposure of a photograph.")] = 1.0,
+    clouds: Annotated[
+        float, typer.Option(min=0.0, help="Relative variation of the sky's light by clouds.")
+    ] = 0.1,
     plan: Annotated[
         Path | None,
         typer.Option(
@@ -78,9 +103,16 @@ def simulate(
         rtk_offset=tuple(1e-3 * v for v in parse_point(offset_mm, "--offset-mm")),  # type: ignore[arg-type]  # three
         survey=1e-3 * survey_mm,
         slope=1e-3 * slope_mrad,
+        gimbal=float(np.radians(gimbal_deg)),
+        kinematics=1e-3 * kinematics_mm,
+        canting=1e-3 * canting_mrad,
+        map_error=1e-3 * map_mrad,
+        lens=lens_px,
+        hover=1e-3 * hover_mm,
     )
     light = rendering.night() if night else rendering.Conditions()
     light = rendering.dark() if dark else light
+    light = replace(light, clouds=clouds, speed=speed, exposure=1e-3 * exposure_ms)
     facets = np.inf if focal is None else focal
     drawing = _Drawing(plant.site, _camera(size, focal_px), errors, light, facets, seed)
     if plan is not None:
@@ -233,7 +265,7 @@ def _write_truth(folder: Path, flight: "Flight") -> None:
     for k, name in enumerate(stand.names):
         numbers = (np.degrees(azimuth[k]), np.degrees(elevation[k]), *stand.vertex[k])
         lines.append(",".join([name, *(f"{v:.7f}" for v in numbers)]))
-        slope = flight.shapes[k].slope
+        slope = flight.maps[k]
         if slope is not None:
             write_slopes(folder / "slopes" / f"{name}.npz", slope)
     write_text(folder / "orientations.csv", "\n".join(lines) + "\n")
