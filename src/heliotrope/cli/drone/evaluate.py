@@ -1,6 +1,7 @@
 """``heliotrope drone evaluate``: the orientations of mirrors from a drone's photographs."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +13,7 @@ from heliotrope.cli.drone import _shared as shared
 
 if TYPE_CHECKING:
     from heliotrope.airborne.evaluate.flight import CampaignResult
+    from heliotrope.airborne.evaluate.reference import Compared
 
 #: Most warnings, and most orientations, that are printed.
 _WARNINGS, _ORIENTATIONS = 12, 40
@@ -28,6 +30,10 @@ def evaluate(
         Path | None,
         typer.Option(help="Folder of slope maps, NAME.npz or NAME.csv for each heliostat."),
     ] = None,
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="Table (CSV) of normals by another method, to compare the result with."),
+    ] = None,
     focal: shared.FocalOption = None,
     survey_mm: shared.SurveyOption = 10.0,
     kinematics_mm: shared.KinematicsOption = 30.0,
@@ -43,8 +49,15 @@ def evaluate(
     """Find mirrors and lamp in a drone's photographs: orientations with their accuracy."""
     from heliotrope.airborne.evaluate.bundle import Priors
     from heliotrope.airborne.evaluate.flight import evaluate_flight
+    from heliotrope.airborne.evaluate.reference import (
+        compare,
+        read_reference,
+        reference_document,
+    )
+    from heliotrope.airborne.evaluate.reference_page import write_reference
     from heliotrope.airborne.evaluate.report import write_result
 
+    known = None if reference is None else read_reference(reference)
     with calibration.connected(scheduler) as client, shared.stages(as_json) as progress:
         result = evaluate_flight(
             folder,
@@ -65,10 +78,15 @@ def evaluate(
         print(f"heliotrope: {line}", file=sys.stderr)
     with calibration.progress("drawing", as_json) as advance:
         write_result(result, out, page=report, progress=advance)
+        compared = () if known is None else compare(result.flights, known)
+        if compared:
+            write_reference(compared, out, page=report)
     if as_json:
-        print_json(result.document())
-    else:
-        _show(result, out)
+        print_json(result.document() | reference_document(compared))
+        return
+    _show(result, out)
+    if compared:
+        _show_reference(compared, out)
 
 
 def _show(result: "CampaignResult", out: Path) -> None:
@@ -106,3 +124,12 @@ def _show_orientations(result: "CampaignResult", out: Path) -> None:
     print_table(head, body, "Orientation less command, mrad")
     if len(rows) > _ORIENTATIONS:
         print(f"and {len(rows) - _ORIENTATIONS} more in {out / 'orientations.csv'}")
+
+
+def _show_reference(compared: "Sequence[Compared]", out: Path) -> None:
+    from heliotrope.airborne.evaluate.reference_page import offset_table
+
+    table = offset_table(compared)
+    body = [*table["rows"][:_ORIENTATIONS], *table["rows"][max(_ORIENTATIONS, len(compared)) :]]
+    print_table(table["head"], body, "Orientation less reference, mrad")
+    print(f"written to {out}: reference.csv, and reference.html unless declined")

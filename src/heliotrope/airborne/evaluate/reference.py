@@ -1,0 +1,239 @@
+"""Orientations compared with a reference: tables 3 to 5 of HelioPoint.
+
+A reference is the normal of a heliostat in the same pose by another method (deflectometry, QDec-H).
+The same reflections are evaluated with the ideal surface and, where a slope map is there, with the
+measured one; slopes that are not known shift the first.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heliotrope.airborne.evaluate.flight import FlightResult
+from heliotrope.airborne.evaluate.orientation import Orientation, Orientations, measure_field
+from heliotrope.airborne.mirror import MirrorShape
+from heliotrope.errors import FormatError, InputError
+from heliotrope.files.cells import read_rows
+from heliotrope.files.limits import check_file
+from heliotrope.geometry import FloatArray, as_float, azimuth_elevation, direction, wrap_signed
+
+_COLUMNS = ("heliostat", "azimuth_deg", "elevation_deg")
+#: Surfaces with which the reflections are evaluated.
+SURFACES = ("ideal", "measured")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Normals of heliostats by another method.
+
+    Attributes
+    ----------
+    normals
+        Unit normals, ENU, by flight ("" for every flight) and heliostat.
+    """
+
+    normals: dict[tuple[str, str], FloatArray]
+
+    def of(self, flight: str, heliostat: str) -> FloatArray | None:
+        """Return the normal in a flight, (3,); None if it is not known."""
+        own = self.normals.get((flight, heliostat))
+        return self.normals.get(("", heliostat)) if own is None else own
+
+
+def read_reference(path: str | Path) -> Reference:
+    """Return the reference of a table (CSV).
+
+    Parameters
+    ----------
+    path
+        Columns heliostat, azimuth_deg (clockwise from north) and elevation_deg of the normal, and
+        flight where a campaign has several.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be read, a row cannot be used, or a heliostat stands there twice.
+    """
+    file = check_file(path, "a table of reference orientations (.csv)")
+    rows = read_rows(file, "a table of reference orientations")
+    rows.need(_COLUMNS)
+    angles = [rows.numbers(name, "degrees") for name in _COLUMNS[1:]]
+    rows.check("elevation_deg", np.abs(angles[1]) > 90.0, angles[1], "° is beyond ±90°")
+    if rows.left_out:
+        raise FormatError(file, rows.left_out[0])
+    if not len(rows):
+        raise FormatError(file, "no rows; give one for each heliostat")
+    found: dict[tuple[str, str], FloatArray] = {}
+    flights = rows.texts("flight") if "flight" in rows.columns else [""] * len(angles[0])
+    normals = direction(*np.radians(angles))
+    for flight, name, normal in zip(flights, rows.texts("heliostat"), normals, strict=True):
+        if (flight, name) in found:
+            raise FormatError(file, f"heliostat {name} is there twice; give one row for each pose")
+        found[flight, name] = normal
+    return Reference(found)
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One heliostat in one pose beside its reference.
+
+    Attributes
+    ----------
+    label
+        Name, with the flight's before it if there are several.
+    reference
+        Unit normal, ENU, (3,).
+    shape
+        Its surface, with the slope map if there is one.
+    ideal, measured
+        By the ideal surface and by the measured one; None without a slope map, or if it could not
+        be evaluated.
+    """
+
+    label: str
+    reference: FloatArray
+    shape: MirrorShape
+    ideal: Orientation | None
+    measured: Orientation | None
+
+    def offset(self, surface: str) -> FloatArray:
+        """Return rotX and rotY from the reference to the result, rad, (2,); NaN without one."""
+        found: Orientation | None = getattr(self, surface)
+        if found is None:
+            return np.full(2, np.nan)
+        return offset_from(self.reference, found)
+
+
+def offset_from(reference: FloatArray, found: Orientation) -> FloatArray:
+    """Return rotX and rotY that turn a reference normal into the one that was found, rad, (2,)."""
+    axis = np.cross(reference, found.normal)
+    sine = float(np.linalg.norm(axis))
+    angle = np.arctan2(sine, float(reference @ found.normal))
+    turn = axis * (angle / sine if sine > 0.0 else 1.0)
+    return np.asarray(turn @ found.rotation[:, :2])
+
+
+def compare(flights: Sequence[FlightResult], reference: Reference) -> tuple[Compared, ...]:
+    """Return the heliostats of flights that have a reference, in the order of the flights.
+
+    Raises
+    ------
+    InputError
+        If none has one.
+    """
+    found = []
+    for flight in flights:
+        ideal, measured = (_evaluated(flight, slopes=slopes) for slopes in (False, True))
+        for row, name in enumerate(flight.measured.found.names):
+            normal = reference.of(flight.data.name, name)
+            results = [each.of(name) for each in (ideal, measured)]
+            if normal is None or results == [None, None]:
+                continue
+            shape = flight.measured.shape(row)
+            measured_one = None if shape.slope is None else results[1]
+            found.append(Compared(flight.label(name), normal, shape, results[0], measured_one))
+    if not found:
+        raise InputError(
+            "reference: none of its heliostats was measured; its names are those of the plant, and "
+            "its flights those of the campaign's folders"
+        )
+    return tuple(found)
+
+
+def _evaluated(flight: FlightResult, *, slopes: bool) -> Orientations:
+    if slopes:
+        return flight.measured.found
+    return measure_field(
+        flight.evaluation.reflections,
+        flight.data.stand.names,
+        flight.data.shape,
+        flight.data.stand.rotation,
+        flight.evaluation.stand.vertex,
+        slopes=False,
+        budget=flight.measured.budget,
+        places=flight.measured.places,
+    )
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Offsets to the reference of M heliostats with one surface.
+
+    Attributes
+    ----------
+    mean, spread
+        Of rotX and rotY, rad, (2,); the spread is the standard deviation about the mean.
+    rms
+        Of rotX and rotY about 0, rad, (2,).
+    count
+        M.
+    within
+        Share of components within 1.645 σ_tot: 0.9 if σ_tot is right.
+    """
+
+    mean: FloatArray
+    spread: FloatArray
+    rms: FloatArray
+    count: int
+    within: float
+
+
+def offsets(compared: Sequence[Compared], surface: str) -> Offsets | None:
+    """Return the offsets with the "ideal" or the "measured" surface; None if there are none."""
+    kept = [c for c in compared if getattr(c, surface) is not None]
+    if not kept:
+        return None
+    values = np.array([c.offset(surface) for c in kept])
+    sigma = np.array([getattr(c, surface).sigma_total for c in kept])
+    return Offsets(
+        values.mean(axis=0),
+        values.std(axis=0, ddof=1) if len(kept) > 1 else np.full(2, np.nan),
+        as_float(np.sqrt(np.mean(values**2, axis=0))),
+        len(kept),
+        float(np.mean(np.abs(values) < 1.645 * sigma)),
+    )
+
+
+def reference_rows(compared: Sequence[Compared]) -> list[dict[str, Any]]:
+    """Return one record for each heliostat: offsets (table 3), azimuth and elevation (4 and 5)."""
+    rows = []
+    for one in compared:
+        row: dict[str, Any] = {"heliostat": one.label}
+        angles = azimuth_elevation(one.reference)
+        for word, value in zip(("azimuth", "elevation"), angles, strict=True):
+            row[f"{word}_reference_deg"] = float(np.degrees(value))
+        for surface in SURFACES:
+            found: Orientation | None = getattr(one, surface)
+            offset = one.offset(surface)
+            normal = np.full(3, np.nan) if found is None else found.normal
+            for axis, turn in zip("xy", offset, strict=True):
+                row[f"rot_{axis}_{surface}_mrad"] = 1e3 * float(turn)
+            for word, angle, at in zip(
+                ("azimuth", "elevation"), azimuth_elevation(normal), angles, strict=True
+            ):
+                row[f"{word}_{surface}_deg"] = float(np.degrees(angle))
+                # As in the paper: the difference of the angles, not of the directions.
+                row[f"{word}_{surface}_off_mrad"] = 1e3 * float(wrap_signed(angle - at))
+        rows.append(row)
+    return rows
+
+
+def reference_document(compared: Sequence[Compared]) -> dict[str, Any]:
+    """Return the comparison as a record for JSON; empty without one."""
+    if not compared:
+        return {}
+    document: dict[str, Any] = {"reference": reference_rows(compared), "reference_offsets": {}}
+    for surface in SURFACES:
+        found = offsets(compared, surface)
+        if found is not None:
+            document["reference_offsets"][surface] = {
+                "mean_mrad": (1e3 * found.mean).tolist(),
+                "spread_mrad": (1e3 * found.spread).tolist(),
+                "rms_mrad": (1e3 * found.rms).tolist(),
+                "heliostats": found.count,
+                "within_90": found.within,
+            }
+    return document
