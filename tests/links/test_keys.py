@@ -2,18 +2,20 @@
 
 import asyncio
 import stat
+import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from heliotrope.cli import main
+from heliotrope.cluster.config_file import read_cluster
 from heliotrope.errors import FormatError, InputError
 from heliotrope.links.clock import SystemClock
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.keys import CLUSTERS, HELIOSTATS, KeyFile, KeyRing, Keys, fingerprint
 from heliotrope.links.link import LinkSettings, SendOutcome, running
-from heliotrope.links.mqtt import Broker, mqtt_link
+from heliotrope.links.mqtt import Broker, _MqttCarrier, mqtt_link
 from heliotrope.links.papers import Papers
 from heliotrope.links.tcp import TcpServer, tcp_link
 from heliotrope.plant.links_file import read_links
@@ -297,3 +299,68 @@ def test_a_plant_takes_changed_keys_and_keeps_them_where_the_file_is_bad(tmp_pat
     keys.chmod(0o640)
     (alarm,) = papers.look()
     assert "others may read it (mode 640)" in alarm.text
+
+
+def put_password(file: Path, word: str) -> None:
+    command = ["mosquitto_passwd", "-b", "-c", str(file), "plant", word]
+    subprocess.run(command, check=True, capture_output=True)
+
+
+@pytest.fixture
+def guarded(mosquitto: Mosquitto, tmp_path: Path) -> Iterator[Mosquitto]:
+    """A broker that asks for a password, which stands in ``passwords``."""
+    del mosquitto  # it skips the test where there is none
+    passwords = tmp_path / "passwords"
+    put_password(passwords, "first word")
+    config = f"listener 8883\nallow_anonymous false\npassword_file {passwords}"
+    yield from mosquitto_for(tmp_path, config)
+
+
+def test_the_broker_s_password_is_taken_when_the_key_file_changes(
+    guarded: Mosquitto, tmp_path: Path
+) -> None:
+    """The broker starts anew with another one: a link connects again once its file has it."""
+    keys, file = tmp_path / "links.keys", tmp_path / "links.toml"
+    KeyFile(keys).new(["K1"])
+    good = keys.read_text()
+    keys.write_text(f'password = "first word"\n{good}')
+    file.write_text(
+        'format = "heliotrope-links"\nversion = 1\nkeys = "links.keys"\n'
+        f'[mqtt]\nurl = "mqtt://127.0.0.1:{guarded.port}/test"\nusername = "plant"\n'
+        '[clusters]\nK1 = "mqtt"\n'
+    )
+
+    async def main() -> None:
+        built = read_links(file).build({"K1": ("A",)}, CLOCK)
+        assert built.papers.look() == []
+        link = built.links["K1"]
+        assert isinstance(link, CarriedLink)
+        carrier = link._carrier
+        assert isinstance(carrier, _MqttCarrier)
+        async with running(link):
+            await until(lambda: carrier._client is not None)
+            guarded.kill()
+            put_password(tmp_path / "passwords", "second word")
+            refused = guarded.log.read_text().count("not authorised")
+            guarded.start()
+            await until(lambda: guarded.log.read_text().count("not authorised") > refused)
+            assert carrier._client is None
+            keys.write_text(f'password = "second word"\n{good}')
+            assert built.papers.look() == []
+            await until(lambda: carrier._client is not None)
+
+    asyncio.run(main())
+
+
+def test_a_cluster_takes_the_broker_s_password_with_its_keys(tmp_path: Path) -> None:
+    example = Path(__file__).parents[2] / "examples" / "cluster" / "C1.toml"
+    file = tmp_path / "C1.toml"
+    text = example.read_text().replace("tcp://10.0.0.2:4840", "mqtt://127.0.0.1/test")
+    file.write_text(text)
+    keys = private(tmp_path / "C1.keys.toml", f'plant = "{OLD.hex()}"\npassword = "first word"\n')
+    installation = read_cluster(file)
+    word = installation.password
+    assert (word.word, "first word" in repr(installation)) == ("first word", False)
+    keys.write_text(f'plant = "{NEW.hex()}"\npassword = "second word"\n')
+    installation.take_keys()
+    assert (word.word, installation.plant_keys.keys) == ("second word", (NEW,))

@@ -60,12 +60,12 @@ class Mosquitto:
         self._process.wait()
 
 
-def mosquitto_for(folder: Path) -> Iterator[Mosquitto]:
+def mosquitto_for(folder: Path, config: str = _CONFIG) -> Iterator[Mosquitto]:
     """Give a test its broker; skip it where there is none, but not where everything is tested."""
     if MOSQUITTO is None:
         if os.environ.get("CI"):
             pytest.fail("mosquitto is not installed, and CI tests everything: apt install it")
         pytest.skip("mosquitto is not installed: links through a broker are not tested")
-    broker = Mosquitto(folder)
+    broker = Mosquitto(folder, config)
     yield broker
     broker.kill()

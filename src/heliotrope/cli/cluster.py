@@ -129,7 +129,7 @@ def _link(installation: "Installation", clock: "Clock", papers: "Papers") -> "Li
         installation.host,
         installation.port,
         installation.plant.username,
-        installation.password or None,
+        installation.password,
         tls,
     )
     return mqtt_link(broker, installation.prefix, name, keys, clock, plant=False)

@@ -14,7 +14,7 @@ from heliotrope.errors import FormatError, InputError
 from heliotrope.files.documents import read_document, read_toml
 from heliotrope.links.addresses import Table, check_encryption, url_parts
 from heliotrope.links.bus_key_file import read_bus_keys
-from heliotrope.links.keys import HELIOSTATS, KeyRing, Keys
+from heliotrope.links.keys import HELIOSTATS, BrokerPassword, KeyRing, Keys
 from heliotrope.sun import Site
 
 _CHRONY = "chronyd now keeps the computer's clock"
@@ -71,7 +71,8 @@ class PlantLinkTable(Table):
     )
     authority: str | None = Field(
         None,
-        description="PEM file of the other end's certificate authority: TLS for `tcp://`.",
+        description="PEM file of the other end's certificate authority, beside this file: "
+        "TLS for `tcp://`.",
     )
     username: str | None = Field(
         None, description="For the MQTT broker; its password is in the key file."
@@ -181,7 +182,7 @@ class Installation:
         File of the keys of the bus, and the keys, replaced by `take_bus_keys`; None: no frame is
         signed.
     plant_keys, password
-        Of the link, replaced by `take_keys`; of the MQTT broker.
+        Of the link, and of the MQTT broker; replaced by `take_keys`.
     error
         Bound of the clock's error that the operator vouches for, s; None: the kernel's is used.
     gpsd
@@ -204,7 +205,7 @@ class Installation:
     bus_key_file: Path | None
     bus_keys: KeyRing | None = field(repr=False)
     plant_keys: KeyRing = field(repr=False)
-    password: str = field(repr=False)
+    password: BrokerPassword
     error: float | None
     gpsd: tuple[str, int] | None
     state: Path
@@ -221,7 +222,7 @@ class Installation:
         found = Keys(self.key_file, HELIOSTATS)
         if not found.plant:
             raise FormatError(self.key_file, "its key is gone; the link needs it", "plant")
-        self.plant_keys.keys = found.plant
+        self.plant_keys.keys, self.password.word = found.plant, found.password
 
     def take_bus_keys(self) -> None:
         """Read the file of the bus's keys again.
@@ -301,7 +302,7 @@ def _install(
         config=config,
         bus_url=bus.url,
         bus=BusSettings(baud_rate=bus.baud_rate, echo=bus.echo),
-        plant=document.plant,
+        plant=_placed(path, document.plant),
         scheme=scheme,
         host=host,
         port=port,
@@ -310,12 +311,19 @@ def _install(
         bus_key_file=bus_key_file,
         bus_keys=None if bus_key_file is None else KeyRing(*read_bus_keys(bus_key_file)),
         plant_keys=KeyRing(*secrets.plant),
-        password=secrets.password,
+        password=BrokerPassword(secrets.password),
         error=document.time.error_s,
         gpsd=_gpsd_at(path, document.time.gpsd),
         state=path.parent / (document.state or f"{document.name}.state.json"),
         emergency_line=path.parent / line if line else None,
     )
+
+
+def _placed(path: Path, table: PlantLinkTable) -> PlantLinkTable:
+    """Return a table whose files stand beside the cluster's file."""
+    if table.authority is None:
+        return table
+    return table.model_copy(update={"authority": str(path.parent / table.authority)})
 
 
 def _gpsd_at(path: Path, text: str) -> tuple[str, int] | None:

@@ -125,7 +125,9 @@ class Kept:
         epoch, reserved = max(epoch, self._given[0]), max(reserved, self._given[1])
         if self._path is not None:
             beside = self._path.with_name(self._path.name + ".new")
-            with beside.open("w", encoding="utf-8") as file:
+            beside.unlink(missing_ok=True)
+            made = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(made, "w", encoding="utf-8") as file:
                 json.dump({"epoch": epoch, "edition": reserved}, file)
                 file.flush()
                 os.fsync(file.fileno())

@@ -15,6 +15,7 @@ import os
 import secrets
 import string
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -76,6 +77,13 @@ def ring_of(name: str, key: bytes | KeyRing) -> KeyRing:
     if not 0 < len(name.encode()) <= _LONGEST_NAME:
         raise InputError(f"cluster {name!r}: a name has 1 to {_LONGEST_NAME} bytes")
     return ring
+
+
+@dataclass
+class BrokerPassword:
+    """The broker's password; where it is replaced, the next connection takes the new one."""
+
+    word: str = field(repr=False)
 
 
 class Keys:

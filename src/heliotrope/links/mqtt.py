@@ -36,7 +36,7 @@ from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.envelope import SealKeys
-from heliotrope.links.keys import KeyRing, ring_of
+from heliotrope.links.keys import BrokerPassword, KeyRing, ring_of
 from heliotrope.links.link import LinkError, LinkLostError, LinkSettings, Statistics
 from heliotrope.links.tls import TlsSource, context_of
 
@@ -72,7 +72,7 @@ class Broker:
     host: str
     port: int = 1883
     username: str | None = None
-    password: str | None = None
+    password: str | BrokerPassword | None = None
     tls: TlsSource = None
     keepalive_s: int = 60
 
@@ -100,6 +100,11 @@ def _ends(prefix: str, cluster: str, *, plant: bool) -> _Ends:
     out, into = ("down", "up") if plant else ("up", "down")
     identifier = f"{topic}/{'plant' if plant else 'cluster'}"
     return _Ends(f"{topic}/{out}", f"{topic}/{into}", f"{topic}/status", identifier)
+
+
+def _word_of(password: str | BrokerPassword | None) -> str | None:
+    word = password.word if isinstance(password, BrokerPassword) else password
+    return word or None
 
 
 class _MqttCarrier:
@@ -134,7 +139,7 @@ class _MqttCarrier:
             broker.host,
             broker.port,
             username=broker.username,
-            password=broker.password,
+            password=_word_of(broker.password),
             identifier=self._ends.identifier,
             protocol=aiomqtt.ProtocolVersion.V5,
             will=will if self._reports else None,

@@ -20,7 +20,7 @@ from heliotrope.files.documents import read_document
 from heliotrope.links.addresses import Table, check_encryption, url_parts
 from heliotrope.links.clock import Clock
 from heliotrope.links.connection import CarriedLink
-from heliotrope.links.keys import CLUSTERS, KeyRing, Keys
+from heliotrope.links.keys import CLUSTERS, BrokerPassword, KeyRing, Keys
 from heliotrope.links.link import Link
 from heliotrope.links.mqtt import Broker, mqtt_link
 from heliotrope.links.papers import Papers, authority_of
@@ -93,13 +93,13 @@ class LinksFile:
     keys
         By cluster; replaced while the links run when the key file changes.
     password
-        For the broker.
+        For the broker; replaced like the keys.
     """
 
     path: Path
     document: LinksDocument
     keys: Mapping[str, KeyRing] = field(repr=False)
-    password: str = field(repr=False)
+    password: BrokerPassword
 
     def check(self, homes: Mapping[str, tuple[str, ...]]) -> None:
         """Check that the file names every cluster of a plant and no other.
@@ -169,6 +169,7 @@ class LinksFile:
                 raise FormatError(path, "its key is gone; the links need it", f"clusters.{name}")
         for name, ring in self.keys.items():
             ring.keys = found.members[name]
+        self.password.word = found.password
 
     def _serve(self, made: "PlantLinks", keys: Mapping[str, KeyRing], clock: Clock) -> None:
         table = self.document.tcp
@@ -198,7 +199,7 @@ class LinksFile:
             tls = ssl.create_default_context()
             if table.authority is not None:
                 tls = authority_of(papers, self.path.parent / table.authority)
-        broker = Broker(host, port, table.username, self.password or None, tls)
+        broker = Broker(host, port, table.username, self.password, tls)
         return mqtt_link(broker, prefix, name, self.keys[name], clock, plant=True)
 
 
@@ -257,7 +258,7 @@ def read_links(path: str | Path) -> LinksFile:
     document = read_document(path, "links", LinksDocument, TABLES)
     keys = _keys_of(path.parent / document.keys if document.keys else None, document)
     rings = {name: KeyRing(*each) for name, each in keys.members.items()}
-    found = LinksFile(path, document, rings, keys.password)
+    found = LinksFile(path, document, rings, BrokerPassword(keys.password))
     _check(found)
     return found
 
