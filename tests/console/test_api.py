@@ -56,6 +56,7 @@ NEEDED = {
     ("DELETE", "accounts/{name}/factor"): "engineer",
     ("POST", "accounts/{name}/password"): "engineer",
     ("POST", "flights"): "engineer",
+    ("POST", "clusters/{name}/frames"): "engineer",
     ("GET", "accounts"): "engineer",
     ("POST", "accounts"): "engineer",
     ("PATCH", "accounts/{name}"): "engineer",

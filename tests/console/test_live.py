@@ -190,6 +190,23 @@ def test_ctl_at_the_plant_itself(ctl: Callable[..., Any], console: LiveConsole) 
     assert "not valid" in str(ctl("wrong", *where, "status").exception)
 
 
+@pytest.mark.parametrize("way", ["console", "plant"])
+def test_frames_of_the_bus_are_recorded_for_an_engineer(
+    ctl: Callable[..., Any], console: LiveConsole, way: str
+) -> None:
+    cluster, name = next(iter(console.live.operations.clusters)), console.live.names[0]
+    where = () if way == "console" else ("--data", str(console.folder))
+    shown = ctl("engineer", *where, "frames", cluster, "--heliostat", name)
+    assert shown.exit_code == 0, shown.output
+    assert {"QUERY_STATUS", "STATUS", "SUN"} <= set(shown.stdout.split())
+    assert name in shown.stdout
+    assert console.live.names[1] not in shown.stdout
+    rows = console.call(lambda: console.live.operations.events(5))
+    assert any("frames of its bus" in row.text and row.text.startswith(cluster) for row in rows)
+    assert "engineer" in str(ctl("operator", *where, "frames", cluster).exception)
+    assert "nobody" in str(ctl("engineer", *where, "frames", "nobody").exception)
+
+
 def _lines() -> list[str]:
     pages = (
         Path(__file__).parents[2] / "docs" / "how-to" / name for name in ("api.md", "console.md")

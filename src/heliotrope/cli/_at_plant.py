@@ -82,6 +82,8 @@ class AtPlant:
         call = _CALLS.get((method, path))
         if call is None and method == "GET" and name and kind in _NAMED:
             call, given = _NAMED[kind], {"name": unquote(name)}
+        if call is None and method == "POST" and kind == "clusters" and name.endswith("/frames"):
+            call, given = "bus_frames", {"name": unquote(name.removesuffix("/frames"))}
         if call is None:
             raise InputError(f"ctl: {path} is only known to the console; leave out --data")
         if call == "command" and given["command"] in ("STOW", "DEFOCUS"):

@@ -402,6 +402,38 @@ def photographs(
 
 
 @app.command()
+def frames(
+    context: typer.Context,
+    cluster: Annotated[str, typer.Argument(help="Cluster.")],
+    heliostat: Annotated[str, typer.Option(help="Only its frames, and those to all.")] = "",
+    as_json: Json = False,
+) -> None:
+    """Record the frames of a cluster's bus for five seconds, and print them decoded."""
+    from urllib.parse import quote
+
+    with _client(context) as client:
+        found = client.ask("POST", f"clusters/{quote(cluster, safe='')}/frames")
+    if heliostat:
+        found = [one for one in found if one["whom"] in (heliostat, "all", "")]
+    if as_json:
+        print_json(found)
+        return
+    rows = [
+        (
+            datetime.fromtimestamp(one["at"], UTC).strftime("%H:%M:%S.%f")[:-3],
+            one["way"],
+            one["whom"],
+            one["kind"] + (" (signed)" if one["signed"] else ""),
+            str(one["sequence"]),
+            str(one["size"]),
+            one["text"],
+        )
+        for one in found
+    ]
+    print_table(("time", "way", "heliostat", "kind", "number", "bytes", ""), rows)
+
+
+@app.command()
 def flight(
     context: typer.Context,
     file: Annotated[Path, typer.Argument(help="flight.json of `heliotrope drone evaluate`.")],

@@ -1,10 +1,11 @@
-"""Questions of the plant: checksums, stored items, statistics, and discovery."""
+"""Questions of the plant: checksums, stored items, statistics, discovery, frames of the bus."""
 
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
+from heliotrope.cluster._bus_log import RecordedBus
 from heliotrope.cluster._discovery import Discovery
 from heliotrope.cluster._exchange import Exchange
 from heliotrope.cluster._nodes import ClusterNode, Nodes, OrderRefusedError
@@ -42,14 +43,16 @@ class Questions:
         self,
         nodes: Nodes,
         exchange: Exchange,
+        bus: RecordedBus,
         reports: Reports,
         clock: Callable[[], float],
     ) -> None:
-        self._nodes, self._exchange = nodes, exchange
+        self._nodes, self._exchange, self._bus = nodes, exchange, bus
         self._reports, self._clock = reports, clock
         self._waiting: deque[Ask | _Recall] = deque(maxlen=64)
         self._later: list[_Recall] = []
         self._discovery: Discovery | None = None
+        self._recording = ""  # identity of the question for frames
 
     @property
     def ready(self) -> bool:
@@ -67,8 +70,10 @@ class Questions:
             self._take_stored(ask)
         elif ask.what == "discover":
             self._waiting.append(ask)
+        elif ask.what == "frames":
+            self._record(ask)
         else:
-            known = "checksums, stored, statistics, discover"
+            known = "checksums, stored, statistics, discover, frames"
             self._error(ask, f"question {ask.what!r} is not known; give one of {known}")
 
     def statistics(self) -> dict[str, Any]:
@@ -81,9 +86,21 @@ class Questions:
         }
 
     def second(self) -> None:
-        """Give questions that are to be retried their turn."""
+        """Give questions that are to be retried their turn; answer with a complete record."""
         self._waiting.extend(self._later)
         self._later.clear()
+        if self._bus.complete:
+            utc_s, why, block = self._bus.taken()
+            names = {str(node.address): node.name for node in self._nodes}
+            data = {"utc_s": utc_s, "over": why, "names": names}
+            self._reports.answer(Answer(self._recording, data, block))
+
+    def _record(self, ask: Ask) -> None:
+        if self._bus.recording:
+            self._error(ask, "another person records it now; ask again in ten seconds")
+        else:
+            self._recording = ask.identity
+            self._bus.record()
 
     async def serve(self) -> None:
         """Do one step of the first question."""

@@ -25,6 +25,7 @@ from collections.abc import Callable
 
 from heliotrope.cluster._broadcast import Broadcast
 from heliotrope.cluster._bus_keys import BusKeys
+from heliotrope.cluster._bus_log import RecordedBus
 from heliotrope.cluster._emergencies import Emergencies
 from heliotrope.cluster._epoch import Epoch
 from heliotrope.cluster._exchange import Exchange
@@ -98,7 +99,8 @@ class Cluster:
         now, present = clock.monotonic(), time.time()
         reports = self._reports = Reports()
         goals = Goals(reports)
-        self._exchange = Exchange(bus, clock, config.answer, config.stored_answer)
+        recorded = RecordedBus(bus, clock)
+        self._exchange = Exchange(recorded, clock, config.answer, config.stored_answer)
         self._watch = Watch(config.name, config.longest_autonomy, reports, now, line)
         epoch = Epoch(kept, self._exchange, reports, present)
         emergencies = Emergencies(self.nodes, self._exchange, goals, reports, clock.monotonic)
@@ -123,7 +125,7 @@ class Cluster:
             self._broadcast.bus_time,
             self._polling.look,
         )
-        questions = Questions(self.nodes, self._exchange, reports, clock.monotonic)
+        questions = Questions(self.nodes, self._exchange, recorded, reports, clock.monotonic)
         self._work = Work(
             self.nodes, self._exchange, emergencies, orders, questions, reports, epoch
         )

@@ -166,6 +166,12 @@ async def take_photograph(console: Here, who: Operator, name: Named) -> JSONResp
     return answer(await console.plant.ask("take_photograph", who.person, name=name))
 
 
+@router.post("/clusters/{name}/frames", response_model=models.many(models.BusFrame), tags=["logs"])
+async def record_frames(console: Here, who: Engineer, name: Named) -> JSONResponse:
+    """Record the frames of a cluster's bus for five seconds; nothing moves."""
+    return answer(await console.plant.ask("bus_frames", who.person, name=name))
+
+
 @router.post("/flights", response_model=models.FlightView, tags=["calibration"])
 async def take_flight(console: Here, who: Engineer, document: FlightDocument) -> JSONResponse:
     """Take a flight of a drone: the flight.json of `heliotrope drone evaluate`; nothing moves."""

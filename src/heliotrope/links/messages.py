@@ -27,6 +27,11 @@ from heliotrope.safety import Alarm, Severity
 
 VERSION = 1
 
+#: Before each entry in a record of a bus: seconds since its beginning; sent (0) or received (1) by
+#: the cluster; number of bytes.
+BUS_ENTRY = "<fBH"
+BUS_SENT, BUS_RECEIVED = 0, 1
+
 #: One row for each heliostat of a cluster, in the order of its configuration. ``heard_ms`` is the
 #: age of its STATUS when the row was written (2^32 - 1: none has come, and the row means nothing);
 #: states and flags as in `lcu.names`. ``steps_ms`` is the age of its step counts and goals, which
@@ -160,9 +165,12 @@ class Parameters:
 
 @dataclass(frozen=True)
 class Ask:
-    """A question: ``checksums``, ``stored`` (of a heliostat), ``statistics``, ``discover``.
+    """A question.
 
+    ``what``: ``checksums``, ``stored`` (of a heliostat), ``statistics``, ``discover``, ``frames``.
     The answer to ``statistics`` names all heliostats in the order of the rows of `ClusterStatus`.
+    The answer to ``frames``, what went over the bus, comes when its time or number is reached; its
+    block holds a `BUS_ENTRY` and the bytes for each.
     """
 
     kind: ClassVar[str] = "ask"

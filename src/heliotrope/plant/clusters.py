@@ -181,6 +181,23 @@ class Clusters:
         self._awaited[identity] = now, take
         end.post(Ask(identity, what, heliostat), QUESTION_LIFE)
 
+    async def answer(
+        self, cluster: str, what: str, timeout: float, heliostat: str = ""
+    ) -> Answer | None:
+        """Ask a cluster, and return its answer; None if none comes within ``timeout`` s."""
+        future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+
+        def take(answer: Answer) -> None:
+            if not future.done():
+                future.set_result(answer)
+
+        self.ask(self.ends[cluster], what, take, heliostat)
+        try:
+            async with asyncio.timeout(timeout):
+                return await future
+        except TimeoutError:
+            return None
+
     def take_answer(self, answer: Answer) -> None:
         """Hand an answer to the part that asked.
 

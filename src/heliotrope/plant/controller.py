@@ -774,6 +774,12 @@ class PlantController:
         self.wanted.set(heliostat, items_of(mechanism))
         self._sync.compare(heliostat)
 
+    async def ask_cluster(self, cluster: str, what: str, timeout: float) -> Answer | None:
+        """Return a cluster's answer to a question, or None; an unknown cluster is an error."""
+        if cluster not in self._clusters.ends:
+            raise UnknownNameError("cluster", cluster, self._clusters.ends)
+        return await self._clusters.answer(cluster, what, timeout)
+
     async def stored(self, heliostat: str, timeout: float = 15.0) -> dict[str, int]:
         """Return the checksums of the items that a local controller stores, by item.
 

@@ -1,6 +1,5 @@
 """Parameters of local controllers: compared with the wanted ones at connection, then pushed."""
 
-import asyncio
 import math
 from collections.abc import Callable, Mapping, Sequence
 
@@ -215,19 +214,11 @@ class ParameterSync:
         RefusedError
             If no answer comes within ``timeout`` s, or nothing is stored.
         """
-        future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
-
-        def take(answer: Answer) -> None:
-            if not future.done():
-                future.set_result(answer)
-
-        self._clusters.ask(self._clusters.home(heliostat), "stored", take, heliostat)
-        try:
-            async with asyncio.timeout(timeout):
-                answer = await future
-        except TimeoutError:
+        home = self._clusters.home(heliostat).name
+        answer = await self._clusters.answer(home, "stored", timeout, heliostat)
+        if answer is None:
             late = f"nothing within {timeout:g} s; check that it is live"
-            raise refusals.NO_ANSWER.error(heliostat=heliostat, problem=late) from None
+            raise refusals.NO_ANSWER.error(heliostat=heliostat, problem=late)
         items = stored_items(answer)
         if not items:
             problem = answer.data.get("error", "nothing is stored")

@@ -203,6 +203,12 @@ NO_ANSWER = Refusal(
     "{heliostat}: its stored parameters cannot be read: {problem}",
     "Check that the heliostat is live, and ask again.",
 )
+BUS_NOT_RECORDED = Refusal(
+    "bus not recorded",
+    "A cluster does not record the frames of its bus.",
+    "cluster {cluster}: the frames of its bus were not recorded: {problem}",
+    "Check that the cluster is connected and nobody else records, then ask again.",
+)
 FLIGHT_KNOWN = Refusal(
     "flight taken before",
     "The plant has taken a flight of that name already.",

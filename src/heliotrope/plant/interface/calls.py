@@ -215,6 +215,9 @@ _ORDERS = {
     "take_photograph": Call(
         Role.OPERATOR, orders.Named, lambda _d, _who, given, _b: given.name, Desk.photographed
     ),
+    "bus_frames": Call(
+        Role.ENGINEER, orders.Named, lambda _d, _who, given, _b: given.name, Desk.bus_frames
+    ),
     "take_flight": Call(
         Role.ENGINEER, orders.Nothing, lambda _, __, ___, blob: blob, Desk.take_flight
     ),

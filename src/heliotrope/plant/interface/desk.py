@@ -18,8 +18,9 @@ from heliotrope.plant import refusals
 from heliotrope.plant.authority import Person
 from heliotrope.plant.interface import orders
 from heliotrope.plant.interface.tickets import Tickets, state_of
+from heliotrope.plant.operations import bus_frames
 from heliotrope.plant.operations.operations import Operations
-from heliotrope.plant.operations.views import CameraView, FlightView, PictureRow
+from heliotrope.plant.operations.views import BusFrame, CameraView, FlightView, PictureRow
 from heliotrope.plant.orders import RECORDING
 from heliotrope.plant.tickets import Ticket
 
@@ -151,6 +152,13 @@ class Desk:
         self.tickets.put(ticket)
         await ticket.written(RECORDING + 1.0)
         return state_of(ticket)
+
+    async def bus_frames(self, person: Person, cluster: str) -> tuple[BusFrame, ...]:
+        """Record the frames of a cluster's bus for five seconds."""
+        found = await bus_frames.record(self.operations.plant, cluster)
+        text = f"recorded {len(found)} frames of its bus"
+        self.operations.logbook.event("command", person.name, f"{cluster}: {text}")
+        return found
 
     # -- photographs -----------------------------------------------------------------------
 

@@ -299,6 +299,38 @@ class PacketRow:
 
 
 @dataclass(frozen=True)
+class BusFrame:
+    """One frame of a cluster's bus.
+
+    Attributes
+    ----------
+    at
+        Time by the cluster's clock, POSIX s.
+    way
+        "sent" or "received" by the cluster.
+    whom
+        The heliostat at the other end, or "all"; "" if the frame is damaged.
+    kind, sequence
+        Name of the message, or "damaged"; its number.
+    size
+        Bytes on the bus.
+    signed
+        Whether it is signed with the key of the bus.
+    text
+        Its fields; the bytes as hexadecimal digits if they cannot be read.
+    """
+
+    at: float
+    way: str
+    whom: str
+    kind: str
+    sequence: int
+    size: int
+    signed: bool
+    text: str
+
+
+@dataclass(frozen=True)
 class Running:
     """A visit under way: heliostat, target, what is being done, and its beginning (POSIX s)."""
 
