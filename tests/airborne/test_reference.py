@@ -22,14 +22,17 @@ from heliotrope.airborne.evaluate.reference import (
 )
 from heliotrope.airborne.evaluate.reference_figures import sampling_figure
 from heliotrope.airborne.evaluate.reference_page import offset_table, write_reference
+from heliotrope.airborne.mirror import ideal
 from heliotrope.airborne.simulate.rendering import render_flight
 from heliotrope.airborne.simulate.simulation import Errors
 from heliotrope.airborne.simulate.trial import TrialConditions, four_facets, trial_mirror
+from heliotrope.airborne.slopes import read_slopes
 from heliotrope.cli.drone import simulate
 from heliotrope.cli.drone.evaluate import evaluate as evaluate_command
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.formats import plant_file
 from heliotrope.geometry import direction, normalize
+from support.deflectometry_files import write_deflectometry
 from support.drone_case import ORIGIN, camera, field, flight, plant
 
 MIRRORS = field(2, 4)
@@ -158,6 +161,19 @@ def test_a_flight_is_compared_with_its_truth(folder: Path, tmp_path: Path) -> No
     other.write_text("heliostat,azimuth_deg,elevation_deg\nZ9,180,40\n")
     with pytest.raises(InputError, match="none of its heliostats was measured"):
         compare(plain.flights, read_reference(other))
+
+
+def test_the_maps_of_a_flight_may_be_deflectometry(folder: Path, tmp_path: Path) -> None:
+    real = MIRRORS.names[2]
+    shape = ideal(MIRRORS, 2)
+    slope = read_slopes(folder / f"truth/slopes/{real}.npz", len(shape))
+    write_deflectometry(tmp_path / f"{real}.h5", shape.with_slopes(slope))
+    result = evaluate_flight(folder, plant(MIRRORS), slopes=tmp_path)
+    assert not [line for line in result.warnings if real in line]
+    assert len([line for line in result.warnings if "taken as ideal" in line]) == 7
+    found = result.flights[0].measured.shape(2).slope
+    assert found is not None
+    np.testing.assert_allclose(found.mean(axis=(1, 2)), slope.mean(axis=(1, 2)), atol=0.02 * MRAD)
 
 
 def test_the_command_compares(folder: Path, tmp_path: Path) -> None:

@@ -49,6 +49,11 @@ def read_slopes(path: str | Path, facets: int) -> FloatArray:
         slope = _read_csv(file)
     else:
         raise FormatError(file, f"the name ends in {file.suffix!r}; slope maps are .npz or .csv")
+    return checked_slopes(file, slope, facets)
+
+
+def checked_slopes(file: Path, slope: FloatArray, facets: int) -> FloatArray:
+    """Return a slope map whose holes are filled; errors as `read_slopes`."""
     if slope.ndim != 4 or slope.shape[3] != 2 or not slope.size:
         raise FormatError(file, f"slopes of shape {slope.shape}; they must be (F, H, W, 2)")
     if len(slope) != facets:

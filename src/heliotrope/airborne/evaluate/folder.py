@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.airborne.deflectometry import find_deflectometry, read_deflectometry
 from heliotrope.airborne.evaluate.reading import PhotoReading
 from heliotrope.airborne.mirror import MirrorShape, ideal
 from heliotrope.airborne.photo import SUFFIXES, LedCamera, Photo, read_camera, read_photos
@@ -106,7 +107,7 @@ def open_flights(
     cluster, point
         Rows of the commands to use for a single flight; "" for all.
     slopes
-        Folder of slope maps, NAME.npz or NAME.csv.
+        Folder of slope maps, NAME.npz or NAME.csv, or of deflectometry in PAINT's form, NAME.h5.
     focal
         Focal length of the facets, m; inf if flat.
 
@@ -226,11 +227,14 @@ class _Surfaces:
             if self._folder is not None:
                 files = [self._folder / f"{name}{suffix}" for suffix in (".npz", ".csv")]
                 there = next((f for f in files if f.exists()), None)
-                if there is None:
-                    self._without.append(name)
-                else:
-                    self._maps += 1
+                measured = there or find_deflectometry(self._folder, name)
+                if there is not None:
                     shape = shape.with_slopes(read_slopes(there, len(shape)))
+                elif measured is not None:
+                    shape = shape.with_slopes(read_deflectometry(measured, shape))
+                else:
+                    self._without.append(name)
+                self._maps += measured is not None
             self._known[name] = shape
         return self._known[name]
 

@@ -28,7 +28,7 @@ def evaluate(
     point: shared.PointOption = "",
     slopes: Annotated[
         Path | None,
-        typer.Option(help="Folder of slope maps, NAME.npz or NAME.csv for each heliostat."),
+        typer.Option(help="Folder of slope maps: NAME.npz, NAME.csv or (PAINT) NAME.h5."),
     ] = None,
     reference: Annotated[
         Path | None,

@@ -1,0 +1,145 @@
+"""Measured surfaces of mirrors as PAINT publishes them (HDF5): points and normals become slopes.
+
+A file holds the groups ``facet1``, ``facet2``, … of one heliostat, in the order of its properties,
+each with the datasets ``surface_points``, m, and ``surface_normals``, (K, 3), in the axes in which
+the properties give the facets. Canting that differs from theirs is part of the slopes.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from heliotrope.airborne.mirror import MirrorShape
+from heliotrope.airborne.slopes import checked_slopes
+from heliotrope.errors import FormatError
+from heliotrope.files.limits import EXPANDED, MIB, check_file
+from heliotrope.geometry import FloatArray, as_float
+
+if TYPE_CHECKING:
+    import h5py
+
+#: Suffix of the files.
+SUFFIX = ".h5"
+# Most cells along an edge of a facet, and points for each cell: a mean of few points is noisy.
+_CELLS, _POINTS = 64, 4
+# Least share of the points that must lie on their facet; others are at its rim.
+_ON_FACET = 0.5
+_WHAT = "a deflectometry file in PAINT's form (.h5)"
+
+
+def find_deflectometry(folder: Path, name: str) -> Path | None:
+    """Return the file of a heliostat, None if there is none.
+
+    ``NAME.h5``; or in the folder, or in ``NAME/Deflectometry`` as PAINT's client stores it, the
+    newest ``NAME-filled-TIME-deflectometry.h5``, or else the newest ``NAME-TIME-…``.
+    """
+    own = folder / f"{name}{SUFFIX}"
+    if own.exists():
+        return own
+    for place in (folder, folder / name / "Deflectometry"):
+        there = sorted(place.glob("*-deflectometry.h5")) if place.is_dir() else []
+        there = [file for file in there if file.name.startswith(f"{name}-")]
+        filled = [file for file in there if file.name.startswith(f"{name}-filled-")]
+        if there:
+            return (filled or there)[-1]
+    return None
+
+
+def read_deflectometry(path: str | Path, shape: MirrorShape) -> FloatArray:
+    """Return the slope deviations of a measured surface from a shape, (F, H, W, 2), rad.
+
+    The normals in each cell of a grid are averaged, and holes are filled from the nearest cell.
+
+    Parameters
+    ----------
+    path
+        The file.
+    shape
+        The mirror as designed.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be read, is for another number of facets, has points beside its facets or
+        normals that look backwards, or as `heliotrope.airborne.slopes.read_slopes`.
+    """
+    import h5py
+
+    file = check_file(path, _WHAT, binary=True)
+    try:
+        with h5py.File(file, "r") as root:
+            names = [name for name in root if str(name).startswith("facet")]
+            if len(names) != len(shape):
+                raise FormatError(
+                    file, f"a map of {len(names)} facets, but the mirror has {len(shape)}"
+                )
+            clouds = [_cloud(file, root, f"facet{k + 1}") for k in range(len(shape))]
+    except (OSError, RuntimeError, KeyError) as error:
+        raise FormatError(
+            file, f"no readable HDF5 ({str(error)[:80]}); it should be {_WHAT}"
+        ) from None
+    fewest = min(len(points) for points, _ in clouds)
+    cells = int(np.clip(np.sqrt(fewest / _POINTS), 1, _CELLS))
+    maps = [_gridded(file, shape, k, *cloud, cells) for k, cloud in enumerate(clouds)]
+    return checked_slopes(file, np.stack(maps), len(shape))
+
+
+def _cloud(file: Path, root: "h5py.File", facet: str) -> tuple[FloatArray, FloatArray]:
+    """Return points and normals of a facet, (K, 3) each, without those that are not numbers."""
+    import h5py
+
+    both = []
+    for name in ("surface_points", "surface_normals"):
+        # A link to another file, or data outside this one, would read what nobody named.
+        linked = root.get(f"{facet}/{name}", getlink=True)
+        data = root[f"{facet}/{name}"] if isinstance(linked, h5py.HardLink) else None
+        if not isinstance(data, h5py.Dataset) or data.external or data.is_virtual:
+            raise FormatError(file, f"{facet} has no {name} of its own")
+        if data.dtype.kind not in "fiu" or data.ndim != 2 or data.shape[1] != 3:
+            raise FormatError(
+                file, f"{facet}/{name}: {data.dtype} of shape {data.shape}; give numbers (K, 3)"
+            )
+        if 8 * data.size > EXPANDED:
+            raise FormatError(
+                file,
+                f"{facet}/{name}: {data.shape[0]:,} points expand to more than the limit of "
+                f"{EXPANDED / MIB:.0f} MiB",
+            )
+        both.append(as_float(data[()]))
+    points, normals = both
+    if len(points) != len(normals) or not len(points):
+        raise FormatError(
+            file, f"{facet}: {len(points)} points and {len(normals)} normals; give one for each"
+        )
+    good = np.isfinite(points).all(axis=-1) & np.isfinite(normals).all(axis=-1)
+    return points[good], normals[good]
+
+
+def _gridded(
+    file: Path, shape: MirrorShape, k: int, points: FloatArray, normals: FloatArray, cells: int
+) -> FloatArray:
+    """Return the mean deviation in each cell of facet ``k``, (cells, cells, 2); NaN without any."""
+    own, half = normals @ shape.axes[k].T, shape.half_size[k]
+    uv = ((points - shape.center[k]) @ shape.axes[k].T)[:, :2]
+    inside = (np.abs(uv) <= half).all(axis=-1)
+    if not len(points) or inside.mean() < _ON_FACET:
+        raise FormatError(
+            file,
+            f"facet{k + 1}: {int(inside.sum())} of {len(points)} points lie on facet {k} of the "
+            "plant file; give the file of this heliostat, in the axes of its properties",
+        )
+    if (own[inside, 2] <= 0.0).any():
+        raise FormatError(
+            file, f"facet{k + 1}: a normal looks backwards; it must look to the front"
+        )
+    uv, own = uv[inside], own[inside]
+    deviation = -own[:, :2] / own[:, 2:] - uv / (2.0 * shape.focal[k])
+    at = np.minimum(((uv / half + 1.0) * 0.5 * cells).astype(np.intp), cells - 1)
+    cell = at[:, 1] * cells + at[:, 0]
+    count = np.bincount(cell, minlength=cells**2)
+    with np.errstate(invalid="ignore"):
+        mean = [
+            np.bincount(cell, weights=deviation[:, i], minlength=cells**2) / count for i in (0, 1)
+        ]
+    return np.stack(mean, axis=-1).reshape(cells, cells, 2)
