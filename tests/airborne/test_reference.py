@@ -163,6 +163,26 @@ def test_a_flight_is_compared_with_its_truth(folder: Path, tmp_path: Path) -> No
         compare(plain.flights, read_reference(other))
 
 
+def test_the_optical_axis_is_chosen(folder: Path, tmp_path: Path) -> None:
+    """The mean reaches every orientation, and the comparison uses the same.
+
+    With the few reflections of this flight both means are alike; what they do with many is tested
+    beside `measure`.
+    """
+    app = typer.Typer()
+    app.command()(evaluate_command)
+    options = ["--field", folder / "plant.toml", "--processes", 1, "--no-report"]
+    for axis in ("area", "plain"):
+        done = CliRunner().invoke(
+            app, [str(a) for a in (folder, *options, "--out", tmp_path, "--axis", axis)]
+        )
+        assert done.exit_code == 0, done.output
+        assert set(pd.read_csv(tmp_path / "orientations.csv")["mean"]) == {axis}
+    result = evaluate_flight(folder, plant(MIRRORS), axis="plain")
+    found = compare(result.flights, read_reference(folder / "truth/orientations.csv"))
+    assert {one.ideal.mean for one in found if one.ideal is not None} == {"plain"}
+
+
 def test_the_maps_of_a_flight_may_be_deflectometry(folder: Path, tmp_path: Path) -> None:
     real = MIRRORS.names[2]
     shape = ideal(MIRRORS, 2)

@@ -12,7 +12,7 @@ from heliotrope.airborne.evaluate.bundle import Priors
 from heliotrope.airborne.evaluate.campaign import Campaign, evaluate_campaign
 from heliotrope.airborne.evaluate.evaluation import FlightEvaluation
 from heliotrope.airborne.evaluate.folder import FlightData, open_flights
-from heliotrope.airborne.evaluate.orientation import measure_field
+from heliotrope.airborne.evaluate.orientation import Mean, measure_field
 from heliotrope.airborne.evaluate.reading import read_many
 from heliotrope.airborne.evaluate.sightings import to_sightings
 from heliotrope.airborne.evaluate.tables import MeasuredFlight
@@ -146,6 +146,7 @@ def evaluate_flight(
     slopes: Path | None = None,
     focal: float = np.inf,
     priors: Priors = PRIORS,
+    axis: Mean = "area",
     keep: Path | None = None,
     processes: int = 1,
     client: "Client | None" = None,
@@ -179,6 +180,9 @@ def evaluate_flight(
         The field.
     priors
         Prior standard deviations.
+    axis
+        What the optical axis of a mirror is: the mean in
+        `heliotrope.airborne.evaluate.orientation.measure`.
     keep, processes, client
         See `heliotrope.airborne.evaluate.reading.read_many`.
     progress
@@ -204,7 +208,7 @@ def evaluate_flight(
     # The RTK base is part of each mirror's position as the adjustment knows it.
     budget = Budget(priors.position, priors.kinematics, 0.0)
     results = [
-        _measure(flight, found, budget)
+        _measure(flight, found, budget, axis)
         for flight, found in zip(flights, campaign.flights, strict=True)
         if found is not None
     ]
@@ -236,7 +240,9 @@ def _read(
     return replace(flight, seen=seen)
 
 
-def _measure(flight: FlightData, found: FlightEvaluation, budget: Budget) -> FlightResult:
+def _measure(
+    flight: FlightData, found: FlightEvaluation, budget: Budget, axis: Mean
+) -> FlightResult:
     """Measure the mirrors of one flight where the photographs showed them to stand."""
     orientations = measure_field(
         found.reflections,
@@ -246,6 +252,7 @@ def _measure(flight: FlightData, found: FlightEvaluation, budget: Budget) -> Fli
         found.stand.vertex,
         budget=budget,
         places=found.place_covariance,
+        mean=axis,
     )
     measured = MeasuredFlight(
         flight.name,

@@ -155,6 +155,7 @@ def _evaluated(flight: FlightResult, *, slopes: bool) -> Orientations:
         slopes=False,
         budget=flight.measured.budget,
         places=flight.measured.places,
+        mean=next((o.mean for o in flight.measured.found.found), "area"),
     )
 
 

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -34,6 +34,13 @@ def evaluate(
         Path | None,
         typer.Option(help="Table (CSV) of normals by another method, to compare the result with."),
     ] = None,
+    axis: Annotated[
+        Literal["area", "plain"],
+        typer.Option(
+            help="Optical axis: mean of the normals over the mirror's area, or over the "
+            "reflections alike (plain)."
+        ),
+    ] = "area",
     focal: shared.FocalOption = None,
     survey_mm: shared.SurveyOption = 10.0,
     kinematics_mm: shared.KinematicsOption = 30.0,
@@ -68,6 +75,7 @@ def evaluate(
             point=point,
             slopes=slopes,
             focal=float("inf") if focal is None else focal,
+            axis=axis,
             priors=Priors(1e-3 * rtk_mm, 1e-3 * survey_mm, 1e-3 * kinematics_mm),
             keep=out / "photographs",
             processes=shared.cores(processes),
