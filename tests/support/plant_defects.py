@@ -13,6 +13,7 @@ from heliotrope.plant.audit import AuditError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency.order import EmergencyOrder
 from heliotrope.plant.identity import Identities
+from heliotrope.plant.operations.automatic import AutomaticControl
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.parameters import ParameterSync
 from heliotrope.plant.tickets import Ticket
@@ -139,6 +140,11 @@ def any_light(patch: pytest.MonkeyPatch) -> None:
         return "no light on the target" if dark else ""
 
     patch.setattr(Centred, "_astray", own)
+
+
+def evening_skipped(patch: pytest.MonkeyPatch) -> None:
+    """Automatic control does not look at the height of the sun."""
+    patch.setattr(AutomaticControl, "_night", lambda self: None)
 
 
 #: Invariants that may find it, name, defect, faults to draw from, pause between them, and the seed

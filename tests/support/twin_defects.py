@@ -388,6 +388,8 @@ DEFECTS = (
            first=9, worlds=("visits",)),
     Defect((12, 16), "any light on a target is the heliostat's", plant_defects.any_light, faults=(),
            first=2, worlds=("visits",)),
+    Defect((16,), "the evening's stow is skipped", plant_defects.evening_skipped, faults=(),
+           first=2, slow=True, worlds=("day",)),
     *(Defect(numbers, name, defect, only, pause, first=first)
       for numbers, name, defect, only, pause, first in plant_defects.ROWS),
     *(Defect((16,), name, defect, faults=(), worlds=worlds, slow=slow)

@@ -12,9 +12,12 @@ from heliotrope.errors import InputError
 from heliotrope.lcu import states
 from heliotrope.lcu.motion import Motion
 from heliotrope.safety import JoinLimiter
+from heliotrope.sun import vector
+from heliotrope.twin.invariants.day import LOW
 from heliotrope.twin.invariants.invariants import TITLES
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.faults import Fault
+from heliotrope.twin.world.scene import scene_of
 from heliotrope.twin.world.simulation import RunPlan, RunResult, run, shrink
 from heliotrope.twin.world.tour import TOUR_LENGTH
 from heliotrope.twin.world.worlds import MIX, WORLDS, mixed
@@ -126,8 +129,10 @@ def test_each_run_of_any_draws_its_worlds_again() -> None:
     assert len(set(drawn)) > 15
 
 
+# The evening comes before a mirror that must be calibrated first has tracked: "day" has its own.
 @pytest.mark.parametrize(
-    "worlds", [("calm",), ("calm", "swarm"), *(("calm", name) for name in MIX[3:])]
+    "worlds",
+    [("calm",), ("calm", "swarm"), *(("calm", name) for name in MIX[3:] if name != "day")],
 )
 def test_no_invariant_is_broken_while_mirrors_track(worlds: tuple[str, ...]) -> None:
     # A jump of the clock, or a change of parameters, may take all mirrors off before one tracks.
@@ -146,6 +151,17 @@ def test_where_nothing_fails_every_command_is_done(seed: int) -> None:
     assert outcome.good, f"{outcome.text}; {outcome.command}"
     assert not outcome.faults
     assert outcome.counts["accepted"] == outcome.counts["commands"] + 3  # each one's parameters
+
+
+def test_the_field_is_raised_in_the_morning() -> None:
+    """The run begins below 8 degrees of the sun, where nothing may be raised."""
+    plan = RunPlan(0, 400.0, 3, faults=(), worlds=("day",))
+    scene = scene_of(plan.worlds, plan.seed, plan.seconds, plan.heliostats)
+    begin = scene.start.timestamp()
+    assert vector(begin, scene.site)[2] < LOW < vector(begin + 300.0, scene.site)[2]
+    outcome = run(plan)
+    assert outcome.good, f"{outcome.text}; {outcome.command}"
+    assert outcome.states[states.TRACKING] > 0
 
 
 def _refuses(*_: object) -> bool:

@@ -35,7 +35,7 @@ def simulate(
 ) -> None:
     """Run the real plant, clusters and local controllers in virtual time, with random faults.
 
-    Fifteen safety invariants are checked at every step; the exit code is 1 if one is broken.
+    Sixteen safety invariants are checked at every step; the exit code is 1 if one is broken.
     """
     from heliotrope.errors import InputError
     from heliotrope.twin.world.simulation import RunPlan

@@ -1,10 +1,12 @@
 """The observers that check the safety invariants.
 
 `Observer` watches one cluster with its boards, `PlantObserver` the plant, `BeamObserver` the true
-beams, `VisitObserver` what photographs have taught the plant; `TITLES` names the invariants.
+beams, `VisitObserver` what photographs have taught the plant, `DayObserver` whether the field
+is at stow while the sun is low; `TITLES` names the invariants.
 """
 
 from heliotrope.twin.invariants.beams import BeamObserver
+from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.invariants import TITLES, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.visits import VisitObserver
@@ -12,6 +14,7 @@ from heliotrope.twin.invariants.visits import VisitObserver
 __all__ = [
     "TITLES",
     "BeamObserver",
+    "DayObserver",
     "InvariantError",
     "Observer",
     "PlantObserver",

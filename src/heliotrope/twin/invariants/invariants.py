@@ -31,10 +31,11 @@ number    check
 13        In no state does a beam stay on the receiver unsent, or in a keep-out volume, for 30 s.
 14        After a loss that took every mirror off, only a person's command brings one back.
 15        A mirror proven to be done is off the receiver, or at stow.
-16        In quiet stretches what was ordered is done; a kept sighting is the mirror's own.
+16        In quiet stretches what was ordered is done; a kept sighting is the mirror's own; while
+          the sun is low, what automatic control was given is at stow.
 ========  ============================================================================
 
-`twin.invariants.beams` checks 12 to 15, `twin.invariants.quiet` and `.visits` 16.
+`twin.invariants.beams` checks 12 to 15, `twin.invariants.quiet`, `.visits` and `.day` 16.
 """
 
 from collections import Counter, deque

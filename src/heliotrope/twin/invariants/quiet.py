@@ -170,6 +170,11 @@ class QuietObserver:
                 Violation(16, now - self._start, mirror.name, f"{state} in a quiet stretch: {saw}")
             )
 
+    @property
+    def stretches(self) -> frozenset[str]:
+        """Heliostats that are in a quiet stretch."""
+        return self._quiet
+
     # -- orders and reports ------------------------------------------------------------------
 
     def leased(self, token: int, now: float) -> None:

@@ -20,10 +20,16 @@ from heliotrope.twin.boards.outfit import (
     stow_beams,
 )
 from heliotrope.twin.invariants.invariants import OFF
-from heliotrope.twin.world.worlds import works
+from heliotrope.twin.world.worlds import drawn, works
 
 #: The sun is at least this high at the beginning and at the end of a drawn scene, rad.
 _LOWEST = math.radians(8.0)
+#: Elevations of the sun below which automatic control stows the field, and above which it raises it
+#: again, rad; and lowest sun of a run that meets one of them: beams need a sun above the ground.
+_STOWS, _RAISES, _UP = math.radians(8.0), math.radians(9.0), math.radians(1.0)
+#: Share of a run before the evening's limit, at least and at most; for the first, and before the
+#: morning's limit, no longer than this, s.
+_BEFORE, _SOON = (0.55, 0.75), 300.0
 #: Nearest two heliostats, and nearest that a beam at rest passes the receiver, m.
 _APART, _BESIDE = 6.0, 8.0
 #: A beam at stow passes receiver and volumes by this much more than their radius, m: nothing can
@@ -72,12 +78,12 @@ USUAL = Scene(Site(37.4, -6.0, 100.0, name="simulation"), datetime(2026, 6, 21, 
 
 
 def scene_of(worlds: Sequence[str], seed: int, seconds: float, heliostats: int) -> Scene:
-    """Return the scene of a run: drawn in the world "place", else the usual one."""
+    """Return the scene of a run: drawn in the worlds "place" and "day", else the usual one."""
     targets = TARGETS if works(worlds) else ()
-    if "place" not in worlds:
+    if not drawn(worlds):
         return replace(USUAL, targets=targets)
     chance = random.Random(f"place {seed}")
-    site, start = _when(chance, seconds)
+    site, start = (_limit if "day" in worlds else _when)(chance, seconds)
     times = np.linspace(0.0, seconds, 2 + int(seconds / _OFTEN))
     suns = np.stack([vector(start.timestamp() + float(at), site) for at in times])
     places: list[tuple[float, float]] = []
@@ -117,6 +123,33 @@ def _when(chance: random.Random, seconds: float) -> tuple[Site, datetime]:
         ends = (start.timestamp(), start.timestamp() + seconds)
         if all(math.asin(float(vector(at, site)[2])) > _LOWEST for at in ends):
             return site, start
+
+
+def _limit(chance: random.Random, seconds: float) -> tuple[Site, datetime]:
+    """Return a site and a time from which the sun meets a limit of elevation, and stays up.
+
+    In the evening it falls below the limit late enough that the field is up before. In the morning
+    it is below the limit first, and rises above the upper one before the run is nearly over; a
+    short run has evenings only.
+    """
+    while True:
+        site, midnight = _when(chance, 0.0)
+        times = midnight.timestamp() + np.arange(0.0, 86400.0, _OFTEN)
+        up = np.arcsin(vector(times, site)[:, 2])
+        evening = chance.random() < 0.5
+        before = up[:-1] > _STOWS if evening else up[:-1] < _STOWS
+        found = np.flatnonzero(before & ((up[1:] < _STOWS) if evening else (up[1:] > _STOWS)))
+        if not len(found):
+            continue
+        share = chance.uniform(*_BEFORE)
+        lead = share * min(seconds, _SOON / _BEFORE[0]) if evening else chance.uniform(5.0, _OFTEN)
+        k = found[0]
+        first = float(times[k] + _OFTEN * (_STOWS - up[k]) / (up[k + 1] - up[k])) - lead
+        suns = vector(first + np.linspace(0.0, seconds, 2 + int(seconds / _OFTEN)), site)
+        height = np.arcsin(suns[:, 2])
+        raised = evening or bool((height[: 1 + int(0.7 * len(height))] > _RAISES).any())
+        if raised and bool((height > _UP).all()):
+            return site, datetime.fromtimestamp(first, UTC)
 
 
 def _ball(chance: random.Random, places: Sequence[tuple[float, float]], suns: FloatArray) -> Ball:

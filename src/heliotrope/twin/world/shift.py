@@ -16,6 +16,7 @@ from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.operations import Operations
 from heliotrope.safety import Act
 from heliotrope.twin.invariants.beams import BeamObserver
+from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.visits import VisitObserver
 from heliotrope.twin.world.operator import ENGINEER, VIEWER, Operator
@@ -38,7 +39,7 @@ class Shift:
         Automatic control.
     operator
         Its persons' means: clears what latches, raises emergencies.
-    observer, beams
+    observer, beams, day
         Told of each act.
     names
         The heliostats.
@@ -56,13 +57,14 @@ class Shift:
         operator: Operator,
         observer: PlantObserver,
         beams: BeamObserver,
+        day: DayObserver,
         names: Sequence[str],
         clock: Clock,
         seed: int,
         pause: float,
     ) -> None:
         self._work, self._operator = work, operator
-        self._observer, self._beams = observer, beams
+        self._observer, self._beams, self._day = observer, beams, day
         self._names, self._clock, self._pause = tuple(names), clock, pause
         self._chance = random.Random(f"shift {seed}")
         self._left: set[str] = set()  # what a person keeps from automatic control
@@ -102,6 +104,7 @@ class Shift:
             operations.unhold(ENGINEER, back)
         self._resumed()
         operations.give_back(ENGINEER, names)
+        self._day.given(names, self._clock.monotonic())
         self._left.clear()
 
     def _resumed(self) -> None:
@@ -118,6 +121,7 @@ class Shift:
     async def _duty(self, operations: Operations) -> None:
         """Take the authority for a while, and command; automatic control gives way."""
         self._observer.gave_way(self._clock.monotonic())
+        self._day.on_duty(self._clock.monotonic())
         token = operations.take_authority(ENGINEER).token
         self._observer.granted(ENGINEER, token, self._clock.monotonic(), seized=False)
         until = self._clock.monotonic() + self._chance.uniform(2.0, _DUTY)
@@ -125,6 +129,7 @@ class Shift:
             while self._clock.monotonic() < until and self._present() is operations:
                 operations.keep_authority(ENGINEER, token)
                 self._observer.kept(self._clock.monotonic())
+                self._day.on_duty(self._clock.monotonic())
                 if self._chance.random() < 0.2:
                     self._commands(operations, token)
                 await asyncio.sleep(1.0)
@@ -136,6 +141,7 @@ class Shift:
     def _commands(self, operations: Operations, token: int) -> None:
         name = self._chance.choice(self._names)
         what = self._chance.choice(["IDLE", "TRACK", "APPROACH", "REFOCUS"])
+        self._day.taken((name,))
         ticket = operations.command(ENGINEER, token, what, (name,))
         now = self._clock.monotonic()
         self._observer.accepted(ENGINEER, token, ticket, what, now)
@@ -144,6 +150,7 @@ class Shift:
     async def _takes_off(self, operations: Operations) -> None:
         """Take a mirror off, in a visit or not."""
         name = self._chance.choice(self._names)
+        self._day.taken((name,))
         what = self._chance.choice(["DEFOCUS", "STOW"])
         (operations.defocus if what == "DEFOCUS" else operations.stow)(VIEWER, (name,))
         self._observer.obeyed(VIEWER.name, what, self._clock.monotonic())
@@ -152,11 +159,13 @@ class Shift:
     async def _holds(self, operations: Operations) -> None:
         """Take a mirror out of service: it goes to stow."""
         name = self._chance.choice(self._names)
+        self._day.taken((name,))
         operations.hold(ENGINEER, (name,), "washing")
         self._observer.obeyed(ENGINEER.name, "STOW", self._clock.monotonic())
         self._left.add(name)
 
     async def _emergency(self, operations: Operations) -> None:
+        self._day.taken(self._names)
         self._operator.raises(operations.plant, VIEWER, Act.DEFOCUS)
         operations.automatic.want(self._names, wanted=False)
         await asyncio.sleep(self._chance.uniform(2.0, _EMERGENCY))
@@ -164,8 +173,9 @@ class Shift:
 
 @dataclass(frozen=True)
 class Working:
-    """Automatic control of a run, the persons beside it, and the observer of its visits."""
+    """Automatic control of a run, the persons beside it, and the observers of its work."""
 
     control: Work
     shift: Shift
     observer: VisitObserver
+    day: DayObserver

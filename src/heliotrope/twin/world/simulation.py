@@ -37,6 +37,7 @@ from heliotrope.twin.boards.outfit import (
 )
 from heliotrope.twin.cameras import FieldSnapshot, mirrors_of
 from heliotrope.twin.invariants.beams import BeamObserver
+from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.quiet import QuietObserver
@@ -55,7 +56,15 @@ from heliotrope.twin.world.shift import Shift, Working
 from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
 from heliotrope.twin.world.twice import SecondPlant
 from heliotrope.twin.world.work import Work
-from heliotrope.twin.world.worlds import Habits, PodErrors, checked, knows_boards, stored_by, works
+from heliotrope.twin.world.worlds import (
+    Habits,
+    PodErrors,
+    checked,
+    drawn,
+    knows_boards,
+    stored_by,
+    works,
+)
 
 #: Longest interval between two looks at the boards, and between two judgements of everything, s.
 LOOK, JUDGE = 0.2, 0.5
@@ -289,7 +298,7 @@ class Simulation:
         if not set(_WRONG).isdisjoint(self.plan.worlds):
             return None
         observers = {pod.name: pod.observer for pod in self.pods}
-        reaches = "place" not in self.plan.worlds
+        reaches = not drawn(self.plan.worlds)
         return QuietObserver(self.begin, observers, self.sun, reaches=reaches)
 
     def _new_work(self) -> Working:
@@ -298,13 +307,14 @@ class Simulation:
         boards = {board.outfit.name: board for board in self.boards}
         sight = FieldSnapshot(clock, mirrors_of(boards), lambda: self.sun(clock.monotonic()))
         work = Work(plan.seed, sight, self._exits)
+        day, names = DayObserver(self.begin, self.boards), tuple(boards)
         shift = Shift(
-            work, self.operator, self.observer, self.beams, tuple(boards), clock, plan.seed, 90.0
+            work, self.operator, self.observer, self.beams, day, names, clock, plan.seed, 90.0
         )
         observer = VisitObserver(
             self.begin, self.boards, self._scene.targets, followed=work.centred
         )
-        return Working(work, shift, observer)
+        return Working(work, shift, observer, day)
 
     def _board(self, outfit: Outfit) -> Board:
         chance = self._chance
@@ -352,9 +362,9 @@ class Simulation:
         return next(pod for pod in self.pods if board in pod.boards)
 
     @property
-    def visits(self) -> VisitObserver | None:
-        """Observer of visits to targets; None: there are none."""
-        return None if self._work is None else self._work.observer
+    def working(self) -> tuple[VisitObserver | DayObserver, ...]:
+        """Observers of automatic control, if there is one."""
+        return () if self._work is None else (self._work.observer, self._work.day)
 
     # -- the plant -------------------------------------------------------------------------
 
@@ -526,6 +536,8 @@ class Simulation:
                     self.quiet.look(going, carried, damage.rest, now)
                 if self._work is not None:
                     self._work.observer.look(self.plant, self.sun(now), now)
+                    calm = frozenset() if self.quiet is None else self.quiet.stretches
+                    self._work.day.look(self.plant, calm, self.sun(now), now)
                 if self._measured:
                     runs = self.plant is not None and not self.operator.waits
                     self.readings.look(carried, now, runs=runs)
@@ -559,7 +571,7 @@ def run(plan: RunPlan) -> RunResult:
         (pod.observer.checks for pod in simulation.pods),
         simulation.observer.checks + simulation.beams.checks + simulation.readings.checks,
     )
-    for extra in (simulation.visits, simulation.quiet):
+    for extra in (*simulation.working, simulation.quiet):
         if extra is not None:
             outcome.checks += extra.checks
     outcome.faults = simulation.faults

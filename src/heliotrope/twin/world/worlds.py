@@ -27,9 +27,12 @@ WORLDS = {
     "calibrations": "persons and beliefs change parameters, rightly or wrongly",
     "twice": "a second plant with the same keys runs for a while, on the same lines",
     "visits": "automatic control raises and calibrates the field, by photographs that may lie",
+    "day": "automatic control meets the morning's or the evening's limit of the sun, at any place",
 }
 #: Worlds with automatic control.
-WORKING = ("visits",)
+WORKING = ("visits", "day")
+#: Worlds in which site, date, hour, and places are drawn.
+DRAWN = ("place", "day")
 #: Faults in a run with automatic control come this many times more seldom: a visit takes a minute.
 _SELDOM = 4.0
 #: Name that lets each run draw its worlds: see `mixed`.
@@ -38,7 +41,7 @@ ANY = "any"
 MIX = (
     "calm", "swarm", "held", "frozen", "disk", "place", "sensors", "parameters", "calibrations",
     "twice",
-    "visits",
+    "visits", "day",
 )  # fmt: skip
 
 
@@ -61,7 +64,7 @@ def mixed(seed: int) -> tuple[str, ...]:
     share = chance.choice([0.0, 0.2, 0.5, 0.8])
     found = [name for name in MIX if chance.random() < share]
     # Automatic control of a second plant is not judged.
-    return tuple(name for name in found if name != "twice" or "visits" not in found)
+    return tuple(name for name in found if name != "twice" or not works(found))
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,11 @@ def pause_of(worlds: Sequence[str], seed: int, pause: float) -> float:
 def works(worlds: Sequence[str]) -> bool:
     """Whether automatic control runs in a run."""
     return not set(worlds).isdisjoint(WORKING)
+
+
+def drawn(worlds: Sequence[str]) -> bool:
+    """Whether site, date, hour, and places are drawn in a run."""
+    return not set(worlds).isdisjoint(DRAWN)
 
 
 def knows_boards(worlds: Sequence[str]) -> bool:

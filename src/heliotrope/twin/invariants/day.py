@@ -1,0 +1,98 @@
+"""The observer of the day: automatic control has the field at stow while the sun is low.
+
+It knows what persons have given to automatic control, and what they have done to it since, from
+these persons; the height of the sun, the boards, and which stretches are quiet (`quiet`). It shares
+no limit with the code under test (invariant 16).
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence, Set
+from math import inf, radians, sin
+
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+from heliotrope.plant.controller import PlantController
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.invariants.invariants import InvariantError, Violation
+
+#: Vertical part of the sun's direction below which the field belongs at stow: 8 degrees.
+LOW = sin(radians(8.0))
+#: Time from there, from the last person's act, and from the beginning of a quiet stretch until a
+#: mirror is on its way to stow: the sun is looked at every 30 s, the field every 2 s, s.
+AWAY_WITHIN = 45.0
+_UP = (
+    states.APPROACHING,
+    states.IDLE,
+    states.TRACKING,
+    states.SEARCHING,
+    states.DEFOCUSED,
+)
+
+
+class DayObserver:
+    """Observes that the field is at stow while the sun is low; see the module.
+
+    Parameters
+    ----------
+    start
+        Zero of the times that it reports, s.
+    boards
+        All heliostats.
+
+    Attributes
+    ----------
+    checks
+        Number of checks of each invariant.
+    """
+
+    def __init__(self, start: float, boards: Sequence[Board]) -> None:
+        self.checks: Counter[int] = Counter()
+        self._start, self._boards = start, {board.outfit.name: board for board in boards}
+        self._given: dict[str, float] = {}
+        self._calm: dict[str, float] = {}
+        self._low_at, self._acted_at = inf, -inf
+
+    def given(self, heliostats: Iterable[str], now: float) -> None:
+        """Note that a person has given heliostats to automatic control."""
+        for name in heliostats:
+            self._given.setdefault(name, now)
+
+    def taken(self, heliostats: Iterable[str]) -> None:
+        """Note that a person has moved heliostats: whose they are then is not judged."""
+        for name in heliostats:
+            self._given.pop(name, None)
+
+    def on_duty(self, now: float) -> None:
+        """Note that a person has the command authority, or asks for it."""
+        self._acted_at = now
+
+    def look(
+        self, plant: PlantController | None, quiet: Set[str], sun: FloatArray, now: float
+    ) -> None:
+        """Judge where the mirrors are.
+
+        Parameters
+        ----------
+        plant
+            None: it does not run.
+        quiet
+            Heliostats in a quiet stretch.
+        sun
+            True direction to the sun, (3,).
+        now
+            s.
+        """
+        self._low_at = min(self._low_at, now) if sun[2] < LOW else inf
+        # A new program knows nothing of what it was given, and in an emergency all is given up.
+        if plant is None or plant.emergency is not None:
+            self._given.clear()
+        self._calm = {name: self._calm.get(name, now) for name in quiet}
+        for name, given_at in self._given.items():
+            since = max(self._low_at, given_at, self._acted_at, self._calm.get(name, inf))
+            if now - since > AWAY_WITHIN:
+                state = self._boards[name].state
+                self.checks[16] += 1
+                if state in _UP:
+                    saw = f"{states.STATES[state]}, and the sun has been low for "
+                    saw += f"{now - self._low_at:.0f} s"
+                    raise InvariantError(Violation(16, now - self._start, name, saw))
