@@ -1,9 +1,13 @@
 """Security events and alarms sent on, to real receivers on loopback."""
 
 import contextlib
+import os
 import re
 import socket
+import sqlite3
 import ssl
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -11,12 +15,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from heliotrope.cli import app
 from heliotrope.errors import InputError
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.operations import Logbook, SecurityEvent, SecurityNote
 from heliotrope.plant.syslog import Receiver, Syslog
 from heliotrope.safety import alarms
+from heliotrope.store import chain
+from heliotrope.store.records import StoreError
 from support.papers import certificate
 
 PATIENCE = 60.0
@@ -215,3 +223,49 @@ def test_the_logbook_sends_alarms_on_when_they_begin_and_end() -> None:
         return sent
 
     assert run_virtual(main) == [("T1", True), ("T1", False)]
+
+
+def test_evidence_of_a_plant_at_work_shows_an_event_that_was_altered(
+    receivers: Callable[..., Heard], tmp_path: Path
+) -> None:
+    """`run` sends heads by syslog and writes them to a folder; the store is checked with both."""
+    heard, folder, data = receivers("tcp"), tmp_path / "heads", tmp_path / "data"
+    folder.mkdir()
+    words = ["run", "--heliostats", "4", "--idle", "--no-console", "--minutes", "0.05",
+             "--data", str(data), "--heads", str(folder),
+             "--syslog", f"tcp://127.0.0.1:{heard.port}"]  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", "from heliotrope.cli import main; main()", *words],
+        env={**os.environ, "HELIOTROPE_THREADS": "1"},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=600.0,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    written = chain.read_heads(folder / chain.HEADS)
+    newest = max(head.number for head in written)
+    assert newest > 0
+    until(lambda: sum(b" CHAIN_HEAD " in message for message in heard.messages) >= 4)
+    log = tmp_path / "log"
+    log.write_bytes(b"\n".join(heard.messages))
+    assert chain.read_heads(log) == written
+    command = [
+        "store",
+        "verify",
+        str(data),
+        "--head",
+        str(folder / chain.HEADS),
+        "--head",
+        str(log),
+    ]
+    good = CliRunner().invoke(app, command)
+    assert good.exit_code == 0, good.exception
+    assert "exported heads fit" in good.output
+    alter = "UPDATE event SET text = 'quiet' WHERE number = ?"
+    with contextlib.closing(sqlite3.connect(data / "store.sqlite")) as store, store:
+        assert store.execute(alter, (newest,)).rowcount == 1
+    bad = CliRunner().invoke(app, command)
+    assert isinstance(bad.exception, StoreError)
+    assert f"event {newest} " in str(bad.exception)
