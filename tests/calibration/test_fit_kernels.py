@@ -41,7 +41,8 @@ def _problem(mechanism: Mechanism) -> tuple[Any, ...]:
 @pytest.mark.parametrize("loss", [kernels.SQUARE, kernels.HUBER, kernels.CAUCHY])
 @pytest.mark.parametrize("kind", every_kind())
 def test_gradient_is_that_of_the_cost(kind: str, loss: int) -> None:
-    problem = _problem(imperfect(every_kind()[kind]))
+    mechanism = imperfect(every_kind()[kind])
+    problem = _problem(mechanism)
     size = len(problem[2])
     hessian, gradient, unused = np.empty((size, size)), np.empty(size), np.empty(size)
     scale, y = 1.7, np.random.default_rng(1).normal(0, 0.3, size)
@@ -54,7 +55,9 @@ def test_gradient_is_that_of_the_cost(kind: str, loss: int) -> None:
     steps = 1e-5 * np.eye(size)
     # The gradient is half the cost's, as the hessian.
     found = np.array([(cost(y + h) - cost(y - h)) / 4e-5 for h in steps])
-    assert gradient == pytest.approx(found, rel=1e-5, abs=1e-6)
+    # The ratio of a worm is searched, and no fit moves it: its derivative counts as 0.
+    moved = [not name.endswith("_worm_ratio") for name in mechanism.parameters]
+    assert gradient[moved] == pytest.approx(found[moved], rel=1e-5, abs=1e-6)
 
 
 @pytest.mark.parametrize("loss", [kernels.HUBER, kernels.CAUCHY])

@@ -72,7 +72,7 @@ MACHINE = Machine(
     (12.0, 0.0, 40.0),
 )
 #: The machine may be busy, s.
-PATIENCE = 60.0
+PATIENCE = 180.0
 
 
 def noon() -> Site:
