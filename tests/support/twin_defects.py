@@ -385,7 +385,7 @@ DEFECTS = (
     Defect((4,), "a cluster obeys two plants", _two_plants_obeyed, ("plant_twice",), 20.0,
            worlds=("twice", "calm"), first=3),
     Defect((12,), "new parameters are not verified", plant_defects.unverified, faults=(),
-           first=9, worlds=("visits",)),
+           first=18, worlds=("visits",)),
     Defect((12, 16), "any light on a target is the heliostat's", plant_defects.any_light, faults=(),
            first=2, worlds=("visits",)),
     Defect((16,), "the evening's stow is skipped", plant_defects.evening_skipped, faults=(),
