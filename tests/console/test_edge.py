@@ -220,7 +220,8 @@ def test_one_large_body_at_a_time(console: LiveConsole, tokens: dict[str, str]) 
 
 
 @pytest.mark.parametrize(
-    ("cookie", "origin"), [(True, "http://evil.example"), (True, None), (False, "own")]
+    ("cookie", "origin"),
+    [(True, "http://evil.example"), (True, "http://["), (True, None), (False, "own")],
 )
 def test_the_socket_of_the_page_is_for_its_own_origin(
     console: LiveConsole, cookie: bool, origin: str | None

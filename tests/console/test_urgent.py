@@ -206,3 +206,26 @@ def test_strangers_are_counted_and_people_are_not() -> None:
     assert by_token(way, "good") == [200]
     assert by_token(way, "evil", 12) == [401] * 9 + [429] * 3
     assert by_token(way, "good", 30) == [200] * 30
+
+
+@pytest.mark.parametrize(
+    ("headers", "body", "status"),
+    [
+        ({"Origin": "http://["}, b"{}", 401),
+        ({"Origin": "http://[::1", "Authorization": f"Bearer {'good' * 16}"}, b"{}", 403),
+        ({"Cookie": f"heliotrope_session={'good' * 16}"}, b'{"csrf": "\\ud800"}', 403),
+    ],
+)
+def test_text_that_cannot_be_read_is_refused_like_any_other(
+    headers: dict[str, str], body: bytes, status: int
+) -> None:
+    """An address without its bracket, and half a surrogate pair, were mistakes of the program."""
+    plant = Plant()
+
+    async def main() -> int:
+        transport = httpx.ASGITransport(app=EmergencyWay(plant.ask, ConsoleSettings()))
+        url = "http://127.0.0.1/api/v1/emergency"
+        async with httpx.AsyncClient(transport=transport, headers=headers) as client:
+            return (await client.post(url, content=body)).status_code
+
+    assert (asyncio.run(main()), plant.orders) == (status, 0)

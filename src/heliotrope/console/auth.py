@@ -13,7 +13,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Annotated, TypeVar, cast
-from urllib.parse import urlsplit
 
 from fastapi import Depends, HTTPException
 from starlette.requests import HTTPConnection
@@ -22,7 +21,7 @@ from heliotrope.console import _words
 from heliotrope.console._attempts import Attempts
 from heliotrope.console.by_proxy import ByProxy, Introduced
 from heliotrope.console.connections import FOUND
-from heliotrope.console.headers import address_of, host_known, secret_of
+from heliotrope.console.headers import address_of, host_known, parts_of, secret_of
 from heliotrope.console.live import Stream
 from heliotrope.console.people import ROLES, person_of
 from heliotrope.console.remote import RemotePeople, RemotePlant
@@ -276,7 +275,7 @@ def same_origin(console: Console, connection: HTTPConnection) -> bool:
     origin = connection.headers.get("origin")
     if origin is None:
         return True
-    there = urlsplit(origin)
+    there = parts_of(origin)
     return there.netloc == connection.headers.get("host") and host_known(
         console.settings, there.netloc
     )

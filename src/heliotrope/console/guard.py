@@ -7,7 +7,6 @@ shape that it accepts; then safe headers on every answer.
 import contextlib
 from collections.abc import Callable
 from typing import Any
-from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
@@ -27,7 +26,7 @@ from heliotrope.console.auth import (
 )
 from heliotrope.console.connections import FOUND
 from heliotrope.console.edge import Edge
-from heliotrope.console.headers import host_known
+from heliotrope.console.headers import host_known, parts_of
 from heliotrope.console.routes import FORM, READ, TINY, Found, Routes
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.plant.operations.security import SecurityEvent
@@ -173,7 +172,7 @@ class Guard:
 
 def _urgent(console: Console, scope: Scope) -> str:
     """Return the origin of the way for EMERGENCY alone, as the page reaches it."""
-    host = urlsplit(f"//{Headers(scope=scope).get('host', '')}").hostname or ""
+    host = parts_of(f"//{Headers(scope=scope).get('host', '')}").hostname or ""
     if not console.emergency_port or not host_known(console.settings, host):
         return ""
     scheme = "https" if console.settings.tls or console.settings.plain else scope["scheme"]

@@ -1,6 +1,7 @@
 """What the headers of a request say: to whom it goes, where it comes from, and whose it is."""
 
 import ipaddress
+from urllib.parse import SplitResult, urlsplit
 
 from starlette.requests import HTTPConnection
 
@@ -17,6 +18,14 @@ def host_known(settings: ConsoleSettings, netloc: str) -> bool:
     """Whether a request names this machine by a known name."""
     host = netloc.rpartition(":")[0] if netloc.rpartition(":")[2].isdigit() else netloc
     return host.lower() in settings.hosts
+
+
+def parts_of(url: str) -> SplitResult:
+    """Return the parts of a URL that a caller wrote; they are empty where it is none."""
+    try:
+        return urlsplit(url)
+    except ValueError:  # as http://[
+        return urlsplit("")
 
 
 def address_of(settings: ConsoleSettings, connection: HTTPConnection) -> str:

@@ -12,7 +12,6 @@ import math
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any
-from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
@@ -28,6 +27,7 @@ from heliotrope.console.headers import (
     address_of,
     host_known,
     network_of,
+    parts_of,
     secret_of,
 )
 from heliotrope.console.settings import ConsoleSettings
@@ -156,7 +156,7 @@ class EmergencyWay:
 
     def _from_page(self, origin: str, host: str) -> bool:
         """Whether an origin is the page of this console, at the name that the request names."""
-        there, here = urlsplit(origin), urlsplit(f"//{host}")
+        there, here = parts_of(origin), parts_of(f"//{host}")
         try:
             port, name = there.port, there.hostname
         except ValueError:
