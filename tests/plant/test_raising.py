@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +11,20 @@ from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.operations import Logbook
+from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.raising import Raising
-from support.plant_bench import ENGINEER, Bench, running
+from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
+#: The sun stands at 5°: below the limit of automatic control, above that of the safety table.
+DUSK = datetime(2026, 6, 21, 15, 10, tzinfo=UTC)
 NAME, OTHER = "P1A", "P2A"
 READY = 1 << meanings.FLAGS.index("READY")
 
 
-def play(folder: Path, scene: Callable[[Bench], Awaitable[None]]) -> None:
+def play(
+    folder: Path, scene: Callable[[Bench], Awaitable[None]], start: datetime | None = None
+) -> None:
     async def main(clock: VirtualClock) -> None:
         bench = Bench(clock, folder)
         for cluster in bench.clusters.values():
@@ -28,7 +34,7 @@ def play(folder: Path, scene: Callable[[Bench], Awaitable[None]]) -> None:
             await bench.wait(2.0)
             await scene(bench)
 
-    run_virtual(main)
+    run_virtual(main, **({} if start is None else {"start": start}))
 
 
 def test_a_mirror_that_a_visit_locks_is_not_lost(tmp_path: Path) -> None:
@@ -103,3 +109,38 @@ def test_who_is_stowed_while_its_aim_is_on_its_way_is_not_sent_to_the_receiver(
         assert OTHER not in sent
 
     play(tmp_path, scene)
+
+
+def test_what_is_found_up_at_dusk_is_stowed_unless_a_person_commands(tmp_path: Path) -> None:
+    """The evening's stow may miss one that was not heard, or that was given back afterwards."""
+
+    async def scene(bench: Bench) -> None:
+        for cluster in bench.clusters.values():
+            cluster.set(states.STOWED)
+        control = AutomaticControl(
+            bench.plant,
+            Logbook(bench.clock),
+            None,
+            scheduler=None,
+            records=None,
+            truth=None,
+            settings=AutomaticSettings(wanted=True),
+        )
+        running = asyncio.create_task(control.run())
+        await bench.wait(10.0)  # the evening's stow finds nobody up
+        late = bench.cluster_of(NAME)
+        late.set(states.DEFOCUSED, NAME)
+        await bench.until(lambda: bench.count(states.DEFOCUSED) == 0, 40.0)
+        control.give_way()
+        token = await bench.commanded()
+        late.set(states.DEFOCUSED, NAME)
+        for _ in range(60):
+            bench.plant.authority.keep(OPERATOR, token)
+            await bench.wait(1.0)
+        assert bench.count(states.DEFOCUSED) == 1
+        bench.plant.release_authority(OPERATOR, token)
+        await bench.until(lambda: bench.count(states.DEFOCUSED) == 0, 40.0)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    play(tmp_path, scene, start=DUSK)

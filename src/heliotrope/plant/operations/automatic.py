@@ -321,25 +321,33 @@ class AutomaticControl:
         self._night()
 
     def _night(self) -> None:
-        """Stow the wanted heliostats before the sun is low."""
+        """Stow the wanted heliostats before the sun is low, and any found up afterwards."""
         now = self._plant.now()
         if now - self._sun_at < _SUN_EVERY:
             return
         self._sun_at = now
         elevation = math.asin(float(np.clip(self._plant.sun_vector()[2], -1.0, 1.0)))
         lowest = self._settings.lowest
-        if self._day and elevation < lowest:
-            self._day = False
-            up = self._plant.field.among(_UP, now) & self._raising.wanted
-            if up.any():
-                names = tuple(self._plant.field.names[row] for row in np.flatnonzero(up))
-                self._losses.ordered(np.flatnonzero(up))
-                self._plant.stow(AUTOMATIC.name, names)
-            text = f"the sun is low: {int(up.sum())} heliostats go to stow"
-            self._log.event("plant", AUTOMATIC.name, text)
+        if elevation < lowest:
+            falls, self._day = self._day, False
+            # One that was not heard then, or was given back since, is stowed when it is seen; not
+            # while a person has the command authority.
+            if falls or self._plant.authority.grant is None or self._has_authority():
+                self._stow_up(told=falls)
         elif not self._day and elevation > lowest + math.radians(1.0):
             self._day = True
             self._log.event("plant", AUTOMATIC.name, "the sun is high enough")
+
+    def _stow_up(self, *, told: bool) -> None:
+        """Stow the wanted heliostats that are up; with ``told`` say so even if there are none."""
+        up = self._plant.field.among(_UP, self._plant.now()) & self._raising.wanted
+        if up.any():
+            names = tuple(self._plant.field.names[row] for row in np.flatnonzero(up))
+            self._losses.ordered(np.flatnonzero(up))
+            self._plant.stow(AUTOMATIC.name, names)
+        if told or up.any():
+            text = f"the sun is low: {int(up.sum())} heliostats go to stow"
+            self._log.event("plant", AUTOMATIC.name, text)
 
     # -- parts of the work -----------------------------------------------------------------
 
