@@ -1,0 +1,368 @@
+"""Changes of a plant file by name: the values of one heliostat, target or receiver.
+
+The changed file is checked as a whole before it takes the place of the old one, which is kept: each
+stored version is a folder that holds a plant file and its table, as they were. Comments, and the
+cells of all other heliostats, stay as they are.
+"""
+
+import getpass
+import io
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+
+from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.field.formats._plant_surfaces import RENAMED, set_surface, surface_values
+from heliotrope.field.formats.plant_file import check_plant, read_plant
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.files import read_parquet, read_text, write_file, write_text
+from heliotrope.files.documents import read_toml
+
+#: Smaller units that a value may be given in, by the unit of its column, and their size there.
+_SMALLER = {"rad": {"mrad": 1e-3, "deg": np.pi / 180.0}, "m": {"mm": 1e-3}}
+_TEXTS = ("cluster", "group")
+_NOTE = "change.txt"
+#: A parameter beyond this many standard deviations of its prior gets a warning.
+_STRANGE = 5.0
+
+
+@dataclass(frozen=True)
+class Change:
+    """A value that changes: its name, the old text and the new one, and the unit."""
+
+    name: str
+    old: str
+    new: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class Edited:
+    """A changed plant file.
+
+    Attributes
+    ----------
+    changes
+        The values that changed.
+    warnings
+        Of the changed file, those that the old one had not.
+    version
+        Stored version of the file as it was before; "" if nothing was written.
+    """
+
+    changes: tuple[Change, ...]
+    warnings: tuple[str, ...]
+    version: str = ""
+
+
+@dataclass(frozen=True)
+class Version:
+    """A stored version of a plant file: its name (the time, UTC), and the change that ended it."""
+
+    name: str
+    note: str
+
+
+def values(path: str | Path, who: str) -> dict[str, str]:
+    """Return the values of a heliostat, a target or a receiver that can be set, by name.
+
+    Raises
+    ------
+    FormatError
+        If the file cannot be used.
+    UnknownNameError
+        If nothing has this name.
+    """
+    return _Files(Path(path)).values(who)
+
+
+def edit(
+    path: str | Path,
+    who: str,
+    given: Mapping[str, str],
+    *,
+    note: str = "",
+    now: datetime | None = None,
+    dry: bool = False,
+) -> Edited:
+    """Change values of one heliostat, target or receiver, and keep the file as it was.
+
+    Parameters
+    ----------
+    path
+        Plant file (TOML).
+    who
+        Name of the heliostat, target or receiver.
+    given
+        Texts by the names of `values`; an angle may be given in ``_mrad`` or ``_deg``, and a length
+        in ``_mm``, where the name ends in ``_rad`` or ``_m``.
+    note
+        Reason, kept with the stored version.
+    now
+        The time; default the clock's.
+    dry
+        Check, but write nothing.
+
+    Raises
+    ------
+    FormatError
+        If the file, or the changed file, cannot be used.
+    InputError
+        Values that do not fit, or nothing that changes.
+    """
+    files = _Files(Path(path))
+    before, surface = files.values(who), who not in files.plant.names
+    warned = {finding.text for finding in check_plant(files.place)}
+    strange = files.set(who, given)
+    after = files.values(given[RENAMED].strip() if surface and RENAMED in given else who)
+    shown = [
+        Change(name, before.get(name, ""), after.get(name, ""), _unit(name))
+        for name in dict.fromkeys((*before, *after))
+        if before.get(name, "") != after.get(name, "")
+    ]
+    if not shown:
+        raise InputError(f"{who}: it has these values already; nothing was changed")
+    with files.trial() as found:
+        new = tuple(text for text in found if text not in warned)
+    if dry:
+        return Edited(tuple(shown), (*strange, *new))
+    said = "; ".join(f"{c.name} {c.old or 'none'} -> {c.new or 'none'}" for c in shown)
+    version = _keep(files.place, files.table, f"{who}: {said}", note, now)
+    files.write(files.place.parent)
+    return Edited(tuple(shown), (*strange, *new), version)
+
+
+def versions(path: str | Path) -> list[Version]:
+    """Return the stored versions of a plant file, oldest first."""
+    found = []
+    folder = _versions(Path(path))
+    for place in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if (place / Path(path).name).is_file():
+            file = place / _NOTE
+            text = read_text(file, "a note") if file.is_file() else ""
+            found.append(Version(place.name, text.strip()))
+    return found
+
+
+def restore(path: str | Path, version: str, *, note: str = "", now: datetime | None = None) -> str:
+    """Bring back a stored version; return that of the file as it was before.
+
+    Raises
+    ------
+    FormatError
+        If the stored file cannot be used.
+    UnknownNameError
+        If there is no such version.
+    """
+    here = Path(path)
+    known = [each.name for each in versions(here)]
+    if version not in known:
+        raise UnknownNameError("stored version", version, known)
+    old = _Files(_versions(here) / version / here.name)
+    # The present file may be the one that cannot be read.
+    kept = _keep(here, old.table, f"version {version} was brought back", note, now)
+    _copy(old.place.parent, here.parent, old.table)
+    _copy(old.place.parent, here.parent, here.name)
+    return kept
+
+
+def _copy(source: Path, home: Path, part: PurePath | str) -> None:
+    content = (source / part).read_bytes()
+    (home / part).parent.mkdir(parents=True, exist_ok=True)
+    write_file(home / part, lambda stream: stream.write(content))
+
+
+class _Files:
+    """The text of a plant file and the cells of its table, to be changed and written."""
+
+    def __init__(self, place: Path) -> None:
+        import tomlkit
+
+        self.plant = read_plant(place)
+        self.place = place
+        self.text = read_text(place, "a plant file")
+        self.document: Any = tomlkit.parse(self.text)
+        self.table = PurePath(str(read_toml(place, "a plant file")["heliostats"]))
+        if self.table.is_absolute() or ".." in self.table.parts:
+            raise FormatError(
+                place, f"{self.table} lies elsewhere; keep it beside the plant file", "heliostats"
+            )
+        self.cells = _read_cells(place.parent / self.table)
+
+    # -- values ----------------------------------------------------------------------------
+
+    def values(self, who: str) -> dict[str, str]:
+        if who in self.plant.names:
+            row = self.cells.loc[self._row(who)]
+            texts = {str(name): str(row[name]) for name in self.cells.columns if name != "name"}
+            return {name: text for name, text in texts.items() if text not in ("", "nan")}
+        return surface_values(self._surface(who))
+
+    def _row(self, who: str) -> int:
+        return int(np.flatnonzero(self.cells["name"].astype(str) == who)[0])
+
+    def _surface(self, who: str) -> Any:
+        tables = [*self.document.get("targets", ()), *self.document.get("receivers", ())]
+        for table in tables:
+            if table["name"] == who:
+                return table
+        names = [*(str(table["name"]) for table in tables), *self.plant.names]
+        raise UnknownNameError("heliostat, target or receiver", who, names)
+
+    # -- changes ---------------------------------------------------------------------------
+
+    def set(self, who: str, given: Mapping[str, str]) -> tuple[str, ...]:
+        """Set values; return warnings."""
+        if who not in self.plant.names:
+            said = set_surface(self._surface(who), given)
+            if RENAMED in given:
+                self._rename(who, given[RENAMED].strip())
+            return said
+        warnings = []
+        for name, text in given.items():
+            column, factor = self._column(who, name)
+            if column in _TEXTS:
+                self.cells.loc[self._row(who), column] = text.strip()
+                continue
+            try:
+                value = float(text) * factor
+            except ValueError:
+                raise InputError(f"{who}: {name}={text}: give a number") from None
+            self._fill(who, column)
+            cell = value if self.table.suffix == ".parquet" else repr(float(value))
+            self.cells.loc[self._row(who), column] = cell
+            warnings += self._strange(who, column, value)
+        return tuple(warnings)
+
+    def _column(self, who: str, name: str) -> tuple[str, float]:
+        """Return the column that a name means, and its unit in that of the column."""
+        group, _ = self.plant.find(who)
+        known = dict.fromkeys((*map(str, self.cells.columns), *_TEXTS, *_parameters(group)))
+        known.pop("name")
+        for stem, factor in _readings(name):
+            for column in (stem, f"parameters.{stem}"):
+                if column in known:
+                    return column, factor
+        raise UnknownNameError(f"value of heliostat {who}", name, known)
+
+    def _fill(self, who: str, column: str) -> None:
+        """Give the other heliostats of the group the nominal value of a new column."""
+        group, _ = self.plant.find(who)
+        if column not in self.cells.columns:
+            self.cells[column] = np.nan if self.table.suffix == ".parquet" else ""
+        mine = self.cells["name"].astype(str).isin(group.names)
+        empty = self.cells[column].isin(["", "nan"]) | self.cells[column].isna()
+        if column.startswith("parameters.") and (empty & mine).any():
+            zero = 0.0 if self.table.suffix == ".parquet" else "0.0"
+            self.cells.loc[empty & mine, column] = zero
+
+    def _strange(self, who: str, column: str, value: float) -> list[str]:
+        group, _ = self.plant.find(who)
+        prior = {name: sigma for name, (sigma, _) in _parameters(group).items()}.get(column)
+        if not prior or abs(value) <= _STRANGE * prior:
+            return []
+        times = f"{value:g} is {abs(value) / prior:.0f} times what installations leave"
+        return [f"{who}: {column} {times} (σ {prior:g}); is it in another unit?"]
+
+    def _rename(self, old: str, new: str) -> None:
+        for camera in self.document.get("cameras", ()):
+            names = camera.get("targets", [])
+            for place, name in enumerate(names):
+                if name == old:
+                    names[place] = new
+
+    # -- files -----------------------------------------------------------------------------
+
+    @contextmanager
+    def trial(self) -> Iterator[list[str]]:
+        """Check the changed file as a whole; yield its warnings."""
+        with tempfile.TemporaryDirectory(dir=self.place.parent, prefix=".plant-") as folder:
+            self.write(Path(folder))
+            findings = check_plant(Path(folder) / self.place.name)
+        texts = [each.text.replace(f"{folder}/", f"{self.place.parent}/") for each in findings]
+        for finding, text in zip(findings, texts, strict=True):
+            if finding.severity == "error":
+                raise InputError(f"{text} (nothing was changed)")
+        yield texts
+
+    def write(self, home: Path) -> None:
+        """Write table and TOML, the table first: a reader never sees half a file."""
+        import tomlkit
+
+        table = home / self.table
+        table.parent.mkdir(parents=True, exist_ok=True)
+        if table.suffix == ".parquet":
+            write_file(table, lambda stream: self.cells.to_parquet(stream, index=False))
+        else:
+            text = io.StringIO()
+            self.cells.to_csv(text, index=False, lineterminator="\n")
+            write_text(table, text.getvalue())
+        write_text(home / self.place.name, tomlkit.dumps(self.document))
+
+
+def _read_cells(path: Path) -> Any:
+    """Return the table; cells of a CSV file as they stand there."""
+    import pandas as pd
+
+    if path.suffix == ".parquet":
+        return pd.DataFrame(read_parquet(path, "the table of heliostats").columns)
+    text = io.StringIO(read_text(path, "the table of heliostats"))
+    return pd.read_csv(text, dtype=str, keep_default_na=False, na_filter=False)
+
+
+def _parameters(group: Heliostats) -> dict[str, tuple[float, str]]:
+    """Return the columns of a group's parameters: standard deviation of the prior, and unit."""
+    known = [group.mechanism.parameter(name) for name in group.mechanism.parameters]
+    return {
+        f"parameters.{one.name}" + ("" if one.unit == "1" else f"_{one.unit}"): (
+            one.prior,
+            one.unit,
+        )
+        for one in known
+    }
+
+
+def _readings(name: str) -> Iterator[tuple[str, float]]:
+    """Yield a name as it stands, and with its smaller unit replaced by that of the file."""
+    yield name, 1.0
+    for unit, smaller in _SMALLER.items():
+        for short, size in smaller.items():
+            if name.endswith(f"_{short}"):
+                yield name.removesuffix(short) + unit, size
+
+
+def _unit(name: str) -> str:
+    stem = name.partition(".")[0] if name.startswith(("corners_m", "markers_m")) else name
+    unit = stem.rpartition("_")[2]
+    return unit if unit in ("m", "deg", "mrad", "rad") else ""
+
+
+def _versions(path: Path) -> Path:
+    return path.with_name(f"{path.stem}.versions")
+
+
+def _keep(place: Path, table: PurePath, change: str, note: str, now: datetime | None) -> str:
+    """Store the files as they are on the disk; return the name of the version."""
+    at = (now or datetime.now(UTC)).astimezone(UTC)
+    stem, home = at.strftime("%Y-%m-%dT%H%M%SZ"), _versions(place)
+    taken = [each.name for each in home.iterdir()] if home.is_dir() else []
+    name = next(n for n in (stem, *(f"{stem}-{k}" for k in range(2, 1000))) if n not in taken)
+    for part in (table, place.name):
+        if (place.parent / part).is_file():
+            _copy(place.parent, home / name, part)
+    said = f"until {at:%Y-%m-%d %H:%M:%S} UTC, {_person()}: {change}"
+    write_text(home / name / _NOTE, f"{said}{f' ({note})' if note else ''}\n")
+    return name
+
+
+def _person() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return "unknown"
