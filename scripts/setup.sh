@@ -24,7 +24,7 @@ fi
 
 [ -x "$VENV/bin/python" ] || "$PYTHON" -m venv "$VENV"
 echo "setup: installing into $VENV"
-quiet() { "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --no-input --no-compile "$@"; }
+quiet() { "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --no-input "$@"; }
 # Every file is compared with requirements.lock. Where a mirror builds its own files, say HASHES=no.
 case "${HASHES:-yes}" in
   yes) pinned=(--require-hashes --no-deps --requirement requirements.lock) ;;
@@ -32,10 +32,14 @@ case "${HASHES:-yes}" in
   *) fail "HASHES=$HASHES; say yes or no" ;;
 esac
 # uv does in seconds what takes pip minutes; where its index is not to be had, pip does it.
+# Modules are compiled here once: where Python may not write beside them, as under the units of
+# docs/how-to/deploy.md, each start would compile them all again.
+uv=("$VENV/bin/uv" pip install --quiet --compile-bytecode --python "$VENV/bin/python")
 { echo "# uv alone"; awk '/^[^ #]/ { on = /^uv==/ } on' "${pinned[-1]}"; } >"$VENV/uv.lock"
 quiet "${pinned[@]:0:${#pinned[@]}-1}" "$VENV/uv.lock" || echo "setup: no uv; pip takes some minutes"
-"$VENV/bin/uv" pip install --quiet --python "$VENV/bin/python" "${pinned[@]}" ||
+"${uv[@]}" "${pinned[@]}" ||
   quiet "${pinned[@]}" ||
   fail "packages could not be installed; where a file differs from requirements.lock, do not use it"
-"$VENV/bin/uv" pip install --quiet --python "$VENV/bin/python" --constraint constraints.txt --editable ".[dev]" ||
+"${uv[@]}" --constraint constraints.txt --editable ".[dev]" ||
   quiet --constraint constraints.txt --editable ".[dev]"
+"$VENV/bin/python" -m compileall -q src || true
