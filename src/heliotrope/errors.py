@@ -17,6 +17,22 @@ never an exception.
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+#: Longest value in an error, in characters.
+_LONGEST = 60
+
+
+def shown(value: object) -> str:
+    """Return a value as an error shows it: in one line, and not too long."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+
+
+def kind_of(value: object) -> str:
+    """Return the type of a value as an error names it: "a heliotrope Plant", "a pvlib Location"."""
+    package, name = type(value).__module__.partition(".")[0], type(value).__name__
+    text = name if package == "builtins" else f"{package} {name}"
+    return f"{'an' if text[0].lower() in 'aeiou' else 'a'} {text}"
+
 
 class HeliotropeError(Exception):
     """Root of everything that Heliotrope raises on purpose."""

@@ -5,16 +5,19 @@ from north in [0, 2π), elevation above the horizon. Arrays carry their batch ax
 first and the vector last, ``(..., 3)``.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import InputError
+from heliotrope.errors import InputError, shown
 
 FloatArray = npt.NDArray[np.float64]
 
 TAU = 2.0 * np.pi
+#: Largest angle of an argument, rad: four turns, because degrees are mostly larger.
+MOST_TURNS = 4.0 * TAU
 #: One milliradian, so that tolerances can be written as ``0.01 * MRAD``.
 MRAD = 1e-3
 
@@ -22,6 +25,61 @@ MRAD = 1e-3
 def as_float(value: npt.ArrayLike) -> FloatArray:
     """Return ``value`` as a float64 array without copying one that already is."""
     return np.asarray(value, dtype=np.float64)
+
+
+def as_numbers(
+    value: npt.ArrayLike,
+    name: str,
+    low: float = -np.inf,
+    high: float = np.inf,
+    unit: str = "",
+    advice: str = "",
+) -> FloatArray:
+    """Return ``value`` as an array of numbers that lie within ``low`` and ``high``.
+
+    A number may be infinite only where a limit is; NaN never passes.
+
+    Parameters
+    ----------
+    value
+        Of any shape.
+    name, unit
+        Name and unit of the value in the error.
+    low, high
+        Limits, in the unit.
+    advice
+        What to do, for the error.
+
+    Raises
+    ------
+    InputError
+        If it is not an array of numbers, or a number is not within the limits.
+    """
+    try:
+        array = as_float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: {shown(value)} is not an array of numbers") from None
+    wrong = ~((array >= low) & (array <= high))
+    if wrong.any():
+        where = tuple(int(i) for i in np.argwhere(wrong)[0])
+        place = f"{name}{list(where)}" if where else name
+        if np.isnan(array[where]):
+            raise InputError(f"{place}: nan is not a number; give a number")
+        number = f"{array[where]:.6g} {unit}".strip()
+        limits = f"{low:.6g} to {high:.6g} {unit}".strip()
+        raise InputError(f"{place}: {number} is not within {limits}; {advice or 'change it'}")
+    return array
+
+
+def as_angles(value: npt.ArrayLike, name: str, limit: float) -> FloatArray:
+    """Return ``value`` as angles in radians of at most ``limit``; degrees are mostly larger.
+
+    Raises
+    ------
+    InputError
+        If it is not an array of numbers, or a number is larger or not finite.
+    """
+    return as_numbers(value, name, -limit, limit, "rad", "degrees need numpy.radians")
 
 
 def as_vectors(value: npt.ArrayLike, name: str) -> FloatArray:
@@ -35,7 +93,7 @@ def as_vectors(value: npt.ArrayLike, name: str) -> FloatArray:
     try:
         array = as_float(value)
     except (TypeError, ValueError):
-        raise InputError(f"{name}: {value!r} is not an array of numbers") from None
+        raise InputError(f"{name}: {shown(value)} is not an array of numbers") from None
     if array.ndim == 0 or array.shape[-1] != 3:
         raise InputError(f"{name}: shape {array.shape}; the last axis must have 3 numbers")
     if not np.isfinite(array).all():
@@ -52,11 +110,27 @@ def common_shape(**arrays: FloatArray) -> tuple[int, ...]:
     InputError
         If the shapes do not broadcast together.
     """
+    return common_batch({name: array.shape for name, array in arrays.items()})
+
+
+def common_batch(shapes: Mapping[str, tuple[int, ...]]) -> tuple[int, ...]:
+    """Return the shape that batches of these shapes broadcast to.
+
+    Raises
+    ------
+    InputError
+        If they do not broadcast together; it names one of each shape.
+    """
     try:
-        return np.broadcast_shapes(*(a.shape for a in arrays.values()))
+        return np.broadcast_shapes(*shapes.values())
     except ValueError:
-        shapes = ", ".join(f"{name} {a.shape}" for name, a in arrays.items() if a.ndim)
-        raise InputError(f"shapes do not broadcast together: {shapes}") from None
+        first: dict[tuple[int, ...], str] = {}
+        for name, shape in shapes.items():
+            first.setdefault(shape, name)
+        listed = ", ".join(f"{name} {shape}" for shape, name in first.items() if shape)
+        raise InputError(
+            f"shapes do not broadcast together: {listed}; give one of each, or equally many"
+        ) from None
 
 
 def normalize(vectors: npt.ArrayLike, name: str = "vector") -> FloatArray:
@@ -118,8 +192,18 @@ def rotation(axis: npt.ArrayLike, angle: npt.ArrayLike) -> FloatArray:
 
 
 def direction(azimuth: npt.ArrayLike, elevation: npt.ArrayLike) -> FloatArray:
-    """Return unit vectors (..., 3) in ENU from azimuth and elevation in radians."""
-    az, el = np.broadcast_arrays(as_float(azimuth), as_float(elevation))
+    """Return unit vectors (..., 3) in ENU from azimuth and elevation in radians.
+
+    Raises
+    ------
+    InputError
+        If the azimuth is not within four turns, or the elevation not within −π/2 to π/2.
+    """
+    az = as_angles(azimuth, "azimuth", MOST_TURNS)
+    # A rounding beyond the zenith is the zenith.
+    el = as_angles(elevation, "elevation", 0.5 * np.pi + 1e-9)
+    common_shape(azimuth=az, elevation=el)
+    az, el = np.broadcast_arrays(az, el)
     cos_el = np.cos(el)
     return np.stack([cos_el * np.sin(az), cos_el * np.cos(az), np.sin(el)], axis=-1)
 
@@ -203,6 +287,17 @@ def tangent_axes(normals: npt.ArrayLike) -> FloatArray:
     return np.stack([first, np.cross(first, n)], axis=-2)
 
 
+def _check_origin(origin: tuple[float, float, float]) -> None:
+    values = as_numbers(origin, "origin")
+    if values.shape != (3,):
+        raise InputError(
+            f"origin: {shown(origin)} is not latitude, longitude and height; give two angles in "
+            "degrees and metres"
+        )
+    as_numbers(values[0], "origin: latitude", -90.0, 90.0, "°")
+    as_numbers(values[1], "origin: longitude", -360.0, 360.0, "°")
+
+
 def geodetic_to_enu(
     latitude_deg: npt.ArrayLike,
     longitude_deg: npt.ArrayLike,
@@ -216,6 +311,7 @@ def geodetic_to_enu(
     """
     import pymap3d
 
+    _check_origin(origin)
     lat, lon, up = np.broadcast_arrays(
         as_float(latitude_deg), as_float(longitude_deg), as_float(height)
     )
@@ -229,6 +325,7 @@ def enu_to_geodetic(
     """Return latitude and longitude in degrees and height in metres of ENU points (..., 3)."""
     import pymap3d
 
-    p = as_float(points)
+    _check_origin(origin)
+    p = as_vectors(points, "points")
     lat, lon, height = pymap3d.enu2geodetic(p[..., 0], p[..., 1], p[..., 2], *origin)
     return as_float(lat), as_float(lon), as_float(height)

@@ -195,7 +195,7 @@ def test_guards(change: dict, text: str) -> None:
         ({"source": [[0.0, 0.0, 0.0]]}, "source: .*length 0"),
         ({"destination": [[np.inf, 0.0, 0.0]]}, "sighting 0: destination"),
         ({"sigma": 0.0}, "sigma 0.0 rad must be above 0"),
-        ({"heliostat": [-1]}, "row is below 0"),
+        ({"heliostat": [-1]}, "heliostat -1 is not a row"),
     ],
 )
 def test_sighting_guards(change: dict, text: str) -> None:

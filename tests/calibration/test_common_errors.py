@@ -73,8 +73,8 @@ def errors(found: FieldFit, true: Mechanism) -> tuple[FloatArray, FloatArray]:
         np.arange(COUNT),
         counts,
         *(place.vertex + 1e6 * place.normal,) * 2,
-        sigma=2.0,
     )
+    seen = replace(seen, sigma=np.full(COUNT, 2.0))
     # With σ of one radian of the normal, whitened residuals are radians.
     lines = linearise(model, seen, found.names)
     spread = lines.jacobian @ found.covariance @ np.swapaxes(lines.jacobian, -1, -2)

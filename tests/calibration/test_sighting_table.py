@@ -97,7 +97,7 @@ def _awkward(drives: int = 2) -> tuple[Sightings, tuple[str, ...]]:
         time=time,
         source_at_infinity=far[:, 0],
         destination_at_infinity=far[:, 1],
-        sigma=10.0 ** rng.uniform(-7, 0, rows),
+        sigma=10.0 ** rng.uniform(-7, -1, rows),
         source_covariance=spread[0],
         destination_covariance=spread[1],
     )
@@ -157,7 +157,7 @@ def test_parts_keep_their_covariances() -> None:
     _same(join([seen.take(np.arange(9)), seen.take(np.arange(9, len(seen)))]), seen)
     with pytest.raises(InputError, match=r"with \[1, 2\] drives"):
         join([seen, _awkward(1)[0]])
-    with pytest.raises(InputError, match="no drives"):
+    with pytest.raises(InputError, match="0 parts"):
         join([])
 
 
@@ -369,6 +369,7 @@ BAD: list[tuple[str, int, str, str]] = [
     ("far away", 9, "400000", "column destination_east: 400000 m is more than 50 km from the"),
     ("sigma 0", 13, "0", "column sigma_mrad: 0 mrad must be above 0"),
     ("sigma below", 13, "-1", "column sigma_mrad: -1 mrad must be above 0"),
+    ("wide sigma", 13, "500", "column sigma_mrad: 500 mrad must be at most 0.2 rad"),
     ("no sigma", 13, "", "column sigma_mrad: the cell is empty; give the ray's standard"),
     ("half a covariance", 15, "", "column destination_cov_en: the cell is empty; give m² of a"),
     ("no variance", 14, "-1e-4", "column destination_cov_ee to destination_cov_uu: [-0.0001, "),

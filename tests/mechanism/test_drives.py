@@ -121,14 +121,14 @@ def test_slope_is_the_derivative(kind: str) -> None:
         (lambda: drives.rotary(200, 10, speed=0), "speed must be above 0"),
         (lambda: drives.rotary(200, 10, scale=-1), "stand still"),
         (lambda: drives.rotary(200, 10, worm_cos=0.1, worm_ratio=40), "backwards"),
-        (lambda: drives.rotary(200, 10, bias=np.nan), "NaN"),
+        (lambda: drives.rotary(200, 10, bias=np.nan), "bias: nan is not a number"),
         (lambda: drives.rotary(200, 10, colour=3), "there is no 'colour'"),
         (lambda: drives.linear_paint(0, 0.08, 0.34, 0.32, 0), "must not be 0"),
         (lambda: drives.linear_paint(1e5, 0.9, 0.34, 0.32, 0), "do not form a triangle"),
         (lambda: drives.linear_paint(1e5, 0.01, 0.34, 0.32, 0), "do not form a triangle"),
         (lambda: drives.linear_guo(0.3, 0.3, 0.5, 0.7, 1e-5), r"do not form a triangle"),
         (lambda: drives.direct(rate=0.0), "is 0 or infinite"),
-        (lambda: drives.direct().angles(np.nan), "counts hold NaN"),
+        (lambda: drives.direct().angles(np.nan), "counts: nan is not a number"),
     ],
 )
 def test_guards(make, text: str) -> None:  # type: ignore[no-untyped-def]

@@ -6,12 +6,14 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration.fit.estimator import check_rows
 from heliotrope.calibration.fit.residuals import frame
 from heliotrope.calibration.paint_splits import KINDS, paint_split
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
-from heliotrope.geometry import FloatArray, angle_between, bisector, reflect
+from heliotrope.geometry import FloatArray, angle_between, as_numbers, bisector, reflect
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.values import Value
 
 Split = Literal[
     "random",
@@ -27,8 +29,8 @@ Split = Literal[
 NEIGHBOURHOOD = 0.1
 
 
-@dataclass(frozen=True)
-class BeamErrors:
+@dataclass(frozen=True, eq=False)
+class BeamErrors(Value):
     """Errors of M sightings under a mechanism.
 
     Attributes
@@ -52,7 +54,14 @@ class BeamErrors:
 
 
 def beam_errors(mechanism: Mechanism, sightings: Sightings) -> BeamErrors:
-    """Return the errors of sightings under mechanisms of batch shape (N,)."""
+    """Return the errors of sightings under mechanisms of batch shape (N,).
+
+    Raises
+    ------
+    InputError
+        If a sighting is of a heliostat that is not there.
+    """
+    check_rows(mechanism, sightings)
     pose = mechanism[sightings.heliostat].pose(sightings.counts)
     source, way = ray_directions(sightings, pose.vertex)
     ray = reflect(source, pose.normal)
@@ -139,7 +148,7 @@ def check_fraction(fraction: float) -> None:
     InputError
         If it does not lie between 0 and 1.
     """
-    if not 0.0 < fraction < 1.0:
+    if not 0.0 < as_numbers(fraction, "fraction") < 1.0:
         raise InputError(f"fraction {fraction}: it must lie between 0 and 1")
 
 

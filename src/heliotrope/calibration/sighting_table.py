@@ -14,7 +14,13 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.sightings import Sightings, camera_target, is_covariance, sightings
+from heliotrope.calibration.sightings import (
+    LARGEST_SIGMA,
+    Sightings,
+    camera_target,
+    is_covariance,
+    sightings,
+)
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.field.target import Target
 from heliotrope.files.cells import (
@@ -300,6 +306,7 @@ def _sigma(rows: Rows) -> FloatArray:
     # Division rounds once; 1e-3 itself is not exact in binary.
     sigma = given if unit == "rad" else given / 1e3
     rows.check(name, ~(sigma > 0.0) & np.isfinite(sigma), given, f" {unit} must be above 0")
+    rows.check(name, sigma > LARGEST_SIGMA, given, f" {unit} must be at most {LARGEST_SIGMA} rad")
     return sigma
 
 

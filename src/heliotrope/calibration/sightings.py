@@ -12,18 +12,21 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import InputError
+from heliotrope.errors import InputError, kind_of
 from heliotrope.field.formats.measurements import Measurements
 from heliotrope.field.heliostats import Heliostats
-from heliotrope.geometry import FloatArray, as_float, normalize
+from heliotrope.geometry import FloatArray, as_float, as_numbers, normalize
 from heliotrope.sun import Times, unix_seconds
+from heliotrope.values import Value
 
+#: Largest standard deviation of a ray, rad: milliradians and degrees are mostly larger.
+LARGEST_SIGMA = 0.2
 #: Largest deviation from 1 of the length of a normalised vector: a few roundings.
 _UNIT = 2e-15
 
 
-@dataclass(frozen=True)
-class Sightings:
+@dataclass(frozen=True, eq=False)
+class Sightings(Value):
     """M sightings of N heliostats.
 
     Attributes
@@ -113,20 +116,22 @@ def sightings(
         If a value is not finite, a direction is zero, sigma is not above 0, or a
         covariance is not symmetric and positive semidefinite; the text names the row.
     """
-    table = np.atleast_2d(as_float(counts))
+    table = np.atleast_2d(_numbers(counts, "counts"))
+    if table.ndim != 2:
+        raise InputError(f"counts: shape {table.shape}; give the drives of M sightings, (M, D)")
     rows = len(table)
 
-    def spread(values: npt.ArrayLike, dtype: npt.DTypeLike) -> np.ndarray:
-        return np.array(np.broadcast_to(np.asarray(values, dtype=dtype), (rows,)))
+    def spread(values: npt.ArrayLike, name: str, dtype: npt.DTypeLike = np.float64) -> np.ndarray:
+        return np.array(_rows(_numbers(values, name), (rows,), name), dtype=dtype)
 
-    far_source = spread(source_at_infinity, np.bool_)
-    far_destination = spread(destination_at_infinity, np.bool_)
+    far_source = spread(source_at_infinity, "source_at_infinity", np.bool_)
+    far_destination = spread(destination_at_infinity, "destination_at_infinity", np.bool_)
     ends = []
     for name, given, far in (
         ("source", source, far_source),
         ("destination", destination, far_destination),
     ):
-        points = np.array(np.broadcast_to(as_float(given), (rows, 3)))
+        points = np.array(_rows(_numbers(given, name), (rows, 3), name))
         _finite(points, name)
         with np.errstate(over="ignore"):
             loose = far & (np.abs(np.linalg.norm(points, axis=-1) - 1.0) > _UNIT)
@@ -134,17 +139,17 @@ def sightings(
             points[loose] = normalize(points[loose], name)
         ends.append(points)
     _finite(table, "counts")
-    spreads = spread(sigma, np.float64)
-    wrong = ~(np.isfinite(spreads) & (spreads > 0))
+    spreads = spread(sigma, "sigma")
+    wrong = ~((spreads <= LARGEST_SIGMA) & (spreads > 0))
     if wrong.any():
         i = int(np.flatnonzero(wrong)[0])
-        raise InputError(f"sighting {i}: sigma {spreads[i]} rad must be above 0")
-    index = spread(heliostat, np.intp)
-    if (index < 0).any():
-        raise InputError("sightings: a heliostat's row is below 0")
+        raise InputError(
+            f"sighting {i}: sigma {spreads[i]} rad must be above 0 and at most {LARGEST_SIGMA} "
+            "rad; milliradians need a factor of 1e-3, degrees numpy.radians"
+        )
     return Sightings(
-        index,
-        spread(unix_seconds(time, unknown=True), np.float64),
+        _heliostats(heliostat, rows),
+        spread(unix_seconds(time, unknown=True), "time"),
         table,
         ends[0],
         ends[1],
@@ -156,8 +161,40 @@ def sightings(
     )
 
 
+def _numbers(given: npt.ArrayLike, name: str) -> FloatArray:
+    """Return an array of numbers, some of which may be NaN: the row is named later."""
+    try:
+        return as_float(given)
+    except (TypeError, ValueError):
+        # Its error says what is wrong.
+        return as_numbers(given, f"sightings: {name}")
+
+
+def _rows(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
+    """Return the values of each sighting."""
+    try:
+        return np.broadcast_to(values, shape)
+    except ValueError:
+        one = "a number" if len(shape) == 1 else "3 numbers"
+        raise InputError(
+            f"sightings: {name} of shape {values.shape}; there are {shape[0]} rows of counts: give "
+            f"{one} for all of them, or shape {shape}"
+        ) from None
+
+
+def _heliostats(given: npt.ArrayLike, rows: int) -> npt.NDArray[np.intp]:
+    values = _rows(_numbers(given, "heliostat"), (rows,), "heliostat")
+    wrong = ~((values >= 0.0) & (values == np.floor(values)))
+    if wrong.any():
+        i = int(np.flatnonzero(wrong)[0])
+        raise InputError(
+            f"sighting {i}: heliostat {values[i]:g} is not a row; give whole numbers from 0 on"
+        )
+    return np.array(values, dtype=np.intp)
+
+
 def _covariances(given: npt.ArrayLike, rows: int, name: str) -> FloatArray:
-    values = as_float(given)
+    values = _numbers(given, name)
     if values.ndim < 2:
         values = np.where(np.eye(3) > 0.0, values[..., None, None], 0.0)
     try:
@@ -385,9 +422,9 @@ def sun_sensor(
         sun,
         sun,
         time=time,
-        sigma=2.0 * as_float(normal_sigma),
+        sigma=2.0 * _numbers(normal_sigma, "normal_sigma"),
         destination_at_infinity=True,
-        destination_covariance=4.0 * as_float(normal_covariance),
+        destination_covariance=4.0 * _numbers(normal_covariance, "normal_covariance"),
     )
 
 
@@ -436,10 +473,17 @@ def join(parts: Sequence[Sightings]) -> Sightings:
     InputError
         If there are none, or they are of mechanisms with different numbers of drives.
     """
+    if isinstance(parts, Sightings):
+        raise InputError("join: one Sightings; give a list of them")
+    for k, part in enumerate(parts):
+        if not isinstance(part, Sightings):
+            raise InputError(f"join: part {k} is {kind_of(part)}; give a list of Sightings")
+    if not len(parts):
+        raise InputError("join: 0 parts; give at least 1")
     drives = sorted({part.counts.shape[-1] for part in parts})
     if len(drives) != 1:
         raise InputError(
-            f"join: sightings of mechanisms with {drives or 'no'} drives; join those of one kind"
+            f"join: sightings of mechanisms with {drives} drives; join those of one kind"
         )
     return Sightings(
         **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Sightings)}

@@ -11,10 +11,11 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.machine import Machine
+from heliotrope.values import Value
 
 
-@dataclass(frozen=True)
-class Facets:
+@dataclass(frozen=True, eq=False)
+class Facets(Value):
     """F facets of each of N heliostats, in the mirror's frame (x right, y up, z out of it).
 
     Attributes
@@ -36,8 +37,8 @@ class Facets:
             raise InputError(f"facets: shapes {sorted(shapes)} must all be (N, F, 3)")
 
 
-@dataclass(frozen=True)
-class Heliostats:
+@dataclass(frozen=True, eq=False)
+class Heliostats(Value):
     """N heliostats of one kind.
 
     Attributes
@@ -147,6 +148,11 @@ class Heliostats:
         if index.dtype == bool:
             index = np.flatnonzero(index)
         index = index.reshape(-1).astype(np.intp)
+        wrong = (index < -len(self)) | (index >= len(self))
+        if wrong.any():
+            raise InputError(
+                f"rows: {index[wrong][0]} is not there; rows go from 0 to {len(self) - 1}"
+            )
         facets = self.facets
         return replace(
             self,

@@ -17,13 +17,14 @@ from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
-from heliotrope.sun import Site
+from heliotrope.sun import Site, check_site
+from heliotrope.values import Value
 
 Surface = TypeVar("Surface", Target, Receiver, Camera)
 
 
-@dataclass(frozen=True)
-class Plant:
+@dataclass(frozen=True, eq=False)
+class Plant(Value):
     """A solar tower plant.
 
     Attributes
@@ -58,6 +59,7 @@ class Plant:
     eyes: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        check_site(self.site)
         seen: dict[str, str] = {}
         for group, heliostats in self.groups.items():
             for name in heliostats.names:

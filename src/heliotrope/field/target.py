@@ -10,10 +10,11 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray, as_vectors, normalize
+from heliotrope.values import Value
 
 
-@dataclass(frozen=True)
-class Target:
+@dataclass(frozen=True, eq=False)
+class Target(Value):
     """A flat calibration target.
 
     Attributes
@@ -107,8 +108,8 @@ class Target:
         return o + length[..., None] * d
 
 
-@dataclass(frozen=True)
-class Receiver:
+@dataclass(frozen=True, eq=False)
+class Receiver(Value):
     """A receiver: the surface that the field heats.
 
     Attributes

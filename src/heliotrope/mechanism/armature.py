@@ -13,10 +13,11 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_vectors, normalize, rotation
 from heliotrope.mechanism.kernels import slots as slot
+from heliotrope.values import Value
 
 
-@dataclass(frozen=True)
-class Armature:
+@dataclass(frozen=True, eq=False)
+class Armature(Value):
     """Two axes with a point on each, a vertex and its normal, at zero joint angles.
 
     Attributes

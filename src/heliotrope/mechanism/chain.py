@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.geometry import FloatArray, as_float
+from heliotrope.geometry import TAU, FloatArray, as_angles, as_numbers
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
@@ -17,7 +17,10 @@ from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.mechanism.kernels.chain import armature_block, jacobian_block, pose_block
 from heliotrope.mechanism.parameters import Parameter
 from heliotrope.parallel import run_blocks
+from heliotrope.values import Value
 
+#: Largest deviation of a length, m: millimetres are mostly larger; and of a ratio.
+_FARTHEST, _LARGEST = 1000.0, 1e6
 #: Valid index of a mechanism.
 Index = (
     int
@@ -29,8 +32,8 @@ Index = (
 )
 
 
-@dataclass(frozen=True)
-class Pose:
+@dataclass(frozen=True, eq=False)
+class Pose(Value):
     """Normals and vertices of mirrors.
 
     Attributes
@@ -45,8 +48,8 @@ class Pose:
     vertex: FloatArray
 
 
-@dataclass(frozen=True)
-class Jacobian:
+@dataclass(frozen=True, eq=False)
+class Jacobian(Value):
     """A pose with its derivatives by P parameters and by the counts of D drives.
 
     Attributes
@@ -69,8 +72,8 @@ class Jacobian:
     vertex_counts: FloatArray
 
 
-@dataclass(frozen=True)
-class Mechanism:
+@dataclass(frozen=True, eq=False)
+class Mechanism(Value):
     """One mechanism, or an array of mechanisms of one kind; batch shape (...).
 
     Build one with a function of `heliotrope.mechanism.kinds`.
@@ -176,15 +179,13 @@ class Mechanism:
         UnknownNameError
             If a name is not in the table.
         InputError
-            If a value is not finite.
+            If a value is not a number, is no angle in radians, or does not fit the shape.
         """
         position, origins = self.position.copy(), self.origins.copy()
         angles, vertex = self.angles.copy(), self.vertex.copy()
         table = self.drives.table.copy()
         for name, value in values.items():
-            delta = as_float(value)
-            if not np.isfinite(delta).all():
-                raise InputError(f"parameter {name}: {value!r} is not finite")
+            delta = self._deviation(name, value)
             what, index, sub = self.parameter(name).code
             if what == slot.MOVES_JOINT:
                 angles[..., index] += delta
@@ -206,6 +207,25 @@ class Mechanism:
             vertex=vertex,
             drives=Drive(table),
         )
+
+    def _deviation(self, name: str, value: npt.ArrayLike) -> FloatArray:
+        """Return the checked deviation of one parameter."""
+        row, label = self.parameter(name), f"parameter {name}"
+        if row.unit == "m":
+            delta = as_numbers(value, label, -_FARTHEST, _FARTHEST, "m", "give metres")
+        elif row.unit == "1":
+            delta = as_numbers(value, label, -_LARGEST, _LARGEST)
+        else:
+            # No pedestal leans by a right angle; the zero of a drive may be off by a turn.
+            most = 0.5 * np.pi if row.code[0] == slot.MOVES_JOINT else TAU
+            delta = as_angles(value, label, most)
+        try:
+            return np.broadcast_to(delta, self.shape)
+        except ValueError:
+            raise InputError(
+                f"{label}: shape {delta.shape} does not fit mechanisms of shape {self.shape}; "
+                "give a number, or one for each mechanism"
+            ) from None
 
     def pose(self, counts: npt.ArrayLike) -> Pose:
         """Return normals and vertices at drive counts.
@@ -296,7 +316,7 @@ class Mechanism:
         self, counts: npt.ArrayLike
     ) -> tuple[FloatArray, npt.NDArray[np.intp], tuple[int, ...]]:
         """Return counts (M, D), the mechanism's row of each, and the batch shape."""
-        given, drives = as_float(counts), len(self.driven)
+        given, drives = as_numbers(counts, "counts"), len(self.driven)
         if given.ndim == 0 or given.shape[-1] != drives:
             raise InputError(
                 f"counts: shape {given.shape}; the last axis must hold the {drives} drives"

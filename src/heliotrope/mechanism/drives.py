@@ -22,15 +22,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import InputError
-from heliotrope.geometry import TAU, FloatArray, as_float
+from heliotrope.errors import InputError, shown
+from heliotrope.geometry import (
+    MOST_TURNS,
+    TAU,
+    FloatArray,
+    as_angles,
+    as_float,
+    as_numbers,
+    common_batch,
+)
 from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.mechanism.kernels.drives import angles_block, counts_block, slopes_block
 from heliotrope.parallel import run_blocks
+from heliotrope.values import Value
 
 
-@dataclass(frozen=True)
-class Drive:
+@dataclass(frozen=True, eq=False)
+class Drive(Value):
     """One drive, or an array of drives of the same or of different kinds.
 
     Attributes
@@ -74,22 +83,22 @@ class Drive:
         Raises
         ------
         InputError
-            If a name is not one of them.
+            If a name is not one of them, or a number is out of range.
         """
         for name in values:
             if name not in SLOTS:
                 raise InputError(f"drive: there is no {name!r}; known: {', '.join(SLOTS)}")
-        shape = np.broadcast_shapes(self.shape, *(np.shape(v) for v in values.values()))
+        given = {name: _number(value, name) for name, value in values.items()}
+        shapes = {name: value.shape for name, value in given.items()}
+        shape = common_batch({"drive": self.shape, **shapes})
         table = np.array(np.broadcast_to(self.table, (*shape, slot.DRIVE_SLOTS)))
-        for name, value in values.items():
+        for name, value in given.items():
             table[..., SLOTS[name]] = value
         return _checked(Drive(table))
 
     def _run(self, block: Any, values: npt.ArrayLike, what: str) -> FloatArray:
-        given = as_float(values)
-        if np.isnan(given).any():
-            raise InputError(f"drive: {what} hold NaN; give finite numbers")
-        shape = np.broadcast_shapes(self.shape, given.shape)
+        given = as_numbers(values, f"drive: {what}")
+        shape = common_batch({"drive": self.shape, what: given.shape})
         rows = np.broadcast_to(np.arange(_size(self.shape)).reshape(self.shape), shape).ravel()
         flat = np.ascontiguousarray(np.broadcast_to(given, shape)).reshape(-1, 1)
         table = np.ascontiguousarray(self.table).reshape(-1, 1, slot.DRIVE_SLOTS)
@@ -121,8 +130,29 @@ SLOTS = {
 }
 
 
+#: Name of each number for errors.
+_NAMES = {index: name for name, index in SLOTS.items()} | {
+    slot.KIND: "kind",
+    slot.SENSE: "sense",
+}
+
+
 def _size(shape: tuple[int, ...]) -> int:
     return int(np.prod(shape, dtype=np.int64))
+
+
+_ANGLES = ("zero", "initial_angle", "bias", "worm_cos", "worm_sin", "sag", "sag_phase")
+_STOPS = ("min_angle", "max_angle")
+
+
+def _number(value: npt.ArrayLike, name: str) -> FloatArray:
+    """Return a number of a drive; an angle must be one in radians, a stop may be infinite."""
+    if name in _ANGLES:
+        return as_angles(value, f"drive: {name}", MOST_TURNS)
+    number = as_numbers(value, f"drive: {name}")
+    if name in _STOPS:
+        as_angles(np.where(np.isinf(number), 0.0, number), f"drive: {name}", MOST_TURNS)
+    return number
 
 
 def _build(kind: float, numbers: dict[int, npt.ArrayLike]) -> Drive:
@@ -135,10 +165,11 @@ def _build(kind: float, numbers: dict[int, npt.ArrayLike]) -> Drive:
         slot.SPEED: np.inf,
         **numbers,
     }
-    shape = np.broadcast_shapes(*(np.shape(value) for value in numbers.values()))
+    given = {index: _number(value, _NAMES[index]) for index, value in numbers.items()}
+    shape = common_batch({_NAMES[index]: value.shape for index, value in given.items()})
     table = np.zeros((*shape, slot.DRIVE_SLOTS))
-    for index, value in numbers.items():
-        table[..., index] = as_float(value)
+    for index, value in given.items():
+        table[..., index] = value
     return _checked(Drive(table))
 
 
@@ -151,8 +182,6 @@ def _checked(drive: Drive) -> Drive:
         If stops are reversed, a rate is zero or a jack's triangle cannot close.
     """
     t = drive.table
-    if np.isnan(t).any():
-        raise InputError("drive: a number is NaN; every constant of a drive must be given")
     rate = t[..., slot.RATE]
     if (rate == 0.0).any() or not np.isfinite(rate).all():
         raise InputError("drive: the angle (or stroke) per count is 0 or infinite; give counts")
@@ -236,11 +265,15 @@ def rotary(
     InputError
         If the numbers describe no drive that can move.
     """
-    per_turn = as_float(steps_per_turn) * as_float(microsteps) * as_float(gear_ratio)
+    steps, micro = (
+        as_numbers(steps_per_turn, "steps_per_turn"),
+        as_numbers(microsteps, "microsteps"),
+    )
+    per_turn = steps * micro * as_numbers(gear_ratio, "gear_ratio")
     if not (np.isfinite(per_turn) & (per_turn > 0)).all():
         raise InputError(
-            f"rotary drive: steps {steps_per_turn!r} × microsteps {microsteps!r} × gear ratio "
-            f"{gear_ratio!r} must be above 0 and finite"
+            f"rotary drive: steps {shown(steps_per_turn)} × microsteps {shown(microsteps)} × "
+            f"gear ratio {shown(gear_ratio)} must be above 0 and finite"
         )
     _check_sense(sense)
     rate = as_float(sense) * TAU / per_turn
@@ -274,9 +307,11 @@ def linear_paint(
     values
         Any of ``SLOTS``.
     """
-    counts_per_metre = as_float(increment)
+    counts_per_metre = as_numbers(increment, "increment")
     if not (np.isfinite(counts_per_metre) & (counts_per_metre != 0)).all():
-        raise InputError(f"linear drive: increment {increment!r} counts per metre must not be 0")
+        raise InputError(
+            f"linear drive: increment {shown(increment)} counts per metre must not be 0"
+        )
     sense = np.where(as_float(clockwise) == 1, 1.0, -1.0)
     return _build(
         slot.LINEAR,
@@ -324,7 +359,8 @@ def linear_grigoriev(
     measures it from the position at 0 counts. The two zeros differ by Φ(length_at_zero).
     """
     _check_sense(sense)
-    a, b, length = as_float(side_a), as_float(side_b), as_float(length_at_zero)
+    a, b = as_numbers(side_a, "side_a"), as_numbers(side_b, "side_b")
+    length = as_numbers(length_at_zero, "length_at_zero")
     jack = _build(
         slot.LINEAR,
         {
@@ -336,7 +372,9 @@ def linear_grigoriev(
         },
     )
     folded = np.arccos((a**2 + b**2 - length**2) / (2.0 * a * b))
-    return jack.replace(zero=as_float(angle_zero) + as_float(sense) * folded).replace(**values)
+    return jack.replace(
+        zero=as_angles(angle_zero, "angle_zero", MOST_TURNS) + as_float(sense) * folded
+    ).replace(**values)
 
 
 def linear_guo(
@@ -370,12 +408,12 @@ def linear_guo(
     AOB is 180° − α − β₀, so the screw shortens as the mirror rises. For a screw that
     lengthens use `linear_grigoriev`.
     """
-    zero = np.pi - as_float(slope)
+    zero = np.pi - as_angles(slope, "slope", np.pi)
     return linear_grigoriev(
         side_a, side_b, length_at_zero, metres_per_count, angle_zero=zero, sense=-1, **values
     )
 
 
 def _check_sense(sense: npt.ArrayLike) -> None:
-    if not np.isin(as_float(sense), (-1.0, 1.0)).all():
-        raise InputError(f"drive: sense {sense!r} must be +1 or −1")
+    if not np.isin(as_numbers(sense, "drive: sense"), (-1.0, 1.0)).all():
+        raise InputError(f"drive: sense {shown(sense)} must be +1 or −1")

@@ -14,14 +14,25 @@ Every two-axis kind is the same chain with other axes::
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import InputError
-from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
+from heliotrope.errors import InputError, UnknownNameError, kind_of
+from heliotrope.geometry import (
+    MOST_TURNS,
+    FloatArray,
+    as_angles,
+    as_float,
+    as_numbers,
+    as_vectors,
+    common_batch,
+    normalize,
+)
 from heliotrope.mechanism.armature import Armature, check_axes
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive, direct
 
 EAST, NORTH, UP = np.eye(3)
 _LEANS = {"east": EAST, "north": NORTH, "up": UP}
+#: Longest distance within a heliostat, m: millimetres are mostly larger.
+_LONGEST = 1000.0
 
 
 def two_axis(
@@ -74,7 +85,10 @@ def two_axis(
     ------
     InputError
         If a direction is zero, the axes are parallel, the normal lies along the
-        secondary axis, or the orientation is no rotation.
+        secondary axis, the orientation is no rotation, two joints have one name, or a
+        point is no vector.
+    UnknownNameError
+        If the primary axis leans in an unknown direction.
     """
     p = as_vectors(position, "position")
     a1, a2 = normalize(axis_1, "axis_1"), normalize(axis_2, "axis_2")
@@ -84,14 +98,21 @@ def two_axis(
         raise InputError("normal: it lies along the secondary axis, which then cannot turn it")
     end = a1 if pole is None else normalize(pole, "pole")
     lean_names = _lean_names(end) if leans is None else leans
+    for name in lean_names:
+        if name not in _LEANS:
+            raise UnknownNameError("lean of the primary axis", str(name), _LEANS)
     lean_axes = [normalize(np.cross(end, _LEANS[name]), "tilt axis") for name in lean_names]
-    steps = [
-        (f"tilt_{lean_names[0]}", lean_axes[0], origin_1),
+    steps: list[tuple[str, FloatArray, npt.ArrayLike]] = [
+        (f"tilt_{lean_names[0]}", lean_axes[0], as_vectors(origin_1, "origin_1")),
         (f"tilt_{lean_names[1]}", lean_axes[1], 0.0),
         (names[0], a1, 0.0),
-        ("non_orthogonality", normalize(np.cross(a2, a1), "axis"), origin_2),
+        (
+            "non_orthogonality",
+            normalize(np.cross(a2, a1), "axis"),
+            as_vectors(origin_2, "origin_2"),
+        ),
         (names[1], a2, 0.0),
-        ("canting", normalize(np.cross(n, a2), "axis"), arm),
+        ("canting", normalize(np.cross(n, a2), "axis"), as_vectors(arm, "arm")),
         ("canting_secondary", a2, 0.0),
     ]
     return _assemble(kind, steps, (2, 4), p, orientation, drives, vertex, n)
@@ -115,29 +136,35 @@ def _assemble(
     vertex: npt.ArrayLike,
     normal: FloatArray,
 ) -> Mechanism:
-    turned = np.eye(3) if orientation is None else as_float(orientation)
+    joints = [step[0] for step in steps]
+    for name in joints:
+        if joints.count(name) > 1:
+            raise InputError(
+                f"names: two joints are called {name!r}; a joint's name is unique, because its "
+                f"parameters are named after it; the joints are {', '.join(joints)}"
+            )
+    turned = np.eye(3) if orientation is None else as_numbers(orientation, "orientation")
     _check_rotation(turned)
-    tables = [d.table for d in (drives or tuple(direct() for _ in driven))]
-    if len(tables) != len(driven):
-        raise InputError(f"drives: {len(tables)} given; this kind has {len(driven)}")
+    tables = _tables(drives, driven)
     v = as_vectors(vertex, "vertex")
     offsets = [as_float(step[2]) for step in steps]
-    shape = np.broadcast_shapes(
-        position.shape[:-1],
-        turned.shape[:-2],
-        v.shape[:-1],
-        normal.shape[:-1],
-        *(step[1].shape[:-1] for step in steps),
-        *(o.shape[:-1] for o in offsets),
-        *(t.shape[:-1] for t in tables),
-    )
+    batches = {
+        "position": position.shape[:-1],
+        "orientation": turned.shape[:-2],
+        "vertex": v.shape[:-1],
+        "normal": normal.shape[:-1],
+        **{f"axis of {step[0]}": step[1].shape[:-1] for step in steps},
+        **{f"origin of {step[0]}": o.shape[:-1] for step, o in zip(steps, offsets, strict=True)},
+        **{f"drive {k + 1}": t.shape[:-1] for k, t in enumerate(tables)},
+    }
+    shape = common_batch(batches)
 
     def spread(array: FloatArray, *tail: int) -> FloatArray:
         return np.array(np.broadcast_to(array, (*shape, *tail)))
 
     return Mechanism(
         kind=kind,
-        joints=tuple(step[0] for step in steps),
+        joints=tuple(joints),
         driven=driven,
         position=spread(position, 3),
         orientation=spread(turned, 3, 3),
@@ -150,9 +177,33 @@ def _assemble(
     )
 
 
+def _tables(drives: object, driven: tuple[int, ...]) -> list[FloatArray]:
+    """Return the tables of the drives, one for each driven joint."""
+    if drives is None:
+        return [direct().table for _ in driven]
+    given = tuple(drives) if isinstance(drives, tuple | list) else (drives,)
+    if len(given) != len(driven):
+        raise InputError(f"drives: {len(given)} given; this kind has {len(driven)}")
+    tables = []
+    for drive in given:
+        if not isinstance(drive, Drive):
+            raise InputError(
+                f"drives: {kind_of(drive)} is not a Drive; give {len(driven)} drives made by "
+                "rotary, direct or linear_paint"
+            )
+        tables.append(drive.table)
+    return tables
+
+
+def _lengths(value: npt.ArrayLike, name: str) -> FloatArray:
+    return as_numbers(value, name, -_LONGEST, _LONGEST, "m", "give metres")
+
+
 def _check_rotation(matrix: FloatArray) -> None:
     if matrix.shape[-2:] != (3, 3) or not np.isfinite(matrix).all():
-        raise InputError("orientation: give finite rotation matrices of shape (..., 3, 3)")
+        raise InputError(
+            f"orientation: shape {matrix.shape}; give finite rotation matrices, (..., 3, 3)"
+        )
     deviation = np.abs(matrix @ np.swapaxes(matrix, -1, -2) - np.eye(3)).max()
     if deviation > 1e-9 or (np.linalg.det(matrix) < 0).any():
         raise InputError(
@@ -186,7 +237,7 @@ def azimuth_elevation(
     orientation, drives
         As for `two_axis`.
     """
-    height, front = as_float(pivot_height), as_float(pivot_offset)
+    height, front = _lengths(pivot_height, "pivot_height"), _lengths(pivot_offset, "pivot_offset")
     return two_axis(
         position,
         -UP,
@@ -242,7 +293,8 @@ def tilt_roll(
     if (flat < 1e-6).any():
         raise InputError("axis: the first axis of a tilt-roll mechanism must not be vertical")
     n = normalize(UP - a1[..., 2:] * a1, "normal")
-    height, gap, front = as_float(pivot_height), as_float(spacing), as_float(pivot_offset)
+    height, front = _lengths(pivot_height, "pivot_height"), _lengths(pivot_offset, "pivot_offset")
+    gap = _lengths(spacing, "spacing")
     return two_axis(
         position,
         a1,
@@ -275,7 +327,8 @@ def target_aligned(
         As for `tilt_roll`.
     """
     p, a = as_vectors(position, "position"), as_vectors(aim, "aim")
-    towards = a - (p + as_float(pivot_height)[..., None] * UP)
+    common_batch({"position": p.shape[:-1], "aim": a.shape[:-1]})
+    towards = a - (p + _lengths(pivot_height, "pivot_height")[..., None] * UP)
     return tilt_roll(
         p,
         towards,
@@ -299,8 +352,13 @@ def pitch_roll(
 
     A positive pitch leans the mirror, which looks up at zero angles, away from the
     azimuth (rad) it faces; the roll axis lies in the mirror.
+
+    Raises
+    ------
+    InputError
+        If the azimuth is not within four turns.
     """
-    facing = as_float(azimuth)
+    facing = as_angles(azimuth, "azimuth", MOST_TURNS)
     axis = np.stack([np.cos(facing), -np.sin(facing), np.zeros_like(facing)], axis=-1)
     return tilt_roll(
         position,
@@ -361,12 +419,17 @@ def polar(
         Radians, north positive, (...).
     pivot_height, pivot_offset, drives
         As for `tilt_roll`.
+
+    Raises
+    ------
+    InputError
+        If the latitude is not within −π/2 to π/2.
     """
-    phi = as_float(latitude)
+    phi = as_angles(latitude, "latitude", 0.5 * np.pi)
     zero = np.zeros_like(phi)
     north_pole = np.stack([zero, np.cos(phi), np.sin(phi)], axis=-1)
     equator = np.stack([zero, -np.sin(phi), np.cos(phi)], axis=-1)
-    height, front = as_float(pivot_height), as_float(pivot_offset)
+    height, front = _lengths(pivot_height, "pivot_height"), _lengths(pivot_offset, "pivot_offset")
     return two_axis(
         position,
         -north_pole,
@@ -454,7 +517,7 @@ def single_axis(
     p, a, n = as_vectors(position, "position"), normalize(axis, "axis"), normalize(normal, "normal")
     if (np.linalg.norm(np.cross(a, n), axis=-1) < 1e-6).any():
         raise InputError("normal: it lies along the axis, which then cannot turn it")
-    height = as_float(pivot_height)
+    height = _lengths(pivot_height, "pivot_height")
     lean_names = _lean_names(a)
     steps: list[tuple[str, FloatArray, npt.ArrayLike]] = [
         (

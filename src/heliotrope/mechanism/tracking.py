@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import InputError
-from heliotrope.geometry import FloatArray, as_float, as_vectors, reflect
+from heliotrope.errors import InputError, kind_of, shown
+from heliotrope.geometry import FloatArray, as_numbers, as_vectors, reflect
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive, direct
@@ -27,6 +27,7 @@ from heliotrope.mechanism.kernels.track import (
     UNREACHABLE,
 )
 from heliotrope.parallel import run_blocks
+from heliotrope.values import Value
 
 Branch = Literal["both", 0, 1]
 
@@ -56,8 +57,8 @@ _TEXTS = {
 }
 
 
-@dataclass(frozen=True)
-class Tracking:
+@dataclass(frozen=True, eq=False)
+class Tracking(Value):
     """Solutions of one or both branches; B branches, D drives.
 
     Attributes
@@ -164,11 +165,8 @@ def track(
     if (np.abs(np.sum(s * s, axis=-1) - 1.0) > 1e-6).any():
         raise InputError("sun: a vector's length differs from 1 by more than 5e-7; normalise it")
     if branch not in ("both", 0, 1):
-        raise InputError(f"branch {branch!r}: give 'both', 0 or 1")
-    if not (np.isfinite(tolerance) and tolerance > 0 and max_iterations >= 1):
-        raise InputError(
-            f"tolerance {tolerance} m and max_iterations {max_iterations} must be above 0"
-        )
+        raise InputError(f"branch {shown(branch)}: give 'both', 0 or 1")
+    _check_settings(tolerance, max_iterations)
     axes = table.shape[-2]
     now = None if current is None else _current(current, axes)
     batches = [armature.shape, table.shape[:-2], s.shape[:-1], p.shape[:-1]]
@@ -284,6 +282,15 @@ def trace(
 
 
 def _tables(mechanism: Mechanism | Armature, drives: Drive | None) -> tuple[Armature, FloatArray]:
+    if not isinstance(mechanism, Mechanism | Armature):
+        raise InputError(
+            f"mechanism: {kind_of(mechanism)} cannot be tracked; give a Mechanism, such as "
+            "plant.heliostat(name), or an Armature with drives, such as plant.armature"
+        )
+    if drives is not None and not isinstance(drives, Drive):
+        raise InputError(
+            f"drives: {kind_of(drives)} is not a Drive; give one of batch shape (..., D)"
+        )
     if isinstance(mechanism, Mechanism):
         table = mechanism.drives.table if drives is None else drives.table
         axes = len(mechanism.driven)
@@ -293,14 +300,26 @@ def _tables(mechanism: Mechanism | Armature, drives: Drive | None) -> tuple[Arma
         axes = 2
         table = np.stack([direct().table] * 2) if drives is None else drives.table
     if table.ndim < 2 or table.shape[-2] != axes:
-        raise InputError(f"drives: batch shape {table.shape[:-1]}; its last axis must be {axes}")
+        raise InputError(
+            f"drives: batch shape {table.shape[:-1]}; its last axis must be {axes}, the drives"
+        )
     return armature, table
 
 
+def _check_settings(tolerance: float, max_iterations: int) -> None:
+    numbers = as_numbers([tolerance, max_iterations], "tolerance and max_iterations")
+    if not (np.isfinite(numbers[0]) and numbers[0] > 0 and numbers[1] >= 1):
+        raise InputError(
+            f"tolerance {tolerance} m and max_iterations {max_iterations} must be above 0"
+        )
+
+
 def _current(current: npt.ArrayLike, axes: int) -> FloatArray:
-    counts = as_float(current)
+    counts = as_numbers(current, "current")
     if counts.ndim == 0 or counts.shape[-1] != axes or not np.isfinite(counts).all():
-        raise InputError(f"current: give finite counts of the {axes} drives, shape (..., {axes})")
+        raise InputError(
+            f"current: shape {counts.shape}; give finite counts of the {axes} drives, (..., {axes})"
+        )
     return counts
 
 

@@ -27,6 +27,7 @@ from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
 from heliotrope.optics.beam import beam_sigma
 from heliotrope.optics.intercept import intercept_rectangle
+from heliotrope.values import Value
 
 #: Default number of cells across and up.
 CELLS = (24, 24)
@@ -34,8 +35,8 @@ CELLS = (24, 24)
 MARGIN = 1.5
 
 
-@dataclass(frozen=True)
-class FluxView:
+@dataclass(frozen=True, eq=False)
+class FluxView(Value):
     """The predicted flux on a receiver.
 
     Attributes
@@ -122,6 +123,8 @@ def predict_flux(
         raise InputError(
             f"flux: {dni} W/m² must be 0 or more and the reflectivity {reflectivity} from 0 to 1"
         )
+    if min(cells) < 1:
+        raise InputError(f"flux: cells {cells}; give at least 1 across and up")
     light = as_vectors(sun, "sun")
     right, up, normal = _axes(receiver)
     size = np.array([receiver.width, receiver.height], dtype=np.float64)

@@ -19,10 +19,11 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float, as_vectors, reflect, tangent_axes
 from heliotrope.mechanism.chain import Mechanism, Pose
 from heliotrope.mechanism.tracking import TrackingStatus, track
+from heliotrope.values import Value
 
 
-@dataclass(frozen=True)
-class ImageOffsets:
+@dataclass(frozen=True, eq=False)
+class ImageOffsets(Value):
     """Where beams cross the plane through the aim perpendicular to the line of sight.
 
     NaN where the nominal mechanism cannot send the sun to the aim, or the beam never

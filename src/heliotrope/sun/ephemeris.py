@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import InputError, TimeError, UnknownNameError
+from heliotrope.errors import InputError, TimeError, UnknownNameError, kind_of
 from heliotrope.geometry import FloatArray, as_float, direction, wrap_positive
 from heliotrope.parallel import run_blocks
 from heliotrope.sun import grena
@@ -212,7 +212,8 @@ def position(times: Times, site: Site, *, algorithm: str = "spa") -> SunPosition
     with the weather by more than 1 mrad.
     """
     if algorithm not in ALGORITHMS:
-        raise UnknownNameError("sun algorithm", algorithm, ALGORITHMS)
+        raise UnknownNameError("sun algorithm", str(algorithm), ALGORITHMS)
+    check_site(site)
     seconds = unix_seconds(times)
     _check_years(seconds, site)
     if algorithm == "grena2008":
@@ -410,6 +411,21 @@ def _delta_t(seconds: FloatArray, site: Site) -> FloatArray:
     return as_float(spa.calculate_deltat(1970 + months // 12, months % 12 + 1))
 
 
+def check_site(site: object) -> None:
+    """Refuse what is not a `Site`.
+
+    Raises
+    ------
+    InputError
+        If it is something else, such as a pvlib Location.
+    """
+    if not isinstance(site, Site):
+        raise InputError(
+            f"site: {kind_of(site)} is not a Site; give Site(latitude_deg, longitude_deg, height), "
+            "in degrees and metres"
+        )
+
+
 def _true_level(apparent: float, site: Site) -> float:
     """Return the true elevation at which SPA's refraction gives ``apparent``."""
     from pvlib import spa
@@ -461,6 +477,7 @@ def _mean_noon(day: Any, site: Site) -> float:
         raise TimeError(f"day: {day!r} is not a date; give a datetime.date or an ISO date")
     if day == date.min:
         raise TimeError(f"day: {day} begins before the calendar of datetime; give a later day")
+    check_site(site)
     midnight = (day - _EPOCH.date()).days * _DAY
     return midnight + _DAY * (0.5 - site.longitude_deg / 360.0)
 

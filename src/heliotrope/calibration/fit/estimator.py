@@ -9,7 +9,7 @@ the whitening by the sighting's covariance, s the scale of the residuals (estima
 robust loss and σ the priors of the parameter table.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Literal
@@ -20,11 +20,11 @@ import numpy.typing as npt
 from heliotrope.calibration.fit import _fit_kernels as kernels
 from heliotrope.calibration.fit.residuals import whitening
 from heliotrope.calibration.sightings import Sightings, ray_directions
-from heliotrope.errors import InputError
+from heliotrope.errors import InputError, UnknownNameError, kind_of
 from heliotrope.geometry import (
     FloatArray,
     angle_between,
-    as_float,
+    as_numbers,
     bisector,
     wrap_signed,
 )
@@ -33,6 +33,7 @@ from heliotrope.mechanism.chain import Mechanism, Pose
 from heliotrope.mechanism.drives import SLOTS, Drive
 from heliotrope.mechanism.tracking import track
 from heliotrope.parallel import run_blocks
+from heliotrope.values import Value
 
 Loss = Literal["square", "huber", "cauchy"]
 _LOSSES = {"square": kernels.SQUARE, "huber": kernels.HUBER, "cauchy": kernels.CAUCHY}
@@ -63,8 +64,8 @@ _TEXTS = {
 }
 
 
-@dataclass(frozen=True)
-class FieldFit:
+@dataclass(frozen=True, eq=False)
+class FieldFit(Value):
     """Fitted parameters of N heliostats, P each.
 
     Attributes
@@ -149,13 +150,14 @@ def fit(
         If a sighting is of a heliostat that is not there, a prior is not above 0, or the model
         names the ratio of a worm.
     UnknownNameError
-        If the model or one of its parameters is unknown.
+        If the model, one of its parameters or the loss is unknown.
     """
-    _check_rows(mechanism, sightings)
+    check_rows(mechanism, sightings)
+    _check_options(loss, max_iterations)
     count, rows = len(mechanism), len(sightings)
-    names = parameter_table.model(model, mechanism.parameters) if isinstance(model, str) else model
+    names = names_of(model, mechanism)
     sigma = _priors(mechanism, names, priors or {})
-    used = np.ones(rows, dtype=np.bool_) if keep is None else np.asarray(keep, dtype=np.bool_)
+    used = mask_of(keep, rows, "keep")
     order = canonical_order(sightings)
     ordered = sightings.take(order)
     pose = mechanism[ordered.heliostat].pose(ordered.counts)
@@ -212,14 +214,80 @@ def fit(
     return result
 
 
-def _check_rows(mechanism: Mechanism, sightings: Sightings) -> None:
+def check_rows(mechanism: Mechanism, sightings: Sightings) -> None:
+    """Refuse what are not N mechanisms and sightings of them.
+
+    Raises
+    ------
+    InputError
+        If they are something else, or a sighting is of a row that is not there.
+    """
+    if not isinstance(mechanism, Mechanism):
+        raise InputError(
+            f"mechanism: {kind_of(mechanism)} is not a Mechanism; give the nominal mechanisms, "
+            "such as plant.groups[name].mechanism"
+        )
+    if not isinstance(sightings, Sightings):
+        raise InputError(
+            f"sightings: {kind_of(sightings)} is not Sightings; make them with heliotrope.sightings"
+        )
     if len(mechanism.shape) != 1:
-        raise InputError(f"fit: mechanisms of shape {mechanism.shape}; give one batch axis (N,)")
+        raise InputError(f"mechanism: shape {mechanism.shape}; give N mechanisms, shape (N,)")
     if len(sightings) and int(sightings.heliostat.max()) >= len(mechanism):
         raise InputError(
-            f"fit: a sighting is of heliostat row {int(sightings.heliostat.max())}; there are "
+            f"sightings: one is of heliostat row {int(sightings.heliostat.max())}; there are "
             f"{len(mechanism)} heliostats"
         )
+    drives = len(mechanism.driven)
+    if sightings.counts.shape[-1] != drives:
+        raise InputError(
+            f"sightings: counts of {sightings.counts.shape[-1]} drives; the mechanisms have "
+            f"{drives}"
+        )
+
+
+def _check_options(loss: str, max_iterations: int) -> None:
+    if loss not in _LOSSES:
+        raise UnknownNameError("loss", str(loss), _LOSSES)
+    if not max_iterations >= 1:
+        raise InputError(f"max_iterations: {max_iterations}; give at least 1")
+
+
+def names_of(model: str | Sequence[str], mechanism: Mechanism) -> tuple[str, ...]:
+    """Return the parameters of a model by name, or of a list of names.
+
+    Raises
+    ------
+    InputError
+        If it is neither.
+    UnknownNameError
+        If there is no such model or parameter.
+    """
+    if isinstance(model, str):
+        return parameter_table.model(model, mechanism.parameters)
+    if not isinstance(model, list | tuple):
+        raise InputError(f"model: {kind_of(model)}; give the name of a model or a list of names")
+    for name in model:
+        mechanism.parameter(name)
+    return tuple(model)
+
+
+def mask_of(given: npt.ArrayLike | None, rows: int, name: str) -> npt.NDArray[np.bool_]:
+    """Return a mask of M sightings; None takes them all.
+
+    Raises
+    ------
+    InputError
+        If it has another shape, or holds something else than true and false.
+    """
+    if given is None:
+        return np.ones(rows, dtype=np.bool_)
+    mask = np.asarray(given)
+    if mask.shape != (rows,) or (mask.dtype != np.bool_ and rows):
+        raise InputError(
+            f"{name}: {mask.dtype} of shape {mask.shape}; give a mask of booleans, ({rows},)"
+        )
+    return mask.astype(np.bool_)
 
 
 def _priors(
@@ -235,9 +303,13 @@ def _priors(
             )
     columns = []
     for name in names:
-        value = as_float(given.get(name, mechanism.parameter(name).prior))
+        value = as_numbers(given.get(name, mechanism.parameter(name).prior), f"prior of {name}")
         if not (np.isfinite(value) & (value > 0)).all():
             raise InputError(f"prior of {name}: {value} must be above 0 and finite")
+        if value.shape not in ((), (len(mechanism),)):
+            raise InputError(
+                f"prior of {name}: shape {value.shape}; give a number, or {len(mechanism)} of them"
+            )
         columns.append(np.broadcast_to(value, (len(mechanism),)))
     return np.stack(columns, axis=-1) if columns else np.empty((len(mechanism), 0))
 

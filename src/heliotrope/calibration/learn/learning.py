@@ -18,19 +18,28 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from heliotrope.calibration.evaluation import BeamErrors, beam_errors
-from heliotrope.calibration.fit.estimator import FieldFit, Loss, canonical_order, fit
+from heliotrope.calibration.fit.estimator import (
+    FieldFit,
+    Loss,
+    canonical_order,
+    check_rows,
+    fit,
+    mask_of,
+    names_of,
+)
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn import drift
 from heliotrope.calibration.learn.drift import DAY, Hyperparameters, Linear, Posterior
 from heliotrope.calibration.learn.regimes import find_regimes, regime_at
 from heliotrope.calibration.learn.unusable import find_unusable, is_usable
 from heliotrope.calibration.sightings import Sightings
+from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
-from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.parallel import threads
 from heliotrope.sun import Times, unix_seconds
+from heliotrope.values import Value
 
 #: Fewest sightings of a heliostat from which the hyperparameters are learnt.
 FEWEST = 8
@@ -52,8 +61,8 @@ ROUNDS = 6
 Progress = Callable[[int, int], None]
 
 
-@dataclass(frozen=True)
-class Prediction:
+@dataclass(frozen=True, eq=False)
+class Prediction(Value):
     """Predicted against measured positions of M beams.
 
     Attributes
@@ -84,8 +93,8 @@ class Prediction:
     usable: npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class Learned:
+@dataclass(frozen=True, eq=False)
+class Learned(Value):
     """Result of learning N heliostats from M sightings.
 
     Attributes
@@ -149,10 +158,18 @@ class Learned:
 
         Raises
         ------
+        InputError
+            A row that is not there.
         TimeError
             Something that is not a time, or has no time zone.
         """
         rows = np.asarray(heliostat, dtype=np.intp)
+        wrong = (rows < 0) | (rows >= len(self.members))
+        if wrong.any():
+            raise InputError(
+                f"heliostat: row {rows[wrong].flat[0]} is not learnt; rows go from 0 to "
+                f"{len(self.members) - 1}"
+            )
         when = np.broadcast_to(unix_seconds(time, unknown=True), rows.shape)
         size = len(self.names)
         values, spread = np.empty((len(rows), size)), np.empty((len(rows), size, size))
@@ -499,10 +516,9 @@ def learn(
     InputError
         As for `heliotrope.calibration.fit.fit`.
     """
-    constant = (
-        parameter_table.model(model, mechanism.parameters) if isinstance(model, str) else model
-    )
-    keep = np.ones(len(sightings), dtype=np.bool_) if used is None else np.asarray(used, np.bool_)
+    check_rows(mechanism, sightings)
+    constant = names_of(model, mechanism)
+    keep = mask_of(used, len(sightings), "used")
     task = Task(constant, dict(priors or {}), loss, own)
     with threadpool_limits(1, "blas"):
         if hyper is None:
