@@ -17,7 +17,7 @@ from pathlib import Path
 import httpx
 
 from heliotrope.errors import HeliotropeError
-from heliotrope.local import EMERGENCY, ORDINARY, ask_once, socket_folder
+from heliotrope.local import EMERGENCY, ORDINARY, ask_once, pack, socket_folder
 
 #: Connections that an attack holds.
 CONNECTIONS = 1100
@@ -385,9 +385,10 @@ def local_idle(place: Place, over: threading.Event) -> None:
 
 
 def local_frames(place: Place, over: threading.Event) -> None:
-    """Frames that claim 4 GB, and noise."""
-    path = socket_folder(place.data) / ORDINARY
-    for data in itertools.cycle((b"\xff" * 16, bytes(range(256)) * 16)):
+    """Frames that claim 4 GB, noise, and text that cannot be written anywhere."""
+    path, odd = socket_folder(place.data) / ORDINARY, b'{"key":"\\ud800"}'
+    said = b"HLP1" + struct.pack("<II", len(odd), 0) + odd
+    for data in itertools.cycle((b"\xff" * 16, bytes(range(256)) * 16, said)):
         if over.wait(0.001):
             return
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as line:
@@ -395,6 +396,57 @@ def local_frames(place: Place, over: threading.Event) -> None:
             line.connect(str(path))
             line.sendall(data)
             line.recv(100)
+
+
+def local_blobs(place: Place, over: threading.Event) -> None:
+    """A viewer's requests with 8 MB each that no call takes."""
+    _unread(place, over, pack({"id": 1, "call": "schedule", "arguments": {}}, bytes(8 << 20)))
+
+
+def local_unread(place: Place, over: threading.Event) -> None:
+    """A viewer asks for the largest view again and again, and reads no answer."""
+    _unread(place, over, pack({"id": 1, "call": "field", "arguments": {}}))
+
+
+def _unread(place: Place, over: threading.Event, request: bytes) -> None:
+    """Send a viewer's request as often as it is taken, over 16 connections; read nothing."""
+    with contextlib.ExitStack() as stack:
+        lines = [_Unread(place, request) for _ in range(16)]
+        for line in lines:
+            stack.callback(line.close)
+        while not over.wait(0.002):
+            for line in lines:
+                line.push()
+
+
+class _Unread:
+    """A connection to the plant's own socket that is opened again where it is cut off."""
+
+    def __init__(self, place: Place, request: bytes) -> None:
+        self._path, self._request = socket_folder(place.data) / ORDINARY, request
+        self._hello = pack({"token": place.token})
+        self._line: socket.socket | None = None
+        self._rest = b""
+
+    def push(self) -> None:
+        """Send as much as goes out at once."""
+        try:
+            if self._line is None:
+                self._line, self._rest = socket.socket(socket.AF_UNIX), self._hello
+                self._line.setblocking(False)
+                self._line.connect(str(self._path))
+            self._rest = self._rest[self._line.send(self._rest) :] or self._request
+        except BlockingIOError:
+            if self._rest is self._hello:  # others wait to be taken
+                self.close()
+        except OSError:
+            self.close()
+
+    def close(self) -> None:
+        """End the connection."""
+        if self._line is not None:
+            self._line.close()
+            self._line = None
 
 
 def local_orders(place: Place, over: threading.Event) -> None:
@@ -416,6 +468,7 @@ ATTACKS: dict[str, Attack] = {
         churn, resets, unread, pipelining, header_bombs, long_paths, unknown_paths, methods,
         not_http, foreign_hosts, foreign_sockets, stranger_streams, wrong_passwords, many_names,
         wrong_tokens, wrong_cookies, viewer_reads, viewer_orders, viewer_streams, operator_orders,
-        operator_stows, large_orders, local_strangers, local_idle, local_frames, local_orders,
+        operator_stows, large_orders, local_strangers, local_idle, local_frames, local_blobs,
+        local_unread, local_orders,
     )
 }  # fmt: skip

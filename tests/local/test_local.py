@@ -30,6 +30,8 @@ from heliotrope.local.sockets import connect, is_ours, listen, make_folder
 
 HELLO = {"token": "good"}
 SHORT = LocalLimits(strangers=4, callers=4, under_way=4, hello_s=0.5, answer_s=0.5, pace_s=0.001)
+#: A call that takes no blob.
+BARE = "bare"
 
 
 @dataclass
@@ -41,7 +43,7 @@ class _Echo:
     """Answers with its arguments; ``wait`` holds an answer back, ``large`` makes it long."""
 
     def __init__(self) -> None:
-        self.most = self.now = 0
+        self.most = self.now = self.held = 0
 
     async def caller(self, hello: dict[str, Any]) -> _Caller | None:
         if hello.get("key") == "console":
@@ -52,10 +54,12 @@ class _Echo:
         given = frame.head["arguments"]
         self.now += 1
         self.most = max(self.most, self.now)
+        self.held += len(frame.blob)
         try:
             await asyncio.sleep(given.get("wait", 0.0))
         finally:
             self.now -= 1
+            self.held -= len(frame.blob)
         if frame.head["call"] == "refuse":
             raise InputError("no")
         if frame.head["call"] == "break":
@@ -68,7 +72,12 @@ async def _serving(folder: Path, limits: LocalLimits = SHORT) -> AsyncIterator[t
     make_folder(folder)
     echo = _Echo()
     server = LocalServer(
-        folder / "plant.sock", echo.caller, echo.answer, lambda e: ("input", str(e)), limits
+        folder / "plant.sock",
+        echo.caller,
+        echo.answer,
+        lambda e: ("input", str(e)),
+        lambda _, head: head.get("call") != BARE,
+        limits,
     )
     server.open()
     async with asyncio.TaskGroup() as group:
@@ -77,9 +86,11 @@ async def _serving(folder: Path, limits: LocalLimits = SHORT) -> AsyncIterator[t
         serving.cancel()
 
 
-def _run(folder: Path, work: Callable[[Path, _Echo], Awaitable[None]]) -> None:
+def _run(
+    folder: Path, work: Callable[[Path, _Echo], Awaitable[None]], limits: LocalLimits = SHORT
+) -> None:
     async def main() -> None:
-        async with asyncio.timeout(30.0), _serving(folder / "interface") as (path, echo):
+        async with asyncio.timeout(60.0), _serving(folder / "interface", limits) as (path, echo):
             await work(path, echo)
 
     asyncio.run(main())
@@ -146,7 +157,22 @@ def test_what_is_no_frame(prefix: bytes, text: str) -> None:
         lengths(prefix, 100, 100)
 
 
-@pytest.mark.parametrize("data", [b"", b"[1]", b"{", b'{"a": NaN}', b"[" * 100_000, b"\xff{}"])
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"[1]",
+        b"{",
+        b'{"a": NaN}',
+        b'{"a": 1e999}',
+        b"[" * 100_000,
+        b"\xff{}",
+        b'{"key": "\\ud800"}',
+        b'{"key": "\xed\xa0\x80"}',
+        b'{"\\udfff": 1}',
+        '{"a": 1}'.encode("utf-16"),
+    ],
+)
 def test_what_is_no_head(data: bytes) -> None:
     with pytest.raises(FrameError, match="local interface"):
         head_of(data)
@@ -232,6 +258,96 @@ def test_a_frame_that_is_too_large_ends_its_connection_only(tmp_path: Path) -> N
     _run(tmp_path, work)
 
 
+@pytest.mark.parametrize(
+    "head",
+    [b'{"key":"\\ud800"}', b'{"token":"\\udfff"}', b'{"token":1e999}', b"[]", b'{"key":{}}'],
+)
+def test_whatever_a_stranger_says_leaves_no_trace_in_the_log(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, head: bytes
+) -> None:
+    """A traceback for each connection would fill the journal, 200 times a second."""
+
+    async def work(path: Path, _: _Echo) -> None:
+        with connect(path, 2.0) as raw:
+            raw.sendall(MARK + struct.pack("<II", len(head), 0) + head)
+            assert await asyncio.to_thread(_ended, raw)
+        assert await _ask(path, a=1) == {"a": 1}
+
+    _run(tmp_path, work)
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b'{"id":1e999,"call":"echo","arguments":{}}',
+        b'{"id":[1],"call":"echo","arguments":{}}',
+        b'{"id":true,"call":"echo","arguments":{}}',
+        b'{"call":"echo","arguments":{}}',
+        b'{"id":1,"call":"echo","arguments":{"a":"\\ud800"}}',
+    ],
+)
+def test_a_request_that_no_answer_fits_ends_its_connection_only(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, head: bytes
+) -> None:
+    async def work(path: Path, echo: _Echo) -> None:
+        with connect(path, 2.0) as raw:
+            raw.sendall(pack(HELLO) + MARK + struct.pack("<II", len(head), 0) + head)
+            assert await asyncio.to_thread(_ended, raw)
+        assert not echo.most
+        assert await _ask(path, a=1) == {"a": 1}
+
+    _run(tmp_path, work)
+    assert not caplog.records
+
+
+def test_a_blob_that_no_call_asked_for_takes_no_memory(tmp_path: Path) -> None:
+    """Callers hold as many requests of 8 MB as they may; none of it is kept."""
+    blob = bytes(8 << 20)
+
+    async def work(path: Path, echo: _Echo) -> None:
+        hold = [
+            asyncio.create_task(_ask(path, call, blob, wait=3.0)) for call in (BARE, BARE, "echo")
+        ]
+        while echo.now < len(hold):
+            await asyncio.sleep(0.01)
+        assert echo.held == len(blob)
+        assert await asyncio.gather(*hold) == [{"wait": 3.0}] * len(hold)
+
+    _run(tmp_path, work)
+
+
+def test_a_console_has_more_requests_under_way_than_others(tmp_path: Path) -> None:
+    async def work(path: Path, echo: _Echo) -> None:
+        line = LocalConnection(path, {"key": "console"})
+        async with asyncio.TaskGroup() as group:
+            running = group.create_task(line.run())
+            while not line.up:
+                await asyncio.sleep(0.01)
+            asked = [group.create_task(line.ask("echo", {"wait": 0.5})) for _ in range(20)]
+            await asyncio.gather(*asked)
+            running.cancel()
+        assert echo.most == 20
+
+    _run(tmp_path, work)
+
+
+def test_a_socket_of_another_user_is_given_no_token(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever made the folder that --data names could otherwise collect tokens."""
+    listener = listen(tmp_path / "a.sock")
+    monkeypatch.setattr("heliotrope.local.sockets.os.getuid", lambda: 12345)
+    monkeypatch.setattr("heliotrope.local.sockets.is_ours", lambda _: False)
+    with pytest.raises(AwayError, match="another user listens there"):
+        ask_once(tmp_path / "a.sock", HELLO, "echo", {})
+    connection, _ = listener.accept()
+    connection.settimeout(5.0)
+    assert connection.recv(100) == b""
+    connection.close()
+    listener.close()
+
+
 def test_requests_under_way_are_bounded(tmp_path: Path) -> None:
     """More requests than a connection may have wait in the client's own buffers."""
 
@@ -262,6 +378,25 @@ def test_a_client_that_never_reads_is_cut_off(tmp_path: Path) -> None:
         assert await _ask(path, a=1) == {"a": 1}
 
     _run(tmp_path, work)
+
+
+def test_answers_to_one_who_was_cut_off_leave_no_trace_in_the_log(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As many requests as may be under way, so that nothing more is read: not even the end."""
+
+    async def work(path: Path, echo: _Echo) -> None:
+        request = pack({"id": 1, "call": "echo", "arguments": {"wait": 0.5}}, b"x" * 4096)
+        with connect(path, 2.0) as raw:
+            raw.sendall(pack(HELLO) + 21 * request)
+            while echo.now < 20:
+                await asyncio.sleep(0.01)
+        while echo.now:
+            await asyncio.sleep(0.01)
+        assert await _ask(path, a=1) == {"a": 1}
+
+    _run(tmp_path, work, LocalLimits(under_way=20))
+    assert not caplog.records
 
 
 def test_the_oldest_caller_gives_way_and_a_console_never(tmp_path: Path) -> None:

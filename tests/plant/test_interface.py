@@ -245,6 +245,15 @@ def test_what_a_token_may_see_and_order(plant: LiveConsole, tokens: dict[str, st
         ask_once(folder / EMERGENCY, operator, "summary", {})
 
 
+def test_a_blob_of_a_viewer_is_passed_over_and_the_role_is_named(
+    plant: LiveConsole, tokens: dict[str, str]
+) -> None:
+    path, viewer = plant.interface.folder / ORDINARY, {"token": tokens["viewer"]}
+    with pytest.raises(CallError, match="needs operator"):
+        ask_once(path, viewer, "aim", {"heliostats": []}, bytes(8 << 20))
+    assert ask_once(path, viewer, "size", {}, bytes(8 << 20)) == 32
+
+
 class Heard:
     """Whether the last local controller has heard DEFOCUS."""
 

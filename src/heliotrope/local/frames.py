@@ -9,7 +9,9 @@ makes it, ``for``: the person on whose behalf. An answer has the ``id`` with a `
 
 import asyncio
 import json
+import math
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +25,8 @@ PREFIX = _PREFIX.size
 REQUEST_HEAD, REQUEST_BLOB = 1 << 20, 8 << 20
 #: Largest head before the caller is known, bytes.
 HELLO_HEAD = 4096
+#: Bytes of a blob that are read at once where it is passed over.
+_PART = 1 << 16
 #: Kind of an error that is a mistake of the program.
 INTERNAL = "internal"
 #: Largest head and blob of an answer, bytes.
@@ -71,10 +75,14 @@ def head_of(data: bytes) -> dict[str, Any]:
     Raises
     ------
     FrameError
-        If it is not a JSON object.
+        If it is not a JSON object, or holds a number or a text that no answer could repeat: an
+        infinite one, or half of a surrogate pair.
     """
     try:
-        found = json.loads(data, parse_constant=_no_number)
+        # As text: of bytes json would accept surrogates, and UTF-16.
+        found = json.loads(data.decode(), parse_constant=_no_number, parse_float=_number)
+        if b"\\u" in data:
+            json.dumps(found, ensure_ascii=False).encode()
     except (ValueError, RecursionError):
         raise FrameError(f"local interface: a head of {len(data)} bytes that is not JSON") from None
     if not isinstance(found, dict):
@@ -86,10 +94,20 @@ def _no_number(text: str) -> float:
     raise ValueError(text)
 
 
+def _number(text: str) -> float:
+    found = float(text)
+    if not math.isfinite(found):
+        raise ValueError(text)
+    return found
+
+
 async def read_frame(
-    reader: asyncio.StreamReader, most_head: int = ANSWER_HEAD, most_blob: int = ANSWER_BLOB
+    reader: asyncio.StreamReader,
+    most_head: int = ANSWER_HEAD,
+    most_blob: int = ANSWER_BLOB,
+    wanted: Callable[[dict[str, Any]], bool] = lambda _: True,
 ) -> Frame:
-    """Read one frame.
+    """Read one frame; a blob that is not ``wanted`` with its head is passed over, not kept.
 
     Raises
     ------
@@ -99,5 +117,9 @@ async def read_frame(
         If the connection ends.
     """
     head, blob = lengths(await reader.readexactly(PREFIX), most_head, most_blob)
-    text = await reader.readexactly(head)
-    return Frame(head_of(text), await reader.readexactly(blob))
+    found = head_of(await reader.readexactly(head))
+    if wanted(found):
+        return Frame(found, await reader.readexactly(blob))
+    while blob:
+        blob -= len(await reader.readexactly(min(blob, _PART)))
+    return Frame(found)

@@ -3,11 +3,13 @@
 Connections are taken at a limited rate. One that does not say who it is in time is cut off; where
 all places are taken, the oldest connection gives way. A connection has a limited number of requests
 under way: while they are, nothing more is read from it. A request counts until its answer is
-written, and a client that does not read its answers is cut off.
+written, and a client that does not read its answers is cut off. A blob is kept only where the call
+takes one from this caller.
 """
 
 import asyncio
 import contextlib
+import functools
 import logging
 import socket
 from collections.abc import Awaitable, Callable
@@ -56,18 +58,19 @@ class LocalLimits:
     strangers, callers, reserved
         Connections that have not said who they are, those that have, and those of consoles: one
         that begins may meet one that ends.
-    under_way
-        Requests under way in one connection.
+    under_way, console_under_way
+        Requests under way in one connection, and in one of a console, which many persons share.
     hello_s, answer_s
         Time to say who is calling, and to take an answer, s.
     pace_s
         Time between two new connections, s.
     """
 
-    strangers: int = 8
+    strangers: int = 32
     callers: int = 16
     reserved: int = 2
-    under_way: int = 32
+    under_way: int = 4
+    console_under_way: int = 32
     hello_s: float = 2.0
     answer_s: float = 5.0
     pace_s: float = 0.005
@@ -87,6 +90,8 @@ class _Peer:
         """Write a frame; a peer that does not take it within ``limit`` s is cut off."""
         try:
             async with asyncio.timeout(limit), self._turn:
+                if self._writer.transport.is_closing():
+                    return  # asyncio would write a line to the log for each answer
                 self._writer.write(data)
                 await self._writer.drain()
         except (TimeoutError, OSError):
@@ -106,6 +111,8 @@ class LocalServer(Generic[C]):
         Returns value and blob of the answer to a request.
     kinds
         Returns kind and text of an error for the client.
+    blob
+        Returns whether the call of a head may bring a blob, from this caller.
     limits
         See `LocalLimits`.
     """
@@ -116,9 +123,11 @@ class LocalServer(Generic[C]):
         caller: Callable[[dict[str, Any]], Awaitable[C | None]],
         answer: Callable[[C, Frame], Awaitable[tuple[Any, bytes]]],
         kinds: Callable[[HeliotropeError], Problem],
+        blob: Callable[[C, dict[str, Any]], bool],
         limits: LocalLimits | None = None,
     ) -> None:
         self._path, self._caller, self._answer, self._kinds = path, caller, answer, kinds
+        self._blob = blob
         self._limits = limits or LocalLimits()
         self._listener: socket.socket | None = None
         #: Taken, and not served yet.
@@ -203,13 +212,17 @@ class LocalServer(Generic[C]):
         return caller
 
     async def _talk(self, reader: asyncio.StreamReader, peer: _Peer, caller: C) -> None:
-        room = asyncio.Semaphore(self._limits.under_way)
+        limits = self._limits
+        most = limits.console_under_way if caller.reserved else limits.under_way
+        room, wanted = asyncio.Semaphore(most), functools.partial(self._blob, caller)
         works = set[asyncio.Task[None]]()
         async with asyncio.TaskGroup() as group:
             try:
                 while True:
                     await room.acquire()
-                    frame = await read_frame(reader, REQUEST_HEAD, REQUEST_BLOB)
+                    frame = await read_frame(reader, REQUEST_HEAD, REQUEST_BLOB, wanted)
+                    if type(frame.head.get("id")) is not int:
+                        raise FrameError("local interface: a request without a number")
                     work = group.create_task(self._one(frame, peer, caller, room))
                     works.add(work)
                     work.add_done_callback(works.discard)
@@ -219,7 +232,7 @@ class LocalServer(Generic[C]):
 
     async def _one(self, frame: Frame, peer: _Peer, caller: C, room: asyncio.Semaphore) -> None:
         """Answer one request."""
-        number, blob = frame.head.get("id"), b""
+        number, blob = frame.head["id"], b""
         try:
             value, blob = await self._answer(caller, frame)
             data = pack({"id": number, "value": value}, blob)

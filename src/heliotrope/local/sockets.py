@@ -1,6 +1,7 @@
 """Unix sockets in a folder that only the plant's own user can enter."""
 
 import contextlib
+import errno
 import os
 import socket
 import stat
@@ -87,7 +88,7 @@ def connect(path: Path, timeout: float) -> socket.socket:
     Raises
     ------
     OSError
-        If nobody listens there.
+        If nobody listens there, or another user, who would be given our key or token.
     """
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     made.settimeout(timeout)
@@ -102,6 +103,8 @@ def connect(path: Path, timeout: float) -> socket.socket:
                     if time.monotonic() > until:
                         raise
                     time.sleep(_AGAIN)
+        if os.getuid() and not is_ours(made):
+            raise PermissionError(errno.EACCES, "another user listens there")
     except BaseException:
         made.close()
         raise

@@ -46,6 +46,8 @@ class Call:
         Whether it belongs to the socket for EMERGENCY, DEFOCUS and STOW.
     console
         Whether only a console may make it.
+    blob
+        Whether it takes a blob.
     """
 
     role: Role
@@ -54,6 +56,7 @@ class Call:
     then: Then | None = None
     urgent: bool = False
     console: bool = False
+    blob: bool = False
 
 
 def _see(look: Callable[[Desk], Any]) -> Call:
@@ -202,8 +205,8 @@ _ORDERS = {
     "keep_authority": Call(Role.OPERATOR, orders.Nothing, lambda d, who, *_: d.keep(who)),
     "release_authority": Call(Role.OPERATOR, orders.Nothing, lambda d, who, *_: d.release(who)),
     "command": Call(Role.OPERATOR, orders.CommandOrder, _command, Desk.recorded),
-    "aim": Call(Role.OPERATOR, orders.PointsOrder, _aim, Desk.recorded),
-    "standby": Call(Role.OPERATOR, orders.PointsOrder, _standby, Desk.recorded),
+    "aim": Call(Role.OPERATOR, orders.PointsOrder, _aim, Desk.recorded, blob=True),
+    "standby": Call(Role.OPERATOR, orders.PointsOrder, _standby, Desk.recorded, blob=True),
     "automatic": Call(
         Role.OPERATOR,
         orders.SomeHeliostats,
@@ -219,7 +222,7 @@ _ORDERS = {
         Role.ENGINEER, orders.Named, lambda _d, _who, given, _b: given.name, Desk.bus_frames
     ),
     "take_flight": Call(
-        Role.ENGINEER, orders.Nothing, lambda _, __, ___, blob: blob, Desk.take_flight
+        Role.ENGINEER, orders.Nothing, lambda _, __, ___, blob: blob, Desk.take_flight, blob=True
     ),
     "hold": Call(Role.OPERATOR, orders.HoldOrder, _hold),
     "unhold": Call(Role.OPERATOR, orders.GivenBack, _unhold),

@@ -202,7 +202,12 @@ class PlantInterface:
         async def answer(caller: LocalCaller, frame: Frame) -> tuple[Any, bytes]:
             return await self._answer(calls, turns, caller, frame)
 
-        return LocalServer(self.folder / name, self._caller, answer, kind_of, _LIMITS)
+        def blob(caller: LocalCaller, head: dict[str, Any]) -> bool:
+            call = calls.get(str(head.get("call")))
+            person = caller.person
+            return call is not None and call.blob and (person is None or person.role >= call.role)
+
+        return LocalServer(self.folder / name, self._caller, answer, kind_of, blob, _LIMITS)
 
     async def _answer(
         self, calls: dict[str, Call], turns: "_Turns", caller: LocalCaller, frame: Frame
