@@ -13,7 +13,7 @@ from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, angle_between, as_numbers, bisector, reflect
 from heliotrope.mechanism.chain import Mechanism
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, span
 
 Split = Literal[
     "random",
@@ -29,7 +29,7 @@ Split = Literal[
 NEIGHBOURHOOD = 0.1
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class BeamErrors(Value):
     """Errors of M sightings under a mechanism.
 
@@ -51,6 +51,18 @@ class BeamErrors(Value):
     normal: FloatArray
     offset: FloatArray
     plane: FloatArray
+
+    def _card(self) -> Card:
+        found = summarise(self.beam)
+        line = f"{found.count} sightings, beam {1e3 * found.median:.3g} mrad median, "
+        line += f"{1e3 * found.rms:.3g} RMS, {1e3 * found.p95:.3g} for 95 %"
+        rows = [
+            ("beam", span(self.beam, 1e3, "mrad")),
+            ("normal", span(self.normal, 1e3, "mrad")),
+            ("to the right", span(self.offset[:, 0], 1e3, "mrad")),
+            ("upwards", span(self.offset[:, 1], 1e3, "mrad")),
+        ]
+        return Card(line, ("error", "range"), rows)
 
 
 def beam_errors(mechanism: Mechanism, sightings: Sightings) -> BeamErrors:

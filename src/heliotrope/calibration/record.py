@@ -14,13 +14,14 @@ import numpy.typing as npt
 
 from heliotrope import __version__
 from heliotrope.calibration.evaluation import beam_errors
-from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome
+from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome, parameter_rows
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.calibration.uncertainty import expected_error
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.optics.beam import ExpectedError
+from heliotrope.values import Card, Value, amount
 
 Identities = npt.NDArray[np.int64]
 
@@ -65,8 +66,8 @@ def _no_residuals() -> FloatArray:
     return np.zeros((0, 2))
 
 
-@dataclass(frozen=True, eq=False)
-class HeliostatCalibration:
+@dataclass(frozen=True, eq=False, repr=False)
+class HeliostatCalibration(Value):
     """The calibration of one heliostat: P parameters from M sightings. Arrays are read-only.
 
     Attributes
@@ -236,6 +237,13 @@ class HeliostatCalibration:
             pushed,
             version=version,
         )
+
+    def _card(self) -> Card:
+        line = f"{self.heliostat}, version {self.version}, {self.model or 'model unknown'}, "
+        line += f"{amount(len(self.sightings), 'sighting')}, beam {1e3 * self.before:.3g} mrad RMS "
+        line += f"before and {1e3 * self.after:.3g} after"
+        rows = parameter_rows(self.names, self.values, self.sigma)
+        return Card(line, ("parameter", "value", "σ"), rows)
 
     @property
     def parameters(self) -> dict[str, float]:

@@ -15,9 +15,9 @@ import numpy.typing as npt
 from heliotrope.errors import InputError, kind_of
 from heliotrope.field.formats.measurements import Measurements
 from heliotrope.field.heliostats import Heliostats
-from heliotrope.geometry import FloatArray, as_float, as_numbers, normalize
+from heliotrope.geometry import FloatArray, as_float, as_numbers, azimuth_elevation, normalize
 from heliotrope.sun import Times, unix_seconds
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, amount, dots, span
 
 #: Largest standard deviation of a ray, rad: milliradians and degrees are mostly larger.
 LARGEST_SIGMA = 0.2
@@ -25,7 +25,7 @@ LARGEST_SIGMA = 0.2
 _UNIT = 2e-15
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Sightings(Value):
     """M sightings of N heliostats.
 
@@ -60,6 +60,29 @@ class Sightings(Value):
     source_covariance: FloatArray
     destination_covariance: FloatArray
 
+    def _card(self) -> Card:
+        some = amount(len(np.unique(self.heliostat)), "heliostat")
+        known = self.time[np.isfinite(self.time)]
+        days = [f"{np.datetime64(int(t), 's').astype('datetime64[D]')}" for t in _ends(known)]
+        when = " to ".join(dict.fromkeys(days)) or "times unknown"
+        far = self.source[self.source_at_infinity]
+        azimuth, elevation = azimuth_elevation(far)
+        rows = [
+            ("sun's azimuth", span(azimuth, np.degrees(1.0), "°")),
+            ("sun's elevation", span(elevation, np.degrees(1.0), "°")),
+            ("sigma of the beam", span(self.sigma, 1e3, "mrad")),
+            ("sources at infinity", f"{len(far)} of {len(self)}"),
+            ("destinations at infinity", f"{self.destination_at_infinity.sum()} of {len(self)}"),
+            *(
+                (f"counts of drive {d + 1}", span(self.counts[:, d]))
+                for d in range(self.counts.shape[-1])
+            ),
+        ]
+        # The sky from below: the zenith in the middle, north up, west to the left.
+        sky = 0.5 * np.pi - elevation
+        picture = dots(sky * np.sin(azimuth), sky * np.cos(azimuth), "suns from the zenith")
+        return Card(f"{len(self)} of {some}, {when}", ("what", "range"), rows, picture)
+
     def __len__(self) -> int:
         return len(self.heliostat)
 
@@ -74,6 +97,10 @@ class Sightings(Value):
         """Return the sightings of one heliostat, renumbered to 0."""
         part = self.take(np.flatnonzero(self.heliostat == heliostat))
         return replace(part, heliostat=np.zeros(len(part), dtype=np.intp))
+
+
+def _ends(values: FloatArray) -> tuple[float, ...]:
+    return (float(values.min()), float(values.max())) if len(values) else ()
 
 
 def sightings(

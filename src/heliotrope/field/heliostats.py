@@ -11,10 +11,10 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.machine import Machine
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, amount, card_of_arrays, dots, span
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Facets(Value):
     """F facets of each of N heliostats, in the mirror's frame (x right, y up, z out of it).
 
@@ -36,8 +36,11 @@ class Facets(Value):
         if len(shapes) != 1 or self.center.ndim != 3 or self.center.shape[-1] != 3:
             raise InputError(f"facets: shapes {sorted(shapes)} must all be (N, F, 3)")
 
+    def _card(self) -> Card:
+        return card_of_arrays(self)
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Heliostats(Value):
     """N heliostats of one kind.
 
@@ -111,6 +114,23 @@ class Heliostats(Value):
             raise InputError(f"heliostats: aim of shape {self.aim.shape}; it must be ({count}, 3)")
         if self.facets is not None and len(self.facets.center) != count:
             raise InputError(f"heliostats: {len(self.facets.center)} rows of facets for {count}")
+
+    def _card(self) -> Card:
+        count = len(self.parameters)
+        state = amount(count, "calibrated parameter") if count else "nominal"
+        line = f"{amount(len(self), self.mechanism.kind + ' heliostat')}, {self.mirror}, {state}"
+        places = self.position
+        rows = [
+            (name, *(f"{x:.2f}" for x in places[i]), f"{self.width[i]:.3g} × {self.height[i]:.3g}")
+            for i, name in enumerate(self.names)
+        ]
+        header = ("heliostat", "east, m", "north, m", "up, m", "mirror, m")
+        return Card(line, header, rows, dots(places[:, 0], places[:, 1], "map"))
+
+    @property
+    def mirror(self) -> str:
+        """Sizes of the mirrors in one phrase: "1.83 × 1.22 m"."""
+        return f"{span(self.width)} × {span(self.height)} m"
 
     def __len__(self) -> int:
         return len(self.names)

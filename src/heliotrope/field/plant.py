@@ -18,12 +18,12 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.sun import Site, check_site
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, amount, dots
 
 Surface = TypeVar("Surface", Target, Receiver, Camera)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Plant(Value):
     """A solar tower plant.
 
@@ -83,6 +83,28 @@ class Plant(Value):
         for name in names:
             if names.count(name) > 1:
                 raise InputError(f"keep-out volume {name}: the name occurs twice")
+
+    def _card(self) -> Card:
+        s = self.site
+        counts = ((self.targets, "target"), (self.receivers, "receiver"), (self.cameras, "camera"))
+        parts = ", ".join(amount(len(found), noun) for found, noun in counts if found)
+        line = f"{self.name}, {amount(len(self), 'heliostat')}; {parts or 'no target'}; site "
+        line += (
+            f"{s.name} {s.latitude_deg:.4f}° north, {s.longitude_deg:.4f}° east, {s.height:.0f} m"
+        )
+        rows = [
+            (
+                name,
+                str(len(group)),
+                group.mechanism.kind,
+                group.mirror,
+                amount(len(group.parameters), "parameter") if group.parameters else "nominal",
+            )
+            for name, group in self.groups.items()
+        ]
+        header = ("group", "heliostats", "kind", "mirrors", "calibrated")
+        places = self.position
+        return Card(line, header, rows, dots(places[:, 0], places[:, 1], "map"))
 
     def __len__(self) -> int:
         return sum(len(group) for group in self.groups.values())

@@ -10,10 +10,10 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray, as_vectors, normalize
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, amount
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Target(Value):
     """A flat calibration target.
 
@@ -56,6 +56,20 @@ class Target(Value):
             raise InputError(
                 f"target {self.name}: its corners span no area; give four corners of a rectangle"
             )
+
+    def _card(self) -> Card:
+        east, north, up = self.center
+        line = f"{self.name}, {self.width:.4g} × {self.height:.4g} m, centre {east:.4g} m east, "
+        line += f"{north:.4g} m north, {up:.4g} m up; {amount(len(self.marks), 'mark')}"
+        rows = [
+            (name, *(f"{x:.3f}" for x in corner))
+            for name, corner in zip(
+                ("upper left", "upper right", "lower right", "lower left"),
+                self.corners,
+                strict=True,
+            )
+        ]
+        return Card(line, ("corner", "east, m", "north, m", "up, m"), rows)
 
     @property
     def _across(self) -> FloatArray:
@@ -108,7 +122,7 @@ class Target(Value):
         return o + length[..., None] * d
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Receiver(Value):
     """A receiver: the surface that the field heats.
 
@@ -139,6 +153,11 @@ class Receiver(Value):
     corners: FloatArray | None = None
     radius: float = 0.0
     opening_angle: float = 0.0
+
+    def _card(self) -> Card:
+        east, north, up = self.center
+        line = f"{self.name}, {self.kind}, {self.width:.4g} × {self.height:.4g} m, centre "
+        return Card(f"{line}{east:.4g} m east, {north:.4g} m north, {up:.4g} m up")
 
     def __post_init__(self) -> None:
         kinds = ("planar", "convex_cylinder", "external_cylinder")

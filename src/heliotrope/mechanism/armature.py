@@ -13,10 +13,10 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_vectors, normalize, rotation
 from heliotrope.mechanism.kernels import slots as slot
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, card_of_arrays
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Armature(Value):
     """Two axes with a point on each, a vertex and its normal, at zero joint angles.
 
@@ -29,6 +29,9 @@ class Armature(Value):
     """
 
     table: FloatArray
+
+    def _card(self) -> Card:
+        return card_of_arrays(self)
 
     @classmethod
     def of(

@@ -17,7 +17,7 @@ from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.mechanism.kernels.chain import armature_block, jacobian_block, pose_block
 from heliotrope.mechanism.parameters import Parameter
 from heliotrope.parallel import run_blocks
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, card_of_arrays, dots, span
 
 #: Largest deviation of a length, m: millimetres are mostly larger; and of a ratio.
 _FARTHEST, _LARGEST = 1000.0, 1e6
@@ -32,7 +32,7 @@ Index = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Pose(Value):
     """Normals and vertices of mirrors.
 
@@ -47,8 +47,11 @@ class Pose(Value):
     normal: FloatArray
     vertex: FloatArray
 
+    def _card(self) -> Card:
+        return card_of_arrays(self)
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Jacobian(Value):
     """A pose with its derivatives by P parameters and by the counts of D drives.
 
@@ -71,8 +74,11 @@ class Jacobian(Value):
     normal_counts: FloatArray
     vertex_counts: FloatArray
 
+    def _card(self) -> Card:
+        return card_of_arrays(self)
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Mechanism(Value):
     """One mechanism, or an array of mechanisms of one kind; batch shape (...).
 
@@ -111,6 +117,23 @@ class Mechanism(Value):
     drives: Drive
     vertex: FloatArray
     normal: FloatArray
+
+    def _card(self) -> Card:
+        joints = [self.joints[k] for k in self.driven]
+        drives = [self.drives[d] for d in range(len(joints))]
+        parts = ", ".join(f"{j} ({d.kinds})" for j, d in zip(joints, drives, strict=True))
+        rows = [
+            (name, f"{span(self.position[..., k])} m")
+            for k, name in enumerate(("east", "north", "up"))
+        ]
+        rows += [(j, d.describe()) for j, d in zip(joints, drives, strict=True)]
+        size = "one" if not self.shape else " × ".join(map(str, self.shape))
+        return Card(
+            f"{size} {self.kind}: {parts}",
+            ("part", "value"),
+            rows,
+            dots(self.position[..., 0], self.position[..., 1], "map") if self.shape else "",
+        )
 
     @property
     def shape(self) -> tuple[int, ...]:

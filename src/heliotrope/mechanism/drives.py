@@ -35,10 +35,10 @@ from heliotrope.geometry import (
 from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.mechanism.kernels.drives import angles_block, counts_block, slopes_block
 from heliotrope.parallel import run_blocks
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, span
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Drive(Value):
     """One drive, or an array of drives of the same or of different kinds.
 
@@ -51,6 +51,36 @@ class Drive(Value):
     """
 
     table: FloatArray
+
+    def _card(self) -> Card:
+        rows = [
+            (name, span(self.table[..., place], *_SHOWN[name]))
+            for name, place in SLOTS.items()
+            if name != "initial_angle" and np.isfinite(self.table[..., place]).any()
+        ]
+        size = "" if not self.shape else f"{' × '.join(map(str, self.shape))} "
+        return Card(f"{size}{self.kinds}, {self.describe()}", ("number", "value"), rows)
+
+    @property
+    def kinds(self) -> str:
+        """Names of its kinds: "rotary", "jack" or "rotary and jack"."""
+        found = self.table[..., slot.KIND]
+        names = {"rotary": slot.ROTARY, "jack": slot.LINEAR}
+        return " and ".join(name for name, kind in names.items() if (found == kind).any())
+
+    def describe(self) -> str:
+        """Return step and stops in one line for people."""
+        rotary = self.table[..., slot.KIND] == slot.ROTARY
+        rate = np.abs(self.table[..., slot.RATE])
+        steps = [
+            span(rate[chosen], 1e6, f"{unit} a count")
+            for chosen, unit in ((rotary, "µrad"), (~rotary, "µm"))
+            if chosen.any()
+        ]
+        stops = self.table[..., [slot.MIN_ANGLE, slot.MAX_ANGLE]]
+        if np.isfinite(stops).any():
+            steps.append(f"stops {span(stops, *_SHOWN['min_angle'])}")
+        return ", ".join(steps)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -130,6 +160,16 @@ SLOTS = {
 }
 
 
+_DEGREES, _MRAD, _METRES = (float(np.degrees(1.0)), "°"), (1e3, "mrad"), (1.0, "m")
+#: Scale and unit in which each number is shown.
+_SHOWN = {
+    **dict.fromkeys(SLOTS, (1.0, "")),
+    **dict.fromkeys(("zero", "sag_phase", "min_angle", "max_angle"), _DEGREES),
+    **dict.fromkeys(("bias", "worm_cos", "worm_sin", "sag"), _MRAD),
+    **dict.fromkeys(("stroke_offset", "offset", "pivot_radius"), _METRES),
+    "rate": (1e6, "µrad or µm a count"),
+    "speed": (1.0, "counts/s"),
+}
 #: Name of each number for errors.
 _NAMES = {index: name for name, index in SLOTS.items()} | {
     slot.KIND: "kind",

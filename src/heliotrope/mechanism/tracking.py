@@ -27,7 +27,7 @@ from heliotrope.mechanism.kernels.track import (
     UNREACHABLE,
 )
 from heliotrope.parallel import run_blocks
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, amount, span
 
 Branch = Literal["both", 0, 1]
 
@@ -57,7 +57,7 @@ _TEXTS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Tracking(Value):
     """Solutions of one or both branches; B branches, D drives.
 
@@ -88,6 +88,20 @@ class Tracking(Value):
     residual: FloatArray
     iterations: npt.NDArray[np.int32]
     best: npt.NDArray[np.int8]
+
+    def _card(self) -> Card:
+        best = self.chosen(self.status)
+        found = [(s.name.lower(), s.text, int((best == s).sum())) for s in TrackingStatus]
+        seen = [(name, text, str(count)) for name, text, count in found if count]
+        angles = np.degrees(self.chosen(self.angles))
+        rows = [
+            (f"drive {d + 1}", f"{span(angles[..., d])} °", span(self.chosen(self.counts)[..., d]))
+            for d in range(angles.shape[-1])
+        ]
+        size = " × ".join(map(str, best.shape)) or "one"
+        line = f"{size} of {amount(self.status.shape[-1], 'branch').replace('chs', 'ches')}: "
+        line += ", ".join(f"{count} {name}" for name, _, count in seen)
+        return Card(line, ("best branch", "angle or meaning", "counts"), [*rows, *seen])
 
     @property
     def reachable(self) -> npt.NDArray[np.bool_]:

@@ -27,7 +27,7 @@ from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
 from heliotrope.optics.beam import beam_sigma
 from heliotrope.optics.intercept import intercept_rectangle
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, amount, span
 
 #: Default number of cells across and up.
 CELLS = (24, 24)
@@ -35,7 +35,7 @@ CELLS = (24, 24)
 MARGIN = 1.5
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FluxView(Value):
     """The predicted flux on a receiver.
 
@@ -62,6 +62,11 @@ class FluxView(Value):
     power: float
     intercept: float
     heliostats: int
+
+    def _card(self) -> Card:
+        line = f"{amount(self.heliostats, 'beam')} on {self.receiver}, {1e-3 * self.power:.4g} kW, "
+        line += f"intercept {100 * self.intercept:.3g} %, "
+        return Card(f"{line}{span(self.flux, 1e-3, 'kW/m²')} in {self.flux.shape} cells")
 
 
 def air_loss(distance: npt.ArrayLike) -> FloatArray:

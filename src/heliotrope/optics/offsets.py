@@ -19,10 +19,10 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float, as_vectors, reflect, tangent_axes
 from heliotrope.mechanism.chain import Mechanism, Pose
 from heliotrope.mechanism.tracking import TrackingStatus, track
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, dots, span
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ImageOffsets(Value):
     """Where beams cross the plane through the aim perpendicular to the line of sight.
 
@@ -44,6 +44,13 @@ class ImageOffsets(Value):
     slant: FloatArray
     normal: FloatArray
     beam: FloatArray
+
+    def _card(self) -> Card:
+        rows = [("right", span(self.right, 1.0, "m")), ("up", span(self.up, 1.0, "m"))]
+        rows.append(("slant range", span(self.slant, 1.0, "m")))
+        size = " × ".join(map(str, self.right.shape)) or "one"
+        line = f"{size}, beam error {1e3 * float(self.rms()):.3g} mrad RMS"
+        return Card(line, ("offset", "range"), rows, dots(self.right, self.up, "offsets"))
 
     @property
     def distance(self) -> FloatArray:

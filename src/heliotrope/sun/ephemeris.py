@@ -22,6 +22,7 @@ from heliotrope.errors import InputError, TimeError, UnknownNameError, kind_of
 from heliotrope.geometry import FloatArray, as_float, direction, wrap_positive
 from heliotrope.parallel import run_blocks
 from heliotrope.sun import grena
+from heliotrope.values import Card, Value, span
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -128,8 +129,8 @@ _SITE_LIMITS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class SunPosition:
+@dataclass(frozen=True, eq=False, repr=False)
+class SunPosition(Value):
     """The position of the sun; the shape (...) is that of the times.
 
     Attributes
@@ -153,6 +154,17 @@ class SunPosition:
     true_elevation: FloatArray
     vector: FloatArray
     true_vector: FloatArray
+
+    def _card(self) -> Card:
+        turn = float(np.degrees(1.0))
+        rows = [
+            ("azimuth", span(self.azimuth, turn, "°")),
+            ("apparent elevation", span(self.elevation, turn, "°")),
+            ("true elevation", span(self.true_elevation, turn, "°")),
+        ]
+        size = " × ".join(map(str, self.azimuth.shape)) or "one"
+        line = ", ".join(f"{name} {value}" for name, value in rows[:2])
+        return Card(f"{size}, {line}", ("angle", "range"), rows)
 
 
 @dataclass(frozen=True)

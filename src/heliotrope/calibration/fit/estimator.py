@@ -33,7 +33,7 @@ from heliotrope.mechanism.chain import Mechanism, Pose
 from heliotrope.mechanism.drives import SLOTS, Drive
 from heliotrope.mechanism.tracking import track
 from heliotrope.parallel import run_blocks
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, amount
 
 Loss = Literal["square", "huber", "cauchy"]
 _LOSSES = {"square": kernels.SQUARE, "huber": kernels.HUBER, "cauchy": kernels.CAUCHY}
@@ -64,7 +64,7 @@ _TEXTS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FieldFit(Value):
     """Fitted parameters of N heliostats, P each.
 
@@ -101,6 +101,18 @@ class FieldFit(Value):
     outcome: npt.NDArray[np.int8]
     centre: FloatArray
 
+    def _card(self) -> Card:
+        ends = [FitOutcome(int(o)) for o in self.outcome]
+        counts = ", ".join(
+            f"{ends.count(o)} {o.name.lower().replace('_', ' ')}" for o in FitOutcome if o in ends
+        )
+        line = f"{amount(len(self.names), 'parameter')} of {amount(len(ends), 'heliostat')} from "
+        line += f"{amount(int(self.count.sum()), 'sighting')}: {counts}"
+        many = len(ends) > 1
+        header = ("parameter", "median size" if many else "value", "median σ" if many else "σ")
+        sizes = np.abs(self.values) if many else self.values
+        return Card(line, header, parameter_rows(self.names, sizes, self.sigma))
+
     @property
     def parameters(self) -> dict[str, FloatArray]:
         """Values by name, each (N,)."""
@@ -110,6 +122,20 @@ class FieldFit(Value):
     def sigma(self) -> FloatArray:
         """Standard deviations of the values, (N, P)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+
+def parameter_rows(
+    names: tuple[str, ...], values: FloatArray, sigma: FloatArray
+) -> list[tuple[str, str, str]]:
+    """Return a row for each parameter: name, median of values (N, P) and of sigmas, with unit."""
+    rows = []
+    for p, name in enumerate(names):
+        scale, unit = parameter_table.shown_in(name)
+        figures = [
+            scale * float(np.median(x[..., p])) if x.size else np.nan for x in (values, sigma)
+        ]
+        rows.append((name, *(f"{x:.4g} {unit}".strip() for x in figures)))
+    return rows  # type: ignore[return-value]
 
 
 def fit(

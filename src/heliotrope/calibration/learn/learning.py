@@ -26,6 +26,7 @@ from heliotrope.calibration.fit.estimator import (
     fit,
     mask_of,
     names_of,
+    parameter_rows,
 )
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn import drift
@@ -39,7 +40,7 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.parallel import threads
 from heliotrope.sun import Times, unix_seconds
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, amount, dots, span
 
 #: Fewest sightings of a heliostat from which the hyperparameters are learnt.
 FEWEST = 8
@@ -61,7 +62,7 @@ ROUNDS = 6
 Progress = Callable[[int, int], None]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Prediction(Value):
     """Predicted against measured positions of M beams.
 
@@ -92,8 +93,18 @@ class Prediction(Value):
     values: FloatArray
     usable: npt.NDArray[np.bool_]
 
+    def _card(self) -> Card:
+        good = self.usable
+        if not good.any():
+            return Card(f"{len(good)} beams, no usable beam")
+        line = f"{len(good)} beams, {(~good).sum()} unusable; errors "
+        line += (
+            f"{span(self.errors.beam[good], 1e3, 'mrad')}, {100 * self.inside[good].mean():.0f} "
+        )
+        return Card(f"{line}% within their 90 % ellipses")
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Learned(Value):
     """Result of learning N heliostats from M sightings.
 
@@ -135,6 +146,23 @@ class Learned(Value):
     outlier: npt.NDArray[np.bool_]
     unusable: npt.NDArray[np.bool_]
     rows: tuple[npt.NDArray[np.intp], ...]
+
+    def _card(self) -> Card:
+        model, all_names = len(self.model), len(self.names)
+        seen = amount(int(self.used.sum()), "sighting")
+        parts = [
+            f"{amount(len(self.members), 'heliostat')} from {seen}",
+            amount(int(self.outlier.sum()), "outlier"),
+            f"{self.unusable.sum()} unusable",
+            amount(model, "constant parameter"),
+            f"{amount(all_names - model, 'parameter')} that only drift",
+        ]
+        static = self.static
+        rows = parameter_rows(static.names, np.abs(static.values), static.sigma)
+        places = self.mechanism.position
+        picture = dots(places[:, 0], places[:, 1], "map")
+        header = ("parameter", "median size", "median σ of the fit")
+        return Card(", ".join(parts), header, rows, picture)
 
     @property
     def names(self) -> tuple[str, ...]:
