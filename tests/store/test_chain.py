@@ -35,7 +35,7 @@ def fill(keeper: Keeper) -> None:
 def verified(keeper: Keeper, *heads: chain.Head) -> tuple[chain.Head, chain.Head]:
     """Check a keeper's chains."""
     with keeper.database.reading() as connection:
-        return chain.verify(connection, heads)
+        return chain.verify(connection, heads).heads
 
 
 def test_what_nobody_touched_fits(
@@ -96,15 +96,50 @@ def test_old_events_leave_and_the_rest_fits(keeper: Keeper) -> None:
     early = verified(keeper)
     keeper.forget_events(103.0)
     keeper.record_event(Event(200.0, "test", "later"))
-    keeper.writer.confirmed().result(10.0)
+    keeper.writer.confirmed().result(60.0)
     assert len(keeper.events()) == 3
     later = verified(keeper, *early)
     keeper.forget_events(1000.0)
+    keeper.writer.confirmed().result(60.0)
+    # With no event left, and with one: a head of the last that has left fits the anchor.
+    assert verified(keeper, *later)[0].digest == later[0].digest
     keeper.record_event(Event(2000.0, "test", "after all had left"))
-    keeper.writer.confirmed().result(10.0)
-    verified(keeper)
-    with pytest.raises(StoreError, match="events up to 6 are no longer kept"):
-        verified(keeper, *later)
+    keeper.writer.confirmed().result(60.0)
+    verified(keeper, *later)
+    with keeper.database.reading() as connection:
+        found = chain.verify(connection, [*early, *later])
+    # The audit's heads are the same, and never leave.
+    assert (found.fitting, found.old) == ((early[1], *later), early[:1])
+    assert found.since == 2000.0
+
+
+@pytest.mark.parametrize("noted", [True, False], ids=["number-noted", "by-an-earlier-program"])
+def test_a_head_of_the_last_event_that_left_is_held_against_the_anchor(
+    keeper: Keeper, noted: bool
+) -> None:
+    fill(keeper)
+    with keeper.database.reading() as connection:
+        (digest,) = connection.scalars(text("SELECT digest FROM event_link WHERE number = 3"))
+    head = chain.Head("event", 3, digest)
+    keeper.forget_events(103.0)
+    keeper.writer.confirmed().result(60.0)
+    if not noted:
+        keeper.do(lambda c: c.execute(text("DELETE FROM about WHERE name = 'event_anchor_number'")))
+    verified(keeper, head)
+    with pytest.raises(StoreError, match="link 3 has another digest; records were removed"):
+        verified(keeper, replace(head, digest="1" * 64))
+
+
+@pytest.mark.parametrize("end", [103.0, 1000.0], ids=["some-kept", "none-kept"])
+def test_heads_that_can_all_not_be_checked_are_no_proof(keeper: Keeper, end: float) -> None:
+    fill(keeper)
+    keeper.forget_events(end)
+    keeper.writer.confirmed().result(60.0)
+    heads = [chain.Head("event", 1, "1" * 64), chain.Head("audit", 0, "0" * 64)]
+    since = "no event is" if end > 200.0 else "events are kept since 1970-01-01T00:01:43Z"
+    with pytest.raises(StoreError, match=f"none of the 2 heads could be checked: {since}"):
+        verified(keeper, *heads)
+    verified(keeper)  # without heads it says nothing about them
 
 
 def test_an_old_store_is_linked_when_it_is_migrated(tmp_path: Path) -> None:
@@ -163,17 +198,23 @@ def test_exported_heads_show_a_chain_that_was_made_anew(tmp_path: Path) -> None:
     command = ["store", "verify", str(tmp_path / "data"), "--head", str(file)]
     said = CliRunner().invoke(app, command)
     assert said.exit_code == 0, said.exception
-    assert "3 of 3 exported heads fit" in said.output
+    assert "3 of 3 heads fit; events are kept since 1970-01-01T00:01:40Z\n" in said.output
     again = Keeper(tmp_path / "data", inline=True)
     again.forget_events(104.0)
     again.close()
-    assert "3 of 3 exported heads fit" in CliRunner().invoke(app, command).output
+    assert "3 of 3 heads fit" in CliRunner().invoke(app, command).output
     shutil.copytree(tmp_path / "data", tmp_path / "later")
     again = Keeper(tmp_path / "later", inline=True)
-    again.forget_events(300.0)
+    again.record_event(Event(400.0, "test", "later still"))
+    again.forget_events(400.0)
     again.close()
-    later = [tmp_path / "later" if str(each).endswith("data") else each for each in command]
-    assert "2 of 3 exported heads fit" in CliRunner().invoke(app, list(map(str, later))).output
+    later = [str(each).replace("/data", "/later") for each in command]
+    told = CliRunner().invoke(app, later).output
+    assert "2 of 3 heads fit; events are kept since 1970-01-01T00:06:40Z, those of earlier" in told
+    old = " ".join(str(head) for head in chain.read_heads(file)[:1])
+    failed = CliRunner().invoke(app, [*later[:-1], old])
+    assert failed.exit_code == 1
+    assert "none of the 1 heads could be checked: events are kept since" in str(failed.exception)
     again = Keeper(tmp_path / "data", inline=True)
     for name in ("event", "event_link"):
         again.do(lambda c, name=name: c.execute(text(f"DELETE FROM {name} WHERE number = 6")))

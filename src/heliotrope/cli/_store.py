@@ -191,11 +191,12 @@ def verify(
     with Database(place) as database:
         database.require()
         with database.reading() as connection:
-            kept = chain.still_kept(connection, exported)
-            found = chain.verify(connection, [*known, *kept])
-    if exported:
-        print(f"{len(kept)} of {len(exported)} exported heads fit; the others are of old events")
-    print(f"{place}: every record fits; {' '.join(map(str, found))}")
+            found = chain.verify(connection, [*known, *exported])
+    if head:
+        all_of = len(found.fitting) + len(found.old)
+        old = ", those of earlier events could not be checked" if found.old else ""
+        print(f"{len(found.fitting)} of {all_of} heads fit; {chain.kept_since(found.since)}{old}")
+    print(f"{place}: every record fits; {' '.join(map(str, found.heads))}")
 
 
 @app.command()

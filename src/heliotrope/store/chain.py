@@ -6,13 +6,16 @@ makes them in the transaction of the record, so they cost no further sync, and a
 chains that fit.
 
 Whoever can write the database can make all digests anew, or remove the newest records. So the
-heads (`heads`) go to another machine, and `verify` compares them.
+heads (`heads`) go to another machine, and `verify` compares them. Old events leave: what remains of
+them is the anchor, number and digest of the last that has left. A head of that event is compared
+with it; one of an older event can be compared with nothing.
 """
 
 import math
 import os
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -20,6 +23,7 @@ from typing import Any
 from sqlalchemy import Connection, RowMapping, func, select
 
 from heliotrope.errors import InputError
+from heliotrope.files.cells import format_time
 from heliotrope.safety import Severity
 from heliotrope.store import _rows as rows
 from heliotrope.store import tables
@@ -27,8 +31,8 @@ from heliotrope.store.digests import AUDIT, EVENT, GENESIS, Head, digest_of
 from heliotrope.store.records import AuditEntry, StoreError
 
 ACCEPTED, RESULT = "accepted", "result"
-#: Row of the table ``about`` with the digest before the oldest event that is kept.
-ANCHOR = "event_anchor"
+#: Rows of the table ``about`` with digest and number of the last event that has left.
+ANCHOR, ANCHOR_NUMBER = "event_anchor", "event_anchor_number"
 _EVENT, _AUDIT = tables.event, tables.audit
 _LINKS = {EVENT: tables.event_link, AUDIT: tables.audit_link}
 
@@ -93,10 +97,22 @@ def _read_last(connection: Connection, chain: str) -> tuple[int, str]:
 
 
 def _anchor(connection: Connection, chain: str) -> str:
-    if chain == AUDIT:
-        return GENESIS
-    query = select(tables.about.c.value).where(tables.about.c.name == ANCHOR)
-    return connection.scalar(query) or GENESIS
+    return GENESIS if chain == AUDIT else _about(connection, ANCHOR) or GENESIS
+
+
+def _about(connection: Connection, name: str) -> str | None:
+    return connection.scalar(select(tables.about.c.value).where(tables.about.c.name == name))
+
+
+def _anchor_number(connection: Connection) -> int:
+    """Return the number of the last event that has left, 0 if none has."""
+    noted = _about(connection, ANCHOR_NUMBER)
+    if noted is not None:
+        return int(noted)
+    if _about(connection, ANCHOR) is None:
+        return 0
+    # Programs before this one did not note it. Numbers follow each other.
+    return (connection.scalar(select(func.min(_LINKS[EVENT].c.number))) or 1) - 1
 
 
 def forget_events(connection: Connection, before: float) -> None:
@@ -106,10 +122,12 @@ def forget_events(connection: Connection, before: float) -> None:
     last = connection.scalar(select(func.max(e.number)))
     end = kept if kept is not None else (last or 0) + 1
     links = _LINKS[EVENT]
-    gone = select(links.c.digest).where(links.c.number < end)
-    digest = connection.scalar(gone.order_by(links.c.number.desc()).limit(1))
-    if digest is not None:
-        rows.replace(connection, tables.about, [{"name": ANCHOR, "value": digest}])
+    gone = select(links.c.number, links.c.digest).where(links.c.number < end)
+    newest = connection.execute(gone.order_by(links.c.number.desc()).limit(1)).first()
+    if newest is not None:
+        anchor = {ANCHOR_NUMBER: str(newest[0]), ANCHOR: str(newest[1])}
+        found = [{"name": name, "value": value} for name, value in anchor.items()]
+        rows.replace(connection, tables.about, found)
         # A chain without links begins where the last one ended.
         connection.info.pop(EVENT, None)
     connection.execute(links.delete().where(links.c.number < end))
@@ -161,12 +179,6 @@ def read_heads(path: Path) -> list[Head]:
     return list(dict.fromkeys(found))
 
 
-def still_kept(connection: Connection, noted: Iterable[Head]) -> list[Head]:
-    """Return the heads whose events are still kept; old events leave, those of the audit never."""
-    first = connection.scalar(select(func.min(_LINKS[EVENT].c.number))) or 0
-    return [head for head in noted if head.chain == AUDIT or head.number >= first]
-
-
 # -- checking ----------------------------------------------------------------------------
 
 
@@ -176,19 +188,53 @@ def heads(connection: Connection) -> tuple[Head, Head]:
     return Head(EVENT, *event), Head(AUDIT, *record)
 
 
-def verify(connection: Connection, known: Iterable[Head] = ()) -> tuple[Head, Head]:
-    """Check both chains, and that heads that were noted before are in them; return the heads.
+@dataclass(frozen=True)
+class Verified:
+    """What a check has found.
+
+    Attributes
+    ----------
+    heads
+        The heads of both chains.
+    fitting
+        Heads that were noted before and are in the chains, or fit the anchor.
+    old
+        Heads of events before the anchor, and of chains that were empty: they show nothing.
+    since
+        Time of the oldest event that is kept, POSIX s; None without any.
+    """
+
+    heads: tuple[Head, Head]
+    fitting: tuple[Head, ...]
+    old: tuple[Head, ...]
+    since: float | None
+
+
+def verify(connection: Connection, known: Iterable[Head] = ()) -> Verified:
+    """Check both chains, and that heads that were noted before are in them.
 
     Raises
     ------
     StoreError
-        If a record does not fit; the text names the first.
+        If a record does not fit; the text names the first. If heads are given, and none of them
+        could be compared with anything.
     """
     _verify_events(connection)
     _verify_audit(connection)
+    fitting, old = list[Head](), list[Head]()
     for head in known:
-        _verify_head(connection, head)
-    return heads(connection)
+        (fitting if _verify_head(connection, head) else old).append(head)
+    since = connection.scalar(select(func.min(_EVENT.c.at)))
+    if old and not fitting:
+        raise StoreError(
+            f"none of the {len(old)} heads could be checked: {kept_since(since)}; give a newer head"
+        )
+    return Verified(heads(connection), tuple(fitting), tuple(old), since)
+
+
+def kept_since(since: float | None) -> str:
+    """Return the words for the time from which events are kept."""
+    return "no event is kept" if since is None else f"events are kept since {format_time(since)}"
 
 
 def _verify_events(connection: Connection) -> None:
@@ -240,16 +286,21 @@ def _verify_audit(connection: Connection) -> None:
             raise StoreError(f"audit record {name} ({entry.what} by {entry.who}) is not linked")
 
 
-def _verify_head(connection: Connection, head: Head) -> None:
+def _verify_head(connection: Connection, head: Head) -> bool:
+    """Check a head; return whether there is still something to compare it with."""
     if head.number == 0:
-        return
+        return False
     table = _LINKS[head.chain]
-    first = connection.scalar(select(func.min(table.c.number))) or 0
     digest = connection.scalar(select(table.c.digest).where(table.c.number == head.number))
-    if digest is None and head.chain == EVENT and head.number < first:
-        raise StoreError(f"head {head}: events up to {first - 1} are no longer kept; give a newer")
+    if digest is None and head.chain == EVENT:
+        anchor = _anchor_number(connection)
+        if head.number < anchor:
+            return False
+        if head.number == anchor:
+            digest = _anchor(connection, EVENT)
     if digest != head.digest:
         what = "is not there" if digest is None else "has another digest"
         raise StoreError(
             f"head {head}: link {head.number} {what}; records were removed or made anew since"
         )
+    return True
