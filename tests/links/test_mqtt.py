@@ -12,9 +12,13 @@ from pathlib import Path
 
 import aiomqtt
 import pytest
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
 
 from heliotrope.errors import InputError
+from heliotrope.links import envelope
 from heliotrope.links.clock import SystemClock, sleep_until
+from heliotrope.links.envelope import OVERHEAD
 from heliotrope.links.link import Link, LinkSettings, SendOutcome, running
 from heliotrope.links.mqtt import Broker, mqtt_link
 from heliotrope.links.tls import client_tls
@@ -117,6 +121,49 @@ def test_retained_messages_are_refused_and_counted(mosquitto: Mosquitto) -> None
                 assert cluster.statistics.received == 1
 
     real(main)
+
+
+def _whole(_: int) -> Properties:
+    return Properties(PacketTypes.CONNECT)
+
+
+@pytest.mark.parametrize("obeys", [True, False], ids=["broker-withholds", "broker-passes-on"])
+def test_huge_messages_of_a_stranger_cost_nothing(
+    mosquitto: Mosquitto,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    obeys: bool,
+) -> None:
+    """The broker keeps them to itself; from one that does not, they are refused by their length."""
+    sizes: list[int] = []
+    digest = envelope.hmac.digest
+
+    def noted(key: bytes, data: bytes, name: str) -> bytes:
+        sizes.append(len(data))
+        return digest(key, data, name)
+
+    monkeypatch.setattr("heliotrope.links.envelope.hmac.digest", noted)
+    if not obeys:
+        monkeypatch.setattr("heliotrope.links.mqtt._asked_of_broker", _whole)
+
+    async def main() -> None:
+        plant, cluster = pair(mosquitto.port, CALM)
+        async with (
+            aiomqtt.Client("127.0.0.1", mosquitto.port) as stranger,
+            running(plant, cluster),
+        ):
+            await connected(plant, cluster)
+            refused = cluster.statistics.refused
+            for size in (CALM.largest + OVERHEAD + 1000, 10_000_000):
+                await stranger.publish(f"{PREFIX}/north/down", bytes(size), qos=1)
+            largest = bytes(CALM.largest)
+            await plant.send(largest)
+            assert await cluster.receive() == largest
+            assert cluster.statistics.refused - refused == (0 if obeys else 2)
+        assert CALM.largest < max(sizes) <= CALM.largest + OVERHEAD
+
+    real(main)
+    assert not caplog.records
 
 
 def test_what_goes_out_is_not_retained_expires_and_is_confirmed(mosquitto: Mosquitto) -> None:

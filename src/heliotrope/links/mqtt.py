@@ -12,6 +12,10 @@ frozen, so the receiver judges again (envelope.py). Sessions begin clean and end
 connection: nothing is kept for a cluster that is away. A retained message on the way up or down
 is not a current order; it is refused and counted.
 
+Whoever the broker lets in may publish under a cluster's topic. The broker is told the size of the
+largest envelope and keeps longer messages to itself; one that comes nevertheless is refused before
+anything is computed over it.
+
 Nothing rests on the status, on the last will or on MQTT's keepalive: a broker that is frozen
 keeps its connections. Our heartbeats pass through the broker to the other end and back, and
 their absence ends a connection.
@@ -22,6 +26,7 @@ adds up to 40 ms to a small message.
 
 import asyncio
 import contextlib
+import logging
 import math
 import socket
 from dataclasses import dataclass
@@ -35,7 +40,7 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
 from heliotrope.links.connection import CarriedLink
-from heliotrope.links.envelope import SealKeys
+from heliotrope.links.envelope import OVERHEAD, SealKeys
 from heliotrope.links.keys import BrokerPassword, KeyRing, ring_of
 from heliotrope.links.link import LinkError, LinkLostError, LinkSettings, Statistics
 from heliotrope.links.tls import TlsSource, context_of
@@ -51,6 +56,11 @@ _GOODBYE = 0.5
 _NO_LIMIT = math.inf
 #: Messages between the socket and the link, which takes them at once.
 _WAITING = 1000
+#: Bytes of a packet beside topic and payload: header, and properties as ours.
+_ROOM = 256
+#: aiomqtt writes a line for each message that finds no room: a stranger would fill the log.
+_LOG = logging.getLogger(f"{__name__}.library")
+_LOG.setLevel(logging.ERROR)
 
 
 @dataclass(frozen=True)
@@ -119,7 +129,7 @@ class _MqttCarrier:
         ends: _Ends,
         ring: KeyRing,
         statistics: Statistics,
-        limit: float,
+        settings: LinkSettings,
         *,
         reports: bool,
     ) -> None:
@@ -127,7 +137,7 @@ class _MqttCarrier:
         self._ends = ends
         self._ring = ring
         self._statistics = statistics
-        self._limit = limit
+        self._limit, self._longest = settings.open_limit, settings.largest + OVERHEAD
         self._reports = reports
         self._client: aiomqtt.Client | None = None
         self._unconfirmed = 0
@@ -147,6 +157,8 @@ class _MqttCarrier:
             timeout=_NO_LIMIT,
             keepalive=broker.keepalive_s,
             max_queued_incoming_messages=_WAITING,
+            properties=_asked_of_broker(self._longest + len(self._ends.into.encode())),
+            logger=_LOG,
             tls_context=context_of(broker.tls),
             socket_options=[(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)],
         )
@@ -216,7 +228,9 @@ class _MqttCarrier:
                 raise LinkLostError(f"the connection to the broker is gone ({error})") from None
             if message.retain:
                 self._statistics.retained += 1
-            elif isinstance(message.payload, bytes):
+            elif len(message.payload) > self._longest:
+                self._statistics.refused += 1
+            else:
                 return message.payload
 
     async def close(self) -> None:
@@ -232,6 +246,13 @@ class _MqttCarrier:
                     await client.__aexit__(None, None, None)
         finally:  # also when the link is closed while it takes its leave
             await _discard(client)
+
+
+def _asked_of_broker(longest: int) -> Properties:
+    """Return what the broker is asked when connecting: no packets with more than a payload."""
+    properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+    properties.MaximumPacketSize = longest + _ROOM
+    return properties
 
 
 def _write_while_open(client: paho.Client) -> None:
@@ -317,7 +338,7 @@ def mqtt_link(
     settings = settings or LinkSettings()
     statistics = Statistics()
     ends = _ends(prefix, cluster, plant=plant)
-    carrier = _MqttCarrier(broker, ends, ring, statistics, settings.open_limit, reports=not plant)
+    carrier = _MqttCarrier(broker, ends, ring, statistics, settings, reports=not plant)
     name = f"cluster {cluster}" if plant else "plant"
     where = f"{name} via {broker.host}:{broker.port}"
     return CarriedLink(where, carrier, clock, settings, statistics)
