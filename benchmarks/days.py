@@ -272,7 +272,7 @@ class Days:
         """Return beam errors (K, 2) and their predicted covariance (K, 2, 2), rad and rad²."""
         believed, count = self.mechanism(name), len(suns)
         solved = track(believed[np.zeros(count, dtype=np.intp)], suns, aim)
-        counts = solved.chosen(solved.counts)
+        counts = solved.best_counts
         row = np.full(count, self.group.index(name))
         seen = sightings(np.arange(count), counts, suns, np.broadcast_to(aim, (count, 3)))
         off = beam_errors(self.truth[row], seen).offset

@@ -179,7 +179,7 @@ class _Run:
         """Put the axes of all mirrors where their beams meet the receiver now."""
         everybody = np.arange(len(self.names), dtype=np.intp)
         found = self.plant.beams.poses(everybody, self.plant.aims, self.plant.sun_vector())
-        counts = found.chosen(found.counts)
+        counts = found.best_counts
         for axis, name in enumerate(("primary", "secondary")):
             self.rows[name] = self.rows[f"{name}_goal"] = counts[:, axis]
 
@@ -191,7 +191,7 @@ class _Run:
         everybody = np.arange(len(self.names), dtype=np.intp)
         found = self.plant.beams.poses(everybody, self.plant.aims, self.plant.sun_vector())
         table = self.plant.design.groups["all"].mechanism.drives
-        counts = table.counts(found.chosen(found.angles) + np.array(_AWAY))
+        counts = table.counts(found.best_angles + np.array(_AWAY))
         self.rows["state"] = states.DEFOCUSED
         for axis, name in enumerate(("primary", "secondary")):
             self.rows[name] = self.rows[f"{name}_goal"] = counts[:, axis]

@@ -74,7 +74,7 @@ def measured(real: Mechanism, believed: Mechanism, when: list[datetime], seed: i
     light = sun.vector(when, SITE)
     row = np.zeros(len(when), dtype=np.intp)
     wanted = track(believed[row], light, TARGET)
-    counts = wanted.chosen(wanted.counts)
+    counts = wanted.best_counts
     pose = real[row].pose(counts)
     ray = reflect(light, pose.normal)
     spot = pose.vertex - ray * (pose.vertex[:, 1] / ray[:, 1])[:, None]

@@ -82,7 +82,7 @@ def measure(drawn: Mechanism, truth: Mechanism, noise: float, seed: int) -> Sigh
     across = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     for s in suns(DAYS["the same day"]):
         wanted = track(truth, s, TARGET)
-        sent = wanted.chosen(wanted.counts) + rng.normal(0.0, 1e-3, (len(drawn), 2))
+        sent = wanted.best_counts + rng.normal(0.0, 1e-3, (len(drawn), 2))
         pose = truth.pose(sent)
         ray = reflect(s, pose.normal)
         # The target faces south: the plane north = 0.
@@ -151,7 +151,7 @@ def study(
     for label, day in DAYS.items():
         sky = suns(day, timedelta(minutes=20))
         wanted = track(learnt, sky[:, None, :], TARGET)
-        pose = real.pose(wanted.chosen(wanted.counts))
+        pose = real.pose(wanted.best_counts)
         way = TARGET - pose.vertex
         way = way / np.linalg.norm(way, axis=-1, keepdims=True)
         error = angle_between(reflect(sky[:, None, :], pose.normal), way)
@@ -169,7 +169,7 @@ def study(
 def _offsets(machine: Mechanism, sky: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return counts (M, 1, 2) of the nominal mirror, and the image's offsets, m, (M, N, 2)."""
     wanted = track(nominal(1), sky[:, None, :], TARGET)
-    counts = wanted.chosen(wanted.counts)
+    counts = wanted.best_counts
     pose = machine.pose(counts)
     ray = reflect(sky[:, None, :], pose.normal)
     spot = pose.vertex - ray * (pose.vertex[..., 1] / ray[..., 1])[..., None]

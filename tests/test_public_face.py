@@ -67,7 +67,7 @@ def test_a_notebook_from_plant_to_calibrated_error() -> None:
     times = hours.astype("datetime64[s]").astype(float)
     suns = ht.sun.vector(times, plant.site)
     tracked = ht.track(actual[0], suns, aim)
-    counts = tracked.chosen(tracked.counts)
+    counts = tracked.best_counts
     seen = ht.sightings(np.zeros(len(times), int), counts, suns, aim, time=times, sigma=1e-4)
     training = ht.split(seen, "chronological", 0.7)
     fitted = ht.fit(nominal[:1], seen.take(training), "guo6")

@@ -59,7 +59,7 @@ def seen() -> ht.Sightings:
     times = 1788336000.0 + 1800.0 * np.arange(12)
     suns = ht.sun.vector(times, SITE)
     found = ht.track(mechs()[0], suns, AIM)
-    return ht.sightings(0, found.chosen(found.counts), suns, AIM, time=times)
+    return ht.sightings(0, found.best_counts, suns, AIM, time=times)
 
 
 @cache
@@ -196,7 +196,7 @@ MECHANISMS = [
 ]  # fmt: skip
 
 TRACKING = [
-    Wrong(lambda: ht.track(plant(), UP, AIM), "mechanism", "heliotrope Plant", "plant.heliostat(name)"),
+    Wrong(lambda: ht.track("P6A", UP, AIM), "mechanism", "a str", "plant[name]"),
     Wrong(lambda: ht.track(azel(), (0.0, 0.0, 2.0), AIM), "sun", "length", "5e-7"),
     Wrong(lambda: ht.track(azel(), (180.0, 45.0), AIM), "sun", "(2,)", "3 numbers"),
     Wrong(lambda: ht.track(azel(), UP, (0.0, 13.0)), "aim", "(2,)", "3 numbers"),
@@ -214,7 +214,7 @@ SIGHTINGS = [
     Wrong(lambda: row(heliostat=-1), "heliostat", "-1", "from 0 on"),
     Wrong(lambda: row(heliostat=0.5), "heliostat", "0.5", "whole numbers"),
     Wrong(lambda: row(heliostat=[0, 0]), "heliostat", "(2,)", "(3,)"),
-    Wrong(lambda: row(counts=np.zeros((2, 3, 2))), "counts", "(2, 3, 2)", "(M, D)"),
+    Wrong(lambda: row(counts=np.zeros((2, 3, 2)), source=np.ones((4, 3))), "source", "(4, 3)", "(2, 3, 3)"),
     Wrong(lambda: row(counts=[(0.0, NAN)]), "counts", "nan", "leave the row out"),
     Wrong(lambda: row(source=np.ones((3, 2))), "source", "(3, 2)", "(3, 3)"),
     Wrong(lambda: row(destination=np.ones((3, 2))), "destination", "(3, 2)", "(3, 3)"),
@@ -239,7 +239,7 @@ CALIBRATION = [
     Wrong(lambda: ht.fit(mechs(), seen(), "malan9"), "model", "'malan9'", "malan8", UnknownNameError),
     Wrong(lambda: ht.fit(mechs(), seen(), ("tilt",)), "parameter", "'tilt'", "tilt_north", UnknownNameError),
     Wrong(lambda: ht.fit(mechs(), seen(), 8), "model", "an int", "name of a model"),  # type: ignore[arg-type]
-    Wrong(lambda: ht.fit(plant(), seen(), "guo6"), "mechanism", "heliotrope Plant", "Mechanism"),  # type: ignore[arg-type]
+    Wrong(lambda: ht.fit("P6A", seen(), "guo6"), "mechanism", "a str", "plant[name]"),  # type: ignore[arg-type]
     Wrong(lambda: ht.fit(mechs(), np.zeros((3, 2)), "guo6"), "sightings", "numpy ndarray", "heliotrope.sightings"),  # type: ignore[arg-type]
     Wrong(lambda: ht.fit(mechs()[:1], row(heliostat=4), "guo6"), "sightings", "row 4", "1 heliostats"),
     Wrong(lambda: ht.fit(mechs(), row(counts=np.zeros((3, 1))), "guo6"), "counts", "1 drives", "have 2"),
@@ -251,7 +251,7 @@ CALIBRATION = [
     Wrong(lambda: ht.learn(mechs(), seen(), "guo6", used=np.ones(3, bool)), "used", "(3,)", "(12,)"),
     Wrong(lambda: learned().parameters_at([1], 0.0), "heliostat", "row 1", "0 to 0"),
     Wrong(lambda: learned().parameters_at([0], "noon"), "times", "'noon'", "ISO 8601", TimeError),
-    Wrong(lambda: predict(learned(), row(heliostat=7)), "heliostat", "row 7", "0 to 0"),
+    Wrong(lambda: predict(learned(), row(heliostat=7)), "heliostat", "row 7", "1 heliostats"),
     Wrong(lambda: ht.beam_errors(mechs()[:2], row(heliostat=7)), "sightings", "row 7", "2 heliostats"),
     Wrong(lambda: ht.evaluate(field().names, mechs(), seen(), "guo6", fraction=0.0), "fraction", "0.0", "between 0 and 1"),
 ]  # fmt: skip
@@ -272,7 +272,7 @@ FIELD = [
     Wrong(lambda: replace(plant().targets[0], corners=np.zeros((4, 3))), "corners", "no area", "rectangle"),
     Wrong(lambda: replace(plant().receivers[0], kind="flat"), "kind", "'flat'", "planar"),
     Wrong(lambda: replace(plant().receivers[0], width=-1.5), "width", "-1.5 m", "above 0"),
-    Wrong(lambda: ht.open_plant(Path("nowhere.toml")), "nowhere.toml", "no such file", "", FormatError),
+    Wrong(lambda: ht.open(Path("nowhere.toml")), "nowhere.toml", "no such file", "", FormatError),
     Wrong(lambda: Sphere("tower", ORIGIN, 0.0), "radius", "0.0 m", "above 0"),
     Wrong(lambda: Box("hall", ORIGIN, (1.0, 1.0)), "size", "(2,)", "3 numbers"),
     Wrong(lambda: Cylinder("mast", ORIGIN, ORIGIN, 1.0), "mast", "coincide", "two points"),

@@ -5,7 +5,7 @@ and corrects them. In a notebook::
 
     import heliotrope as ht
 
-    plant = ht.open_plant("plant.toml")
+    plant = ht.open("plant.toml")
     sun = ht.sun.vector("2026-09-02T10:00Z", plant.site)
 
 A name is loaded when it is first used, so the import itself is light. The names below are the
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         calibrate,
         camera_target,
         evaluate,
+        join,
         predict,
         read_field_sightings,
         read_sightings,
@@ -35,9 +36,11 @@ if TYPE_CHECKING:
         write_sightings,
     )
     from heliotrope.calibration.fit import fit
+    from heliotrope.calibration.learn import compare_models as compare
     from heliotrope.calibration.learn import learn
     from heliotrope.calibration.sightings import sightings
     from heliotrope.field import (
+        Heliostat,
         Heliostats,
         Plant,
         Receiver,
@@ -46,7 +49,7 @@ if TYPE_CHECKING:
         prototype,
         roughly_installed,
     )
-    from heliotrope.field.formats import open_plant
+    from heliotrope.field.formats import open_plant as open  # noqa: A004 - used as ht.open
     from heliotrope.field.formats.plant_file import read_plant, write_plant
     from heliotrope.mechanism import Mechanism, Tracking, track
     from heliotrope.mechanism import kinds as kinds
@@ -57,6 +60,7 @@ __version__ = "0.1.0"
 
 #: The module of each name.
 _HOMES = {
+    "Heliostat": "heliotrope.field",
     "Heliostats": "heliotrope.field",
     "Learned": "heliotrope.calibration",
     "Mechanism": "heliotrope.mechanism",
@@ -69,18 +73,20 @@ _HOMES = {
     "beam_errors": "heliotrope.calibration",
     "calibrate": "heliotrope.calibration",
     "camera_target": "heliotrope.calibration",
+    "compare": "heliotrope.calibration.learn",
     "evaluate": "heliotrope.calibration",
     "example_plant": "heliotrope.field",
     "fit": "heliotrope.calibration.fit",
     "image_offsets": "heliotrope.optics",
+    "join": "heliotrope.calibration",
     "learn": "heliotrope.calibration.learn",
-    "open_plant": "heliotrope.field.formats",
     "predict": "heliotrope.calibration",
     "predict_flux": "heliotrope.optics",
     "prototype": "heliotrope.field",
     "read_field_sightings": "heliotrope.calibration",
     "read_plant": "heliotrope.field.formats.plant_file",
     "read_sightings": "heliotrope.calibration",
+    "open": "heliotrope.field.formats",
     "roughly_installed": "heliotrope.field",
     "sightings": "heliotrope.calibration.sightings",
     "split": "heliotrope.calibration",
@@ -90,6 +96,8 @@ _HOMES = {
     "write_report": "heliotrope.calibration",
     "write_sightings": "heliotrope.calibration",
 }
+#: Names that are shorter here than in their modules.
+_SHORT = {"compare": "compare_models", "open": "open_plant"}
 #: Modules that are used as such.
 _MODULES = {
     "geometry": "heliotrope.geometry",
@@ -99,6 +107,7 @@ _MODULES = {
 }
 
 __all__ = [
+    "Heliostat",
     "Heliostats",
     "Learned",
     "Mechanism",
@@ -112,14 +121,16 @@ __all__ = [
     "beam_errors",
     "calibrate",
     "camera_target",
+    "compare",
     "evaluate",
     "example_plant",
     "fit",
     "geometry",
     "image_offsets",
+    "join",
     "kinds",
     "learn",
-    "open_plant",
+    "open",
     "optics",
     "predict",
     "predict_flux",
@@ -146,7 +157,7 @@ if not TYPE_CHECKING:
         if name in _MODULES:
             found = import_module(_MODULES[name])
         elif name in _HOMES:
-            found = getattr(import_module(_HOMES[name]), name)
+            found = getattr(import_module(_HOMES[name]), _SHORT.get(name, name))
         else:
             raise AttributeError(f"module 'heliotrope' has no attribute {name!r}")
         globals()[name] = found

@@ -17,7 +17,7 @@ def main() -> None:
     mechanism = kinds.azimuth_elevation(np.array([[0.0, 50.0, 0.0]]), pivot_offset=0.2)
     sun, aim = np.array([0.0, -0.6, 0.8]), np.array([0.0, 0.0, 30.0])
     tracking = track(mechanism, sun, aim)
-    counts = tracking.chosen(tracking.counts)
+    counts = tracking.best_counts
     mechanism.jacobian(counts, ("tilt_north", "position_up"))
     mechanism.drives.radians_per_count(counts)
     fit(mechanism, sightings([0], counts, sun, aim), "malan8")

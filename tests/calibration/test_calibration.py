@@ -36,7 +36,7 @@ def _seen(nominal: Mechanism, truth: Mechanism, noise: float, seed: int = 1) -> 
         for azimuth in np.linspace(-1.6, 1.6, 9):
             sun = direction(azimuth, height * np.cos(0.6 * azimuth))
             wanted = track(nominal, sun, AIM)
-            counts = wanted.chosen(wanted.counts)
+            counts = wanted.best_counts
             pose = truth.pose(counts)
             ray = reflect(sun, pose.normal)
             way = AIM - pose.vertex
@@ -121,8 +121,8 @@ def test_far_strokes_of_jacks_are_found() -> None:
     truth = one.with_parameters(far)
     sun = direction(np.linspace(2.0, 4.0, 25), 0.8 - 0.1 * np.linspace(-1, 1, 25) ** 2)
     wanted = track(truth, sun, (0.0, 3.0, 40.0))
-    assert wanted.reachable.any(axis=-1).all()
-    counts = wanted.chosen(wanted.counts)
+    assert wanted.reachable.all()
+    counts = wanted.best_counts
     pose = truth.pose(counts)
     seen = sightings(0, counts, sun, pose.vertex + 60.0 * reflect(sun, pose.normal), sigma=1e-5)
     found = fit(one[None], seen, (*names, "canting"))

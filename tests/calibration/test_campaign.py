@@ -67,9 +67,9 @@ def _check(found: CalibrationCampaign, fleets: list[Fleet], timing: Timing, targ
         centers = np.array([t.center for t in targets])[found.target[mine]]
         solved = track(some, vector, centers, current=found.counts[mine])
         assert (solved.chosen(solved.status) == TrackingStatus.OK).all()
-        np.testing.assert_allclose(solved.chosen(solved.counts), found.counts[mine], atol=1e-3)
+        np.testing.assert_allclose(solved.best_counts, found.counts[mine], atol=1e-3)
         home = track(some, vector, fleet.aim[rows])
-        way = np.abs(found.counts[mine] - home.chosen(home.counts))
+        way = np.abs(found.counts[mine] - home.best_counts)
         seconds = (way / some.drives.table[..., SLOTS["speed"]]).max(axis=-1)
         assert (found.arrive[mine] - found.leave[mine] >= seconds - 1e-5).all()
         assert (found.back[mine] - found.done[mine] >= seconds - 1e-5).all()
@@ -128,7 +128,7 @@ def test_a_campaign_against_taking_turns() -> None:
         rows = np.arange(len(times)) % 18
         suns = sun.vector(times, PLANT.site)
         solved = track(FIELD[rows], suns, PLANT.targets[0].center)
-        made = camera_target(rows, solved.chosen(solved.counts), suns, PLANT.targets[0].center)
+        made = camera_target(rows, solved.best_counts, suns, PLANT.targets[0].center)
         covariance = np.linalg.inv(precision(FIELD, NAMES, made))
         rms = np.sqrt(np.einsum("npq,nqp->n", fleet.form, covariance))
         return float(np.sqrt(np.mean(rms**2)))

@@ -88,7 +88,7 @@ def test_nothing_that_is_possible_is_left_out(possible: CandidateSightings) -> N
             ray = reflect(vector, solved.chosen(solved.normal))
             slant = angle_between(-ray, np.broadcast_to(target.normal, ray.shape))
             lit = angle_between(np.broadcast_to(vector, ray.shape), ray) / 2 <= np.radians(75.0)
-            count += int((solved.chosen(solved.reachable) & lit & (slant <= np.radians(70))).sum())
+            count += int((solved.reachable & lit & (slant <= np.radians(70))).sum())
     assert len(possible) == count
 
 
@@ -149,7 +149,7 @@ def test_beam_variance_against_moved_mirrors(year: FloatArray) -> None:
         x = rng.normal(0.0, 0.05 * sizes)
         moved = FIELD[7].with_parameters(dict(zip(NAMES, x, strict=True)))
         solved = track(FIELD[7], suns, AIM)
-        pose = moved.pose(solved.chosen(solved.counts))
+        pose = moved.pose(solved.best_counts)
         way = (AIM - pose.vertex) / np.linalg.norm(AIM - pose.vertex, axis=-1, keepdims=True)
         beam = angle_between(reflect(suns, pose.normal), way)
         predicted = np.sqrt(np.trace(year[7] @ np.multiply.outer(x, x)))
@@ -316,7 +316,7 @@ def test_the_expected_error_comes_true(possible: CandidateSightings, year: Float
     moved = nominal.with_parameters(learnt.parameters)
     suns = suns_of_year(PLANT.site, 2026)
     solved = track(moved, suns[:, None], AIM)
-    there = truth.pose(solved.chosen(solved.counts))
+    there = truth.pose(solved.best_counts)
     way = AIM - there.vertex
     way /= np.linalg.norm(way, axis=-1, keepdims=True)
     rms = float(np.sqrt(np.mean(angle_between(reflect(suns[:, None], there.normal), way) ** 2)))

@@ -43,13 +43,13 @@ def _thrown(
     parts = []
     for sun in suns:
         wanted = track(truth, sun, aim)
-        counts = wanted.chosen(wanted.counts)
+        counts = wanted.best_counts
         pose = truth.pose(counts)
         ray = reflect(sun, pose.normal)
         length = np.linalg.norm(aim - pose.vertex, axis=-1, keepdims=True)
         spot = pose.vertex + length * ray
         spot += rng.normal(0.0, noise, spot.shape) * length
-        good = np.flatnonzero(wanted.reachable.any(axis=-1))
+        good = np.flatnonzero(wanted.reachable)
         parts.append((good, counts[good], np.tile(sun, (len(good), 1)), spot[good]))
     rows, counts, source, spot = (np.concatenate(p) for p in zip(*parts, strict=True))
     return sightings(rows, counts, source, spot, sigma=noise)
@@ -154,7 +154,7 @@ def test_the_ellipse_holds_nine_of_ten() -> None:
     sun = direction(2.4, 0.7)
     found = expected_error(nominal[0], names, root @ root.T, sun, AIM)
     wanted = track(nominal, sun, AIM)
-    pose = real.pose(wanted.chosen(wanted.counts))
+    pose = real.pose(wanted.best_counts)
     ray = reflect(sun, pose.normal)
     way = AIM - pose.vertex
     way = way / np.linalg.norm(way, axis=-1, keepdims=True)

@@ -91,7 +91,7 @@ def test_track_gives_both_branches(call: Any, plant_file: Path) -> None:
     )
     assert len(found["branches"]) == 2
     plant = example_plant()
-    mechanism = plant.heliostat("P6A")
+    mechanism = plant["P6A"].calibrated
     vector = sun.vector("2026-09-02T10:00:00Z", plant.site)
     keys = {
         "azimuth_deg",
@@ -220,7 +220,7 @@ def test_track_traces_the_iteration_of_both_branches(call: Any) -> None:
 
 
 def test_track_aims_at_a_point_fixed_to_the_mirror(call: Any) -> None:
-    mechanism = open_plant(HELIOK).heliostat("HeliostatA")
+    mechanism = open_plant(HELIOK)["HeliostatA"].calibrated
     zero, there = mechanism.pose([0.0, 0.0]), mechanism.pose([0.3, 0.7])
     # A point on the mirror's own normal is met where the mirror looks at the sun.
     aim, light = zero.vertex + 2.0 * zero.normal, there.normal
@@ -339,7 +339,7 @@ def test_calibrate_a_plant_with_a_table(call: Any, plant_file: Path, tmp_path: P
     for hour in range(8, 17):
         s = sun.vector(datetime(2026, 9, 2, hour, tzinfo=UTC), plant.site)
         wanted = track(group.mechanism, s, plant.targets[0].center)
-        counts = wanted.chosen(wanted.counts)
+        counts = wanted.best_counts
         pose = truth.pose(counts)
         spot = plant.targets[0].intersect(pose.vertex, reflect(s, pose.normal))
         good = np.flatnonzero(np.isfinite(spot).all(axis=-1))

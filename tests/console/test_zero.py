@@ -104,7 +104,7 @@ def test_lock_position_restores_counts_that_were_lost() -> None:
         # The mirror stands where its beam is at the aim; its counts are 40 and -25 steps wrong.
         mechanism = plant.beliefs.present(name)[0]
         found = track(mechanism, plant.sun_vector(), target)
-        right = np.round(found.chosen(found.counts))
+        right = np.round(found.best_counts)
         wrong = (right + [40.0, -25.0]).tolist()
         assert await zero(plant, ENGINEER, token, [name], wrong).end(20.0)
         await asyncio.sleep(3.0)

@@ -41,13 +41,13 @@ def test_published_angles_are_met() -> None:
     )
     # HelioK stops at 0.1 mm of accuracy at 60 m and prints four digits, in single precision.
     np.testing.assert_allclose(np.degrees(result.angles), published, atol=3e-4)
-    assert result.reachable.all()
+    assert result.served.all()
 
 
 def test_stops_leave_the_branch_that_heliok_selects() -> None:
     heliostats = plant().groups["heliostats"]
     result = track(heliostats.mechanism, heliok.sun(scene()), heliostats.aim)
-    np.testing.assert_array_equal(result.reachable, [[True, False], [True, False]])
+    np.testing.assert_array_equal(result.served, [[True, False], [True, False]])
     np.testing.assert_array_equal(result.best, [0, 0])
 
 
@@ -206,7 +206,7 @@ def test_reference_cases_pass_through_a_file(tmp_path: Path, case: dict[str, Any
     result = track(heliostats.mechanism, sun, heliostats.aim)
     for branch in case["branches"]:
         k = branch["branch"]
-        assert result.reachable[0, k] == (branch["status"] == "ok")
+        assert result.served[0, k] == (branch["status"] == "ok")
         if branch["status"] == "ok":
             wanted = [branch["alpha_rad"], branch["beta_rad"]]
             turns = (result.angles[0, k] - wanted) / (2 * np.pi)

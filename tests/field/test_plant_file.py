@@ -436,7 +436,7 @@ CORNERS = example_plant().targets[0].corners
         (lambda: Target("t", CORNERS * [1, 0, 0], CORNERS[0]), "span no area"),
         (lambda: Receiver("r", "flat", CORNERS[0], CORNERS[1], 1.0, 1.0), "kind 'flat'; known"),
         (lambda: Receiver("r", "planar", CORNERS[0], CORNERS[1], -1.0, 1.0), "width -1.0 m"),
-        (lambda: example_plant().heliostat("P9Z"), "there is no heliostat 'P9Z'"),
+        (lambda: example_plant()["P9Z"].calibrated, "there is no heliostat 'P9Z'"),
         (lambda: example_plant().target("tower"), "there is no target 'tower'"),
     ],
 )

@@ -54,7 +54,7 @@ def test_full_steps_cost_him_three_quarters_of_a_milliradian() -> None:
     for minutes in range(0, 600, 10):
         when = datetime(2012, 9, 2, 5, 40, tzinfo=UTC) + timedelta(minutes=minutes)
         found = track(mechanism, vector(when, PLANT.site), PLANT.targets[0].center)
-        counts = found.chosen(found.counts)
+        counts = found.best_counts
         ideal = mechanism.pose(counts).normal
         for full in (1, MICROSTEPS):
             normal = mechanism.pose(np.round(counts / full) * full).normal

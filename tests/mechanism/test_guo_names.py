@@ -39,11 +39,11 @@ def test_his_parameters_of_a_mechanism_track_as_its_armature() -> None:
     his, pivot = of_mechanism(real)
     found = guo.track(aim - pivot, sun, his, exact=True)
     ours = track(real, sun, aim)
-    joints = ours.chosen(ours.angles)
+    joints = ours.best_angles
     assert np.abs(wrap_signed(found.gamma[:, 0] - joints[:, 0])).max() < 1e-9
     assert np.abs(found.alpha[:, 0] - joints[:, 1]).max() < 1e-9
     # With the zeros the same machine takes what the drives show.
-    shown = ours.chosen(ours.counts)
+    shown = ours.best_counts
     with_zeros, _ = of_mechanism(real, zeros=True)
     normals = guo.forward(shown[:, 1], shown[:, 0], with_zeros)
     assert angle_between(normals, ours.chosen(ours.normal)).max() < 1e-12

@@ -66,9 +66,9 @@ def test_every_kind_tracks_with_all_imperfections(kind: str) -> None:
     mechanism = imperfect(every_kind()[kind], seed=2)
     sun, aim = direction(2.6, 0.7), np.array([0.0, 0.0, 40.0])
     found = track(mechanism, sun, aim)
-    assert found.reachable.any()
+    assert found.served.any()
     branch = int(found.best)
-    assert found.reachable[branch]
+    assert found.served[branch]
     pose = mechanism.pose(found.counts[branch])
     assert _miss(sun, aim, pose.normal, pose.vertex) < 2e-9
 
@@ -77,9 +77,9 @@ def test_near_field_needs_newton() -> None:
     machine = kinds.azimuth_elevation((0, 0, 0), pivot_offset=0.5)
     sun, aim = direction(0.5, 0.8), np.array([0.3, 1.2, 0.9])
     plain = track(machine, sun, aim, newton=False, max_iterations=5)
-    assert not plain.reachable.all()
+    assert not plain.served.all()
     found = track(machine, sun, aim)
-    assert found.reachable.all()
+    assert found.served.all()
     assert (_miss(sun, aim, found.normal, found.vertex) < 1e-9).all()
 
 
@@ -92,7 +92,7 @@ def test_keyhole(zeta: float) -> None:
     sun = normalize(normal + 0.4 * np.array([1.0, 0.2, 0.0]))
     aim = vertex + 60.0 * reflect(sun, normal)
     found = track(machine, sun, aim)
-    assert found.reachable.all()
+    assert found.served.all()
     assert (_miss(sun, aim, found.normal, found.vertex) < 1.1e-9).all()
 
 
@@ -162,7 +162,7 @@ def test_count_stops_and_turns() -> None:
     for turns in (-2, 0, 1):
         near = angle + np.array([2 * np.pi * turns, 0.0])
         found = track(wide, sun, aim, current=near + 0.1)
-        np.testing.assert_allclose(found.chosen(found.angles), near, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(found.best_angles, near, rtol=0, atol=1e-8)
     # Counts as stops, running against the angle.
     machine = kinds.azimuth_elevation(
         (0, 0, 0),

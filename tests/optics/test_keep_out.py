@@ -356,7 +356,7 @@ def test_the_way_leaves_the_tower_aside_where_straight_ahead_is_not_clear() -> N
     sun = direction(math.radians(95.0), math.radians(55.0))
     mirror, stow = MirrorOptics.of(2.0, 2.0), (0.0, math.pi / 2)
     straight = track(mechanism, sun, (70.0, 0.0, 0.0))
-    goal = straight.chosen(straight.angles)
+    goal = straight.best_angles
     path = np.array([[goal[0], math.pi / 2], goal])
     assert optics.sweep(mechanism.armature, path, sun, mirror, [RECEIVER]).entered.any()
     foot, standby = (14.0, 3.0, 0.0), (14.0, 12.0, 48.0)

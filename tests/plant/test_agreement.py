@@ -61,7 +61,7 @@ def steps_at(bench: Bench, late: float, east: float = 0.0) -> list[int]:
     sun = fast_vector(bench.clock.utc().timestamp() - late, site)
     group, row = DESIGN.find(NAME)
     found = track(group.mechanism[row], sun, plant.aims[plant.field.place(NAME)])
-    return [round(float(x)) for x in found.chosen(found.counts)]
+    return [round(float(x)) for x in found.best_counts]
 
 
 async def go(bench: Bench, seconds: int, late: float, east: float = 0.0) -> None:
@@ -192,7 +192,7 @@ def test_a_new_aim_that_waits_for_its_turn_is_no_disagreement(tmp_path: Path) ->
 def test_a_new_calibration_counts_once_the_local_controller_has_it(tmp_path: Path) -> None:
     bench = Bench(VirtualClock(), tmp_path)
     plant, row = bench.plant, bench.plant.field.place(NAME)
-    other, agreement = DESIGN.heliostat("P5B"), plant._agreement
+    other, agreement = DESIGN["P5B"].calibrated, plant._agreement
     before = agreement._armature[row].copy()
     agreement.believe(row, other.armature.table, other.drives.table)
     agreement._look(1.0)

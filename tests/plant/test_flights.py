@@ -141,7 +141,7 @@ def counts_at(mechanism: Mechanism, normals: FloatArray) -> FloatArray:
 
     vertex = mechanism.pose(np.zeros((len(mechanism), 2))).vertex
     solved = track(mechanism, normals, vertex + 1e6 * normals)
-    return solved.chosen(solved.counts)
+    return solved.best_counts
 
 
 @pytest.fixture

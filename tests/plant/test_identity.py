@@ -17,12 +17,12 @@ from support.plant_bench import ENGINEER, OPERATOR, Bench, ScriptedCluster, runn
 
 DESIGN = example_plant()
 PAIR = ("P5A", "P5B")
-CRC = {name: crc32(items_of(DESIGN.heliostat(name))["armature"]) for name in DESIGN.names}
+CRC = {name: crc32(items_of(DESIGN[name].calibrated)["armature"]) for name in DESIGN.names}
 
 
 def wanted_of(*names: str) -> Wanted:
     """What some heliostats should store."""
-    return Wanted({name: items_of(DESIGN.heliostat(name)) for name in names})
+    return Wanted({name: items_of(DESIGN[name].calibrated) for name in names})
 
 
 def stores(bench: Bench, name: str, crc: int) -> None:
@@ -81,7 +81,7 @@ def test_exchanged_addresses_are_named_and_neither_is_moved_or_written(
             with pytest.raises(RefusedError, match="ZERO P5A: its address answers with"):
                 plant.zero(ENGINEER, token, "P5A", (0, 0))
             with pytest.raises(RefusedError, match="PARAMETERS P5A: its address answers"):
-                plant.parameters(ENGINEER, token, "P5A", items_of(DESIGN.heliostat("P5A")))
+                plant.parameters(ENGINEER, token, "P5A", items_of(DESIGN["P5A"].calibrated))
             ticket = plant.command(ENGINEER, token, "APPROACH", (*PAIR, "P5C"))
             assert ticket.blocked.keys() == set(PAIR)
             for _ in range(40):
@@ -176,7 +176,7 @@ def test_an_armature_that_is_nobodys_is_no_exchange(tmp_path: Path) -> None:
             assert named(bench) == set()
             assert plant.command(OPERATOR, token, "APPROACH", PAIR)
             # The plant learns that what P5A stores is P5C's, calibrated by another way.
-            leans = DESIGN.heliostat("P5C").with_parameters({"tilt_north": 1e-3})
+            leans = DESIGN["P5C"].calibrated.with_parameters({"tilt_north": 1e-3})
             stores(bench, "P5A", crc32(items_of(leans)["armature"]))
             await bench.wait(2.0)
             assert named(bench) == set()
@@ -228,7 +228,7 @@ def test_nothing_moves_before_the_boards_of_a_connection_are_known(tmp_path: Pat
             cluster.mute = True
             await bench.until(lambda: cluster.link.connected, 5.0)
             await bench.wait(0.1)
-            items = items_of(DESIGN.heliostat("P5A"))
+            items = items_of(DESIGN["P5A"].calibrated)
             for motion in ("IDLE", "UNLOCK"):
                 with pytest.raises(RefusedError, match=f"{motion} P5A.*has not been heard since"):
                     plant.command(ENGINEER, token, motion, PAIR)

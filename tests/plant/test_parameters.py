@@ -39,7 +39,7 @@ def play(folder: Path, scene: Scene, **options: Any) -> Bench:
 
 def items(name: str, **error: float) -> dict[str, bytes]:
     """What a heliostat should store if it is off by ``error`` from nominal."""
-    return items_of(example_plant().heliostat(name).with_parameters(error))
+    return items_of(example_plant()[name].calibrated.with_parameters(error))
 
 
 @pytest.mark.parametrize("state", [states.IDLE, states.TRACKING, states.DEFOCUSED])
@@ -115,7 +115,7 @@ def test_nothing_moves_beside_what_is_wanted(tmp_path: Path) -> None:
         assert NAME not in plant.wanted.missing
         assert await plant.command(ENGINEER, token, "IDLE", (NAME,)).end(5.0)
         # From the moment that other ones are wanted, nothing moves until they are stored.
-        plant.want(NAME, example_plant().heliostat(NAME).with_parameters({"azimuth_bias": 1e-3}))
+        plant.want(NAME, example_plant()[NAME].calibrated.with_parameters({"azimuth_bias": 1e-3}))
         with pytest.raises(BeamError, match="TRACK P1A: it stores"):
             plant.command(ENGINEER, token, "TRACK", (NAME,))
 
@@ -143,10 +143,10 @@ def test_a_locked_mirror_takes_only_parameters_with_a_clear_way_to_standby(tmp_p
 
     async def scene(bench: Bench, token: int) -> None:
         plant, cluster = bench.plant, bench.cluster_of(NAME)
-        mirror, sun = bench.design.heliostat(NAME), plant.sun_vector()
+        mirror, sun = bench.design[NAME].calibrated, plant.sun_vector()
         assert await plant.standby(ENGINEER, token, {NAME: rest}).end(5.0)
         found = track(mirror, sun, rest)
-        counts, row = np.round(found.chosen(found.counts)), cluster.names.index(NAME)
+        counts, row = np.round(found.best_counts), cluster.names.index(NAME)
         for end, count in zip(("primary", "secondary"), counts, strict=True):
             cluster.rows[end][row] = cluster.rows[f"{end}_goal"][row] = count
         cluster.set(states.LOCKED, NAME)
@@ -168,7 +168,7 @@ def test_a_locked_mirror_takes_only_parameters_with_a_clear_way_to_standby(tmp_p
 
 def test_stored_items_give_the_pose_that_they_were_made_of() -> None:
     error = {"azimuth_bias": 3e-3, "elevation_bias": -2e-3, "tilt_east": 4e-3, "sag": 1e-3}
-    before = example_plant().heliostat(NAME)
+    before = example_plant()[NAME].calibrated
     after = before.with_parameters(error)
     armature, drives = tables_with(items_of(after), before.armature.table, before.drives.table)
     assert (armature == after.armature.table).all()

@@ -367,7 +367,7 @@ def test_whose_beam_would_sweep_through_a_volume_does_not_join(tmp_path: Path) -
         for east, clear in ((-8.0, False), (9.0, True)):
             found = track(group.mechanism[row], plant.sun_vector(), (east, 0.0, 8.0))
             for axis, end in enumerate(("primary", "secondary")):
-                cluster.rows[end][0] = round(float(found.chosen(found.counts)[axis]))
+                cluster.rows[end][0] = round(float(found.best_counts[axis]))
             await bench.wait(2.0)
             ticket = plant.command(OPERATOR, token, "TRACK", ("P5A",))
             assert await ticket.end(10.0) is clear
@@ -416,7 +416,7 @@ def test_what_is_stored_is_compared_and_pushed(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="item 'address' of 2 bytes cannot be pushed"):
             plant.parameters(ENGINEER, token, "P1A", {"address": b"12"})
 
-    mechanism = example_plant().heliostat("P1A")
+    mechanism = example_plant()["P1A"].calibrated
     wanted = Wanted({"P1A": items_of(mechanism, machine)})
     bench = play(tmp_path, scene, wanted=wanted)
     assert {ask.what for ask in bench.cluster_of("P1A").of(Ask)} == {"stored"}

@@ -81,12 +81,12 @@ async def follow(bench: Bench, *, learns: bool) -> None:
         if learns:
             aims = plant.aims[row] if np.isfinite(plant.aims[row]).all() else aim[None]
             poses = plant.beams.poses(row, aims, plant.sun_vector())
-            counts = poses.chosen(poses.counts)[0]
+            counts = poses.best_counts[0]
             armature = packed("armature", tuple(plant.beams.armature.table[row[0]]))
             cluster.rows["armature_crc"][place] = crc32(armature)
         else:
             found = track(nominal, plant.sun_vector(), aim)
-            counts = found.chosen(found.counts)
+            counts = found.best_counts
         for axis, end in enumerate(("primary", "secondary")):
             count = round(float(counts[axis]))
             cluster.rows[end][place] = cluster.rows[f"{end}_goal"][place] = count
@@ -553,7 +553,7 @@ def test_the_plant_finds_a_worm_that_the_constants_leave(tmp_path: Path) -> None
                 aim = bench.design.targets[0].center
                 for name, machine in (("constants", constants), ("plant", beliefs.present(NAME))):
                     found = track(machine, light, aim)
-                    pose = real.pose(found.chosen(found.counts))
+                    pose = real.pose(found.best_counts)
                     ray = reflect(light, pose.normal[0])
                     left[name].append(float(angle_between(ray, normalize(aim - pose.vertex[0]))))
 

@@ -54,7 +54,7 @@ def put(bench: Bench, name: str, state: int, at: Point, end: Point | None = None
     row, rows = cluster.names.index(name), np.array([plant.field.place(name)])
     for what, point in (("", at), ("_goal", at if end is None else end)):
         found = plant.beams.poses(rows, np.array([point]), plant.sun_vector())
-        steps = found.chosen(found.counts)[0].round()
+        steps = found.best_counts[0].round()
         for axis, value in zip(("primary", "secondary"), steps, strict=True):
             cluster.rows[axis + what][row] = value
 
@@ -137,7 +137,7 @@ def test_stow_is_ordered_where_defocus_ends_on_the_receiver(share: float, act: A
     field = FieldState({"C1": DESIGN.names})
     row = np.array([field.index["P5A"]])
     found = check.poses(row, np.array([ON]), SUN)
-    begin = found.chosen(found.angles)[0] - share * np.array(Config().defocus)
+    begin = found.best_angles[0] - share * np.array(Config().defocus)
     counts = Drive(check.drives.table[row[0]]).counts(begin).round()
     field.rows["primary"][row], field.rows["secondary"][row] = counts
     field.rows["state"][row] = states.LOCKED

@@ -67,7 +67,7 @@ def counts(plant: PlantController, name: str, point: tuple[float, float, float])
     """The step counts that put the beam of a heliostat on a point."""
     group, row = DESIGN.find(name)
     found = track(group.mechanism[row], plant.sun_vector(), point)
-    return [round(float(x)) for x in found.chosen(found.counts)]
+    return [round(float(x)) for x in found.best_counts]
 
 
 async def stands(bench: Bench, name: str, state: int, at: list[int]) -> None:
@@ -327,7 +327,7 @@ def test_an_approach_is_known_to_turn_azimuth_first(tmp_path: Path) -> None:
         plant = bench.plant
         group, row = DESIGN.find("P5A")
         found = track(group.mechanism[row], plant.sun_vector(), WALKWAY.center)
-        inside, drives = found.chosen(found.angles), group.mechanism[row].drives
+        inside, drives = found.best_angles, group.mechanism[row].drives
 
         def steps(angles: FloatArray) -> list[int]:
             return [round(float(x)) for x in drives.counts(angles)]
@@ -351,7 +351,7 @@ def test_the_way_out_is_the_one_that_ends_outside_and_is_inside_for_less() -> No
     group, place = DESIGN.find("P5A")
     drives = group.mechanism[place].drives
     found = track(group.mechanism[place], sun, WALKWAY.center)
-    begin, here = found.chosen(found.angles), found.chosen(found.counts)
+    begin, here = found.best_angles, found.best_counts
     limits = (AxisLimits(-(1 << 28), 1 << 28, 1000, 1000, 0),) * 2
     far = tuple(round(x) for x in drives.counts(begin + np.array([0.8, 0.3])))
     machine = Machine(limits, (far[0], far[1]), (0.1, 0.1))
@@ -668,7 +668,7 @@ def test_the_way_to_an_aim_is_that_of_the_branch_on_which_the_mirror_stands() ->
     sun = vector(scene.start.timestamp(), scene.site)
     stow = np.tile(np.array(MACHINE.stow, dtype=float), (4, 1))
     found = check.poses(rows, np.tile(RECEIVER, (4, 1)), sun, stow)
-    here = np.asarray(found.chosen(found.counts))
+    here = found.best_counts
     aims = np.tile(TARGETS[0].center, (4, 1))
     turned: list[float] = []
 

@@ -243,7 +243,7 @@ class Bench:
         mine = np.flatnonzero(silent & np.isfinite(plant.aims[places]).all(axis=-1))
         if len(mine):
             found = plant.beams.poses(places[mine], plant.aims[places[mine]], plant.sun_vector())
-            counts = np.rint(found.chosen(found.counts)).astype(np.int32)
+            counts = np.rint(found.best_counts).astype(np.int32)
             for i, name in enumerate(_STEPS):
                 rows[name][mine] = counts[:, i % 2]
         return rows

@@ -76,7 +76,7 @@ def machine(mechanism: Mechanism, like: Machine) -> Machine:
     found = track(mechanism, UP, mechanism.position + 1000.0 * UP)
     jack = mechanism.kind == "two_jacks"
     low, high = (0, 80_000) if jack else (-222_000, 222_000)
-    stow = np.clip(np.round(found.chosen(found.counts)), low, high).astype(np.int64).reshape(2)
+    stow = np.clip(np.round(found.best_counts), low, high).astype(np.int64).reshape(2)
     axis = AxisLimits(low, high, int(RATE), 16_000, 40)
     return replace(like, axes=(axis, axis), stow=(int(stow[0]), int(stow[1])), defocus=(0.1, 0.05))
 

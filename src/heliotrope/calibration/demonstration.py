@@ -49,7 +49,7 @@ def measure(
         times = solar.daylight(day, site, every=timedelta(minutes=70), min_elevation=0.2)
         for time, sun in zip(times, solar.vector(times, site), strict=True):
             wanted = track(nominal, sun, target.center)
-            counts = np.round(wanted.chosen(wanted.counts))
+            counts = np.round(wanted.best_counts)
             pose = truth.pose(counts)
             spot = target.intersect(pose.vertex, reflect(sun, pose.normal))
             spot = spot + rng.normal(0.0, noise, (len(nominal), 2)) @ target.axes
@@ -102,7 +102,7 @@ def track_day(
 
     def beam(mechanism: Mechanism) -> FloatArray:
         wanted = track(mechanism, suns[:, None, :], aim)
-        pose = truth.pose(np.round(wanted.chosen(wanted.counts)))
+        pose = truth.pose(np.round(wanted.best_counts))
         way = aim - pose.vertex
         way = way / np.linalg.norm(way, axis=-1, keepdims=True)
         return angle_between(reflect(suns[:, None, :], pose.normal), way)

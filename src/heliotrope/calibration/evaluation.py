@@ -6,13 +6,12 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.fit.estimator import check_rows
 from heliotrope.calibration.fit.residuals import frame
+from heliotrope.calibration.named import Field, members
 from heliotrope.calibration.paint_splits import KINDS, paint_split
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, angle_between, as_numbers, bisector, reflect
-from heliotrope.mechanism.chain import Mechanism
 from heliotrope.values import Card, Value, span
 
 Split = Literal[
@@ -65,16 +64,19 @@ class BeamErrors(Value):
         return Card(line, ("error", "range"), rows)
 
 
-def beam_errors(mechanism: Mechanism, sightings: Sightings) -> BeamErrors:
-    """Return the errors of sightings under mechanisms of batch shape (N,).
+def beam_errors(mechanism: Field, sightings: Sightings) -> BeamErrors:
+    """Return the errors of sightings.
 
-    Raises
-    ------
-    InputError
-        If a sighting is of a heliostat that is not there.
+    Parameters
+    ----------
+    mechanism
+        Mechanisms, batch shape (N,) or (); a heliostat, a group or a plant counts as calibrated.
+    sightings
+        M sightings of these heliostats.
     """
-    check_rows(mechanism, sightings)
-    pose = mechanism[sightings.heliostat].pose(sightings.counts)
+    given = members(mechanism, "calibrated")
+    sightings = given.rows_of(sightings)
+    pose = given.mechanism[sightings.heliostat].pose(sightings.counts)
     source, way = ray_directions(sightings, pose.vertex)
     ray = reflect(source, pose.normal)
     distance = np.where(

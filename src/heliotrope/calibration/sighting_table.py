@@ -7,6 +7,7 @@ heliostat, column, value, remedy); a file that cannot be used raises an error.
 import csv
 import io
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -111,7 +112,8 @@ def read_sightings(
         source_covariance=spread["source"][good],
         destination_covariance=spread["destination"][good],
     )
-    return seen, tuple(kinds[i] for i in good), rows.left_out
+    named = replace(seen, names=tuple(names))
+    return named, tuple(kinds[i] for i in good), rows.left_out
 
 
 def write_sightings(
@@ -231,7 +233,7 @@ def read_malan(
         time=time[good],
         sigma=sigma,
     )
-    return seen, rows.left_out
+    return replace(seen, names=tuple(names)), rows.left_out
 
 
 def _is_parquet(path: Path) -> bool:

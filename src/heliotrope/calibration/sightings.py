@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import InputError, kind_of
+from heliotrope.errors import InputError, UnknownNameError, kind_of
 from heliotrope.field.formats.measurements import Measurements
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.geometry import FloatArray, as_float, as_numbers, azimuth_elevation, normalize
@@ -47,6 +47,8 @@ class Sightings(Value):
     source_covariance, destination_covariance
         Further covariance of each end, ENU, (M, 3, 3): m² for a point, rad² for a
         direction, of which only the part across the direction counts.
+    names
+        Names of the heliostats by row, (N,); () where rows count the mechanisms given with them.
     """
 
     heliostat: npt.NDArray[np.intp]
@@ -59,6 +61,7 @@ class Sightings(Value):
     sigma: FloatArray
     source_covariance: FloatArray
     destination_covariance: FloatArray
+    names: tuple[str, ...] = ()
 
     def _card(self) -> Card:
         some = amount(len(np.unique(self.heliostat)), "heliostat")
@@ -91,12 +94,36 @@ class Sightings(Value):
         index = np.asarray(rows)
         # NumPy makes an array of floats of an empty list.
         index = index if index.size else index.astype(np.intp)
-        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        return replace(self, **{name: getattr(self, name)[index] for name in _COLUMNS})
 
-    def of(self, heliostat: int) -> "Sightings":
-        """Return the sightings of one heliostat, renumbered to 0."""
-        part = self.take(np.flatnonzero(self.heliostat == heliostat))
-        return replace(part, heliostat=np.zeros(len(part), dtype=np.intp))
+    def of(self, heliostat: int | str) -> "Sightings":
+        """Return the sightings of one heliostat, by row or name, renumbered to 0.
+
+        Raises
+        ------
+        UnknownNameError
+            If no heliostat of that name was seen.
+        """
+        if isinstance(heliostat, str) and heliostat not in self.names:
+            raise UnknownNameError("heliostat (of the sightings)", heliostat, self.names)
+        row = self.names.index(heliostat) if isinstance(heliostat, str) else heliostat
+        part = self.take(np.flatnonzero(self.heliostat == row))
+        return replace(
+            part,
+            heliostat=np.zeros(len(part), dtype=np.intp),
+            names=self.names[row : row + 1],
+        )
+
+    def renumbered(self, rows: npt.ArrayLike) -> "Sightings":
+        """Return the sightings as those of other mechanisms, by row (M,) and without names."""
+        return replace(self, heliostat=np.asarray(rows, dtype=np.intp), names=())
+
+    def __getitem__(self, heliostat: str) -> "Sightings":
+        """Return the sightings of one heliostat by name; see `of`."""
+        return self.of(heliostat)
+
+
+_COLUMNS = tuple(f.name for f in fields(Sightings) if f.name != "names")
 
 
 def _ends(values: FloatArray) -> tuple[float, ...]:
@@ -118,10 +145,14 @@ def sightings(
 ) -> Sightings:
     """Return checked sightings; everything broadcasts to the M rows of ``counts``.
 
+    Counts of several batch axes, such as (T, N, D) of N heliostats at T times, give as many
+    sightings, the last axis fastest; all else broadcasts to (T, N), and a list of times goes
+    along the first axis.
+
     Parameters
     ----------
     heliostat
-        Row of the heliostat of each sighting, (M,).
+        Name of the heliostat of each sighting, or its row among the mechanisms, () or (M,).
     counts
         Drive counts, (M, D).
     source, destination
@@ -144,12 +175,12 @@ def sightings(
         covariance is not symmetric and positive semidefinite; the text names the row.
     """
     table = np.atleast_2d(_numbers(counts, "counts"))
-    if table.ndim != 2:
-        raise InputError(f"counts: shape {table.shape}; give the drives of M sightings, (M, D)")
+    batch = table.shape[:-1]
+    table = table.reshape(-1, table.shape[-1])
     rows = len(table)
 
     def spread(values: npt.ArrayLike, name: str, dtype: npt.DTypeLike = np.float64) -> np.ndarray:
-        return np.array(_rows(_numbers(values, name), (rows,), name), dtype=dtype)
+        return np.array(_rows(_numbers(values, name), batch, name), dtype=dtype).ravel()
 
     far_source = spread(source_at_infinity, "source_at_infinity", np.bool_)
     far_destination = spread(destination_at_infinity, "destination_at_infinity", np.bool_)
@@ -158,7 +189,7 @@ def sightings(
         ("source", source, far_source),
         ("destination", destination, far_destination),
     ):
-        points = np.array(_rows(_numbers(given, name), (rows, 3), name))
+        points = np.array(_rows(_numbers(given, name), (*batch, 3), name)).reshape(rows, 3)
         _finite(points, name)
         with np.errstate(over="ignore"):
             loose = far & (np.abs(np.linalg.norm(points, axis=-1) - 1.0) > _UNIT)
@@ -174,9 +205,10 @@ def sightings(
             f"sighting {i}: sigma {spreads[i]} rad must be above 0 and at most {LARGEST_SIGMA} "
             "rad; milliradians need a factor of 1e-3, degrees numpy.radians"
         )
+    index, names = _named(heliostat)
     return Sightings(
-        _heliostats(heliostat, rows),
-        spread(unix_seconds(time, unknown=True), "time"),
+        _heliostats(index, batch),
+        spread(_along_first(unix_seconds(time, unknown=True), batch), "time"),
         table,
         ends[0],
         ends[1],
@@ -185,6 +217,7 @@ def sightings(
         spreads,
         _covariances(source_covariance, rows, "source_covariance"),
         _covariances(destination_covariance, rows, "destination_covariance"),
+        names,
     )
 
 
@@ -202,15 +235,15 @@ def _rows(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
     try:
         return np.broadcast_to(values, shape)
     except ValueError:
-        one = "a number" if len(shape) == 1 else "3 numbers"
+        one = "3 numbers" if name in ("source", "destination") else "a number"
         raise InputError(
             f"sightings: {name} of shape {values.shape}; there are {shape[0]} rows of counts: give "
             f"{one} for all of them, or shape {shape}"
         ) from None
 
 
-def _heliostats(given: npt.ArrayLike, rows: int) -> npt.NDArray[np.intp]:
-    values = _rows(_numbers(given, "heliostat"), (rows,), "heliostat")
+def _heliostats(given: npt.ArrayLike, batch: tuple[int, ...]) -> npt.NDArray[np.intp]:
+    values = _rows(_numbers(given, "heliostat"), batch, "heliostat").ravel()
     wrong = ~((values >= 0.0) & (values == np.floor(values)))
     if wrong.any():
         i = int(np.flatnonzero(wrong)[0])
@@ -218,6 +251,24 @@ def _heliostats(given: npt.ArrayLike, rows: int) -> npt.NDArray[np.intp]:
             f"sighting {i}: heliostat {values[i]:g} is not a row; give whole numbers from 0 on"
         )
     return np.array(values, dtype=np.intp)
+
+
+def _named(heliostat: npt.ArrayLike) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return rows and their names, in the order in which the names occur; () for rows."""
+    given = np.asarray(heliostat)
+    if given.dtype.kind not in "UO":
+        return given, ()
+    names = tuple(dict.fromkeys(str(name) for name in given.ravel()))
+    place = {name: i for i, name in enumerate(names)}
+    rows = np.array([place[str(name)] for name in given.ravel()], dtype=np.intp)
+    return rows.reshape(given.shape), names
+
+
+def _along_first(times: FloatArray, batch: tuple[int, ...]) -> FloatArray:
+    """Return a list of times as the first of several batch axes."""
+    if times.ndim == 1 and len(batch) > 1 and len(times) == batch[0]:
+        return times.reshape(-1, *(1,) * (len(batch) - 1))
+    return times
 
 
 def _covariances(given: npt.ArrayLike, rows: int, name: str) -> FloatArray:
@@ -344,7 +395,7 @@ def of_measurements(
         time=measurements.time[kept],
         sigma=sigma,
     )
-    return seen, left_out
+    return replace(seen, names=heliostats.names), left_out
 
 
 def camera_target(
@@ -512,6 +563,18 @@ def join(parts: Sequence[Sightings]) -> Sightings:
         raise InputError(
             f"join: sightings of mechanisms with {drives} drives; join those of one kind"
         )
-    return Sightings(
-        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Sightings)}
-    )
+    named = [part for part in parts if part.names]
+    if named and len(named) != len(parts):
+        raise InputError(
+            "join: some sightings name their heliostats and others number them; name all, as in "
+            "sightings(names, …)"
+        )
+    names = tuple(dict.fromkeys(name for part in named for name in part.names))
+    if named:
+        place = {name: i for i, name in enumerate(names)}
+        parts = [
+            replace(p, heliostat=np.array([place[n] for n in p.names], np.intp)[p.heliostat])
+            for p in parts
+        ]
+    columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _COLUMNS}
+    return Sightings(**columns, names=names)

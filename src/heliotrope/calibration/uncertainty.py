@@ -117,8 +117,8 @@ def expected_error(
     each = mechanism if mechanism.shape else mechanism[None]
     each = each[np.zeros(count, dtype=np.intp)] if len(each) == 1 else each
     found = track(each, suns, aims)
-    reachable = found.chosen(found.reachable)
-    counts = np.where(reachable[:, None], found.chosen(found.counts), 0.0)
+    reachable = found.reachable
+    counts = np.where(reachable[:, None], found.best_counts, 0.0)
     slope = _beam_slope(each, counts, suns, aims, names)
     spread = slope @ as_float(covariance) @ np.swapaxes(slope, -1, -2)
     spread = spread + noise**2 * np.eye(2)
@@ -158,11 +158,11 @@ def error_form(
         part = slice(first, min(first + step, count))
         some = mechanism[part]
         solved = track(some, sky[:, None], aims[part])
-        able = solved.chosen(solved.reachable).T
+        able = solved.reachable.T
         row, which = np.nonzero(able)
         if not row.size:
             continue
-        counts = solved.chosen(solved.counts)[which, row]
+        counts = solved.best_counts[which, row]
         slope = _beam_slope(some[row], counts, sky[which], aims[part][row], names)
         poses = able.sum(axis=1)
         # `nonzero` lists the poses heliostat by heliostat.

@@ -12,6 +12,7 @@ from heliotrope.errors import InputError, TimeError
 
 if TYPE_CHECKING:
     from heliotrope.field.plant import Plant
+    from heliotrope.sun import Site
 
 
 def parse_time(text: str) -> datetime:
@@ -52,11 +53,26 @@ def parse_point(text: str, what: str) -> tuple[float, float, float]:
     return values[0], values[1], values[2]
 
 
-def open_plant(path: Path) -> "Plant":
-    """Return the plant of a TOML file, a HelioK XML file or a folder in PAINT's form."""
+def open_plant(path: Path, site: "Site | None" = None) -> "Plant":
+    """Return the plant of a file or folder, whatever its format."""
     from heliotrope.field import formats
 
-    return formats.open_plant(path)
+    return formats.open_plant(path, site=site)
+
+
+def parse_site(text: str) -> "Site":
+    """Return a site from "LATITUDE,LONGITUDE,HEIGHT", degrees and m."""
+    from heliotrope.sun import Site
+
+    parts = text.split(",")
+    try:
+        latitude, longitude, height = (float(part) for part in parts)
+    except ValueError:
+        raise InputError(
+            f"site {text!r}: give three numbers, latitude and longitude in degrees and the height "
+            "in m, as in 50.913,6.388,87"
+        ) from None
+    return Site(latitude, longitude, height)
 
 
 def print_json(value: Any) -> None:

@@ -9,6 +9,7 @@ from heliotrope.cli._common import (
     open_plant,
     parse_duration,
     parse_point,
+    parse_site,
     parse_time,
     print_json,
     print_table,
@@ -24,7 +25,8 @@ if TYPE_CHECKING:
 
 
 FieldArgument = Annotated[
-    Path, typer.Argument(help="Plant file (TOML), HelioK XML or PAINT folder.")
+    Path,
+    typer.Argument(help="Plant file (TOML), PAINT folder, HelioK XML, SolarPILOT or OpenCSP CSV."),
 ]
 HeliostatOption = Annotated[str, typer.Option(help="Name of the heliostat.")]
 AimOption = Annotated[
@@ -51,6 +53,10 @@ def track(
     every: Annotated[
         str | None, typer.Option(help="Track the whole day of TIME at this interval: 30s, 10min.")
     ] = None,
+    site: Annotated[
+        str | None,
+        typer.Option(help="LATITUDE,LONGITUDE,HEIGHT (degrees, m) of a file that gives no place."),
+    ] = None,
     calibration: Annotated[
         Path | None, typer.Option(help="calibration.json of heliotrope calibrate to apply first.")
     ] = None,
@@ -74,12 +80,14 @@ def track(
     from heliotrope.geometry import normalize
     from heliotrope.mechanism import tracking
 
-    plant = open_plant(field)
+    # With a given sun the place on Earth does not matter.
+    place = site or ("0,0,0" if sun is not None else "")
+    plant = open_plant(field, parse_site(place) if place else None)
     if calibration is not None:
         from heliotrope.calibration.report.results import apply_to_plant, read_json
 
         plant = apply_to_plant(plant, read_json(calibration))
-    mechanism = plant.heliostat(heliostat)
+    mechanism = plant[heliostat].calibrated
     goal = np.array(aim_of(plant, heliostat, aim, target))
     moment = parse_time(time or "now")
     _check(every, law, local, trace)
@@ -142,17 +150,15 @@ def _sun_of(field: Path) -> "np.ndarray | None":
 
 def aim_of(plant: "Plant", heliostat: str, aim: str | None, target: str | None) -> Any:
     """Return the aim that options name, else the heliostat's own, else the first target, (3,)."""
-    import numpy as np
-
     if aim is not None and target is not None:
         raise InputError("give --aim or --target, not both")
     if aim is not None:
         return parse_point(aim, "aim")
     if target is not None:
         return plant.target(target).center
-    group, row = plant.find(heliostat)
-    if group.aim is not None and np.isfinite(group.aim[row]).all():
-        return group.aim[row]
+    own = plant[heliostat].aim
+    if own is not None:
+        return own
     if not plant.targets:
         raise InputError("this plant has no target; give --aim east,north,up in metres")
     return plant.targets[0].center
@@ -200,7 +206,7 @@ def _branch(result: "Tracking", b: int) -> dict[str, Any]:
         "vertex": result.vertex[b],
         "angles_rad": result.angles[b],
         "counts": result.counts[b],
-        "reachable": bool(result.reachable[b]),
+        "reachable": bool(result.served[b]),
         "residual_mrad": float(1e3 * result.residual[b]),
         "iterations": int(result.iterations[b]),
         "status": status.name.lower(),
@@ -241,9 +247,9 @@ def _day(
     from heliotrope.geometry import azimuth_elevation
 
     azimuth, elevation = azimuth_elevation(result.chosen(result.normal))
-    angles: np.ndarray = result.chosen(result.angles)
-    counts: np.ndarray = result.chosen(result.counts)
-    reachable: np.ndarray = result.chosen(result.reachable)
+    angles: np.ndarray = result.best_angles
+    counts: np.ndarray = result.best_counts
+    reachable: np.ndarray = result.reachable
     residual: np.ndarray = result.chosen(result.residual)
     iterations: np.ndarray = result.chosen(result.iterations)
     rows = [

@@ -46,17 +46,16 @@ def view(
     if kind not in (".html", ".glb"):
         raise InputError(f"view: {out.name}; give a file that ends in .html or .glb")
     plant = open_plant(field)
-    mechanism = plant.heliostat(heliostat)
-    group, row = plant.find(heliostat)
-    width, height = float(group.width[row]), float(group.height[row])
+    one = plant[heliostat]
+    mechanism, width, height = one.calibrated, one.width, one.height
     goal = np.array(aim_of(plant, heliostat, aim, target))
     times = solar.daylight(parse_time(time).date(), plant.site, every=parse_duration(every))
     light = np.asarray(solar.vector(times, plant.site))
     found = tracking.track(mechanism, light, goal)
-    good = found.chosen(found.reachable)
+    good = found.reachable
     if not good.any():
         raise InputError(f"heliostat {heliostat}: the beam reaches the aim at no time of this day")
-    angles = np.unwrap(found.chosen(found.angles)[good], axis=0)
+    angles = np.unwrap(found.best_angles[good], axis=0)
     chosen = [at for at, one in zip(times, good, strict=True) if one]
     seconds = np.array([(at - chosen[0]).total_seconds() for at in chosen]) / _PACE
     if kind == ".glb":

@@ -12,6 +12,9 @@ from heliotrope.field.example import (
     example_plant,
     roughly_installed,
 )
+from heliotrope.field.heliostat import (
+    Heliostat,
+)
 from heliotrope.field.heliostats import (
     Facets,
     Heliostats,
@@ -43,6 +46,7 @@ __all__ = [
     "Camera",
     "Cylinder",
     "Facets",
+    "Heliostat",
     "Heliostats",
     "Mark",
     "Plant",

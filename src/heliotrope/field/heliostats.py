@@ -9,7 +9,9 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray, as_float
+from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.values import Card, Value, amount, card_of_arrays, dots, span
 
@@ -144,6 +146,22 @@ class Heliostats(Value):
     def calibrated(self) -> Mechanism:
         """The mechanisms with the calibrated deviations applied."""
         return self.mechanism.with_parameters(self.parameters)
+
+    @property
+    def armature(self) -> Armature:
+        """Armatures of the calibrated mechanisms, (N,)."""
+        return self.calibrated.armature
+
+    @property
+    def drives(self) -> Drive:
+        """Drives of the calibrated mechanisms, (N, D)."""
+        return self.calibrated.drives
+
+    def own_aim(self, row: int) -> FloatArray | None:
+        """Return the aim point of a row, ENU metres, (3,); None where none is given."""
+        if self.aim is None or not np.isfinite(self.aim[row]).all():
+            return None
+        return np.asarray(self.aim[row])
 
     @cached_property
     def _index(self) -> dict[str, int]:

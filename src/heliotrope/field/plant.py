@@ -1,6 +1,6 @@
 """A plant: site, tower, targets, receivers and the heliostats, group by group."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar
@@ -9,12 +9,13 @@ import numpy as np
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.camera import Camera
+from heliotrope.field.heliostat import Heliostat
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Volume
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.chain import Mechanism, join_mechanisms
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.sun import Site, check_site
@@ -136,10 +137,39 @@ class Plant(Value):
             raise UnknownNameError("heliostat", name, self.names) from None
         return self.groups[group], row
 
-    def heliostat(self, name: str) -> Mechanism:
-        """Return the calibrated mechanism of one heliostat, batch shape ()."""
-        group, row = self.find(name)
-        return group.calibrated[row]
+    def __getitem__(self, name: str) -> Heliostat:
+        """Return heliostat ``name``.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no heliostat of that name.
+        """
+        heliostats, row = self.find(name)
+        group, _ = self._place[name]
+        return Heliostat(heliostats.take([row]), group, self.site, self.targets)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._place
+
+    def __iter__(self) -> Iterator[Heliostat]:
+        return (self[name] for name in self.names)
+
+    @cached_property
+    def nominal(self) -> Mechanism:
+        """The mechanisms of all heliostats as designed, (N,), in the order of ``names``.
+
+        Raises
+        ------
+        InputError
+            If the plant has heliostats of several kinds; take its groups one by one then.
+        """
+        return join_mechanisms([g.mechanism for g in self.groups.values()])
+
+    @cached_property
+    def calibrated(self) -> Mechanism:
+        """The mechanisms of all heliostats with their calibrated deviations; see `nominal`."""
+        return join_mechanisms([g.calibrated for g in self.groups.values()])
 
     def machine(self, name: str) -> Machine:
         """Return motor limits and resting places of one heliostat.
@@ -188,6 +218,10 @@ class Plant(Value):
         """Calibrated drives of all heliostats, batch shape (N, 2)."""
         tables = [g.calibrated.drives.table for g in self.groups.values()]
         return Drive(np.concatenate(tables or [np.empty((0, 2, 19))]))
+
+    def with_notes(self, notes: Mapping[str, str]) -> "Plant":
+        """Return the plant with further remarks."""
+        return replace(self, notes={**self.notes, **notes})
 
     def with_groups(self, groups: Mapping[str, Heliostats]) -> "Plant":
         """Return the plant with other heliostats."""

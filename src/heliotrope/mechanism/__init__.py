@@ -18,9 +18,11 @@ from heliotrope.mechanism.armature import (
     check_axes,
 )
 from heliotrope.mechanism.chain import (
+    Calibrated,
     Jacobian,
     Mechanism,
     Pose,
+    join_mechanisms,
 )
 from heliotrope.mechanism.drives import (
     SLOTS,
@@ -51,6 +53,7 @@ from heliotrope.mechanism.parameters import (
 )
 from heliotrope.mechanism.tracking import (
     Branch,
+    Steered,
     Tracking,
     TrackingStatus,
     track,
@@ -62,17 +65,20 @@ __all__ = [
     "Armature",
     "AxisLimits",
     "Branch",
+    "Calibrated",
     "Drive",
     "Jacobian",
     "Machine",
     "Mechanism",
     "Parameter",
     "Pose",
+    "Steered",
     "Tracking",
     "TrackingStatus",
     "azimuth_elevation",
     "check_axes",
     "direct",
+    "join_mechanisms",
     "linear_grigoriev",
     "linear_guo",
     "linear_paint",

@@ -1,9 +1,10 @@
 """A mechanism is data: joints from ground to mirror, two of them driven."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import EllipsisType
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -78,6 +79,14 @@ class Jacobian(Value):
         return card_of_arrays(self)
 
 
+class Calibrated(Protocol):
+    """Deviations of parameters from a nominal mechanism: a fit, a record, a file's content."""
+
+    @property
+    def parameters(self) -> Mapping[str, npt.ArrayLike]:
+        """Deviations by name, rad, m or 1."""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Mechanism(Value):
     """One mechanism, or an array of mechanisms of one kind; batch shape (...).
@@ -104,6 +113,9 @@ class Mechanism(Value):
         Batch shape (..., D).
     vertex, normal
         Mirror's vertex (m) and unit normal in the mirror's frame, (..., 3).
+    deviations
+        Deviations of the parameters that it carries, by name, as `with_parameters` and
+        `with_calibration` summed them up, rad, m or 1, each (...).
     """
 
     kind: str
@@ -117,6 +129,7 @@ class Mechanism(Value):
     drives: Drive
     vertex: FloatArray
     normal: FloatArray
+    deviations: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def _card(self) -> Card:
         joints = [self.joints[k] for k in self.driven]
@@ -159,6 +172,7 @@ class Mechanism(Value):
             drives=Drive(self.drives.table[index]),
             vertex=self.vertex[index],
             normal=self.normal[index],
+            deviations={name: np.asarray(v[index]) for name, v in self.deviations.items()},
         )
 
     @cached_property
@@ -207,6 +221,7 @@ class Mechanism(Value):
         position, origins = self.position.copy(), self.origins.copy()
         angles, vertex = self.angles.copy(), self.vertex.copy()
         table = self.drives.table.copy()
+        carried = dict(self.deviations)
         for name, value in values.items():
             delta = self._deviation(name, value)
             what, index, sub = self.parameter(name).code
@@ -222,6 +237,7 @@ class Mechanism(Value):
                 vertex[..., sub] += delta
             else:
                 vertex += delta[..., None] * self.normal
+            carried[name] = carried.get(name, 0.0) + delta
         return replace(
             self,
             position=position,
@@ -229,7 +245,26 @@ class Mechanism(Value):
             angles=angles,
             vertex=vertex,
             drives=Drive(table),
+            deviations=carried,
         )
+
+    def with_calibration(self, calibration: Calibrated) -> "Mechanism":
+        """Return the mechanism moved by a calibration, for example the result of `fit`.
+
+        One calibration moves many mechanisms alike; a calibration of N heliostats moves N.
+
+        Raises
+        ------
+        InputError
+            If it is of another number of heliostats.
+        UnknownNameError
+            If this kind of mechanism lacks one of its parameters.
+        """
+        moved = {}
+        for name, given in calibration.parameters.items():
+            value = np.asarray(given)
+            moved[name] = value.reshape(()) if value.size == 1 else value
+        return self.with_parameters(moved)
 
     def _deviation(self, name: str, value: npt.ArrayLike) -> FloatArray:
         """Return the checked deviation of one parameter."""
@@ -356,3 +391,36 @@ class Mechanism(Value):
         rows = np.ascontiguousarray(np.broadcast_to(index, shape)).ravel()
         flat = np.ascontiguousarray(np.broadcast_to(given, (*shape, drives)))
         return flat.reshape(-1, drives), rows, shape
+
+
+def join_mechanisms(parts: Sequence[Mechanism]) -> Mechanism:
+    """Return mechanisms of one kind, each of batch shape (n,), as one of shape (N,).
+
+    Raises
+    ------
+    InputError
+        If there are none, or they are of several kinds.
+    """
+    kinds = sorted({part.kind for part in parts})
+    if len({(part.kind, part.joints, part.driven) for part in parts}) != 1:
+        raise InputError(
+            f"mechanisms of {', '.join(kinds) or 'no kind'}: join those of one kind; take a group "
+            "of the plant (plant.groups) where kinds differ"
+        )
+
+    carried = dict.fromkeys(name for part in parts for name in part.deviations)
+    return replace(
+        parts[0],
+        position=np.concatenate([part.position for part in parts]),
+        orientation=np.concatenate([part.orientation for part in parts]),
+        axes=np.concatenate([part.axes for part in parts]),
+        origins=np.concatenate([part.origins for part in parts]),
+        angles=np.concatenate([part.angles for part in parts]),
+        vertex=np.concatenate([part.vertex for part in parts]),
+        normal=np.concatenate([part.normal for part in parts]),
+        drives=Drive(np.concatenate([part.drives.table for part in parts])),
+        deviations={
+            name: np.concatenate([p.deviations.get(name, np.zeros(p.shape)) for p in parts])
+            for name in carried
+        },
+    )

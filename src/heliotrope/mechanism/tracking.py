@@ -7,7 +7,7 @@ on the armature, hence for every mechanism and every error model alike.
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,6 @@ import numpy.typing as npt
 from heliotrope.errors import InputError, kind_of, shown
 from heliotrope.geometry import FloatArray, as_numbers, as_vectors, reflect
 from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive, direct
 from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.mechanism.kernels.block import track_block
@@ -30,6 +29,18 @@ from heliotrope.parallel import run_blocks
 from heliotrope.values import Card, Value, amount, span
 
 Branch = Literal["both", 0, 1]
+
+
+class Steered(Protocol):
+    """Anything with axes and drives: mechanisms, a heliostat, heliostats, a plant."""
+
+    @property
+    def armature(self) -> Armature:
+        """Batch shape (...)."""
+
+    @property
+    def drives(self) -> Drive:
+        """Batch shape (..., D)."""
 
 
 class TrackingStatus(IntEnum):
@@ -104,9 +115,24 @@ class Tracking(Value):
         return Card(line, ("best branch", "angle or meaning", "counts"), [*rows, *seen])
 
     @property
-    def reachable(self) -> npt.NDArray[np.bool_]:
-        """Whether the beam reaches its aim, (..., B)."""
+    def served(self) -> npt.NDArray[np.bool_]:
+        """Whether the beam reaches its aim on each branch, (..., B)."""
         return np.asarray(self.status == TrackingStatus.OK)
+
+    @property
+    def reachable(self) -> npt.NDArray[np.bool_]:
+        """Whether the beam reaches its aim on the best branch, (...)."""
+        return np.asarray(self.chosen(self.served))
+
+    @property
+    def best_counts(self) -> FloatArray:
+        """Drive counts of the best branch, (..., D)."""
+        return np.asarray(self.chosen(self.counts))
+
+    @property
+    def best_angles(self) -> FloatArray:
+        """Joint angles of the best branch, rad, (..., D)."""
+        return np.asarray(self.chosen(self.angles))
 
     def chosen(self, values: np.ndarray) -> np.ndarray:
         """Return the best branch's part of one of the arrays above, (..., rest)."""
@@ -116,7 +142,7 @@ class Tracking(Value):
 
 
 def track(
-    mechanism: Mechanism | Armature,
+    mechanism: Steered | Armature,
     sun: npt.ArrayLike,
     aim: npt.ArrayLike,
     *,
@@ -136,7 +162,7 @@ def track(
     Parameters
     ----------
     mechanism
-        Mechanisms, or armatures.
+        Mechanisms; a heliostat, heliostats or a plant, as calibrated; or armatures.
     sun
         Unit vectors to the source, ENU, (..., 3).
     aim
@@ -244,7 +270,7 @@ class TraceStep:
 
 
 def trace(
-    mechanism: Mechanism | Armature,
+    mechanism: Steered | Armature,
     sun: npt.ArrayLike,
     aim: npt.ArrayLike,
     *,
@@ -295,24 +321,24 @@ def trace(
     return tuple(steps)
 
 
-def _tables(mechanism: Mechanism | Armature, drives: Drive | None) -> tuple[Armature, FloatArray]:
-    if not isinstance(mechanism, Mechanism | Armature):
+def _tables(mechanism: Steered | Armature, drives: Drive | None) -> tuple[Armature, FloatArray]:
+    steered = isinstance(getattr(mechanism, "drives", None), Drive)
+    if not isinstance(mechanism, Armature) and not steered:
         raise InputError(
-            f"mechanism: {kind_of(mechanism)} cannot be tracked; give a Mechanism, such as "
-            "plant.heliostat(name), or an Armature with drives, such as plant.armature"
+            f"mechanism: {kind_of(mechanism)} cannot be tracked; give a Mechanism, plant[name], a "
+            "group, a plant, or an Armature with drives"
         )
     if drives is not None and not isinstance(drives, Drive):
         raise InputError(
             f"drives: {kind_of(drives)} is not a Drive; give one of batch shape (..., D)"
         )
-    if isinstance(mechanism, Mechanism):
-        table = mechanism.drives.table if drives is None else drives.table
-        axes = len(mechanism.driven)
-        armature = mechanism.armature
-    else:
+    if isinstance(mechanism, Armature):
         armature = mechanism
-        axes = 2
-        table = np.stack([direct().table] * 2) if drives is None else drives.table
+        own = np.stack([direct().table] * 2)
+    else:
+        armature, own = mechanism.armature, mechanism.drives.table
+    table = own if drives is None else drives.table
+    axes = own.shape[-2]
     if table.ndim < 2 or table.shape[-2] != axes:
         raise InputError(
             f"drives: batch shape {table.shape[:-1]}; its last axis must be {axes}, the drives"

@@ -178,7 +178,7 @@ def _stand(
             "make it with nominal.with_parameters"
         )
     tracked = track(nominal, sun, aim)
-    counts = tracked.chosen(tracked.counts)
+    counts = tracked.best_counts
     try:
         np.broadcast_shapes(counts.shape[:-1], actual.shape)
     except ValueError:

@@ -280,7 +280,7 @@ class BeamCheck:
             )
         good = status == TrackingStatus.OK
         if good.any():
-            path = motion(rows[good], counts[good], solved.chosen(solved.counts)[good])
+            path = motion(rows[good], counts[good], solved.best_counts[good])
             found |= self.moving(rows[good], path, sun)
         return found
 
@@ -398,10 +398,10 @@ class BeamCheck:
     ) -> None:
         """Add the volumes on the way from one point to another."""
         before = self.poses(rows, start, sun)
-        counts = before.chosen(before.counts)
+        counts = before.best_counts
         after = self.poses(rows, aims, sun, counts)
         good = before.chosen(before.status) == TrackingStatus.OK
-        path = np.stack([before.chosen(before.angles), after.chosen(after.angles)], axis=-2)
+        path = np.stack([before.best_angles, after.best_angles], axis=-2)
         if good.any():
             self._check_motion(found, rows[good], path[good], sun)
 

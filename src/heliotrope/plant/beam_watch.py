@@ -243,7 +243,7 @@ class BeamWatch:
         counts = self._field.counts(rows)
         found = self._check.poses(rows, self.points.standbys[rows], light, counts)
         good = found.chosen(found.status) == TrackingStatus.OK
-        rows, ends = rows[good], found.chosen(found.counts)[good]
+        rows, ends = rows[good], found.best_counts[good]
         return rows, self._ways.motion(rows, counts[good], ends)
 
     def _by_counts(self, name: str, values: Sequence[float], rows: Rows) -> FloatArray:

@@ -197,4 +197,4 @@ class Flights:
 
 
 def _as_row(sightings: Sightings, row: int) -> Sightings:
-    return replace(sightings, heliostat=np.full(len(sightings), row, dtype=np.intp))
+    return sightings.renumbered(np.full(len(sightings), row))

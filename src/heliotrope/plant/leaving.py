@@ -51,7 +51,7 @@ def way_out(
     aimed = None
     if aim is not None and np.isfinite(aim).all():
         found = check.poses(np.array([row]), aim[None], sun, counts[None])
-        aimed = as_float(found.chosen(found.angles)[0])
+        aimed = as_float(found.best_angles[0])
     ways = {
         Act.DEFOCUS: np.stack([begin, turned_away(begin, machine, drives, aimed)]),
         Act.STOW: np.stack([begin, corner, end]),

@@ -73,10 +73,10 @@ def change_of_beam(before: Tables, after: Tables, aims: npt.ArrayLike) -> float:
     solved = [
         track(Armature(many(a)), light, goals, drives=Drive(many(d))) for a, d in (before, after)
     ]
-    reached, again = (found.chosen(found.reachable) for found in solved)
+    reached, again = (found.reachable for found in solved)
     if not reached.any() or (reached & ~again).any():
         return math.inf
-    angles = Drive(many(before[1])).angles(solved[1].chosen(solved[1].counts))
+    angles = Drive(many(before[1])).angles(solved[1].best_counts)
     normal, vertex = Armature(many(before[0])).pose(angles)
     missed = angle_between(reflect(light, normal), normalize(goals - vertex))
     return float(missed[reached].max())

@@ -182,7 +182,7 @@ class Ways:
             for i in left[~good]:
                 found[check.names[rows[i]]] = "its beam does not reach all points of the safe way"
             left, light = left[good], light[good]
-            first, last = at[left], np.round(solved.chosen(solved.counts)[good])
+            first, last = at[left], np.round(solved.best_counts[good])
             moves = self.turns if place == 0 else self.motion
             path = moves(rows[left], first, last)
             wrong = check.crossing(rows[left], path, light, _WHEN)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,7 @@ from heliotrope.values import Card, Value, span
 
 if TYPE_CHECKING:
     import pandas as pd
+    from pvlib.location import Location
 
 #: Accepted as times: an aware datetime, an ISO 8601 text with an offset or Z, unix
 #: seconds (UTC), a list or an array of these, or a time-zone aware pandas index or column.
@@ -94,6 +95,16 @@ class Site:
                     f"site {self.name!r}: {field} = {value} {unit} is not a number from "
                     f"{low:g} to {high:g} {unit}; {advice}"
                 )
+
+    @classmethod
+    def from_pvlib(cls, location: "Location") -> Self:
+        """Return the site of a pvlib ``Location``: latitude, longitude, altitude and name."""
+        return cls(
+            float(location.latitude),
+            float(location.longitude),
+            float(location.altitude or 0.0),
+            name=location.name or "",
+        )
 
     @property
     def origin(self) -> tuple[float, float, float]:

@@ -212,10 +212,10 @@ def face(
         vertex = solved.chosen(solved.vertex)
         sun = normalize(goal - vertex, "direction to the look point")
     return Facing(
-        solved.chosen(solved.counts),
+        solved.best_counts,
         solved.chosen(solved.normal),
         vertex,
-        solved.chosen(solved.reachable),
+        solved.reachable,
     )
 
 

@@ -159,7 +159,7 @@ def look_counts(heliostats: Heliostats, point: npt.ArrayLike) -> FloatArray:
         raise InputError(
             f"heliostat {heliostats.names[i]}: cannot face {to.tolist()} m; choose another point"
         )
-    return as_float(result.chosen(result.counts))
+    return result.best_counts
 
 
 def hover_grid(

@@ -10,7 +10,7 @@ robust loss and σ the priors of the parameter table.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Literal
 
@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from heliotrope.calibration.fit import _fit_kernels as kernels
 from heliotrope.calibration.fit.residuals import whitening
+from heliotrope.calibration.named import Field, members
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError, UnknownNameError, kind_of
 from heliotrope.geometry import (
@@ -66,7 +67,7 @@ _TEXTS = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FieldFit(Value):
-    """Fitted parameters of N heliostats, P each.
+    """Fitted parameters of N heliostats, P each; without N where one mechanism was fitted.
 
     Attributes
     ----------
@@ -115,13 +116,27 @@ class FieldFit(Value):
 
     @property
     def parameters(self) -> dict[str, FloatArray]:
-        """Values by name, each (N,)."""
-        return {name: self.values[:, p] for p, name in enumerate(self.names)}
+        """Values by name, each (N,), as `Mechanism.with_calibration` takes them."""
+        return {name: self.values[..., p] for p, name in enumerate(self.names)}
 
     @property
     def sigma(self) -> FloatArray:
         """Standard deviations of the values, (N, P)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    def of_one(self) -> "FieldFit":
+        """Return the fit of a single heliostat without the axis N."""
+        return replace(
+            self,
+            values=self.values[0],
+            covariance=self.covariance[0],
+            prior=self.prior[0],
+            scale=self.scale[0],
+            count=self.count[0],
+            iterations=self.iterations[0],
+            outcome=self.outcome[0],
+            centre=self.centre[0],
+        )
 
 
 def parameter_rows(
@@ -139,7 +154,7 @@ def parameter_rows(
 
 
 def fit(
-    mechanism: Mechanism,
+    mechanism: Field,
     sightings: Sightings,
     model: str | tuple[str, ...],
     *,
@@ -154,7 +169,8 @@ def fit(
     Parameters
     ----------
     mechanism
-        Nominal mechanisms, batch shape (N,).
+        The heliostats: their nominal mechanisms, batch shape (N,) or (); or ``plant[name]``, a
+        group, or a plant, whose nominal mechanisms are fitted.
     sightings
         Sightings of these heliostats, in any order.
     model
@@ -178,11 +194,34 @@ def fit(
     UnknownNameError
         If the model, one of its parameters or the loss is unknown.
     """
-    check_rows(mechanism, sightings)
     _check_options(loss, max_iterations)
+    given = members(mechanism)
+    fitted = _fit(
+        given.mechanism,
+        given.rows_of(sightings),
+        model,
+        priors or {},
+        loss,
+        adapt_scale,
+        keep,
+        max_iterations,
+    )
+    return fitted.of_one() if given.single else fitted
+
+
+def _fit(
+    mechanism: Mechanism,
+    sightings: Sightings,
+    model: str | tuple[str, ...],
+    priors: Mapping[str, npt.ArrayLike],
+    loss: Loss,
+    adapt_scale: bool,
+    keep: npt.ArrayLike | None,
+    max_iterations: int,
+) -> FieldFit:
     count, rows = len(mechanism), len(sightings)
     names = names_of(model, mechanism)
-    sigma = _priors(mechanism, names, priors or {})
+    sigma = _priors(mechanism, names, priors)
     used = mask_of(keep, rows, "keep")
     order = canonical_order(sightings)
     ordered = sightings.take(order)
@@ -238,38 +277,6 @@ def fit(
     result.values[:] += begin
     result.lengths[order] = np.sqrt(squares) / result.scale[ordered.heliostat]
     return result
-
-
-def check_rows(mechanism: Mechanism, sightings: Sightings) -> None:
-    """Refuse what are not N mechanisms and sightings of them.
-
-    Raises
-    ------
-    InputError
-        If they are something else, or a sighting is of a row that is not there.
-    """
-    if not isinstance(mechanism, Mechanism):
-        raise InputError(
-            f"mechanism: {kind_of(mechanism)} is not a Mechanism; give the nominal mechanisms, "
-            "such as plant.groups[name].mechanism"
-        )
-    if not isinstance(sightings, Sightings):
-        raise InputError(
-            f"sightings: {kind_of(sightings)} is not Sightings; make them with heliotrope.sightings"
-        )
-    if len(mechanism.shape) != 1:
-        raise InputError(f"mechanism: shape {mechanism.shape}; give N mechanisms, shape (N,)")
-    if len(sightings) and int(sightings.heliostat.max()) >= len(mechanism):
-        raise InputError(
-            f"sightings: one is of heliostat row {int(sightings.heliostat.max())}; there are "
-            f"{len(mechanism)} heliostats"
-        )
-    drives = len(mechanism.driven)
-    if sightings.counts.shape[-1] != drives:
-        raise InputError(
-            f"sightings: counts of {sightings.counts.shape[-1]} drives; the mechanisms have "
-            f"{drives}"
-        )
 
 
 def _check_options(loss: str, max_iterations: int) -> None:

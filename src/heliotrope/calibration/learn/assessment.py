@@ -254,13 +254,13 @@ def _axes(learned: Learned, values: FloatArray, seen: Sightings) -> AxisAccuracy
     source, way = ray_directions(seen, vertex)
     aim = np.where(seen.destination_at_infinity[:, None], vertex + FAR * way, seen.destination)
     solved = track(learnt, source, aim, current=seen.counts)
-    good = solved.chosen(solved.reachable)
+    good = solved.reachable
     driven = [learnt.joints[j] for j in learnt.driven]
     if good.sum() < 2 or len(driven) != 2:
         return None
     gamma = driven.index("azimuth") if "azimuth" in driven else 0
     alpha = 1 - gamma
-    computed = solved.chosen(solved.angles)[good]
+    computed = solved.best_angles[good]
     found = []
     for mechanism in (learned.mechanism[seen.heliostat], learnt):
         angles = mechanism.drives.angles(seen.counts)[good]

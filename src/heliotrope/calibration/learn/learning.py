@@ -22,7 +22,6 @@ from heliotrope.calibration.fit.estimator import (
     FieldFit,
     Loss,
     canonical_order,
-    check_rows,
     fit,
     mask_of,
     names_of,
@@ -33,8 +32,9 @@ from heliotrope.calibration.learn import drift
 from heliotrope.calibration.learn.drift import DAY, Hyperparameters, Linear, Posterior
 from heliotrope.calibration.learn.regimes import find_regimes, regime_at
 from heliotrope.calibration.learn.unusable import find_unusable, is_usable
+from heliotrope.calibration.named import NOWHERE, Field, Members, Surroundings, members
 from heliotrope.calibration.sightings import Sightings
-from heliotrope.errors import InputError
+from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.optics.beam import CHI_SQUARE_90
@@ -133,6 +133,10 @@ class Learned(Value):
     rows
         For each heliostat the rows of its sightings, outliers included, in the order of its
         member.
+    heliostats
+        Names, (N,); () if unknown.
+    around
+        The place of the heliostats, as far as it is known.
     """
 
     mechanism: Mechanism
@@ -146,6 +150,48 @@ class Learned(Value):
     outlier: npt.NDArray[np.bool_]
     unusable: npt.NDArray[np.bool_]
     rows: tuple[npt.NDArray[np.intp], ...]
+    heliostats: tuple[str, ...] = ()
+    around: Surroundings = NOWHERE
+
+    def row(self, heliostat: int | str) -> int:
+        """Return the row of a heliostat, by name or by row.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such heliostat.
+        """
+        if isinstance(heliostat, str):
+            if heliostat not in self.heliostats:
+                raise UnknownNameError("heliostat (learnt)", heliostat, self.heliostats)
+            return self.heliostats.index(heliostat)
+        if not 0 <= heliostat < len(self.members):
+            raise InputError(
+                f"heliostat {heliostat}: there are {len(self.members)}, from 0; give a row or name"
+            )
+        return heliostat
+
+    def __getitem__(self, heliostat: int | str) -> "Learned":
+        """Return one heliostat of the field, by name or by row."""
+        i = self.row(heliostat)
+        mine = np.flatnonzero(self.sightings.heliostat == i)
+        place = np.full(len(self.sightings), -1)
+        place[mine] = np.arange(len(mine))
+        whole = ("names", "lengths")
+        one = {k: v[[i]] for k, v in vars(self.static).items() if k not in whole}
+        return replace(
+            self,
+            mechanism=self.mechanism[np.array([i])],
+            sightings=self.sightings.of(i),
+            used=self.used[mine],
+            static=replace(self.static, lengths=self.static.lengths[mine], **one),
+            members=self.members[i : i + 1],
+            regime=self.regime[mine],
+            outlier=self.outlier[mine],
+            unusable=self.unusable[mine],
+            rows=(place[self.rows[i]],),
+            heliostats=self.heliostats[i : i + 1],
+        )
 
     def _card(self) -> Card:
         model, all_names = len(self.model), len(self.names)
@@ -227,6 +273,7 @@ def predict(learned: Learned, sightings: Sightings) -> Prediction:
     sightings
         M of these heliostats, at any time.
     """
+    sightings = Members(learned.mechanism, learned.heliostats).rows_of(sightings)
     values, spread = learned.parameters_at(sightings.heliostat, sightings.time)
     return predict_with(learned, sightings, values, spread)
 
@@ -247,7 +294,7 @@ def predict_with(
     """
     rows = sightings.heliostat
     moved = moved_by(learned.mechanism, rows, learned.names, values)
-    alone = replace(sightings, heliostat=np.arange(len(rows)))
+    alone = sightings.renumbered(np.arange(len(rows)))
     found = beam_errors(moved, alone)
     line = linearise(moved, sightings, learned.names)
     noise = np.array([m.hyper.noise**2 * m.hyper.heavy for m in learned.members])[rows]
@@ -494,7 +541,7 @@ def finish(
 
 
 def learn(
-    mechanism: Mechanism,
+    mechanism: Field,
     sightings: Sightings,
     model: str | tuple[str, ...],
     *,
@@ -514,7 +561,8 @@ def learn(
     Parameters
     ----------
     mechanism
-        Nominal, (N,).
+        The heliostats: their nominal mechanisms, (N,) or (); or ``plant[name]``, a group, or a
+        plant of one kind, whose nominal mechanisms are learnt. The last three give names.
     sightings
         M of these heliostats, in any order.
     model
@@ -544,22 +592,23 @@ def learn(
     InputError
         As for `heliotrope.calibration.fit.fit`.
     """
-    check_rows(mechanism, sightings)
-    constant = names_of(model, mechanism)
+    given = members(mechanism)
+    nominal, sightings = given.mechanism, given.rows_of(sightings)
+    constant = names_of(model, nominal)
     keep = mask_of(used, len(sightings), "used")
     task = Task(constant, dict(priors or {}), loss, own)
     with threadpool_limits(1, "blas"):
         if hyper is None:
-            hyper = field_of(mechanism, sightings, keep, task, processes, rounds)
-    whole = np.arange(len(mechanism))
+            hyper = field_of(nominal, sightings, keep, task, processes, rounds)
+    whole = np.arange(len(nominal))
     if runner is None:
-        parts = [learn_part(mechanism, sightings, keep, task, hyper, progress)]
+        parts = [learn_part(nominal, sightings, keep, task, hyper, progress)]
         pieces = [whole]
     else:
         pieces = np.array_split(whole, max(1, -(-len(whole) // chunk)))
-        cut = [_cut(mechanism, sightings, keep, task, piece) for piece in pieces]
+        cut = [_cut(nominal, sightings, keep, task, piece) for piece in pieces]
         parts = runner([(*c[:4], hyper) for c in cut], progress)
-    return _join(mechanism, sightings, keep, constant, hyper, pieces, parts)
+    return _join(given, sightings, keep, constant, hyper, pieces, parts)
 
 
 @dataclass(frozen=True)
@@ -631,12 +680,12 @@ def _cut(
     place[rows] = np.arange(len(rows))
     mine = np.flatnonzero(place[sightings.heliostat] >= 0)
     part = sightings.take(mine)
-    part = replace(part, heliostat=place[part.heliostat].astype(np.intp))
+    part = part.renumbered(place[part.heliostat])
     return mechanism[rows], part, used[mine], task.of(rows, len(mechanism)), mine
 
 
 def _join(
-    mechanism: Mechanism,
+    given: Members,
     sightings: Sightings,
     used: npt.NDArray[np.bool_],
     model: tuple[str, ...],
@@ -664,7 +713,7 @@ def _join(
     static = FieldFit(names=model, lengths=lengths, **whole)
     members = tuple(m for part in parts for m in part.members)
     return Learned(
-        mechanism,
+        given.mechanism,
         sightings,
         model,
         used,
@@ -675,6 +724,8 @@ def _join(
         outlier,
         unusable,
         tuple(rows),
+        given.names or sightings.names,
+        given.around,
     )
 
 

@@ -8,12 +8,13 @@ candidate within one standard error of the best is chosen (Breiman et al. 1984).
 
 import contextlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.learn import learning
+from heliotrope.calibration.named import Field, members
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray
@@ -111,7 +112,7 @@ def _worms(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
 
 
 def compare_models(
-    mechanism: Mechanism,
+    mechanism: Field,
     sightings: Sightings,
     models: Mapping[str, tuple[str, ...]] | None = None,
     *,
@@ -123,7 +124,7 @@ def compare_models(
     Parameters
     ----------
     mechanism
-        Nominal, (N,).
+        Heliostats as for `learn`.
     sightings
         M of these heliostats.
     models
@@ -138,24 +139,26 @@ def compare_models(
     InputError
         If no heliostat has enough sightings, or there are no models.
     """
-    trials = candidate_models(mechanism) if models is None else dict(models)
+    given = members(mechanism)
+    nominal, sightings = given.mechanism, given.rows_of(sightings)
+    trials = candidate_models(nominal) if models is None else dict(models)
     keep = np.ones(len(sightings), np.bool_) if used is None else np.asarray(used, np.bool_)
-    counts = np.bincount(sightings.heliostat[keep], minlength=len(mechanism))
+    counts = np.bincount(sightings.heliostat[keep], minlength=len(nominal))
     chosen = np.argsort(-counts, kind="stable")[:HELIOSTATS]
     chosen = np.sort(chosen[counts[chosen] >= learning.FEWEST])
     if not len(chosen) or not trials:
         raise InputError(
             f"models: no heliostat has {learning.FEWEST} sightings; name the model instead of auto"
         )
-    place = np.full(len(mechanism), -1)
+    place = np.full(len(nominal), -1)
     place[chosen] = np.arange(len(chosen))
     part = sightings.take(np.flatnonzero(keep & (place[sightings.heliostat] >= 0)))
-    part = replace(part, heliostat=place[part.heliostat].astype(np.intp))
+    part = part.renumbered(place[part.heliostat])
     scores, evidence, good = {}, {}, np.ones(len(part), dtype=np.bool_)
     for name, names in trials.items():
         if progress:
             progress(name)
-        found = learning.learn(mechanism[chosen], part, names, own=False, rounds=2)
+        found = learning.learn(nominal[chosen], part, names, own=False, rounds=2)
         score, mask = _scores(found)
         scores[name], good = score, good & ~mask
         evidence[name] = float(sum(m.log_evidence() for m in found.members))

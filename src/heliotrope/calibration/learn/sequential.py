@@ -1,7 +1,7 @@
 """Predicts each sighting from what was measured before it, as a plant in service does."""
 
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import numpy.typing as npt
@@ -131,13 +131,13 @@ def _predict(
     cut = {n: np.asarray(v)[copies] if np.shape(v) == (count,) else v for n, v in priors.items()}
     found = learn(
         learned.mechanism[copies],
-        replace(past, heliostat=owner.astype(np.intp)),
+        past.renumbered(owner),
         learned.model,
         priors=cut,
         hyper=learned.hyper,
         runner=runner,
     )
-    wanted = replace(seen.take(asked), heliostat=np.arange(len(asked), dtype=np.intp))
+    wanted = seen.take(asked).renumbered(np.arange(len(asked)))
     return predict(found, wanted)
 
 

@@ -289,7 +289,7 @@ class _Schedule:
         fleet = self.fleets[k]
         some, armature = fleet.mechanism[rows], Armature(self.armatures[k][rows])
         home = track(armature, sun, fleet.aim[rows], drives=some.drives)
-        stand = home.chosen(home.counts)
+        stand = home.best_counts
         stand = np.where(np.isfinite(stand), stand, 0.0)
         aimed = aim_at(some, sun, target, self.limits, current=stand)
         speed = some.drives.table[..., SLOTS["speed"]]

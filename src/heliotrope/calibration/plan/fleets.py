@@ -1,7 +1,7 @@
 """Heliostats to plan for, with the information on their parameters, kind by kind."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -136,7 +136,7 @@ def _of(made: Sightings, rows: list[int], total: int) -> Sightings:
     number = np.full(total, -1, dtype=np.intp)
     number[rows] = np.arange(len(rows))
     part = made.take(np.flatnonzero(number[made.heliostat] >= 0))
-    return replace(part, heliostat=number[part.heliostat])
+    return part.renumbered(number[part.heliostat])
 
 
 def _usual_model(mechanism: Mechanism) -> str:

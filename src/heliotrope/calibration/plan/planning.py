@@ -159,11 +159,11 @@ def aim_at(
         back = back / np.linalg.norm(back, axis=-1, keepdims=True)
         obliquity = angle_between(back, np.broadcast_to(target.normal, back.shape))
         able = (
-            solved.chosen(solved.reachable)
+            solved.reachable
             & (incidence <= limits.max_incidence)
             & (obliquity <= limits.max_obliquity)
         )
-    return Aimed(solved.chosen(solved.counts), normal, incidence, obliquity, able)
+    return Aimed(solved.best_counts, normal, incidence, obliquity, able)
 
 
 def candidate_sightings(

@@ -61,6 +61,11 @@ class FieldParameters:
     used: npt.NDArray[np.int64]
 
     @property
+    def parameters(self) -> dict[str, FloatArray]:
+        """Values by name, each (N,), as `Mechanism.with_calibration` takes them."""
+        return {name: self.values[:, p] for p, name in enumerate(self.names)}
+
+    @property
     def sigma(self) -> FloatArray:
         """Standard deviations of the values, (N, P)."""
         return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))

@@ -46,6 +46,7 @@ __all__ = [
     "PlacedSurface",
     "Surface",
     "XmlElement",
+    "has_location",
     "heliostats",
     "models",
     "read",
@@ -365,6 +366,11 @@ def surfaces(document: Document) -> list[PlacedSurface]:
         PlacedSurface(kit.path, _surface(values, kit.element, kit.position, kit.axes))
         for kit in _scene(document, values, "ShapeKit")
     ]
+
+
+def has_location(document: Document) -> bool:
+    """Return whether the document names the place on Earth, as `site` needs."""
+    return any(True for w in document.root.elements("World") for _ in w.elements("Location"))
 
 
 def site(document: Document, height: float) -> Site:

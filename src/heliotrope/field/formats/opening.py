@@ -1,28 +1,109 @@
 """Opens a plant, whatever file or folder it comes in."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from heliotrope.errors import FormatError
+from heliotrope.field.formats import heliok, opencsp, solarpilot
 from heliotrope.field.plant import Plant
+from heliotrope.files import check_table, read_text
 from heliotrope.sun import Site
 
+#: SolarPILOT's own default for the size of a mirror, m.
+DEFAULT_MIRROR = 12.2
+_TABLES = (".csv", ".txt", ".tsv")
 
-def open_plant(path: str | Path) -> Plant:
-    """Return the plant of a TOML file, a HelioK XML file or a folder in PAINT's form.
+
+def open_plant(
+    path: str | Path,
+    *,
+    site: Site | None = None,
+    centroids: str | Path | None = None,
+    templates: Mapping[int, solarpilot.Template] | None = None,
+) -> Plant:
+    """Return the plant of a file or folder, whatever its format.
+
+    Plant files (TOML), folders in PAINT's form, HelioK scenes (XML), SolarPILOT layouts and
+    OpenCSP fields (both .csv, .txt or .tsv) are told apart by their names and first lines.
+
+    Parameters
+    ----------
+    path
+        The file or folder.
+    site
+        The plant's reference point, for the formats that give none: SolarPILOT, OpenCSP, and
+        HelioK without ``<Location>``. HelioK gives no height; without ``site`` it is 0 m.
+    centroids
+        OpenCSP's table of facet centroids; without it the facets stand edge to edge.
+    templates
+        Dimensions of SolarPILOT's heliostats by template number. A layout does not give them;
+        without them mirrors are 12.2 m × 12.2 m, SolarPILOT's default, and ``notes`` say so.
 
     Raises
     ------
     FormatError
-        If it does not exist or cannot be used; the text names file, place, value and limit.
+        If it does not exist, cannot be used, or needs a site; the text names file, place, value
+        and limit.
     """
-    # The readers load libraries that an opener of one format does not need.
-    from heliotrope.field.formats import heliok, paint, plant_file
-
     place = Path(path)
     if place.is_dir():
+        # These readers load libraries that an opener of another format does not need.
+        from heliotrope.field.formats import paint
+
         return paint.read_plant(place)
     if not place.exists():
         raise FormatError(place, "there is no such file; give a plant file or a folder")
-    if place.suffix.lower() == ".xml":
-        return heliok.to_plant(heliok.read(place), Site(0.0, 0.0, 0.0))
+    suffix = place.suffix.lower()
+    if suffix == ".xml":
+        return _of_heliok(place, site)
+    if suffix in _TABLES:
+        if _is_opencsp(place):
+            table = opencsp.read_field(place)
+            known = None if centroids is None else opencsp.read_centroids(centroids)
+            return opencsp.to_plant(table, _needed(place, site), known)
+        return _of_solarpilot(place, _needed(place, site), templates)
+    from heliotrope.field.formats import plant_file
+
     return plant_file.read_plant(place)
+
+
+def _of_heliok(place: Path, site: Site | None) -> Plant:
+    document = heliok.read(place)
+    if site is None and not heliok.has_location(document):
+        raise FormatError(place, f"no <Location> in <World>, {_GIVE}")
+    return heliok.to_plant(document, site or heliok.site(document, 0.0))
+
+
+def _of_solarpilot(
+    place: Path, site: Site, templates: Mapping[int, solarpilot.Template] | None
+) -> Plant:
+    layout = solarpilot.read_layout(place)
+    if templates is not None:
+        return solarpilot.to_plant(layout, site, templates)
+    mirror = solarpilot.Template(DEFAULT_MIRROR, DEFAULT_MIRROR)
+    plant = solarpilot.to_plant(layout, site, dict.fromkeys(layout.template.tolist(), mirror))
+    size = (
+        f"the layout gives none: {DEFAULT_MIRROR} m × {DEFAULT_MIRROR} m with the mirror in its "
+        "pivot is SolarPILOT's default; give templates"
+    )
+    return plant.with_notes({"size of the mirrors": size})
+
+
+_GIVE = (
+    "so the sun above it is unknown; give the site (site=Site(latitude, longitude, height), "
+    "--site LATITUDE,LONGITUDE,HEIGHT)"
+)
+
+
+def _needed(place: Path, site: Site | None) -> Site:
+    if site is None:
+        raise FormatError(place, f"this format holds no place on Earth, {_GIVE}")
+    return site
+
+
+def _is_opencsp(place: Path) -> bool:
+    """Return whether the first line names OpenCSP's columns."""
+    what = "a table of heliostats (SolarPILOT or OpenCSP)"
+    text = read_text(check_table(place, what), what)
+    first = text.lstrip("\ufeff").split("\n", 1)[0]
+    return all(column in first for column in ("Name", "Num. Facets", "Pivot Height"))

@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -81,7 +80,7 @@ class Keeping:
                 mine = kept.sightings.heliostat == kept.names.index(name)
                 rows = np.flatnonzero(mine & ~flown)
             targets = [kept.targets[row] for row in rows]
-            seen = replace(kept.sightings.take(rows), heliostat=np.zeros(len(rows), np.intp))
+            seen = kept.sightings.take(rows).renumbered(np.zeros(len(rows)))
             self._beliefs.recall(record, seen, kept.identities[rows], targets)
         self._beliefs.number_with(self._number)
         self._beliefs.subscribe(functools.partial(self._keep, records), held=False)

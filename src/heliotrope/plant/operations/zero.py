@@ -106,7 +106,7 @@ def lock_position(
     found = track(mechanism, sun, aim, current=counts)
     if TrackingStatus(int(found.chosen(found.status))) is not TrackingStatus.OK:
         raise refused(why="its axes cannot turn the beam to its aim now")
-    wanted = np.round(found.chosen(found.counts))
+    wanted = np.round(found.best_counts)
     turn = float(angle_between(mechanism.pose(counts).normal, mechanism.pose(wanted).normal))
     if turn > MOST_TURN:
         raise refused(

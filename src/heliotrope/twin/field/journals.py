@@ -106,7 +106,7 @@ class Journals:
             tolerance=2e-10,
         )
         good = np.asarray(found.chosen(found.status) == TrackingStatus.OK)
-        return np.asarray(found.chosen(found.angles)), good
+        return np.asarray(found.best_angles), good
 
     def items(self, row: int) -> dict[str, bytes]:
         """Return the items that a controller stores."""

@@ -89,7 +89,7 @@ class VisitObserver:
         here = [axis.turned for axis in board.axes] - slip
         for point in (RECEIVER, *(target.center for target in self._targets)):
             found = track(believed, sun, np.asarray(point), current=here)
-            counts = found.chosen(found.counts)
+            counts = found.best_counts
             if not np.isfinite(counts).all():
                 continue
             pose = truth.pose(counts + slip)

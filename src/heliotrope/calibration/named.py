@@ -1,0 +1,141 @@
+"""Heliostats as the functions of calibration take them, and sightings that find theirs by name.
+
+Functions take mechanisms, one heliostat of a plant, a group, or a whole plant of one kind. Where
+heliostats and sightings both have names, they are matched by them; else by their rows.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.errors import InputError, UnknownNameError, kind_of
+from heliotrope.field.heliostat import Heliostat
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Target
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.sun import Site
+
+#: One mechanism or more, with or without names.
+Field: TypeAlias = Mechanism | Heliostat | Heliostats | Plant
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """The place of heliostats that are learnt: what a forecast needs besides them.
+
+    Attributes
+    ----------
+    site
+        The plant's reference point; None if unknown.
+    targets
+        The plant's targets.
+    """
+
+    site: Site | None = None
+    targets: tuple[Target, ...] = ()
+
+
+NOWHERE = Surroundings()
+
+
+@dataclass(frozen=True, eq=False)
+class Members:
+    """N heliostats.
+
+    Attributes
+    ----------
+    mechanism
+        (N,).
+    names
+        (N,); () if unknown.
+    single
+        Whether one was given without a batch axis.
+    around
+        Their surroundings.
+    """
+
+    mechanism: Mechanism
+    names: tuple[str, ...] = ()
+    single: bool = False
+    around: Surroundings = NOWHERE
+
+    def rows_of(self, sightings: Sightings) -> Sightings:
+        """Return the sightings with the rows of these heliostats.
+
+        Raises
+        ------
+        InputError
+            If a sighting is of a heliostat that is not there, or sightings with names meet
+            another number of heliostats without.
+        UnknownNameError
+            If a sighting names a heliostat that is not there.
+        """
+        count, drives = len(self.mechanism), len(self.mechanism.driven)
+        if not isinstance(sightings, Sightings):
+            raise InputError(
+                f"sightings: {kind_of(sightings)} is not Sightings; make them with "
+                "heliotrope.sightings"
+            )
+        if sightings.counts.shape[-1] != drives:
+            raise InputError(
+                f"sightings: counts of {sightings.counts.shape[-1]} drives; the mechanisms have "
+                f"{drives}"
+            )
+        if sightings.names and self.names:
+            return _matched(sightings, self.names)
+        if sightings.names and len(sightings.names) != count:
+            raise InputError(
+                f"sightings: they name {len(sightings.names)} heliostats, the first "
+                f"{sightings.names[0]}, but the {count} mechanisms have no names; give the plant, "
+                "its group or one of its heliostats"
+            )
+        if len(sightings) and int(sightings.heliostat.max()) >= count:
+            raise InputError(
+                f"sightings: one is of heliostat row {int(sightings.heliostat.max())}; there are "
+                f"{count} heliostats"
+            )
+        return sightings
+
+
+def members(given: Field, state: Literal["nominal", "calibrated"] = "nominal") -> Members:
+    """Return heliostats with their nominal or their calibrated mechanisms.
+
+    Raises
+    ------
+    InputError
+        If a plant has heliostats of several kinds, or mechanisms have several batch axes.
+    """
+    if isinstance(given, Mechanism):
+        if len(given.shape) > 1:
+            raise InputError(
+                f"mechanism: shape {given.shape}; give one mechanism, or N of shape (N,)"
+            )
+        return Members(given if given.shape else given[None], single=not given.shape)
+    if isinstance(given, Heliostat):
+        group = given.heliostats
+        chosen = group.mechanism if state == "nominal" else group.calibrated
+        return Members(chosen, group.names, True, Surroundings(given.site, given.targets))
+    if isinstance(given, Heliostats):
+        return Members(given.mechanism if state == "nominal" else given.calibrated, given.names)
+    if isinstance(given, Plant):
+        chosen = given.nominal if state == "nominal" else given.calibrated
+        return Members(chosen, given.names, around=Surroundings(given.site, given.targets))
+    raise InputError(
+        f"mechanism: {kind_of(given)} is not a Mechanism; give nominal mechanisms, plant[name], a "
+        "group of the plant, or the plant"
+    )
+
+
+def _matched(sightings: Sightings, names: tuple[str, ...]) -> Sightings:
+    if sightings.names == names:
+        return sightings
+    place = {name: i for i, name in enumerate(names)}
+    rows = np.array([place.get(name, -1) for name in sightings.names], dtype=np.intp)
+    found = rows[sightings.heliostat]
+    if (found < 0).any():
+        stranger = sightings.names[int(sightings.heliostat[int(np.argmin(found))])]
+        raise UnknownNameError("heliostat (of a sighting)", stranger, names)
+    return replace(sightings, heliostat=found, names=names)

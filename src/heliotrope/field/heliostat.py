@@ -1,0 +1,90 @@
+"""One heliostat of a plant: what `Plant` gives for a name."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.machine import Machine
+from heliotrope.sun import Site
+
+
+@dataclass(frozen=True, eq=False)
+class Heliostat:
+    """One heliostat, as ``plant["P6A"]`` gives it; `track` takes it like a plant of one.
+
+    Attributes
+    ----------
+    heliostats
+        The heliostat as a group of one.
+    group
+        Name of its group in the plant.
+    site
+        The plant's reference point: the origin of ENU.
+    targets
+        The plant's targets.
+    """
+
+    heliostats: Heliostats
+    group: str
+    site: Site
+    targets: tuple[Target, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.heliostats.names[0]
+
+    @property
+    def nominal(self) -> Mechanism:
+        """The mechanism as designed, batch shape ()."""
+        return self.heliostats.mechanism[0]
+
+    @cached_property
+    def calibrated(self) -> Mechanism:
+        """The mechanism with its calibrated deviations, batch shape ()."""
+        return self.heliostats.calibrated[0]
+
+    @property
+    def armature(self) -> Armature:
+        """Of the calibrated mechanism, batch shape ()."""
+        return self.calibrated.armature
+
+    @property
+    def drives(self) -> Drive:
+        """Of the calibrated mechanism, batch shape (D,)."""
+        return self.calibrated.drives
+
+    @property
+    def position(self) -> FloatArray:
+        """Nominal position, ENU metres, (3,)."""
+        return self.nominal.position
+
+    @property
+    def width(self) -> float:
+        """Width of the mirror, m."""
+        return float(self.heliostats.width[0])
+
+    @property
+    def height(self) -> float:
+        """Height of the mirror, m."""
+        return float(self.heliostats.height[0])
+
+    @property
+    def aim(self) -> FloatArray | None:
+        """Aim point in operation, ENU metres, (3,); None where the plant gives none."""
+        return self.heliostats.own_aim(0)
+
+    @property
+    def cluster(self) -> str:
+        """Name of its cluster, "" if none."""
+        return self.heliostats.cluster[0] if self.heliostats.cluster else ""
+
+    @property
+    def machine(self) -> Machine | None:
+        """Motor limits and resting places; None where the plant file gives none."""
+        return self.heliostats.machines[0] if self.heliostats.machines else None
