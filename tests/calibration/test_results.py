@@ -262,7 +262,7 @@ def _of(seen: Sightings, rows: list[int]) -> Sightings:
     """Sightings of some heliostats, whose rows are then 0, 1, …"""
     kept = seen.take(np.flatnonzero(np.isin(seen.heliostat, rows)))
     place = {row: k for k, row in enumerate(rows)}
-    return dataclasses.replace(kept, heliostat=np.array([place[int(h)] for h in kept.heliostat]))
+    return kept.renumbered([place[int(h)] for h in kept.heliostat])
 
 
 @pytest.mark.parametrize("others", [2, pytest.param(0, marks=pytest.mark.slow)])
