@@ -6,7 +6,7 @@ A photograph of the beam on a target, a reflection seen by a drone, a sun sensor
 field all give this record.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -543,7 +543,7 @@ def field_camera(
     )
 
 
-def join(parts: Sequence[Sightings]) -> Sightings:
+def join(parts: Iterable[Sightings]) -> Sightings:
     """Return sightings of several kinds or campaigns as one, in the order given.
 
     Raises
@@ -553,6 +553,7 @@ def join(parts: Sequence[Sightings]) -> Sightings:
     """
     if isinstance(parts, Sightings):
         raise InputError("join: one Sightings; give a list of them")
+    parts = list(parts)
     for k, part in enumerate(parts):
         if not isinstance(part, Sightings):
             raise InputError(f"join: part {k} is {kind_of(part)}; give a list of Sightings")
