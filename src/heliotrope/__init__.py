@@ -48,10 +48,11 @@ if TYPE_CHECKING:
         example_plant,
         prototype,
         roughly_installed,
+        track_day,
     )
     from heliotrope.field.formats import open_plant as open  # noqa: A004 - used as ht.open
     from heliotrope.field.formats.plant_file import read_plant, write_plant
-    from heliotrope.mechanism import Mechanism, Tracking, track
+    from heliotrope.mechanism import Mechanism, Tracking, track, track_path
     from heliotrope.mechanism import kinds as kinds
     from heliotrope.optics import image_offsets, predict_flux
     from heliotrope.sun import Site
@@ -92,6 +93,8 @@ _HOMES = {
     "split": "heliotrope.calibration",
     "summarise": "heliotrope.calibration",
     "track": "heliotrope.mechanism",
+    "track_day": "heliotrope.field",
+    "track_path": "heliotrope.mechanism",
     "write_plant": "heliotrope.field.formats.plant_file",
     "write_report": "heliotrope.calibration",
     "write_sightings": "heliotrope.calibration",
@@ -144,6 +147,8 @@ __all__ = [
     "summarise",
     "sun",
     "track",
+    "track_day",
+    "track_path",
     "write_plant",
     "write_report",
     "write_sightings",

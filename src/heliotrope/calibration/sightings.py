@@ -557,7 +557,7 @@ def join(parts: Iterable[Sightings]) -> Sightings:
     for k, part in enumerate(parts):
         if not isinstance(part, Sightings):
             raise InputError(f"join: part {k} is {kind_of(part)}; give a list of Sightings")
-    if not len(parts):
+    if not parts:
         raise InputError("join: 0 parts; give at least 1")
     drives = sorted({part.counts.shape[-1] for part in parts})
     if len(drives) != 1:

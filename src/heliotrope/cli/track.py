@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from heliotrope.field.plant import Plant
+    from heliotrope.mechanism import TrackedPath
     from heliotrope.mechanism.tracking import TraceStep, Tracking
 
 
@@ -57,6 +58,10 @@ def track(
         str | None,
         typer.Option(help="LATITUDE,LONGITUDE,HEIGHT (degrees, m) of a file that gives no place."),
     ] = None,
+    over_the_top: Annotated[
+        bool,
+        typer.Option(help="With --every: go over the top wherever that saves slews or motion."),
+    ] = False,
     calibration: Annotated[
         Path | None, typer.Option(help="calibration.json of heliotrope calibrate to apply first.")
     ] = None,
@@ -78,7 +83,7 @@ def track(
 
     from heliotrope import sun as solar
     from heliotrope.geometry import normalize
-    from heliotrope.mechanism import tracking
+    from heliotrope.mechanism import track_path, tracking
 
     # With a given sun the place on Earth does not matter.
     place = site or ("0,0,0" if sun is not None else "")
@@ -93,8 +98,10 @@ def track(
     _check(every, law, local, trace)
     if every is not None:
         times = solar.daylight(moment.date(), plant.site, every=parse_duration(every))
-        result = tracking.track(mechanism, solar.vector(times, plant.site), goal, local=local)
-        _day(heliostat, [t.isoformat() for t in times], result, mechanism.joints, as_json)
+        followed = track_path(
+            mechanism, solar.vector(times, plant.site), goal, local=local, over_the_top=over_the_top
+        )
+        _day(heliostat, [t.isoformat() for t in times], followed, mechanism.joints, as_json)
         return
     own = _sun_of(field) if sun is None and time is None else None
     if sun is not None:
@@ -240,29 +247,26 @@ def _print_branches(document: dict[str, Any], heliostat: str) -> None:
 
 
 def _day(
-    heliostat: str, times: list[str], result: "Tracking", joints: tuple[str, ...], as_json: bool
+    heliostat: str, times: list[str], path: "TrackedPath", joints: tuple[str, ...], as_json: bool
 ) -> None:
     import numpy as np
 
     from heliotrope.geometry import azimuth_elevation
 
-    azimuth, elevation = azimuth_elevation(result.chosen(result.normal))
-    angles: np.ndarray = result.best_angles
-    counts: np.ndarray = result.best_counts
-    reachable: np.ndarray = result.reachable
-    residual: np.ndarray = result.chosen(result.residual)
-    iterations: np.ndarray = result.chosen(result.iterations)
+    azimuth, elevation = azimuth_elevation(path.normal)
+    slews = {slew.step: slew.reason for slew in path.slews}
     rows = [
         {
             "time": time,
-            "branch": int(result.best[i]),
+            "branch": int(path.branch[i]),
+            "over_the_top": bool(path.over_the_top[i]),
             "azimuth_deg": float(np.degrees(azimuth[i])),
             "elevation_deg": float(np.degrees(elevation[i])),
-            "angles_rad": angles[i],
-            "counts": counts[i],
-            "reachable": bool(reachable[i]),
-            "residual_mrad": float(1e3 * residual[i]),
-            "iterations": int(iterations[i]),
+            "angles_rad": path.angles[i],
+            "counts": path.counts[i],
+            "reachable": bool(path.reachable[i]),
+            "residual_mrad": float(1e3 * path.residual[i]),
+            "slew": slews.get(i),
         }
         for i, time in enumerate(times)
     ]
@@ -270,17 +274,18 @@ def _day(
         print_json({"heliostat": heliostat, "joints": joints, "day": rows})
         return
     print_table(
-        ["time", "branch", "azimuth", "elevation", "counts", "residual"],
+        ["time", "branch", "azimuth", "elevation", "counts", "residual", ""],
         [
             [
                 str(r["time"]),
                 str(r["branch"]),
                 f"{r['azimuth_deg']:.4f}°",
                 f"{r['elevation_deg']:.4f}°",
-                "  ".join(f"{c:.1f}" for c in counts[i]),
+                "  ".join(f"{c:.1f}" for c in path.counts[i]),
                 f"{r['residual_mrad']:.3g} mrad" + ("" if r["reachable"] else " !"),
+                f"slew: {r['slew']}" if r["slew"] else "",
             ]
             for i, r in enumerate(rows)
         ],
-        title=f"{heliostat}, {len(rows)} positions",
+        title=f"{heliostat}, {len(rows)} positions, {len(slews)} slews",
     )

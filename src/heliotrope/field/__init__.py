@@ -8,6 +8,10 @@ ones; `example_plant` has 18 heliostats, `prototype` is Malan's.
 from heliotrope.field.camera import (
     Camera,
 )
+from heliotrope.field.day import (
+    TrackedDay,
+    track_day,
+)
 from heliotrope.field.example import (
     example_plant,
     roughly_installed,
@@ -54,9 +58,11 @@ __all__ = [
     "Receiver",
     "Sphere",
     "Target",
+    "TrackedDay",
     "Volume",
     "example_plant",
     "outline",
     "prototype",
     "roughly_installed",
+    "track_day",
 ]

@@ -51,6 +51,11 @@ from heliotrope.mechanism.parameters import (
     MODELS,
     Parameter,
 )
+from heliotrope.mechanism.path import (
+    Slew,
+    TrackedPath,
+    track_path,
+)
 from heliotrope.mechanism.tracking import (
     Branch,
     Steered,
@@ -72,7 +77,9 @@ __all__ = [
     "Mechanism",
     "Parameter",
     "Pose",
+    "Slew",
     "Steered",
+    "TrackedPath",
     "Tracking",
     "TrackingStatus",
     "azimuth_elevation",
@@ -89,6 +96,7 @@ __all__ = [
     "target_aligned",
     "tilt_roll",
     "track",
+    "track_path",
     "two_axis",
     "two_jacks",
 ]

@@ -1,0 +1,134 @@
+"""A heliostat, or a plant, through one day."""
+
+from dataclasses import dataclass
+from datetime import date, timedelta
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope import sun as solar
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.heliostat import Heliostat
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver, Target
+from heliotrope.geometry import FloatArray, as_vectors
+from heliotrope.mechanism.path import TrackedPath, track_path
+from heliotrope.mechanism.tracking import Steered
+from heliotrope.sun import Site
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedDay:
+    """The poses of a day.
+
+    Attributes
+    ----------
+    names
+        Names of the heliostats, (N,); () if unknown.
+    time
+        T times, UTC.
+    sun
+        Unit vectors to the apparent sun, ENU, (T, 3).
+    aim
+        ENU metres, (3,) or (N, 3).
+    path
+        The poses, (T,) of one heliostat or (T, N).
+    """
+
+    names: tuple[str, ...]
+    time: "pd.DatetimeIndex"
+    sun: FloatArray
+    aim: FloatArray
+    path: TrackedPath
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+def track_day(
+    heliostat: Steered,
+    day: date | str,
+    aim: str | Target | Receiver | npt.ArrayLike | None = None,
+    *,
+    site: Site | None = None,
+    every: timedelta = timedelta(minutes=10),
+    min_elevation: float = 0.0,
+    over_the_top: bool = False,
+) -> TrackedDay:
+    """Return the poses that follow the sun through a day, as one path (see `track_path`).
+
+    Parameters
+    ----------
+    heliostat
+        ``plant[name]``, a plant, or mechanisms, batch shape () or (N,).
+    day
+        Date of local mean solar time.
+    aim
+        Name of a target of the plant, a target or receiver, or points (m), (3,) or (N, 3). By
+        default the heliostat's own aim, or the plant's first target.
+    site
+        Place, if only mechanisms are given.
+    every, min_elevation
+        Step, and lowest apparent elevation of the sun, rad; see `heliotrope.sun.daylight`.
+    over_the_top
+        Whether the mirror may go over the top wherever that saves slews or motion.
+
+    Raises
+    ------
+    InputError
+        If there is no site or no aim, or the sun does not rise that day.
+    UnknownNameError
+        If there is no such target.
+    """
+    known = isinstance(heliostat, Heliostat | Plant)
+    place = site or (heliostat.site if isinstance(heliostat, Heliostat | Plant) else None)
+    if place is None:
+        raise InputError(
+            "track_day: mechanisms alone stand nowhere; give plant[name], or site=Site(latitude, "
+            "longitude, height)"
+        )
+    times = solar.daylight(day, place, every=every, min_elevation=min_elevation)
+    if not len(times):
+        raise InputError(f"track_day: the sun does not rise on {day} at {place.name or 'the site'}")
+    light = solar.vector(times, place)
+    goal = _aim(heliostat, aim)
+    path = track_path(heliostat, light, goal, over_the_top=over_the_top)
+    names: tuple[str, ...] = ()
+    if known:
+        names = (heliostat.name,) if isinstance(heliostat, Heliostat) else heliostat.names  # type: ignore[attr-defined]
+    return TrackedDay(names, times, light, goal, path)
+
+
+def _aim(heliostat: Steered, aim: str | Target | Receiver | npt.ArrayLike | None) -> FloatArray:
+    if isinstance(aim, Target | Receiver):
+        return aim.center
+    targets = heliostat.targets if isinstance(heliostat, Heliostat | Plant) else ()
+    if isinstance(aim, str):
+        for target in targets:
+            if target.name == aim:
+                return target.center
+        raise UnknownNameError("target", aim, [t.name for t in targets])
+    if aim is not None:
+        return as_vectors(aim, "aim")
+    if not targets and not isinstance(heliostat, Heliostat):
+        raise InputError("aim: there is no target; give a point, east, north and up in m")
+    first = targets[0].center if targets else None
+    own = _own_aims(heliostat)
+    if first is None and not all(one is not None for one in own):
+        raise InputError("aim: there is no target; give a point, east, north and up in m")
+    if all(one is None for one in own):
+        return np.asarray(first)
+    each = np.array([first if one is None else one for one in own])
+    return each[0] if isinstance(heliostat, Heliostat) else each
+
+
+def _own_aims(heliostat: Steered) -> list[FloatArray | None]:
+    if isinstance(heliostat, Heliostat):
+        return [heliostat.aim]
+    if isinstance(heliostat, Plant):
+        return [g.own_aim(row) for g in heliostat.groups.values() for row in range(len(g))]
+    return [None]
