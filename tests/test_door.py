@@ -77,6 +77,7 @@ def test_a_heliostat_is_a_plant_of_one() -> None:
     )
     assert plant["P6A"].position.tolist() == [19.2, -30.8, 0.0]
     assert plant["P6A"].cluster == "pod-6"
+    assert repr(plant["P6A"]).startswith("<Heliostat: P6A, azimuth_elevation, at 19.2, -30.8")
     assert "P6A" in plant
     assert "P9Z" not in plant
     assert [h.name for h in plant] == list(plant.names)
@@ -124,6 +125,7 @@ def test_names_find_their_heliostats_whatever_the_order() -> None:
     row = plant.names.index("P6A")
     np.testing.assert_allclose(fitted.values[row], alone.values, atol=1e-12)
     assert alone.values.shape == (4,)
+    assert "1 heliostat" in repr(alone)
     before = ht.beam_errors(plant["P6A"], some["P6A"]).beam
     after = ht.beam_errors(plant["P6A"].nominal.with_calibration(alone), some["P6A"]).beam
     assert np.median(after) < 0.2 * np.median(before)

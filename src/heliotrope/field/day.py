@@ -16,13 +16,14 @@ from heliotrope.geometry import FloatArray, as_vectors
 from heliotrope.mechanism.path import TrackedPath, track_path
 from heliotrope.mechanism.tracking import Steered
 from heliotrope.sun import Site
+from heliotrope.values import Card, Value, amount
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-@dataclass(frozen=True, eq=False)
-class TrackedDay:
+@dataclass(frozen=True, eq=False, repr=False)
+class TrackedDay(Value):
     """The poses of a day.
 
     Attributes
@@ -44,6 +45,12 @@ class TrackedDay:
     sun: FloatArray
     aim: FloatArray
     path: TrackedPath
+
+    def _card(self) -> Card:
+        who = self.names[0] if len(self.names) == 1 else amount(len(self.names), "heliostat")
+        inner = self.path._card()  # noqa: SLF001 - the same record without names
+        line = f"{who}, {self.time[0]:%Y-%m-%d %H:%M} to {self.time[-1]:%H:%M} UTC: {inner.line}"
+        return Card(line, inner.header, inner.rows)
 
     def __len__(self) -> int:
         return len(self.time)

@@ -11,10 +11,11 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.sun import Site
+from heliotrope.values import Card, Value
 
 
-@dataclass(frozen=True, eq=False)
-class Heliostat:
+@dataclass(frozen=True, eq=False, repr=False)
+class Heliostat(Value):
     """One heliostat, as ``plant["P6A"]`` gives it; `track` takes it like a plant of one.
 
     Attributes
@@ -33,6 +34,14 @@ class Heliostat:
     group: str
     site: Site
     targets: tuple[Target, ...] = ()
+
+    def _card(self) -> Card:
+        east, north, up = self.position
+        line = f"{self.name}, {self.nominal.kind}, at {east:.1f}, {north:.1f}, {up:.1f} m"
+        rows = [("mirror", f"{self.width:.2f} × {self.height:.2f} m"), ("cluster", self.cluster)]
+        for name, value in self.calibrated.deviations.items():
+            rows.append((name, f"{float(value):.4g} {self.nominal.parameter(name).unit}"))
+        return Card(line, ("part", "value"), rows)
 
     @property
     def name(self) -> str:

@@ -16,7 +16,7 @@ from heliotrope.geometry import TAU, FloatArray, angle_between, as_float, as_vec
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.mechanism.tracking import Steered, Tracking, TrackingStatus, track
-from heliotrope.values import Value
+from heliotrope.values import Card, Value, amount, span
 
 #: Costs in rad of motion: a pose that misses, one over the top, a slew. Each outweighs all below
 #: it over a day of 10,000 poses.
@@ -27,7 +27,7 @@ _SIDE = 0.1
 _FOLLOWS, _SLACK = 2.0, 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Slew(Value):
     """A step that the sun's motion does not explain.
 
@@ -48,8 +48,12 @@ class Slew(Value):
     turn: FloatArray
     reason: str
 
+    def _card(self) -> Card:
+        turns = ", ".join(f"{np.degrees(one):.1f}°" for one in self.turn)
+        return Card(f"before pose {self.step} of heliostat {self.row}: {self.reason} ({turns})")
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class TrackedPath(Value):
     """Poses at T times in their order; (...) are the batch axes of the heliostats.
 
@@ -82,6 +86,17 @@ class TrackedPath(Value):
     branch: npt.NDArray[np.int8]
     over_the_top: npt.NDArray[np.bool_]
     slews: tuple[Slew, ...]
+
+    def _card(self) -> Card:
+        shape = " × ".join(map(str, self.status.shape))
+        line = f"{shape} poses, {int(self.reachable.sum())} reach the aim, "
+        line += amount(len(self.slews), "slew")
+        rows = [
+            (f"joint {k + 1}", span(np.degrees(self.angles[..., k]), unit="°"))
+            for k in range(self.angles.shape[-1])
+        ]
+        rows += [(f"slew before pose {s.step}", s.reason) for s in self.slews]
+        return Card(line, ("part", "range"), rows)
 
     @property
     def reachable(self) -> npt.NDArray[np.bool_]:
@@ -343,8 +358,8 @@ def _slews(
 ) -> tuple[Slew, ...]:
     """Return the steps that change the branch, go back a turn, or leave the sun."""
     turn = np.diff(angles, axis=0)
-    changed = np.diff(branch, axis=0) != 0
-    whole = (np.abs(turn) > np.pi + 1e-9).any(axis=-1)
+    changed = np.asarray(np.diff(branch, axis=0) != 0)
+    whole = np.asarray((np.abs(turn) > np.pi + 1e-9).any(axis=-1))
     shift = angle_between(normal[1:], normal[:-1])
     strays = shift > _FOLLOWS * angle_between(sun[1:], sun[:-1]) + _SLACK
     found = []

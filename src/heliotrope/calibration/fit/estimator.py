@@ -103,7 +103,7 @@ class FieldFit(Value):
     centre: FloatArray
 
     def _card(self) -> Card:
-        ends = [FitOutcome(int(o)) for o in self.outcome]
+        ends = [FitOutcome(int(o)) for o in np.atleast_1d(self.outcome)]
         counts = ", ".join(
             f"{ends.count(o)} {o.name.lower().replace('_', ' ')}" for o in FitOutcome if o in ends
         )
@@ -111,8 +111,8 @@ class FieldFit(Value):
         line += f"{amount(int(self.count.sum()), 'sighting')}: {counts}"
         many = len(ends) > 1
         header = ("parameter", "median size" if many else "value", "median σ" if many else "σ")
-        sizes = np.abs(self.values) if many else self.values
-        return Card(line, header, parameter_rows(self.names, sizes, self.sigma))
+        sizes = np.abs(self.values) if many else np.atleast_2d(self.values)
+        return Card(line, header, parameter_rows(self.names, sizes, np.atleast_2d(self.sigma)))
 
     @property
     def parameters(self) -> dict[str, FloatArray]:
