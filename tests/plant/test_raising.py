@@ -144,3 +144,30 @@ def test_what_is_found_up_at_dusk_is_stowed_unless_a_person_commands(tmp_path: P
         await asyncio.gather(running, return_exceptions=True)
 
     play(tmp_path, scene, start=DUSK)
+
+
+def test_a_mirror_that_is_locked_at_dusk_is_stowed_soon_after(tmp_path: Path) -> None:
+    """A visit locks it for its parameters just when the evening looks who is up."""
+
+    async def scene(bench: Bench) -> None:
+        for cluster in bench.clusters.values():
+            cluster.set(states.STOWED)
+        late = bench.cluster_of(NAME)
+        late.set(states.LOCKED, NAME)
+        control = AutomaticControl(
+            bench.plant,
+            Logbook(bench.clock),
+            None,
+            scheduler=None,
+            records=None,
+            truth=None,
+            settings=AutomaticSettings(wanted=True),
+        )
+        running = asyncio.create_task(control.run())
+        await bench.wait(3.0)
+        late.set(states.IDLE, NAME)
+        await bench.until(lambda: bench.count(states.IDLE) == 0, 15.0)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    play(tmp_path, scene, start=DUSK)

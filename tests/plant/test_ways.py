@@ -663,7 +663,7 @@ def test_the_way_to_an_aim_is_that_of_the_branch_on_which_the_mirror_stands() ->
     """A mirror without known stops reaches an aim in two poses; it takes the nearer one."""
     fits = outfits(4, 5)
     scene = scene_of(("visits",), 5, 180.0, 4)
-    design = design_of(fits, {"C1": [each.name for each in fits]}, scene)
+    design = _stopless(design_of(fits, {"C1": [each.name for each in fits]}, scene))
     check, rows = BeamCheck(design, design.names), np.arange(4)
     sun = vector(scene.start.timestamp(), scene.site)
     stow = np.tile(np.array(MACHINE.stow, dtype=float), (4, 1))
@@ -680,3 +680,34 @@ def test_the_way_to_an_aim_is_that_of_the_branch_on_which_the_mirror_stands() ->
 
     assert check.on_the_way(rows, here, aims, sun, motion) == {}
     assert 0.0 < turned[0] < 20_000
+
+
+def _stopless(design: Plant) -> Plant:
+    """The same plant, whose file tells nothing of the motors."""
+    groups = {name: replace(group, machines=()) for name, group in design.groups.items()}
+    return replace(design, groups=groups)
+
+
+def test_poses_are_those_within_the_limits_of_the_motors() -> None:
+    """By another pose an approach was proven, and the true beam crossed the receiver."""
+    scene = scene_of(("place",), 800085, 180.0, 4)
+    fits = outfits(4, 800085, scene.places)
+    design = design_of(fits, {"C1": [each.name for each in fits]}, scene)
+    rows, stow = np.arange(4), np.tile(np.array(MACHINE.stow, dtype=float), (4, 1))
+    sun = vector(scene.start.timestamp() + 15.0, scene.site)
+
+    def first(check: BeamCheck) -> FloatArray:
+        """Where the axes are at the first point of the way from stow."""
+        standbys = np.tile(np.array(MACHINE.standby, dtype=float), (4, 1))
+        points = Ways(check, {}).points(rows, standbys)[0][:, 0]
+        solved = check.poses(rows, points, sun, stow)
+        return np.asarray(solved.chosen(solved.counts))
+
+    low, high = np.transpose([(axis.low, axis.high) for axis in MACHINE.axes])
+    check = BeamCheck(design, design.names)
+    assert ((first(check) >= low) & (first(check) <= high)).all()
+    drives = design.groups["all"].mechanism.drives.table[0]
+    check.replace(0, check.armature.table[0].copy(), drives.copy())  # a new calibration
+    assert ((first(check) >= low) & (first(check) <= high)).all()
+    free = first(BeamCheck(_stopless(design), design.names))
+    assert (free[0] > high).any()

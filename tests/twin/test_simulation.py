@@ -80,11 +80,15 @@ def test_what_was_found_once_stays_mended(seed: int, seconds: float) -> None:
         (200184, 75.0, "swarm held frozen disk place sensors parameters calibrations"),
         (400007, 103.0, "place calibrations"),
         (500152, 84.0, "calm held disk place sensors calibrations twice"),
+        (800085, 73.0, "calm place"),
+        (800132, 77.0, "calm swarm held disk place sensors calibrations day"),
+        (800195, 44.0, "frozen place sensors"),
     ],
 )
 def test_what_any_world_found_once_stays_mended(seed: int, seconds: float, worlds: str) -> None:
     """An approach over the receiver; a scene; parameters not compared; two proofs of DEFOCUS;
-    a defocus onto the receiver.
+    a defocus onto the receiver; an approach by the other pose; leases of one moment in any order;
+    SUN of a second in which the cluster stood still.
     """
     outcome = run(RunPlan(seed, seconds, 4, pause=12.0, worlds=tuple(worlds.split())))
     assert outcome.good, f"{outcome.text}; {outcome.command}"

@@ -54,7 +54,8 @@ class Broadcast:
         quality = _QUALITIES.index(present.quality)
         if await exchange.broadcast("TIME", int(week), int(1000.0 * seconds), quality):
             self._offset = present.gps_s - now
-        if not self._watch.verdict.dark and not self._watch.alone(now):
+        # Asked now: the program may have stood still since this second began.
+        if not self._watch.verdict.dark and not self._watch.alone(self._clock.monotonic()):
             second = round(present.gps_s - self._config.phase)
             utc_s = present.utc_s - (present.gps_s - second)
             values = broadcast_values(second, utc_s, self._config.site)

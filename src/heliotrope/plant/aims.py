@@ -10,7 +10,8 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.volumes import Volume, around
 from heliotrope.geometry import FloatArray, as_float, as_vectors
 from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.drives import SLOTS, Drive
+from heliotrope.mechanism.machine import Machine
 from heliotrope.mechanism.tracking import Tracking, TrackingStatus, track
 from heliotrope.optics import MirrorOptics, beams, crossing, find_entries, sweep
 
@@ -109,6 +110,8 @@ class BeamCheck:
         Places of the heliostats, ENU, m, (N, 3).
     solids
         The receivers with some room, which no approach leads a beam across.
+    machines
+        Limits and resting places of heliostats, by name, as far as the design knows them.
 
     Raises
     ------
@@ -133,6 +136,14 @@ class BeamCheck:
         self.position = design.position[rows]
         self.armature = Armature(design.armature.table[rows])
         self.drives = Drive(design.drives.table[rows])
+        self.machines: dict[str, Machine] = {
+            name: machine
+            for group in design.groups.values()
+            if group.machines
+            for name, machine in zip(group.names, group.machines, strict=True)
+        }
+        for row in range(len(rows)):
+            self._stop(row)
         groups = design.groups.values()
         sizes = [
             np.concatenate([getattr(g, what) for g in groups])[rows] for what in ("width", "height")
@@ -143,6 +154,17 @@ class BeamCheck:
         """Take the new calibration of a heliostat: rows (18,) and (2, 19)."""
         self.armature.table[row] = armature
         self.drives.table[row] = drives
+        self._stop(row)
+
+    def _stop(self, row: int) -> None:
+        """Take the limits of the machine as stops: the local controller chooses the pose by them.
+
+        Without stops the pose nearest to the present one may be another than the mirror takes.
+        """
+        machine, table = self.machines.get(self.names[row]), self.drives.table[row]
+        for i, axis in enumerate(() if machine is None else machine.axes):
+            table[i, SLOTS["min_count"]] = max(table[i, SLOTS["min_count"]], axis.low)
+            table[i, SLOTS["max_count"]] = min(table[i, SLOTS["max_count"]], axis.high)
 
     def poses(
         self,

@@ -42,7 +42,6 @@ from heliotrope.links.messages import (
 )
 from heliotrope.mechanism.board_items import POSE_ITEMS, Wanted, items_of, tables_with
 from heliotrope.mechanism.chain import Mechanism
-from heliotrope.mechanism.machine import Machine
 from heliotrope.plant import refusals
 from heliotrope.plant.agreement import Agreement
 from heliotrope.plant.aims import BeamCheck, default_aims
@@ -172,7 +171,7 @@ class PlantController:
         place = disk or AtOnce()
         points = Points(self.field.names, assigned)
         self.aims, self.standbys = points.aims, points.standbys
-        self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, _machines(design))
+        self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, self.beams.machines)
         self._agreement = Agreement(
             self.field, points, self.beams, design.site, lambda: clock.utc().timestamp()
         )
@@ -909,16 +908,6 @@ class PlantController:
         reason = "" if name == "LOCK" else self._sentinel.refusal(clusters)
         if reason := reason or self._rivals.refusal(clusters):
             raise refusals.NOT_NOW.error(what=name, reason=reason)
-
-
-def _machines(design: Plant) -> dict[str, Machine]:
-    """Return the machines that the design knows, by heliostat."""
-    return {
-        name: machine
-        for group in design.groups.values()
-        if group.machines
-        for name, machine in zip(group.names, group.machines, strict=True)
-    }
 
 
 def _checked(

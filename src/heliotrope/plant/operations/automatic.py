@@ -40,8 +40,9 @@ from heliotrope.store.records import Records
 AUTOMATIC = Person("automatic control", Role.ENGINEER)
 _UP = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING, states.DEFOCUSED)
 _READY = (states.IDLE, states.TRACKING)
-#: Time between checks of the sun's elevation, s.
-_SUN_EVERY = 30.0
+#: Time between checks of the sun's elevation, s: a mirror that is locked for its parameters at one
+#: check in the evening is stowed at the next.
+_SUN_EVERY = 10.0
 #: Wait after a person has given the command authority back, before it is taken, s.
 _COURTESY = 5.0
 #: Time between predictions of the field's errors, s.

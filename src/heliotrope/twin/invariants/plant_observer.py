@@ -29,6 +29,8 @@ RECORD_WITHIN = 2.0
 #: How long a cluster may accept a void token: until the last lease with it has arrived and has
 #: expired, s.
 VOID_WITHIN = 4.2
+#: Leases that go to different clusters within this time are of one moment, s.
+_AT_ONCE = 0.5
 #: Longest time from posting a command to join to its execution, beyond its lifetime: in transit and
 #: late on the bus; and the interval between looks at the boards, s.
 LATE, LOOKS = 1.8, 0.5
@@ -169,15 +171,16 @@ class PlantObserver:
     def _leased(self, token: int, now: float) -> None:
         """Follow the authority of automatic control, which no person tells of.
 
-        It may only have what nobody holds.
+        It may only have what nobody holds. Leases of one moment to several clusters may be from
+        before a grant and after it, and arrive here in any order.
         """
         holder = self._live(now)
         if holder is not None and holder[1] == token:
             if self._by_itself():
                 self.kept(now)
-        elif token == 0:
+        elif token == 0 and (holder is None or now - holder[2] > _AT_ONCE):
             self.gave_way(now)
-        elif token not in self.old:
+        elif token not in self.old and token != 0:
             if self._by_itself():
                 self._end(now)
             self.granted(AUTOMATIC, token, now, seized=False)

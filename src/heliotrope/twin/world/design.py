@@ -29,7 +29,12 @@ def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], scene:
     names = tuple(each.name for each in fits)
     size = np.full(len(fits), 2.0)
     group = Heliostats(
-        names, mechanisms(fits), size, size, cluster=tuple(home[name] for name in names)
+        names,
+        mechanisms(fits),
+        size,
+        size,
+        cluster=tuple(home[name] for name in names),
+        machines=(MACHINE,) * len(fits),
     )
     receiver = Receiver(
         "receiver", "planar", np.array(RECEIVER), np.array([0.0, 1.0, 0.0]), 6.0, 6.0
