@@ -96,6 +96,8 @@ class Photo:
         Standard deviation of the position east, north, up, m, (3,).
     path
         The file; None if there is no image.
+    by_hand
+        Whether the rotation follows from mirrors that a person has named in the photograph.
     """
 
     name: str
@@ -104,6 +106,7 @@ class Photo:
     rotation: FloatArray
     sigma_position: FloatArray = field(default_factory=lambda: np.full(3, RTK_SIGMA))
     path: Path | None = None
+    by_hand: bool = False
 
     def __post_init__(self) -> None:
         position, turned = checked_pose(f"photo {self.name}", self.position, self.rotation)

@@ -1,6 +1,6 @@
 """The evaluation of a drone's flight, from its folder of photographs to sightings."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ from heliotrope.airborne.evaluate.bundle import Priors
 from heliotrope.airborne.evaluate.campaign import Campaign, evaluate_campaign
 from heliotrope.airborne.evaluate.evaluation import FlightEvaluation
 from heliotrope.airborne.evaluate.folder import FlightData, open_flights
+from heliotrope.airborne.evaluate.matching import Matches, read_matches, turn_by_hand
 from heliotrope.airborne.evaluate.orientation import Mean, measure_field
 from heliotrope.airborne.evaluate.reading import read_many
 from heliotrope.airborne.evaluate.sightings import to_sightings
@@ -147,6 +148,7 @@ def evaluate_flight(
     focal: float = np.inf,
     priors: Priors = PRIORS,
     axis: Mean = "area",
+    matches: Path | None = None,
     keep: Path | None = None,
     processes: int = 1,
     client: "Client | None" = None,
@@ -183,6 +185,9 @@ def evaluate_flight(
     axis
         What the optical axis of a mirror is: the mean in
         `heliotrope.airborne.evaluate.orientation.measure`.
+    matches
+        Table of mirrors that a person has named in photographs
+        (`heliotrope.airborne.evaluate.matching.read_matches`).
     keep, processes, client
         See `heliotrope.airborne.evaluate.reading.read_many`.
     progress
@@ -203,7 +208,11 @@ def evaluate_flight(
         slopes=slopes,
         focal=focal,
     )
-    flights = [_read(flight, keep, processes, client, progress) for flight in opened]
+    if matches is not None:
+        named, left_out = read_matches(matches, plant.names)
+        opened = [_turned(flight, named) for flight in opened]
+        warnings += [*left_out, *_strange(named, opened)]
+    flights = [read_flight(f, keep, processes, client, progress) for f in opened]
     campaign = evaluate_campaign(flights, priors)
     # The RTK base is part of each mirror's position as the adjustment knows it.
     budget = Budget(priors.position, priors.kinematics, 0.0)
@@ -220,13 +229,30 @@ def evaluate_flight(
     return CampaignResult(plant, tuple(flights), campaign, tuple(results), not_used, all_warnings)
 
 
-def _read(
+def _turned(flight: FlightData, named: Matches) -> FlightData:
+    """Return a flight with the attitudes that a person's places give."""
+    photos, problems = turn_by_hand(flight.photos, flight.camera, flight.stand, named, flight.name)
+    return replace(flight, photos=photos, problems=(*flight.problems, *problems))
+
+
+def _strange(named: Matches, flights: Sequence[FlightData]) -> list[str]:
+    """Return a line for each photograph that is named but not there."""
+    there = {name for f in flights for p in f.photos for name in (p.name, f"{f.name}/{p.name}")}
+    missing = dict.fromkeys(name for name in named.photo if name not in there)
+    return [
+        f"{named.path.name}: there is no photograph {name!r}; its places are not used"
+        for name in missing
+    ]
+
+
+def read_flight(
     flight: FlightData,
-    keep: Path | None,
-    processes: int,
-    client: "Client | None",
-    progress: Progress | None,
+    keep: Path | None = None,
+    processes: int = 1,
+    client: "Client | None" = None,
+    progress: Progress | None = None,
 ) -> FlightData:
+    """Return a flight with what its photographs show; see `evaluate_flight`."""
     what = f"reading {flight.name}".strip()
     seen = read_many(
         flight.photos,

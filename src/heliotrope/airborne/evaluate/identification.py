@@ -288,10 +288,12 @@ def find_lights(
     spots, _ = find_spots(picture, frame[None], most=_MOST_LIGHTS)
     feet, rows = expected_feet(photo, camera, stand)
     none = np.empty(0, dtype=np.intp)
+    found = Identified(photo.rotation, none, none)
     if len(spots) < FEWEST:
         text = f"nothing: it is dark and shows {len(spots)} lights, {FEWEST} are needed"
-        return Identified(photo.rotation, none, none, text), spots
-    found = identify(camera, photo, replace(stand.take(rows), vertex=feet), spots.pixel)
+        return replace(found, reason=text), spots
+    if not photo.by_hand:
+        found = identify(camera, photo, replace(stand.take(rows), vertex=feet), spots.pixel)
     if found.reason:
         text = (
             f"ambiguous: it is dark, and its {len(spots)} lights cannot be assigned to mirrors; "

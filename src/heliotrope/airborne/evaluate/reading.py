@@ -56,6 +56,11 @@ CORNER_FLOOR = 0.07
 _SKEW, _SKEW_SHARE = 1.5, 0.03
 #: Largest distance of edges from those of mirrors laid over a photograph, px.
 _OVERLAID = 3.0
+#: The same where a person has named mirrors: share of a mirror's side, and limits, px.
+_BY_HAND, _BY_HAND_PX = 0.15, (3.0, 12.0)
+#: Problems that a person can solve who sees which mirror is which, and how.
+_NAMEABLE = ("nothing", "wrong_field", "ambiguous")
+BY_HAND = "name mirrors in it by hand (heliotrope drone match, then drone evaluate --matches)"
 #: With fewer photographs, starting processes costs more time than it saves.
 FEWEST_FOR_PROCESSES = 4
 
@@ -122,10 +127,17 @@ class PhotoReading:
         """Whether it shows the lamp."""
         return not self.problem and len(self.spot) > 0
 
+    @property
+    def nameable(self) -> bool:
+        """Whether it shows mirrors, perhaps, but which ones is unknown: a person may see it."""
+        return self.problem.startswith(_NAMEABLE)
+
     def why_unused(self) -> str:
         """Return a line that says why its corners cannot be used; "" if they can."""
         if self.has_corners:
             return ""
+        if self.nameable:
+            return f"{self.name}: {self.problem}; or {BY_HAND}"
         return f"{self.name}: {self.problem or 'outline: no mirror edges could be measured'}"
 
     def save(self, path: Path) -> None:
@@ -199,6 +211,11 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) 
         return PhotoReading(
             photo.name, f"overexposed: {100 * clipped:.0f} % of it is clipped; shorten the exposure"
         )
+    if photo.by_hand:
+        if is_dark(picture):
+            return _lights(picture, photo, camera, stand)
+        wide = float(np.clip(_BY_HAND * typical, *_BY_HAND_PX))
+        return _look_along(picture, photo, camera, stand, (wide, _OVERLAID, 2.0))
     if seen_from(stand, photo.position, camera.focal).overlapping:
         return _look_overlapping(picture, photo, camera, stand)
     found = Identified(photo.rotation, _no_rows(), _no_rows(), "nothing: no patches")
@@ -237,8 +254,20 @@ def _look_overlapping(
     if found.reason:
         return PhotoReading(photo.name, found.reason)
     there = photo.moved(photo.position, found.rotation)
+    return _look_along(picture, there, camera, stand, (_OVERLAID, 2.0))
+
+
+def _look_along(
+    picture: Picture,
+    photo: Photo,
+    camera: LedCamera,
+    stand: MirrorPoses,
+    reaches: Sequence[float],
+) -> PhotoReading:
+    """Return what a picture shows whose attitude is right to the first of ``reaches``, px."""
+    there = photo
     # Edges against the ground correct the attitude; then they are measured where they belong.
-    for reach in (_OVERLAID, 2.0):
+    for reach in reaches:
         rows, expected = _in_frame(there, camera, stand)
         if not len(rows):
             return _nothing_in_frame(photo)
@@ -469,7 +498,7 @@ def _digest(camera: LedCamera, stand: MirrorPoses) -> bytes:
 def _mark(photo: Photo, base: bytes) -> str:
     """Return a key for a photograph's file, position and attitude with this camera and field."""
     state = photo.path.stat() if photo.path is not None and photo.path.exists() else None
-    recorded = photo.position.tobytes() + photo.rotation.tobytes()
+    recorded = photo.position.tobytes() + photo.rotation.tobytes() + bytes([photo.by_hand])
     file = "" if state is None else f"{photo.name} {state.st_size} {state.st_mtime_ns}"
     return hashlib.sha256(base + recorded + file.encode()).hexdigest()[:32]
 

@@ -3,6 +3,7 @@
 import typer
 
 from heliotrope.cli.drone.evaluate import evaluate
+from heliotrope.cli.drone.match import match
 from heliotrope.cli.drone.plan import plan
 from heliotrope.cli.drone.rtk import rtk
 from heliotrope.cli.drone.simulate import simulate
@@ -17,5 +18,5 @@ def _root() -> None:
     """Measure a field with a drone, its lamp and its camera."""
 
 
-for command in (plan, evaluate, rtk, simulate):
+for command in (plan, evaluate, match, rtk, simulate):
     app.command()(command)

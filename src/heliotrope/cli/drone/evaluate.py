@@ -41,6 +41,10 @@ def evaluate(
             "reflections alike (plain)."
         ),
     ] = "area",
+    matches: Annotated[
+        Path | None,
+        typer.Option(help="Table (CSV) of mirrors named by hand, as `drone match` prepares it."),
+    ] = None,
     focal: shared.FocalOption = None,
     survey_mm: shared.SurveyOption = 10.0,
     kinematics_mm: shared.KinematicsOption = 30.0,
@@ -76,6 +80,7 @@ def evaluate(
             slopes=slopes,
             focal=float("inf") if focal is None else focal,
             axis=axis,
+            matches=matches,
             priors=Priors(1e-3 * rtk_mm, 1e-3 * survey_mm, 1e-3 * kinematics_mm),
             keep=out / "photographs",
             processes=shared.cores(processes),

@@ -1,0 +1,210 @@
+"""Mirrors that a person names in photographs which the program cannot identify by itself.
+
+HelioPoint improves the camera's attitude "using automatic or manual feature matching". A table says
+where in a photograph some mirrors, or their corners, are seen. These places give the attitude by
+Wahba's problem, and it takes the place of the gimbal's: the photograph is then read as the others
+are, from an attitude that needs no search.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.airborne.evaluate.identification import expected_feet, nearest_rotation, quad_area
+from heliotrope.airborne.photo import LedCamera, Photo
+from heliotrope.airborne.standing import MirrorPoses
+from heliotrope.errors import FormatError
+from heliotrope.field.camera import undistort
+from heliotrope.files.cells import Rows, find_heliostats, read_rows
+from heliotrope.geometry import FloatArray, as_float
+
+#: What a row may name: the corners in the order of an outline, the mirror's middle, the lamp on it.
+CORNERS = ("upper left", "upper right", "lower right", "lower left")
+MIDDLE, LIGHT = "middle", "light"
+#: Columns of the table.
+COLUMNS = ("photo", "heliostat", "corner", "x_px", "y_px")
+#: Fewest places that give an attitude; with three, a wrong name can be noticed.
+FEWEST = 2
+#: A place this many mirrors' sides from where the others put it has a wrong name.
+_OFF = 0.4
+
+
+@dataclass(frozen=True)
+class Matches:
+    """K places in photographs that a person has named.
+
+    Attributes
+    ----------
+    path
+        The table.
+    photo
+        Name of each photograph, or FLIGHT/NAME, (K,).
+    heliostat
+        Name of the heliostat, (K,).
+    corner
+        What is seen there: one of `CORNERS`, `MIDDLE` or `LIGHT`, (K,).
+    pixel
+        Where, px; the centre of the first pixel is (0, 0), (K, 2).
+    """
+
+    path: Path
+    photo: tuple[str, ...]
+    heliostat: tuple[str, ...]
+    corner: tuple[str, ...]
+    pixel: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.photo)
+
+    def of(self, photo: str, flight: str) -> npt.NDArray[np.intp]:
+        """Return the rows of a photograph."""
+        names = (photo, f"{flight}/{photo}")
+        return np.array([k for k, name in enumerate(self.photo) if name in names], dtype=np.intp)
+
+
+def read_matches(path: str | Path, names: Sequence[str]) -> tuple[Matches, list[str]]:
+    """Return the places that a table names, and a line for each row that was left out.
+
+    Rows without a heliostat are skipped: they are outlines that nobody has named. An empty
+    ``corner`` is the middle of the mirror.
+
+    Parameters
+    ----------
+    path
+        CSV with `COLUMNS`; others are not read.
+    names
+        Names of the plant's heliostats.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be read, lacks a column, or names nothing.
+    """
+    rows = read_rows(Path(path), "a table of mirrors named in photographs")
+    rows.need([name for name in COLUMNS if name != "corner"])
+    blank = {k for k, name in enumerate(rows.texts("heliostat")) if not name.strip()}
+    heliostat = find_heliostats(rows, "heliostat", names)
+    corner = _corners(rows)
+    places = np.stack([rows.numbers(c, "pixels") for c in ("x_px", "y_px")], axis=-1)
+    good = [int(k) for k in rows.good if int(k) not in blank]
+    for k in blank:
+        rows.reasons.pop(k, None)
+    if not good:
+        left = f"; {rows.left_out[0]}" if rows.left_out else ""
+        raise FormatError(rows.path, f"no row names a heliostat; fill in the column{left}")
+    photo = rows.texts("photo")
+    return Matches(
+        rows.path,
+        tuple(photo[k].strip() for k in good),
+        tuple(names[heliostat[k]] for k in good),
+        tuple(corner[k] for k in good),
+        as_float(places[good]),
+    ), rows.left_out
+
+
+def _corners(rows: Rows) -> list[str]:
+    known = (*CORNERS, MIDDLE, LIGHT)
+    found = []
+    for k, text in enumerate(rows.texts("corner")):
+        name = " ".join(text.replace("_", " ").split()).casefold() or MIDDLE
+        if name not in known:
+            rows.refuse(k, "corner", f"{text!r} is none of {', '.join(known)}")
+        found.append(name)
+    return found
+
+
+def turn_by_hand(
+    photos: Sequence[Photo],
+    camera: LedCamera,
+    stand: MirrorPoses,
+    matches: Matches,
+    flight: str = "",
+) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """Return photographs with the attitudes that a person's places give, and the problems.
+
+    Parameters
+    ----------
+    photos
+        Photographs as recorded by the drone.
+    camera
+        Lens.
+    stand
+        All mirrors in their expected poses.
+    matches
+        Places that were named.
+    flight
+        Name of the flight, "" if it is the only one.
+
+    Returns
+    -------
+    The photographs, those with places `by_hand`, and a line for each whose places were not used.
+    """
+    turned, problems = [], []
+    for photo in photos:
+        rows = matches.of(photo.name, flight)
+        found = _turned(photo, camera, stand, matches, rows) if len(rows) else photo
+        if isinstance(found, str):
+            problems.append(f"{matches.path.name}: {photo.name}: {found}")
+            found = photo
+        turned.append(found)
+    return tuple(turned), tuple(problems)
+
+
+def _turned(
+    photo: Photo,
+    camera: LedCamera,
+    stand: MirrorPoses,
+    matches: Matches,
+    rows: npt.NDArray[np.intp],
+) -> Photo | str:
+    """Return a photograph with the attitude of its places, or why they give none."""
+    unknown = [matches.heliostat[k] for k in rows if matches.heliostat[k] not in stand.names]
+    if unknown:
+        return f"heliostat {unknown[0]} was not commanded in this flight; correct the name"
+    if len(rows) < FEWEST:
+        return f"{len(rows)} place is named, {FEWEST} are needed and 3 show a wrong name; name more"
+    seen = undistort(camera, matches.pixel[rows])
+    rays = np.concatenate([seen, np.ones((len(seen), 1))], axis=-1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    mirrors = np.array([stand.names.index(matches.heliostat[k]) for k in rows])
+    here = photo
+    # Where the lamp is seen on a mirror depends on the lamp's own place, and so on the attitude.
+    for _ in range(2):
+        points = np.stack(
+            [
+                _point(here, camera, stand, int(row), matches.corner[k])
+                for row, k in zip(mirrors, rows, strict=True)
+            ]
+        )
+        ways = points - photo.position
+        ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+        if float(np.linalg.svd(ways - ways.mean(axis=0))[1][0]) < 1e-3:
+            return "its places are all at one point; name mirrors farther from each other"
+        here = photo.moved(photo.position, nearest_rotation(ways, rays))
+    gap = np.linalg.norm(here.pixels(camera, points) - matches.pixel[rows], axis=-1)
+    side = np.sqrt(quad_area(here.pixels(camera, stand.corners[mirrors])))
+    off = gap / np.where(np.isfinite(side), side, 1.0)
+    worst = int(np.argmax(np.where(np.isfinite(off), off, np.inf)))
+    if not off[worst] < _OFF:
+        name, corner = matches.heliostat[rows[worst]], matches.corner[rows[worst]]
+        return (
+            f"{name}, {corner}, is {gap[worst]:.0f} px from where the other places put it; "
+            "correct its name or its place"
+        )
+    return replace(here, by_hand=True)
+
+
+def _point(
+    photo: Photo, camera: LedCamera, stand: MirrorPoses, row: int, corner: str
+) -> FloatArray:
+    """Return the point that a place shows, ENU metres, (3,)."""
+    if corner in CORNERS:
+        return as_float(stand.corners[row, CORNERS.index(corner)])
+    if corner == LIGHT:
+        feet, found = expected_feet(photo, camera, stand.take([row]))
+        if len(found):
+            return as_float(feet[0])
+    return as_float(stand.corners[row].mean(axis=0))
