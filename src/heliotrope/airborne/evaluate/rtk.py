@@ -1,6 +1,7 @@
 """RTK positions compared with photogrammetry, after appendix A of HelioPoint.
 
-The paper's flight photographs coded targets on the ground; ours uses the mirrors of the field.
+The paper's flight photographs coded targets on the ground (`check_rtk_by_targets`). Any flight over
+the field shows mirrors, whose edges are good to millimetres only (`check_rtk`, ours).
 """
 
 from collections.abc import Sequence
@@ -9,7 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from heliotrope.airborne.evaluate.bundle import Priors, adjust
+from heliotrope.airborne.evaluate.coded import SeenTargets
 from heliotrope.airborne.evaluate.evaluation import adjust_photos, corners_of, disagrees
+from heliotrope.airborne.evaluate.photogrammetry import Photogrammetry, compared, locate, usable
 from heliotrope.airborne.evaluate.reading import PhotoReading
 from heliotrope.airborne.photo import LedCamera, Photo
 from heliotrope.airborne.standing import MirrorPoses
@@ -31,7 +34,8 @@ class RtkCheck:
     difference
         RTK less photogrammetry, east, north, up, m, (P, 3).
     mean, mean_sigma
-        Offset common to all positions and its standard deviation, from the adjustment, m, (3,).
+        Offset common to all positions and its standard deviation, from the adjustment, m, (3,);
+        NaN by coded targets, whose places are not known.
     covariance
         Covariance of a single difference about the mean, m², (3, 3): that of RTK and of
         photogrammetry together.
@@ -105,6 +109,47 @@ def check_rtk(
         free.position_sigma.mean(axis=0),
         *share_of_rtk(gap, free.position_sigma),
     ), problems
+
+
+def check_rtk_by_targets(
+    photos: Sequence[Photo], seen: Sequence[SeenTargets], camera: LedCamera
+) -> tuple[RtkCheck, Photogrammetry, tuple[str, ...]]:
+    """Return how RTK positions scatter about those from coded targets, as appendix A does.
+
+    The photogrammetric positions are fitted into RTK's by a similarity, so nothing is said of a
+    common offset, turn or scale.
+
+    Raises
+    ------
+    InputError
+        If too few photographs or targets can be used.
+    """
+    good, wrong = usable(seen)
+    problems = tuple(f"{photos[k].name}: {reason}" for k, reason in wrong.items())
+    recorded = [photos[k] for k in good]
+    try:
+        found = locate(recorded, [seen[k] for k in good], camera)
+    except InputError as error:
+        first = f"; the first of the others: {problems[0]}" if problems else ""
+        raise InputError(f"{error}{first}") from None
+    gap, _ = compared(as_float([p.position for p in recorded]), found.position)
+    # The similarity takes seven of the 3P degrees of freedom, not only the three of the mean.
+    fair = gap * np.sqrt((len(gap) - 1.0) / (len(gap) - 7.0 / 3.0))
+    unknown = np.full(3, np.nan)
+    sigma = found.position_sigma
+    return (
+        RtkCheck(
+            tuple(p.name for p in recorded),
+            gap,
+            unknown,
+            unknown,
+            np.cov(fair.T),
+            as_float(np.sqrt(np.mean(sigma**2, axis=0))),
+            *share_of_rtk(fair, sigma),
+        ),
+        found,
+        problems,
+    )
 
 
 def share_of_rtk(gap: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:

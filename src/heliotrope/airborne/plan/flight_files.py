@@ -134,10 +134,33 @@ def write_plan(
     InputError
         If a format or the aircraft is unknown, or the folder cannot be written to.
     """
+    into = Path(folder)
+    written = write_missions(
+        into,
+        [mission(plan, sortie, sortie_name(sortie)) for sortie in plan.sorties],
+        formats=formats,
+        aircraft=aircraft,
+        around=fence(plan),
+        progress=progress,
+    )
+    write_text(into / "commands.csv", commands(plan))
+    write_text(into / "plan.json", json.dumps(document(plan), separators=(",", ":")) + "\n")
+    return [into / "plan.json", into / "commands.csv", *written]
+
+
+def write_missions(
+    into: Path,
+    missions: Sequence[Mission],
+    *,
+    formats: Sequence[str] = FORMATS,
+    aircraft: str = "M3E",
+    around: Fence | None = None,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Write the waypoint files of missions into a folder for each format; see `write_plan`."""
     for name in formats:
         if name not in FORMATS:
             raise InputError(f"format {name!r}: give some of {', '.join(FORMATS)}")
-    into = Path(folder)
     try:
         for name in ("", *formats):
             (into / name).mkdir(parents=True, exist_ok=True)
@@ -145,14 +168,12 @@ def write_plan(
         raise InputError(
             f"{into}: cannot be created ({error.strerror}); give another folder"
         ) from None
-    around, written = fence(plan), []
-    for done, sortie in enumerate(plan.sorties):
+    written = []
+    for done, flown in enumerate(missions):
         if progress is not None:
-            progress(done, len(plan.sorties))
-        label = sortie_name(sortie)
-        flown = mission(plan, sortie, label)
+            progress(done, len(missions))
         for name in formats:
-            path = into / name / (label + _SUFFIX[name])
+            path = into / name / (flown.name + _SUFFIX[name])
             if name == "dji":
                 body = waypoints.wpml(flown, aircraft)
                 write_file(path, lambda stream, data=body: stream.write(data))  # type: ignore[misc]
@@ -161,9 +182,7 @@ def write_plan(
                     path, waypoints.qgc(flown, around) if name == "qgc" else waypoints.litchi(flown)
                 )
             written.append(path)
-    write_text(into / "commands.csv", commands(plan))
-    write_text(into / "plan.json", json.dumps(document(plan), separators=(",", ":")) + "\n")
-    return [into / "plan.json", into / "commands.csv", *written]
+    return written
 
 
 def commands(plan: FlightPlan) -> str:

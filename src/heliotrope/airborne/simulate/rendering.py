@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.airborne._photo_metadata import Metadata, exif_and_xmp
+from heliotrope.airborne.coded_targets import CELLS, CodedTarget, white_cells
+from heliotrope.airborne.coded_targets import MARGIN as SHEET_MARGIN
 from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.airborne.photo import LedCamera, Photo, gimbal_of_rotation, write_camera
@@ -33,6 +35,8 @@ Picture = npt.NDArray[np.uint8]
 #: Blue, green, red of sky, ground and lamp, relative.
 SKY_TINT, GROUND_TINT, LED_TINT = (1.25, 1.0, 0.80), (0.72, 0.95, 1.15), (1.0, 1.0, 1.0)
 _TEXTURE, _TEXEL = 1024, 0.04
+#: Light of a coded target's sheet and ink, full scale.
+PAPER, INK = 0.55, 0.02
 
 
 @dataclass(frozen=True)
@@ -121,12 +125,15 @@ class FlightScene:
         Height of the ground, ENU m.
     conditions
         Light, lens and sensor.
+    targets
+        Coded targets on the ground.
     """
 
     stand: MirrorPoses
     shapes: Sequence[MirrorShape]
     ground: float = 0.0
     conditions: Conditions = field(default_factory=Conditions)
+    targets: Sequence[CodedTarget] = ()
 
 
 def render(
@@ -150,6 +157,8 @@ def render(
     order = np.argsort(-np.linalg.norm(scene.stand.vertex - photo.position, axis=-1))
     if conditions.sun is not None:
         _shadows(image, camera, photo, scene)
+    for target in scene.targets:
+        _target(image, camera, photo, target)
     hit = {int(h): np.flatnonzero(lamp.heliostat == h) for h in np.unique(lamp.heliostat)}
     for row in order:
         # Nearer mirrors hide mirrors and spots behind them.
@@ -230,6 +239,20 @@ def _shadows(image: Light, camera: LedCamera, photo: Photo, scene: FlightScene) 
         seen = photo.pixels(camera, outline)
         if np.isfinite(seen).all():
             _cover(image, seen, np.zeros(3), 0.55)
+
+
+def _target(image: Light, camera: LedCamera, photo: Photo, target: CodedTarget) -> None:
+    """Draw a coded target: white sheet, black square, white cells."""
+    rows, columns = np.nonzero(white_cells(target.number))
+    low = np.array([-SHEET_MARGIN, 0.0, *columns])
+    top = np.array([-SHEET_MARGIN, 0.0, *rows])
+    wide = np.array([CELLS + 2.0 * SHEET_MARGIN, CELLS, *np.ones(len(rows))])
+    right, down = np.array([0.0, 1.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0, 1.0])
+    squares = target.at(low[:, None] + wide[:, None] * right, top[:, None] + wide[:, None] * down)
+    seen = photo.pixels(camera, squares)
+    if np.isfinite(seen).all():
+        for k, outline in enumerate(seen):
+            _cover(image, outline, np.full(3, INK if k == 1 else PAPER), 1.0)
 
 
 def _mirror(image: Light, camera: LedCamera, photo: Photo, scene: FlightScene, row: int) -> None:

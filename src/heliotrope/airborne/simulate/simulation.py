@@ -260,12 +260,12 @@ def fly(
         shapes,
         tuple(p[0] for p in pairs),
         tuple(p[1] for p in pairs),
-        _miscalibrated(camera, wrong.lens),
+        miscalibrated(camera, wrong.lens),
         tuple(_measured_map(shape, wrong, own) for shape in shapes),
     )
 
 
-def _miscalibrated(camera: LedCamera, lens: float) -> LedCamera:
+def miscalibrated(camera: LedCamera, lens: float) -> LedCamera:
     """Return a camera whose first radial coefficient displaces a corner by ``lens`` px."""
     radius = float(np.hypot(*camera.size)) / (2.0 * camera.focal)
     distortion = camera.distortion.copy()

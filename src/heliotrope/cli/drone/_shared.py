@@ -1,14 +1,18 @@
 """Shared by the commands of a drone's flight: arguments, options and progress bars."""
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from heliotrope.cli import _calibration as calibration
+
+if TYPE_CHECKING:
+    from heliotrope.airborne.photo import LedCamera
 
 FolderArgument = Annotated[
     Path, typer.Argument(help="Folder with photographs, camera.toml and commands.csv.")
@@ -70,3 +74,33 @@ def stages(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
             bars[what](done, of)
 
         yield show
+
+
+def rendered_camera(size: str, focal_px: float = 0.0) -> "LedCamera":
+    """Return the camera of rendered photographs; a focal length of 0 is 3/4 of the width."""
+    import numpy as np
+
+    from heliotrope.airborne.photo import LedCamera
+    from heliotrope.errors import InputError
+
+    match = re.fullmatch(r"(\d{2,5})[x×](\d{2,5})", size)
+    if not match:
+        raise InputError(f"--size {size!r}: write WIDTHxHEIGHT in pixels, such as 4000x3000")
+    width, height = int(match[1]), int(match[2])
+    f = focal_px or 0.75 * width
+    matrix = np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
+    return LedCamera((width, height), matrix, np.array([-0.08, 0.06, 3e-4, -2e-4, -0.01]))
+
+
+def formats(text: str) -> tuple[str, ...]:
+    """Return the formats of waypoint files that --formats names."""
+    from heliotrope.airborne.plan.flight_files import FORMATS
+    from heliotrope.errors import InputError
+
+    names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
+    if names == ("none",):
+        return ()
+    for name in names:
+        if name not in FORMATS:
+            raise InputError(f"--formats {name!r}: give some of {','.join(FORMATS)}, or none")
+    return names

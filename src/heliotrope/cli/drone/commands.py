@@ -2,6 +2,7 @@
 
 import typer
 
+from heliotrope.cli.drone.dome import dome
 from heliotrope.cli.drone.evaluate import evaluate
 from heliotrope.cli.drone.match import match
 from heliotrope.cli.drone.plan import plan
@@ -18,5 +19,5 @@ def _root() -> None:
     """Measure a field with a drone, its lamp and its camera."""
 
 
-for command in (plan, evaluate, match, rtk, simulate):
+for command in (plan, evaluate, match, dome, rtk, simulate):
     app.command()(command)

@@ -7,6 +7,7 @@ import typer
 
 from heliotrope.cli._calibration import progress
 from heliotrope.cli._common import open_plant, parse_duration, parse_point, print_json, print_table
+from heliotrope.cli.drone import _shared as shared
 
 if TYPE_CHECKING:
     from heliotrope.airborne.plan.airspace import Airspace
@@ -94,7 +95,7 @@ def plan(
 
     plant = open_plant(field)
     air, place = _airspace(plant, airspace, tower, (min_height, max_height))
-    wanted = _formats(formats)
+    wanted = shared.formats(formats)
     settings = PlanSettings(
         size=size,
         spread=float(np.radians(spread_deg)),
@@ -161,19 +162,6 @@ def _check_aircraft(aircraft: str) -> None:
 
     if aircraft not in AIRCRAFT:
         raise UnknownNameError("aircraft", aircraft, AIRCRAFT)
-
-
-def _formats(text: str) -> tuple[str, ...]:
-    from heliotrope.airborne.plan.flight_files import FORMATS
-    from heliotrope.errors import InputError
-
-    names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
-    if names == ("none",):
-        return ()
-    for name in names:
-        if name not in FORMATS:
-            raise InputError(f"--formats {name!r}: give some of {','.join(FORMATS)}, or none")
-    return names
 
 
 def _numbers(text: str, count: int, what: str) -> tuple[float, ...]:

@@ -1,6 +1,5 @@
 """``heliotrope drone simulate``: photographs of a simulated flight, with the truth."""
 
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,6 +8,7 @@ import typer
 
 from heliotrope.cli import _calibration as calibration
 from heliotrope.cli._common import open_plant, parse_point
+from heliotrope.cli.drone import _shared as shared
 
 if TYPE_CHECKING:
     from heliotrope.airborne.photo import LedCamera
@@ -114,7 +114,9 @@ def simulate(
     light = rendering.dark() if dark else light
     light = replace(light, clouds=clouds, speed=speed, exposure=1e-3 * exposure_ms)
     facets = np.inf if focal is None else focal
-    drawing = _Drawing(plant.site, _camera(size, focal_px), errors, light, facets, seed)
+    drawing = _Drawing(
+        plant.site, shared.rendered_camera(size, focal_px), errors, light, facets, seed
+    )
     if plan is not None:
         _campaign(drawing, plan, stations, mirrors, folder)
         return
@@ -234,21 +236,6 @@ def _nearest(heliostats: "Heliostats", count: int) -> "Heliostats":
     position = heliostats.position
     away = np.linalg.norm(position - position.mean(axis=0), axis=-1)
     return heliostats.take(np.sort(np.argsort(away, kind="stable")[:count]))
-
-
-def _camera(size: str, focal_px: float) -> "LedCamera":
-    import numpy as np
-
-    from heliotrope.airborne.photo import LedCamera
-    from heliotrope.errors import InputError
-
-    match = re.fullmatch(r"(\d{2,5})[x×](\d{2,5})", size)
-    if not match:
-        raise InputError(f"--size {size!r}: write WIDTHxHEIGHT in pixels, such as 4000x3000")
-    width, height = int(match[1]), int(match[2])
-    f = focal_px or 0.75 * width
-    matrix = np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
-    return LedCamera((width, height), matrix, np.array([-0.08, 0.06, 3e-4, -2e-4, -0.01]))
 
 
 def _write_truth(folder: Path, flight: "Flight") -> None:

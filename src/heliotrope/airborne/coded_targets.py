@@ -1,0 +1,91 @@
+"""Coded targets on the ground, by which photogrammetry finds where a drone was (appendix A).
+
+A target is a black square with a pattern that tells its number (OpenCV's ArUco, dictionary 4×4,
+250 numbers), on a white sheet whose margin is one cell wide. Its four outer corners are measured;
+where it lies need not be known.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float
+
+#: Numbers that a target may have, and cells across the black square.
+NUMBERS, CELLS = 250, 6
+#: White margin of the sheet, cells.
+MARGIN = 1
+
+
+@dataclass(frozen=True)
+class CodedTarget:
+    """A target where it lies.
+
+    Attributes
+    ----------
+    number
+        0 to 249.
+    corners
+        Corners of the black square, ENU metres: upper left, upper right, lower right, lower left
+        of the pattern, (4, 3).
+    """
+
+    number: int
+    corners: FloatArray
+
+    def at(self, u: npt.ArrayLike, v: npt.ArrayLike) -> FloatArray:
+        """Return points of the sheet, cells right and down of the upper left corner, (..., 3)."""
+        a, b = as_float(u)[..., None] / CELLS, as_float(v)[..., None] / CELLS
+        start = self.corners[0]
+        right, down = self.corners[1] - start, self.corners[3] - start
+        return as_float(start + a * right + b * down)
+
+
+@lru_cache(maxsize=NUMBERS)
+def white_cells(number: int) -> npt.NDArray[np.bool_]:
+    """Return which cells of the black square are white, (CELLS, CELLS), rows from the top.
+
+    Raises
+    ------
+    InputError
+        If there is no such number.
+    """
+    import cv2
+
+    if not 0 <= number < NUMBERS:
+        raise InputError(f"target {number}: there are numbers from 0 to {NUMBERS - 1}")
+    codes = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
+    return np.asarray(cv2.aruco.generateImageMarker(codes, number, CELLS) > 127)
+
+
+def square_target(
+    number: int, center: npt.ArrayLike, side: float, right: npt.ArrayLike, down: npt.ArrayLike
+) -> CodedTarget:
+    """Return a target of a side (m) with its middle at ``center``, along unit vectors (3,)."""
+    half = 0.5 * side
+    x, y = half * as_float(right), half * as_float(down)
+    return CodedTarget(number, as_float(center) + np.stack([-x - y, x - y, x + y, y - x]))
+
+
+def target_sheet(number: int, side_mm: float) -> str:
+    """Return a sheet to print, as SVG in millimetres: the black square has the given side."""
+    cell = side_mm / CELLS
+    whole = side_mm + 2 * MARGIN * cell
+    rows, columns = np.nonzero(white_cells(number))
+    cells = "".join(
+        f'<rect x="{(MARGIN + c) * cell:.3f}" y="{(MARGIN + r) * cell:.3f}" width="{cell:.3f}" '
+        f'height="{cell:.3f}" fill="white"/>\n'
+        for r, c in zip(rows.tolist(), columns.tolist(), strict=True)
+    )
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{whole:.3f}mm" height="{whole:.3f}mm" '
+        f'viewBox="0 0 {whole:.3f} {whole:.3f}" shape-rendering="crispEdges">\n'
+        f'<rect width="{whole:.3f}" height="{whole:.3f}" fill="white"/>\n'
+        f'<rect x="{cell:.3f}" y="{cell:.3f}" width="{side_mm:.3f}" height="{side_mm:.3f}"/>\n'
+        f"{cells}"
+        f'<text x="{cell:.3f}" y="{whole - 0.3 * cell:.3f}" font-size="{0.5 * cell:.3f}">'
+        f"{number}</text>\n</svg>\n"
+    )

@@ -1,0 +1,175 @@
+"""The dome flight of HelioPoint's appendix A: photographs of coded targets from a hemisphere.
+
+Photogrammetry needs rays that cross at wide angles, from all sides and several heights; every
+photograph looks at the middle of the targets. The paper shows such a flight (figure 7) and states
+neither its radius nor the numbers; those here are ours.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.airborne.coded_targets import NUMBERS, CodedTarget, square_target, target_sheet
+from heliotrope.airborne.photo import gimbal_of_rotation
+from heliotrope.airborne.plan.flight_files import write_missions
+from heliotrope.airborne.plan.waypoints import Mission
+from heliotrope.errors import InputError
+from heliotrope.field.camera import look_at
+from heliotrope.files.text import write_text
+from heliotrope.geometry import FloatArray, as_float, as_vectors, direction, enu_to_geodetic
+from heliotrope.sun import Site
+
+#: Elevations of the rings of photographs, rad.
+RINGS = tuple(np.radians([35.0, 50.0, 65.0, 80.0]).tolist())
+
+
+@dataclass(frozen=True)
+class Dome:
+    """A dome flight.
+
+    Attributes
+    ----------
+    center
+        Middle of the targets on the ground, ENU metres, (3,).
+    position
+        Of the P photographs in the order of the flight, ENU metres, (P, 3).
+    rotation
+        Camera axes to ENU, (P, 3, 3).
+    targets
+        Where the targets are to lie; decimetres do not matter.
+    side
+        Of their black squares, m.
+    """
+
+    center: FloatArray
+    position: FloatArray
+    rotation: FloatArray
+    targets: tuple[CodedTarget, ...]
+    side: float
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+
+def plan_dome(
+    center: npt.ArrayLike,
+    *,
+    radius: float = 15.0,
+    elevations: Sequence[float] | FloatArray = RINGS,
+    photographs: int = 48,
+    targets: int = 25,
+    spacing: float = 2.5,
+    side: float = 0.4,
+) -> Dome:
+    """Return a dome over a square of coded targets.
+
+    Parameters
+    ----------
+    center
+        Middle of the targets on the ground, ENU metres, (3,).
+    radius
+        Distance of the photographs from it, m.
+    elevations
+        Of the rings of photographs, rad.
+    photographs
+        In all; each ring has a share like its circumference, at least four.
+    targets, spacing, side
+        Number of targets, a square of which is laid out; between neighbours; of the black
+        squares, m.
+
+    Raises
+    ------
+    InputError
+        If a number is out of its range.
+    """
+    for name, value, low, high in (
+        ("radius", radius, 2.0, 200.0),
+        ("photographs", photographs, 12, 500),
+        ("targets", targets, 4, NUMBERS),
+        ("spacing", spacing, 1.5 * side, 50.0),
+        ("side", side, 0.05, 5.0),
+    ):
+        if not low <= value <= high:
+            raise InputError(f"dome: {name} {value:g} must be from {low:g} to {high:g}")
+    rings = np.sort(as_float(elevations))
+    if len(rings) < 2 or rings[0] < np.radians(15.0) or rings[-1] > np.radians(88.0):
+        raise InputError(
+            f"dome: elevations {np.degrees(rings).tolist()}°; give two or more from 15 to 88"
+        )
+    middle = as_vectors(center, "center")
+    share = np.cos(rings) / np.cos(rings).sum()
+    places: list[FloatArray] = []
+    for ring, (up, part) in enumerate(zip(rings, share, strict=True)):
+        count = max(4, round(photographs * part))
+        # Neighbouring rings are turned, and flown one way, then the other.
+        turns = 2.0 * np.pi * (np.arange(count) + 0.5 * (ring % 2)) / count
+        around = turns if ring % 2 == 0 else turns[::-1]
+        places += [middle + radius * direction(a, float(up)) for a in around.tolist()]
+    position = np.stack(places)
+    across = int(np.ceil(np.sqrt(targets)))
+    grid = np.stack(np.divmod(np.arange(targets), across), axis=-1)[:, ::-1] - 0.5 * (across - 1)
+    laid = tuple(
+        square_target(k, middle + [spacing * x, -spacing * y, 0.0], side, [1, 0, 0], [0, -1, 0])
+        for k, (x, y) in enumerate(grid.tolist())
+    )
+    rotation = np.stack([look_at(place, middle) for place in position])
+    return Dome(middle, position, rotation, laid, side)
+
+
+def write_dome(
+    dome: Dome,
+    site: Site,
+    folder: Path,
+    *,
+    home: npt.ArrayLike,
+    formats: Sequence[str],
+    aircraft: str = "M3E",
+    speed: float = 3.0,
+    rest: float = 2.5,
+) -> list[Path]:
+    """Write waypoint files, a sheet to print for each target, and where each target lies.
+
+    Parameters
+    ----------
+    dome, site, folder
+        The flight, the place of ENU's origin, and where the files go.
+    home
+        Place of take-off, ENU metres, (3,).
+    formats, aircraft
+        See `heliotrope.airborne.plan.flight_files.write_plan`.
+    speed, rest
+        Between photographs, m/s, and time to come to rest, s.
+    """
+    origin = site.latitude_deg, site.longitude_deg, site.height
+    start = as_vectors(home, "home")
+    lat, lon, _ = enu_to_geodetic(dome.position, origin)
+    angles = np.degrees([gimbal_of_rotation(r)[:2] for r in dome.rotation])
+    count = len(dome)
+    there = tuple(float(v) for v in enu_to_geodetic(start, origin))
+    mission = Mission(
+        "dome",
+        lat,
+        lon,
+        dome.position[:, 2] - start[2],
+        angles[:, 0] % 360.0,
+        angles[:, 1],
+        np.full(count, rest),
+        np.ones(count, np.bool_),
+        speed,
+        (there[0], there[1], there[2]),
+        float(dome.position[:, 2].max() - start[2]),
+    )
+    written = write_missions(folder, [mission], formats=formats, aircraft=aircraft)
+    lines = ["number,east_m,north_m,up_m"]
+    (folder / "targets").mkdir(exist_ok=True)
+    for target in dome.targets:
+        path = folder / "targets" / f"target-{target.number:03d}.svg"
+        write_text(path, target_sheet(target.number, 1e3 * dome.side))
+        written.append(path)
+        middle = target.corners.mean(axis=0)
+        lines.append(f"{target.number},{','.join(f'{v:.3f}' for v in middle)}")
+    write_text(folder / "targets.csv", "\n".join(lines) + "\n")
+    return [folder / "targets.csv", *written]
