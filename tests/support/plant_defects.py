@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from heliotrope.calibration.learn.own_model import OwnModel
+from heliotrope.calibration.record import HeliostatCalibration
+from heliotrope.calibration.sightings import join
 from heliotrope.links.messages import Stage
 from heliotrope.plant import authority, field_state
 from heliotrope.plant.audit import AuditError
@@ -17,6 +20,7 @@ from heliotrope.plant.operations.automatic import AutomaticControl
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.parameters import ParameterSync
 from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.photographs import Centred, seen
 from heliotrope.plant.visits.verification import Verification
 from heliotrope.safety import JoinLimiter
@@ -140,6 +144,37 @@ def any_light(patch: pytest.MonkeyPatch) -> None:
         return "no light on the target" if dark else ""
 
     patch.setattr(Centred, "_astray", own)
+
+
+def surer_than_it_is(patch: pytest.MonkeyPatch) -> None:
+    """A calibration states a tenth of its true deviations."""
+    before = HeliostatCalibration.__post_init__
+
+    def sure(self: Any) -> None:
+        object.__setattr__(self, "covariance", 0.01 * np.asarray(self.covariance))
+        before(self)
+
+    patch.setattr(HeliostatCalibration, "__post_init__", sure)
+
+
+def counted_often(patch: pytest.MonkeyPatch) -> None:
+    """Every sighting is counted ten times in the fit."""
+    fit = OwnModel.fit
+
+    def repeated(self: Any, nominal: Any, sightings: Any) -> Any:
+        return fit(self, nominal, join([sightings] * 10))
+
+    patch.setattr(OwnModel, "fit", repeated)
+
+
+def sun_of_later(patch: pytest.MonkeyPatch) -> None:
+    """A sighting is given the sun of half a minute after its photograph."""
+    sighting = CalibrationCycle._sighting
+
+    def late(self: Any, shot: Any, counts: Any) -> Any:
+        return sighting(self, replace(shot, at=shot.at + 30.0), counts)
+
+    patch.setattr(CalibrationCycle, "_sighting", late)
 
 
 def evening_skipped(patch: pytest.MonkeyPatch) -> None:

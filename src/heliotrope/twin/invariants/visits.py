@@ -1,7 +1,8 @@
 """The observer of visits: what photographs have taught the plant, beside the true mirrors.
 
 It judges two things that the plant keeps: a calibration, by which the mirror's true beam must go
-where it is aimed (12), and a sighting, which must show the mirror's own beam (16).
+where it is aimed, and miss it by no more than the calibration's own covariance says (12), and a
+sighting, which must show the mirror's own beam (16).
 """
 
 from collections import Counter
@@ -9,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, reflect
@@ -23,6 +25,10 @@ from heliotrope.twin.invariants.invariants import InvariantError, Violation
 #: A sighting this far from the beam's true place is not of that beam, m: the noise of centroids,
 #: play of the gears and counts that are interpolated stay below it.
 FOREIGN = 1.0
+#: A calibration misses by at most this many of its own standard deviations, in the direction of the
+#: miss; and what its covariance need not hold, rad of beam in each direction: single steps, and
+#: step counts that are interpolated to the moment of a photograph.
+DEVIATIONS, FLOOR = 4.0, 1e-4
 
 
 class VisitObserver:
@@ -54,6 +60,7 @@ class VisitObserver:
         self._boards, self._targets = {b.outfit.name: b for b in boards}, tuple(targets)
         self._judged: dict[str, object] = {}
         self._kept: dict[str, int] = {}
+        self._slipped: set[str] = set()  # sightings from before tell nothing of now
 
     def _check(self, number: int, good: bool, now: float, subject: str, saw: str) -> None:
         self.checks[number] += 1
@@ -70,10 +77,12 @@ class VisitObserver:
         if plant is None:
             return
         for name, board in self._boards.items():
+            if any(board.slip):
+                self._slipped.add(name)
             record = plant.beliefs.record(name)
             if record is not None and self._judged.get(name) is not record:
                 self._judged[name] = record
-                self._believed(board, plant.beliefs.present(name)[0], sun, now)
+                self._believed(board, record, plant.beliefs.nominal(name)[0], sun, now)
             seen = plant.beliefs.seen(name)
             known = self._kept.get(name, 0)
             if seen is not None and len(seen.sightings) > known:
@@ -83,19 +92,38 @@ class VisitObserver:
                         board, seen.sightings.take(np.arange(known, len(seen.sightings))), now
                     )
 
-    def _believed(self, board: Board, believed: Mechanism, sun: FloatArray, now: float) -> None:
+    def _believed(
+        self,
+        board: Board,
+        record: HeliostatCalibration,
+        nominal: Mechanism,
+        sun: FloatArray,
+        now: float,
+    ) -> None:
         """Check where the true beam goes if the mirror is aimed by what the plant believes."""
         truth, slip = board.outfit.mechanism, np.asarray(board.slip, dtype=np.float64)
+        believed, name = record.mechanism(nominal), board.outfit.name
         here = [axis.turned for axis in board.axes] - slip
         for point in (RECEIVER, *(target.center for target in self._targets)):
-            found = track(believed, sun, np.asarray(point), current=here)
+            aim = np.asarray(point, dtype=np.float64)
+            found = track(believed, sun, aim, current=here)
             counts = found.best_counts
             if not np.isfinite(counts).all():
                 continue
             pose = truth.pose(counts + slip)
-            miss = _passes(pose.vertex, reflect(sun, pose.normal), np.asarray(point))
+            ray = reflect(sun, pose.normal)
+            miss = _passes(pose.vertex, ray, aim)
             saw = f"by the calibration that the plant believes its beam is {miss:.1f} m astray"
-            self._check(12, miss <= ASTRAY, now, board.outfit.name, saw)
+            self._check(12, miss <= ASTRAY, now, name, saw)
+            if name in self._slipped or not self._followed:
+                continue
+            across = _across(aim - pose.vertex)
+            slope = _slope(record, nominal, counts, sun) @ across.T
+            spread = slope.T @ record.covariance @ slope + FLOOR**2 * np.eye(2)
+            off = across @ ray
+            deviations = float(np.sqrt(off @ np.linalg.solve(spread, off)))
+            saw = f"its calibration misses by {deviations:.1f} of its own standard deviations"
+            self._check(12, deviations <= DEVIATIONS, now, name, saw)
 
     def _own(self, board: Board, sightings: Sightings, now: float) -> None:
         """Check that sightings show the beam of the mirror itself."""
@@ -105,6 +133,29 @@ class VisitObserver:
             miss = _passes(vertex, ray, seen)
             saw = f"a sighting that the plant keeps is {miss:.1f} m from its true beam"
             self._check(16, miss <= FOREIGN, now, board.outfit.name, saw)
+
+
+def _across(way: FloatArray) -> FloatArray:
+    """Return unit vectors to the right of and above a direction (3,), (2, 3)."""
+    right = np.cross(way, (0.0, 0.0, 1.0))
+    above = np.cross(right, way)
+    return np.stack([right / np.linalg.norm(right), above / np.linalg.norm(above)])
+
+
+def _slope(
+    record: HeliostatCalibration, nominal: Mechanism, counts: FloatArray, sun: FloatArray
+) -> FloatArray:
+    """Return by how much the beam turns with each parameter of a calibration, (P, 3)."""
+    found = []
+    for name, value, sigma in zip(record.names, record.values, record.sigma, strict=True):
+        step = max(1e-3 * float(sigma), 1e-9)
+        one, two = (
+            nominal.with_parameters({**record.parameters, name: float(value) + way * step})
+            for way in (-1.0, 1.0)
+        )
+        turned = reflect(sun, two.pose(counts).normal) - reflect(sun, one.pose(counts).normal)
+        found.append(turned / (2.0 * step))
+    return np.array(found)
 
 
 def _passes(vertex: FloatArray, ray: FloatArray, point: FloatArray) -> float:

@@ -1,4 +1,8 @@
-"""The camera of the world "visits": true centroids with noise, and photographs that lie."""
+"""The camera of the world "visits": true centroids with noise, and photographs that lie.
+
+A beam wavers by as much as the settings of a visit say, so that the covariance of a calibration,
+which stands on them, is the true one, and `VisitObserver` can judge it.
+"""
 
 import random
 from dataclasses import dataclass, replace
@@ -12,6 +16,8 @@ from heliotrope.twin.cameras import ExactCamera, FieldSnapshot
 
 #: What a photograph may show instead of the heliostat's beam.
 LIES = ("still", "passing", "before")
+#: Variance of a centroid in the plane of the target, m².
+_CENTROID = 1e-4
 #: Photographs in turn that show the same lie.
 _RUNS = (1, 3, 4, 6, 12)
 #: Greatest speed of another mirror's spot that crosses a target, m/s.
@@ -40,6 +46,8 @@ class LyingCamera:
         Seed of noise and lies.
     share
         Share of the photographs with which lies begin.
+    waver
+        Standard deviation of a beam in each direction, beside that of its centroid, rad.
 
     Attributes
     ----------
@@ -47,9 +55,10 @@ class LyingCamera:
         Number of photographs of each kind that lied.
     """
 
-    def __init__(self, sight: FieldSnapshot, seed: int, share: float) -> None:
-        self._true = ExactCamera(sight, 1e-4, seed)
-        self._sight, self._share = sight, share
+    def __init__(self, sight: FieldSnapshot, seed: int, share: float, waver: float) -> None:
+        self._true = ExactCamera(sight, _CENTROID, seed)
+        self._sight, self._share, self._waver = sight, share, waver
+        self._wind = np.random.default_rng([seed, 1])
         self._chance = random.Random(f"camera {seed}")
         self._lie: dict[str, _Lie] = {}
         self._last: dict[str, Shot] = {}
@@ -57,7 +66,7 @@ class LyingCamera:
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
         """Return what a photograph shows: the heliostat's beam, or something else."""
-        true = await self._true.photograph(target, heliostat)
+        true = self._wavered(target, await self._true.photograph(target, heliostat), heliostat)
         lie = self._lie.get(target.name)
         if lie is None and self._chance.random() < self._share:
             lie = self._begun(target, true.at)
@@ -72,6 +81,15 @@ class LyingCamera:
         shown = self._shown(target, true, before, lie)
         self._last[target.name] = shown
         return shown
+
+    def _wavered(self, target: Target, shot: Shot, heliostat: str) -> Shot:
+        """Return a photograph of the beam turned by the wind."""
+        mirror = next(each for each in self._sight.mirrors() if each.heliostat == heliostat)
+        slant = float(np.linalg.norm(target.center - mirror.vertex))
+        return replace(
+            shot,
+            point=shot.point + (slant * self._waver * self._wind.standard_normal(2)) @ target.axes,
+        )
 
     def _begun(self, target: Target, now: float) -> _Lie:
         chance = self._chance
@@ -91,4 +109,4 @@ class LyingCamera:
             return replace(before, at=true.at)
         self.lies[lie.kind] += 1
         place = lie.place + (true.at - lie.since) * lie.speed
-        return Shot(np.asarray(target.point(place)), true.at, 1e-4)
+        return Shot(np.asarray(target.point(place)), true.at, _CENTROID)

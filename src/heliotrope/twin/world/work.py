@@ -85,7 +85,7 @@ class Work:
 
     def __init__(self, seed: int, sight: FieldSnapshot, exits: contextlib.ExitStack) -> None:
         self.centred = random.Random(f"visits {seed}").random() < 0.5
-        self.camera = LyingCamera(sight, seed, LIES)
+        self.camera = LyingCamera(sight, seed, LIES, VISIT.sigma)
         self._clock = sight.clock
         folder = exits.enter_context(tempfile.TemporaryDirectory())
         self._records = Keeper(Path(folder) / "records.sqlite", inline=True)
