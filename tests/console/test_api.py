@@ -37,7 +37,8 @@ NEEDED = {
     **{("GET", path): "viewer" for path in (
         "alarms", "authority", "calibration", "clusters", "commands", "commands/{identity}",
         "emergency", "events", "field", "flights", "heliostats/{name}", "holds", "packets",
-        "receivers/{name}/flux", "schedule", "session", "summary", "sun", "targets/{name}",
+        "heliostats/{name}/parameters", "receivers/{name}/flux", "schedule", "session", "summary",
+        "sun", "targets/{name}",
         "targets/{name}/photograph", "tokens", "photographs", "photographs/{identity}")},
     ("POST", "emergency"): "viewer",
     ("DELETE", "session"): "viewer",
@@ -56,6 +57,7 @@ NEEDED = {
     ("DELETE", "accounts/{name}/factor"): "engineer",
     ("POST", "accounts/{name}/password"): "engineer",
     ("POST", "flights"): "engineer",
+    ("POST", "parameters"): "engineer",
     ("POST", "clusters/{name}/frames"): "engineer",
     ("GET", "accounts"): "engineer",
     ("POST", "accounts"): "engineer",

@@ -32,6 +32,8 @@ class Provenance(StrEnum):
     CAMERA = "camera"
     DRONE = "drone"
     TABLE = "table"
+    #: Without sightings: a person has set the values.
+    PERSON = "person"
 
 
 class CalibrationOutcome(StrEnum):

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
-from urllib.parse import unquote
+from urllib.parse import parse_qsl, unquote
 
 from heliotrope.errors import InputError
 from heliotrope.local import EMERGENCY, ORDINARY, ask_once, socket_folder
@@ -35,13 +35,21 @@ _CALLS = {
     ("DELETE", "authority"): "release_authority",
     ("POST", "alarms/acknowledge"): "acknowledge",
     ("PUT", "calibration"): "switch_calibration",
+    ("POST", "calibration/next"): "calibrate",
     ("POST", "flights"): "take_flight",
     ("POST", "holds"): "hold",
     ("POST", "holds/release"): "unhold",
+    ("POST", "parameters"): "set_parameters",
     ("POST", "automatic/resume"): "resume",
 }
-#: Calls about one thing, by the beginning of the path.
-_NAMED = {"heliostats": "heliostat", "commands": "one_command"}
+#: Calls about one thing, by the method, the beginning and the end of the path.
+_NAMED = (
+    ("GET", "heliostats/", "/parameters", "parameters"),
+    ("GET", "heliostats/", "", "heliostat"),
+    ("GET", "commands/", "", "one_command"),
+    ("POST", "clusters/", "/frames", "bus_frames"),
+    ("POST", "targets/", "/photograph", "take_photograph"),
+)
 
 
 class AtPlant:
@@ -78,13 +86,10 @@ class AtPlant:
             If the plant refuses it, or cannot be reached.
         """
         given, blob = dict(body or {}), b""
-        kind, _, name = path.partition("/")
         call = _CALLS.get((method, path))
-        if call is None and method == "GET" and name and kind in _NAMED:
-            call, given = _NAMED[kind], {"name": unquote(name)}
-        if call is None and method == "POST" and kind == "clusters" and name.endswith("/frames"):
-            call, given = "bus_frames", {"name": unquote(name.removesuffix("/frames"))}
         if call is None:
+            call, given = _named(method, path, given)
+        if not call:
             raise InputError(f"ctl: {path} is only known to the console; leave out --data")
         if call == "command" and given["command"] in ("STOW", "DEFOCUS"):
             call, given = given["command"].lower(), {"heliostats": given["heliostats"]}
@@ -107,3 +112,19 @@ class AtPlant:
         """Give a command; return its progress."""
         order = {"command": name, "heliostats": list(heliostats), "values": list(values)}
         return self.ask("POST", "commands", order)
+
+
+def _named(method: str, path: str, given: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Return the call about one thing, or about kept photographs, and its arguments."""
+    place, _, query = path.partition("?")
+    if (method, place) == ("GET", "photographs"):
+        asked = dict(parse_qsl(query))
+        return "kept_photographs", {
+            "heliostat": asked.get("heliostat", ""),
+            "limit": int(asked.get("limit", "50")),
+        }
+    for way, head, tail, call in _NAMED:
+        name = path.removeprefix(head).removesuffix(tail)
+        if way == method and path == f"{head}{name}{tail}" and name:
+            return call, {"name": unquote(name)}
+    return "", given

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from heliotrope.cli._common import parse_point, print_json, print_table
-from heliotrope.errors import InputError
+from heliotrope.errors import InputError, UnknownNameError
 
 if TYPE_CHECKING:
     from heliotrope.cli._at_plant import AtPlant
@@ -362,6 +362,88 @@ def calibrate(
         order = {"heliostat": heliostat, "target": target}
         found = client.ask("POST", "calibration/next", order)
     print(f"asked for: {', '.join(found['asked'])}")
+
+
+@app.command("parameters")
+def error_parameters(
+    context: typer.Context,
+    heliostat: Annotated[str, typer.Argument(help="Heliostat.")],
+    values: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[NAME=VALUE]…", help="New values; none: show them.", show_default=False
+        ),
+    ] = None,
+    reason: Annotated[str, typer.Option(help="Reason, kept with the values.")] = "",
+    version: Annotated[int, typer.Option(help="Bring back this earlier version.")] = 0,
+    wait: Wait = 60.0,
+    as_json: Json = False,
+) -> None:
+    """Show or set the error parameters of a heliostat at stow, locked or at rest.
+
+    Angles are in mrad and lengths in mm; NAME_deg=VALUE is in degrees.
+    """
+    from urllib.parse import quote
+
+    order = {"heliostat": heliostat, "reason": reason, "version": version}
+    with _client(context) as client:
+        if not values and not version:
+            found = client.get(f"heliostats/{quote(heliostat, safe='')}/parameters")
+            _show_parameters(found, as_json)
+            return
+        if not reason.strip():
+            raise InputError("ctl: give the reason for other parameters with --reason")
+        units = {}
+        if values:
+            found = client.get(f"heliostats/{quote(heliostat, safe='')}/parameters")
+            units = {one["name"]: one["unit"] for one in found["parameters"]}
+        order["values"] = dict(_parameter(text, units) for text in values or ())
+        client.ask("POST", "authority")
+        try:
+            _follow(client, client.ask("POST", "parameters", order), wait)
+        finally:
+            client.ask("DELETE", "authority")
+
+
+#: Units on the screen: name, and its size in the unit of the API.
+_SHOWN = {"rad": ("mrad", 1e-3), "m": ("mm", 1e-3), "1": ("", 1.0)}
+
+
+def _parameter(text: str, units: dict[str, str]) -> tuple[str, float]:
+    """Return name and value of NAME=VALUE, in the unit of the API."""
+    given, _, number = text.partition("=")
+    name = given
+    for ending in ("_mrad", "_mm", "_deg"):
+        name = name.removesuffix(ending)
+    if name not in units:
+        raise UnknownNameError("parameter", name, units)
+    size = 0.017453292519943295 if given.endswith("_deg") else _SHOWN[units[name]][1]
+    try:
+        return name, float(number) * size
+    except ValueError:
+        shown = _SHOWN[units[name]][0]
+        raise InputError(f"{text!r}: give NAME=VALUE with a number, {shown}") from None
+
+
+def _show_parameters(found: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print_json(found)
+        return
+    rows = []
+    for one in found["parameters"]:
+        unit, size = _SHOWN[one["unit"]]
+        values = (one["file"], one["value"], one["sigma"], one["prior"])
+        shown = ("" if v is None else f"{v / size:.3f}" for v in values)
+        rows.append((one["name"], *shown, unit))
+    head = ("parameter", "plant file", "in use", "σ", "σ installed", "unit")
+    print_table(head, rows, f"{found['heliostat']}, version {found['version']}")
+    print(f"stored by its local controller: {found['stored']}")
+    lines = [
+        (str(e["version"]), _utc(e["at"]), e["person"], str(e["sightings"]), e["note"])
+        for e in found["earlier"]
+    ]
+    if lines:
+        print_table(("earlier version", "time", "person", "sightings", "note"), lines)
 
 
 @app.command()

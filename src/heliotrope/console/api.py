@@ -145,6 +145,15 @@ async def target(console: Here, who: Anyone, name: Named) -> JSONResponse:
     return answer(await console.plant.ask("target", name=name))
 
 
+@router.get(
+    "/heliostats/{name}/parameters", response_model=models.ParametersView, tags=["calibration"]
+)
+async def parameters(console: Here, who: Anyone, name: Named) -> JSONResponse:
+    """Return the error parameters of a heliostat: in use, stored by it, and earlier versions."""
+    del who
+    return answer(await console.plant.ask("parameters", name=name))
+
+
 @router.get("/photographs", response_model=models.many(models.PictureRow), tags=["calibration"])
 async def kept(
     console: Here,

@@ -158,6 +158,15 @@ async def calibrate(console: Here, who: Operator, order: orders.OneCalibration) 
     return answer(await console.plant.ask("calibrate", who.person, **order.model_dump()))
 
 
+@router.post("/parameters", response_model=models.TicketState, tags=["calibration"])
+async def set_parameters(
+    console: Here, who: Engineer, order: orders.ParameterOrder
+) -> models.TicketState:
+    """Set error parameters of a heliostat at rest, or bring back an earlier version."""
+    found = await console.plant.ask("set_parameters", who.person, **order.model_dump())
+    return models.TicketState(**found)
+
+
 @router.post(
     "/targets/{name}/photograph", response_model=models.CameraReading, tags=["calibration"]
 )

@@ -664,6 +664,7 @@ class PlantController:
         heliostat: str,
         items: Mapping[str, bytes],
         confirmed: str = "",
+        record: HeliostatCalibration | None = None,
     ) -> Ticket:
         """Push items of the journal (see `board_items`) to one heliostat, and keep them wanted.
 
@@ -679,6 +680,9 @@ class PlantController:
             Name, and bytes by item.
         confirmed
             Why a change above the limit of the settings is right; the audit keeps it.
+        record
+            The calibration that the items come from, believed from the moment that they are sent;
+            None: it is taken later.
 
         Raises
         ------
@@ -707,6 +711,8 @@ class PlantController:
             self.wanted.set(heliostat, items)
             self._use(row, *self._tables(heliostat, items)[1])
             self._joining.drop("its parameters are being written", frozenset([heliostat]))
+            if record is not None:
+                self.beliefs.take(record)
 
         self._sync.push(ticket, heliostat, items, token, use)
         return ticket

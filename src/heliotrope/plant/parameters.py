@@ -236,7 +236,8 @@ class ParameterSync:
                 self.compare(name)
         live = self._field.live(now)
         for name, due in self._due.items():
-            if now >= due and live[self._field.index[name]]:
+            # One that is being written is compared when its ticket has ended.
+            if now >= due and live[self._field.index[name]] and name not in self._tickets:
                 self._due[name] = now + AGAIN
                 self._ask(name)
         if token and allowed:

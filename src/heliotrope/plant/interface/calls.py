@@ -157,6 +157,9 @@ _VIEWS = {
     "one_command": Call(Role.VIEWER, orders.Named, lambda d, _, a, __: d.tickets.get(a.name)),
     "target": Call(Role.VIEWER, orders.Named, _target),
     "photograph": Call(Role.VIEWER, orders.Picture, _photograph),
+    "parameters": Call(
+        Role.VIEWER, orders.Named, lambda _d, _who, given, _b: given.name, Desk.parameters
+    ),
     "kept_photographs": Call(
         Role.VIEWER, orders.KeptOf, lambda _d, _who, given, _b: given, Desk.kept
     ),
@@ -215,6 +218,9 @@ _ORDERS = {
     "resume": Call(Role.OPERATOR, orders.Nothing, lambda d, who, *_: d.operations.resume(who)),
     "switch_calibration": Call(Role.OPERATOR, orders.Switch, _switch),
     "calibrate": Call(Role.OPERATOR, orders.OneCalibration, _calibrate),
+    "set_parameters": Call(
+        Role.ENGINEER, orders.ParameterOrder, lambda _d, _who, given, _b: given, Desk.set_parameters
+    ),
     "take_photograph": Call(
         Role.OPERATOR, orders.Named, lambda _d, _who, given, _b: given.name, Desk.photographed
     ),

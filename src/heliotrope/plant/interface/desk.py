@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from heliotrope.errors import UnknownNameError
+from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.volumes import outline
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
@@ -20,6 +20,7 @@ from heliotrope.plant.interface import orders
 from heliotrope.plant.interface.tickets import Tickets, state_of
 from heliotrope.plant.operations import bus_frames
 from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.operations.typed_parameters import ParametersView
 from heliotrope.plant.operations.views import BusFrame, CameraView, FlightView, PictureRow
 from heliotrope.plant.orders import RECORDING
 from heliotrope.plant.tickets import Ticket
@@ -152,6 +153,21 @@ class Desk:
         self.tickets.put(ticket)
         await ticket.written(RECORDING + 1.0)
         return state_of(ticket)
+
+    async def parameters(self, _: Person, heliostat: str) -> ParametersView:
+        """Return the error parameters of a heliostat, with what its local controller stores."""
+        return await self.operations.parameters.view(heliostat)
+
+    async def set_parameters(self, who: Person, given: orders.ParameterOrder) -> dict[str, Any]:
+        """Set error parameters of a heliostat, or bring back an earlier version."""
+        here, token = self.operations.parameters, self.token_of(who)
+        if bool(given.values) == bool(given.version):
+            raise InputError("parameters: give either values or a version")
+        if given.version:
+            ticket = await here.restore(who, token, given.heliostat, given.version, given.reason)
+        else:
+            ticket = here.change(who, token, given.heliostat, given.values, given.reason)
+        return await self.recorded(who, ticket)
 
     async def bus_frames(self, person: Person, cluster: str) -> tuple[BusFrame, ...]:
         """Record the frames of a cluster's bus for five seconds."""

@@ -93,6 +93,15 @@ class OneCalibration(Strict):
     target: Annotated[str, Field(max_length=64)] = ""
 
 
+class ParameterOrder(Strict):
+    """New error parameters of a heliostat by name, rad, m or 1, or an earlier version, and why."""
+
+    heliostat: Name
+    values: Annotated[dict[Name, Number], Field(max_length=40)] = {}
+    version: Annotated[int, Field(ge=0, le=2**31)] = 0
+    reason: Annotated[Words, Field(min_length=1)]
+
+
 class KeptOf(Strict):
     """The newest kept photographs of a heliostat ("": those that persons asked for)."""
 

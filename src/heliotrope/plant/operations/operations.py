@@ -35,6 +35,7 @@ from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.security import SecurityLog
+from heliotrope.plant.operations.typed_parameters import TypedParameters
 from heliotrope.plant.operations.viewing import Viewer
 from heliotrope.plant.operations.views import (
     AlarmRow,
@@ -116,7 +117,7 @@ class Operations:
 
     Attributes
     ----------
-    plant, logbook, automatic, security, pictures
+    plant, logbook, automatic, security, pictures, parameters
         See their classes.
     """
 
@@ -148,6 +149,7 @@ class Operations:
         )
         self.security = SecurityLog(logbook, plant.clock)
         self._viewer = Viewer(plant, self.automatic)
+        self.parameters = TypedParameters(plant, logbook, records)
         self._flux: dict[str, _Cached] = {}
         self._closing = asyncio.Event()
 

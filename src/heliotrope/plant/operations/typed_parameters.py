@@ -1,0 +1,249 @@
+"""Error parameters that a person sets where a calibration cannot: shown, set, brought back.
+
+They become a version of the heliostat's calibration without sightings, and are written by the way
+that calibrations take: at rest, where old and new beams are free, compared afterwards. The next fit
+replaces them. Earlier versions come from the store.
+"""
+
+import asyncio
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from heliotrope.calibration.record import HeliostatCalibration, Provenance
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.mechanism.board_items import differing, items_of
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.visits.settings import CycleSettings
+from heliotrope.store.records import Records
+
+#: Wait for the answer of a local controller, s.
+_PATIENCE = 5.0
+
+
+@dataclass(frozen=True)
+class ParameterState:
+    """A parameter: deviation from the nominal mechanism, in the plant file and in use, and σ."""
+
+    name: str
+    unit: str
+    file: float
+    value: float
+    sigma: float
+    prior: float
+
+
+@dataclass(frozen=True)
+class EarlierParameters:
+    """A version of a heliostat's parameters: POSIX s, person, note, sightings, values by name."""
+
+    version: int
+    at: float
+    person: str
+    note: str
+    sightings: int
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class ParametersView:
+    """The parameters of a heliostat.
+
+    Attributes
+    ----------
+    heliostat, version
+        Name, and the version in use; 0 before the first.
+    stored
+        Whether the local controller stores what is in use, in words.
+    parameters
+        Each one.
+    earlier
+        Versions before the one in use, newest first.
+    """
+
+    heliostat: str
+    version: int
+    stored: str
+    parameters: tuple[ParameterState, ...]
+    earlier: tuple[EarlierParameters, ...]
+
+
+class TypedParameters:
+    """Parameters of heliostats, for people.
+
+    Parameters
+    ----------
+    plant, log
+        The controller, and the logbook for events.
+    records
+        The store with the earlier versions; None: there are none.
+    most
+        Largest deviation that may be set, in standard deviations of the prior.
+    """
+
+    def __init__(
+        self,
+        plant: PlantController,
+        log: Logbook,
+        records: Records | None,
+        most: float = CycleSettings().most,
+    ) -> None:
+        self._plant, self._log, self._records, self._most = plant, log, records, most
+
+    # -- looking ---------------------------------------------------------------------------
+
+    async def view(self, heliostat: str) -> ParametersView:
+        """Return the parameters of a heliostat, and what its local controller stores."""
+        record, group = self._plant.beliefs.record(heliostat), self._plant.design.find(heliostat)[0]
+        stored = await self._stored(heliostat)
+        now = self._now(heliostat)
+        in_file = self._file(heliostat)
+        states = []
+        for name in group.mechanism.parameters:
+            known, sigma = group.mechanism.parameter(name), float("nan")
+            if record is not None and name in record.names:
+                sigma = float(record.sigma[record.names.index(name)])
+            value, file = now.get(name, 0.0), in_file.get(name, 0.0)
+            states.append(ParameterState(name, known.unit, file, value, sigma, known.prior))
+        version = 0 if record is None else record.version
+        earlier = [
+            EarlierParameters(
+                one.version, one.at, one.person, one.note, len(one.sightings), one.parameters
+            )
+            for one in await self._history(heliostat)
+            if one.version != version
+        ]
+        return ParametersView(heliostat, version, stored, tuple(states), tuple(earlier[::-1]))
+
+    async def _stored(self, heliostat: str) -> str:
+        try:
+            sums = await self._plant.stored(heliostat, _PATIENCE)
+        except RefusedError as error:
+            return f"unknown: {error}"
+        other = differing(items_of(self._plant.beliefs.present(heliostat)[0]), sums)
+        return f"others: {', '.join(other)}" if other else "the same"
+
+    async def _history(self, heliostat: str) -> list[HeliostatCalibration]:
+        if self._records is None:
+            return []
+        return await asyncio.to_thread(self._records.calibration_history, heliostat)
+
+    def _file(self, heliostat: str) -> dict[str, float]:
+        group, row = self._plant.design.find(heliostat)
+        return {name: float(values[row]) for name, values in group.parameters.items()}
+
+    def _now(self, heliostat: str) -> dict[str, float]:
+        record = self._plant.beliefs.record(heliostat)
+        return self._file(heliostat) if record is None else record.parameters
+
+    # -- setting ---------------------------------------------------------------------------
+
+    def change(
+        self,
+        person: Person,
+        token: int,
+        heliostat: str,
+        values: Mapping[str, float],
+        reason: str,
+    ) -> Ticket:
+        """Set parameters of one heliostat that stands where they may be written.
+
+        Parameters
+        ----------
+        person, token
+            An engineer, with the token of the command authority.
+        heliostat, values
+            Name, and the new values by parameter, rad, m or 1; the others stay.
+        reason
+            Kept with the version and in the audit.
+
+        Raises
+        ------
+        RefusedError
+            If it is not accepted.
+        InputError
+            Values that are not credible, no reason, or nothing that changes.
+        UnknownNameError
+            If there is no such heliostat or parameter.
+        """
+        mechanism = self._plant.beliefs.nominal(heliostat)
+        for name, value in values.items():
+            if name not in mechanism.parameters:
+                raise UnknownNameError(f"parameter of {heliostat}", name, mechanism.parameters)
+            prior = mechanism.parameter(name).prior
+            if not abs(value) <= self._most * prior:
+                raise InputError(
+                    f"{heliostat}: {name} {value:g} is beyond {self._most:g} standard deviations "
+                    f"of an installation ({prior:g} {mechanism.parameter(name).unit}); check the "
+                    "unit and the installation"
+                )
+        last = self._plant.beliefs.record(heliostat)
+        record = self._typed(heliostat, mechanism, {**self._now(heliostat), **values}, values)
+        shown = ", ".join(f"{name} {value:g}" for name, value in values.items())
+        model = "" if last is None else last.model
+        record = replace(record, model=model, note=reason.strip())
+        return self._write(person, token, record, reason, shown)
+
+    async def restore(
+        self, person: Person, token: int, heliostat: str, version: int, reason: str
+    ) -> Ticket:
+        """Bring back an earlier version of a heliostat's parameters; see `change`."""
+        self._plant.field.place(heliostat)
+        known = {one.version: one for one in await self._history(heliostat)}
+        if version not in known:
+            raise UnknownNameError(f"version of {heliostat}", str(version), map(str, known))
+        note = f"version {version} again: {reason.strip()}"
+        record = replace(known[version], note=note, pushed=())
+        return self._write(person, token, record, reason, f"version {version} again")
+
+    def _typed(
+        self,
+        heliostat: str,
+        mechanism: Mechanism,
+        values: Mapping[str, float],
+        typed: Collection[str],
+    ) -> HeliostatCalibration:
+        """Return a record of values; those typed are as uncertain as those of an installation."""
+        last, names = self._plant.beliefs.record(heliostat), tuple(values)
+        prior = np.array([mechanism.parameter(name).prior for name in names])
+        covariance = np.diag(prior**2)
+        if last is not None:
+            kept = [name for name in last.names if name not in typed]
+            to = np.array([names.index(name) for name in kept], dtype=np.intp)
+            at = np.array([last.names.index(name) for name in kept], dtype=np.intp)
+            covariance[np.ix_(to, to)] = last.covariance[np.ix_(at, at)]
+        numbers = np.array([values[name] for name in names])
+        return HeliostatCalibration(
+            heliostat, 0.0, names, numbers, covariance, prior, provenance=Provenance.PERSON
+        )
+
+    def _write(
+        self, person: Person, token: int, given: HeliostatCalibration, reason: str, shown: str
+    ) -> Ticket:
+        plant, name = self._plant, given.heliostat
+        if not reason.strip():
+            raise InputError(f"{name}: give the reason for other parameters; the audit keeps it")
+        last = plant.beliefs.record(name)
+        new = given.mechanism(plant.beliefs.nominal(name))[0]
+        before, items = items_of(plant.beliefs.present(name)[0]), items_of(new)
+        changed = tuple(item for item, data in items.items() if before[item] != data)
+        if not changed:
+            raise InputError(f"{name}: it has these parameters already; nothing was changed")
+        record = replace(
+            given,
+            at=plant.clock.utc().timestamp(),
+            person=person.name,
+            pushed=changed,
+            version=1 if last is None else last.version + 1,
+        )
+        chosen = {item: items[item] for item in changed}
+        ticket = plant.parameters(
+            person, token, name, chosen, confirmed=reason.strip(), record=record
+        )
+        self._log.event("command", person.name, f"PARAMETERS {name}: {shown} ({reason.strip()})")
+        return ticket

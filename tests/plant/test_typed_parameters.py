@@ -1,0 +1,165 @@
+"""Error parameters that a person sets: proved, kept as a version, and brought back."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from heliotrope.calibration.record import HeliostatCalibration, Provenance
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.example import example_plant
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.messages import Parameters
+from heliotrope.mechanism.board_items import Wanted, items_of
+from heliotrope.plant.audit import read
+from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.operations.typed_parameters import TypedParameters
+from support.plant_bench import ENGINEER, OPERATOR, Bench, running
+
+NAME = "P1A"
+Scene = Callable[[Bench, int, TypedParameters], Awaitable[None]]
+
+
+class Kept:
+    """A store that keeps all versions, and a logbook."""
+
+    def __init__(self) -> None:
+        self.versions: list[HeliostatCalibration] = []
+        self.told: list[str] = []
+
+    def calibration_history(self, heliostat: str) -> list[HeliostatCalibration]:
+        return [one for one in self.versions if one.heliostat == heliostat]
+
+    def event(self, kind: str, who: str, text: str) -> None:
+        self.told.append(text)
+
+
+@pytest.fixture(autouse=True)
+def _no_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def at_once(work: Callable[..., Any], *given: Any) -> Any:
+        return work(*given)
+
+    monkeypatch.setattr(asyncio, "to_thread", at_once)  # virtual time has no threads
+
+
+def play(folder: Path, scene: Scene, state: int = states.STOWED) -> tuple[Bench, Kept]:
+    made: list[Bench] = []
+    kept = Kept()
+
+    async def main(clock: VirtualClock) -> None:
+        items = items_of(example_plant()[NAME].calibrated)
+        bench = Bench(clock, folder, wanted=Wanted({NAME: items}))
+        made.append(bench)
+        cluster = bench.cluster_of(NAME)
+        cluster.stored[NAME].update(items)
+        async with running(bench):
+            token = await bench.commanded(ENGINEER)
+            bench.plant.beliefs.subscribe(kept.versions.append)
+            cluster.set(state, NAME)
+            await bench.wait(3.0)
+            await scene(bench, token, TypedParameters(bench.plant, kept, kept))
+
+    run_virtual(main)
+    return made[0], kept
+
+
+def test_what_is_set_is_stored_believed_and_kept_with_its_reason(tmp_path: Path) -> None:
+    async def scene(bench: Bench, token: int, typed: TypedParameters) -> None:
+        ticket = typed.change(ENGINEER, token, NAME, {"tilt_east": 0.004}, "levelled on 3 March")
+        assert await ticket.end(20.0), ticket.text
+        wanted = items_of(example_plant()[NAME].calibrated.with_parameters({"tilt_east": 0.004}))
+        assert bench.cluster_of(NAME).stored[NAME] == wanted
+        record = bench.plant.beliefs.record(NAME)
+        assert record is not None
+        assert (record.version, record.person, record.note) == (
+            1,
+            ENGINEER.name,
+            "levelled on 3 March",
+        )
+        assert record.provenance is Provenance.PERSON
+        view = await typed.view(NAME)
+        assert (view.version, view.stored) == (1, "the same")
+        (tilt,) = (one for one in view.parameters if one.name == "tilt_east")
+        assert (tilt.file, tilt.value) == (0.0, 0.004)
+        assert tilt.sigma == pytest.approx(tilt.prior)
+
+    bench, kept = play(tmp_path, scene)
+    notes = [record.note for record in read(bench.audit.path)[0] if record.what == "PARAMETERS"]
+    assert notes[-1].endswith("; confirmed: levelled on 3 March")
+    assert kept.told == [f"PARAMETERS {NAME}: tilt_east 0.004 (levelled on 3 March)"]
+
+
+def test_an_earlier_version_is_listed_and_brought_back(tmp_path: Path) -> None:
+    async def scene(bench: Bench, token: int, typed: TypedParameters) -> None:
+        for value, why in ((0.004, "first"), (0.001, "second")):
+            ticket = typed.change(ENGINEER, token, NAME, {"tilt_east": value}, why)
+            assert await ticket.end(20.0), ticket.text
+            bench.plant.authority.keep(ENGINEER, token)
+        (earlier,) = (await typed.view(NAME)).earlier
+        assert (earlier.version, earlier.note, earlier.values["tilt_east"]) == (1, "first", 0.004)
+        ticket = await typed.restore(ENGINEER, token, NAME, 1, "the level was wrong")
+        assert await ticket.end(20.0), ticket.text
+        record = bench.plant.beliefs.record(NAME)
+        assert record is not None
+        assert (record.version, record.parameters) == (3, {"tilt_east": 0.004})
+        assert record.note == "version 1 again: the level was wrong"
+        with pytest.raises(UnknownNameError, match="version of P1A '9'"):
+            await typed.restore(ENGINEER, token, NAME, 9, "why not")
+
+    play(tmp_path, scene)
+
+
+def test_values_that_were_measured_keep_their_uncertainty(tmp_path: Path) -> None:
+    async def scene(bench: Bench, token: int, typed: TypedParameters) -> None:
+        covariance = np.array([[4e-8, 1e-8], [1e-8, 9e-8]])
+        record = HeliostatCalibration(
+            NAME, 1.0, ("tilt_north", "tilt_east"), np.array([1e-3, 2e-3]), covariance, np.ones(2),
+            version=7,
+        )  # fmt: skip
+        bench.plant.beliefs.take(record)
+        bench.cluster_of(NAME).stored[NAME].update(bench.plant.wanted.items[NAME])
+        await bench.plant.stored(NAME)
+        bench.plant.authority.keep(ENGINEER, token)
+        typed.change(ENGINEER, token, NAME, {"tilt_east": 3e-3}, "levelled")
+        await bench.wait(5.0)
+        found = bench.plant.beliefs.record(NAME)
+        assert found is not None
+        assert (found.version, found.parameters) == (8, {"tilt_north": 1e-3, "tilt_east": 3e-3})
+        prior = bench.plant.beliefs.nominal(NAME).parameter("tilt_east").prior
+        assert found.covariance == pytest.approx(np.diag([4e-8, prior**2]))
+
+    play(tmp_path, scene)
+
+
+@pytest.mark.parametrize("state", [states.TRACKING, states.IDLE])
+def test_nothing_is_set_while_the_beam_is_out(tmp_path: Path, state: int) -> None:
+    async def scene(bench: Bench, token: int, typed: TypedParameters) -> None:
+        with pytest.raises(RefusedError, match="stow it first"):
+            typed.change(ENGINEER, token, NAME, {"tilt_east": 0.004}, "levelled")
+        assert bench.plant.beliefs.record(NAME) is None
+        assert not bench.cluster_of(NAME).of(Parameters)
+
+    _, kept = play(tmp_path, scene, state)
+    assert kept.told == []
+
+
+def test_who_may_and_what_is_credible(tmp_path: Path) -> None:
+    async def scene(bench: Bench, token: int, typed: TypedParameters) -> None:
+        for values, reason, error, text in (
+            ({"tilt_east": 1.5}, "units", InputError, "beyond 6 standard deviations"),
+            ({"tilt_east": float("nan")}, "units", InputError, "beyond 6 standard deviations"),
+            ({"tilt_east": 0.004}, " ", InputError, "give the reason"),
+            ({"tilt_east": 0.0}, "again", InputError, "has these parameters already"),
+            ({"tilt_est": 0.004}, "typo", UnknownNameError, "did you mean tilt_east"),
+        ):
+            with pytest.raises(error, match=text):
+                typed.change(ENGINEER, token, NAME, values, reason)
+        with pytest.raises(RefusedError, match="engineer"):
+            typed.change(OPERATOR, token, NAME, {"tilt_east": 0.004}, "levelled")
+        assert not bench.cluster_of(NAME).of(Parameters)
+
+    play(tmp_path, scene)
