@@ -31,6 +31,7 @@ class LiveOptions:
     installed: Callable[[Mechanism], Mechanism] | None = None
     boards: bool = False
     centroid: float = 1e-5
+    bus_key: bytes = b""
     cycle: CycleSettings = CYCLE
     work: AutomaticSettings = field(default_factory=lambda: AutomaticSettings(wanted=True))
     plant: PlantSettings = field(default_factory=PlantSettings)
@@ -38,7 +39,13 @@ class LiveOptions:
     def world(self) -> WorldOptions:
         """Return the options of the world."""
         return WorldOptions(
-            self.seed, self.rendered, self.threads, self.installed, self.boards, self.centroid
+            self.seed,
+            self.rendered,
+            self.threads,
+            self.installed,
+            self.boards,
+            self.centroid,
+            self.bus_key,
         )
 
     def settings(self) -> AssemblySettings:

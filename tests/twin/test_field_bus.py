@@ -1,6 +1,8 @@
 """A real cluster whose heliostats are rows of a vectorised field."""
 
 import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable
 
 import numpy as np
 import pytest
@@ -8,10 +10,11 @@ import pytest
 from heliotrope.cluster.config import ClusterConfig, Member
 from heliotrope.cluster.controller import Cluster
 from heliotrope.errors import InputError
-from heliotrope.lcu import states, wire
+from heliotrope.lcu import journal, messages, names, states, wire
 from heliotrope.lcu.sender import Sender
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.in_process import memory_pair
+from heliotrope.links.keys import KeyRing
 from heliotrope.links.link import LinkClosedError, SendOutcome, running
 from heliotrope.links.messages import Command, Emergency, Lease, Stage, decode, encode
 from heliotrope.mechanism import kinds
@@ -20,6 +23,7 @@ from heliotrope.twin.boards.clocks import SimulatedTime
 from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STEPS_PER_TURN, STOW
 from heliotrope.twin.field.field import Field
 from heliotrope.twin.field.field_bus import FieldBus, _stuffed, _unstuffed
+from support.lcu_machines import sha256
 from support.midsummer import SITE
 
 TOKEN = 77
@@ -84,6 +88,126 @@ def test_a_cluster_leads_rows_of_a_field() -> None:
     assert {m.identity for m in done} >= {"a", "b", "c", "d"}  # type: ignore[attr-defined]
     assert ("DEFOCUS", range(1, 4)) in told
     assert ("AIM", range(2, 3)) in told
+
+
+OWN = [bytes([k]) * 32 for k in range(4)]
+BUS_KEY, REFUSED_KEY = b"the bus's key...", messages.REFUSED_KEY
+
+
+@contextlib.asynccontextmanager
+async def signed(
+    field: Field, clock: VirtualClock, ring: KeyRing | None
+) -> AsyncIterator[tuple[FieldBus, Cluster, Callable[[float], Awaitable[None]]]]:
+    """Run a cluster that signs the bus of a field whose local controllers have gates."""
+    plant, mine, _ = memory_pair(clock)
+    bus = FieldBus(field, range(4), keys=OWN)
+    members = tuple(Member(f"H{n}", n + 1, n + 1, OWN[n]) for n in range(4))
+    config = ClusterConfig("C", SITE, members)
+    cluster = Cluster(config, bus, mine, clock, SimulatedTime(clock), bus_keys=ring)
+
+    async def live(seconds: float) -> None:
+        for tick in range(round(20 * seconds)):
+            if tick % 20 == 0:
+                await plant.send(encode(Lease(TOKEN)), expires=clock.monotonic() + 1.0)
+            await asyncio.sleep(0.05)
+            field.advance(50)
+
+    async with running(plant, mine, bus), running(cluster):
+        yield bus, cluster, live
+
+
+def flags(bus: FieldBus) -> list[set[str]]:
+    """Flags that the local controllers tell."""
+    told = [int.from_bytes(each[1:5], "little") for each in bus._statuses()]
+    return [{name for k, name in enumerate(names.FLAGS) if word >> k & 1} for word in told]
+
+
+async def result(bus: FieldBus, frame: bytes) -> int:
+    """Send a frame to one local controller; return the result in its answer."""
+    (answer,) = wire.Reader().feed(await bus.transact(frame, 0.1))
+    values = answer.values()
+    assert answer.name == "ACK"
+    assert values is not None
+    return int(values[2])
+
+
+def test_a_field_takes_the_key_of_its_bus_and_obeys_its_cluster_only() -> None:
+    field = a_field()
+
+    async def main(clock: VirtualClock) -> None:
+        async with signed(field, clock, KeyRing(BUS_KEY)) as (bus, cluster, live):
+            await live(12)
+            assert all({"BUS_KEY", "SUN_FRESH"} <= each for each in flags(bus))
+            assert all("SESSION_WANTED" not in each for each in flags(bus))
+            stored = {field.journals.items(row)["bus_keys"] for row in range(4)}
+            assert stored == {BUS_KEY + bytes(16)}  # what came over the wire was encrypted
+            # A stranger who knows epoch, count, token and time, but no key.
+            own = cluster._exchange.sender
+            stranger = Sender(wire.CLUSTER_ADDRESS, own.epoch, sha256)
+            stranger.count = own.count + 5
+            expires = int(cluster._broadcast.bus_time() or 0) + 9
+            token = cluster._exchange.token(TOKEN)
+            for name in ("LOCK", "IDLE", "APPROACH"):
+                assert await result(bus, stranger.frame(1, name, token, expires)) == REFUSED_KEY
+            lease = field.leases(np.arange(4)).tolist()
+            await bus.transmit(stranger.frame(wire.BROADCAST, "SUN", 1, 0, 0, 1 << 30, 0, 0, 0))
+            assert field.leases(np.arange(4)).tolist() == lease
+            assert set(field.state.tolist()) == {states.STOWED}
+            number = 1 + [row[0] for row in journal.ITEMS].index("bus_keys")
+            data = await bus.transact(stranger.frame(1, "QUERY_STORED", number), 0.1)
+            assert wire.Reader().feed(data)[0].payload == bytes([number])
+            # One whose supply was cut forgets the session, and is given one over its own number.
+            field.cut(np.array([2]))
+            await live(3)
+            field.restore(np.array([2]))
+            await bus.transact(stranger.frame(3, "QUERY_STATUS"), 0.1)  # it starts with that
+            assert {"BUS_KEY", "SESSION_WANTED"} <= flags(bus)[2]
+            await live(8)
+            assert {"BUS_KEY", "SUN_FRESH"} <= flags(bus)[2]
+            assert set(field.state.tolist()) == {states.STOWED}
+            await bus.transmit(stranger.frame(wire.BROADCAST, "DEFOCUS"))
+            assert await result(bus, stranger.frame(1, "STOW")) == messages.DONE
+
+    run_virtual(main)
+
+
+def test_the_same_stranger_locks_a_field_whose_bus_is_not_signed() -> None:
+    field = a_field()
+
+    async def main(clock: VirtualClock) -> None:
+        async with signed(field, clock, None) as (bus, cluster, live):
+            await live(5)
+            own = cluster._exchange.sender
+            stranger = Sender(wire.CLUSTER_ADDRESS, own.epoch, sha256)
+            stranger.count = own.count + 5
+            expires = int(cluster._broadcast.bus_time() or 0) + 9
+            token = cluster._exchange.token(TOKEN)
+            for word, until, wanted in (
+                (token, expires - 30, messages.EXPIRED),
+                (token + 1, expires, messages.REFUSED_AUTHORITY),
+                (token, expires, messages.DONE),
+            ):
+                assert await result(bus, stranger.frame(1, "LOCK", word, until)) == wanted
+            old = Sender(wire.CLUSTER_ADDRESS, own.epoch, sha256)
+            repeated = old.frame(1, "UNLOCK", token, expires)
+            assert await result(bus, repeated) == messages.DUPLICATE
+            assert field.state.tolist() == [states.LOCKED] + 3 * [states.STOWED]
+
+    run_virtual(main)
+
+
+def test_a_field_without_gates_takes_signed_frames_as_its_boards_would() -> None:
+    field = a_field()
+    bus = FieldBus(field, range(4))
+    sender = Sender(0, 1)
+    sender.sign = lambda data: bytes(8)
+
+    async def main(clock: VirtualClock) -> None:
+        del clock
+        await bus.transmit(sender.frame(wire.BROADCAST, "SUN", 1, 0, 0, 1 << 30, 0, 0, 0))
+        assert (field.leases(np.arange(4)) > 0).all()
+
+    run_virtual(main)
 
 
 def test_answers_are_frames_of_the_wire() -> None:

@@ -216,11 +216,16 @@ PHOTOGRAPHS = 1 + CYCLE.shots + 1
 #: A visit in the twin, s: a photograph every 5 s, and twice the way to the target and back, because
 #: the new parameters are written between the last photograph of the fit and the confirming one.
 VISIT = 5.0 * PHOTOGRAPHS + 2 * 12.0
+#: Key of the bus where it is signed.
+BUS_KEY = b"the bus's key..."
 #: Time in which the field goes from stow to standby, s.
 RAISED = 35.0
 
 
-def test_a_small_plant_raises_itself_learns_and_is_stowed() -> None:
+@pytest.mark.parametrize("key", [b"", BUS_KEY], ids=["open-bus", "signed-bus"])
+def test_a_small_plant_raises_itself_learns_and_is_stowed(key: bytes) -> None:
+    """With a key of the bus the gates of the firmware judge every order and every new parameter."""
+
     async def work(plant: LivePlant) -> None:
         before = plant.errors()
         # Two targets serve three heliostats: on each, three visits one after another.
@@ -238,8 +243,12 @@ def test_a_small_plant_raises_itself_learns_and_is_stowed() -> None:
         assert view.quality[-1].calibrated == 3
         assert await plant.stowed()
         assert plant.operations.summary().states == {"STOWED": 3}
+        kept = [plant.field.journals.items(row).get("bus_keys", b"")[:16] for row in range(3)]
+        assert kept == [key] * 3
+        # Mirrors that rose before they had the key are named until they stand again.
+        assert not [r for r in plant.operations.alarms() if "bus" in r.condition and r.active]
 
-    live(work, lay_out("radial", 3))
+    live(work, lay_out("radial", 3), replace(EXACT, bus_key=key))
 
 
 def test_step_counts_that_come_seldom_are_not_taken_for_new(
@@ -411,11 +420,16 @@ def test_what_a_live_plant_refuses() -> None:
     run_virtual(main)
 
 
-@pytest.mark.parametrize("boards", [False, True], ids=["field", "boards"])
-def test_an_emergency_of_the_twin_is_proven_with_its_flux(boards: bool) -> None:
+@pytest.mark.parametrize(
+    ("boards", "key"),
+    [(False, b""), (True, b""), (True, BUS_KEY)],
+    ids=["field", "boards", "boards-signed"],
+)
+def test_an_emergency_of_the_twin_is_proven_with_its_flux(boards: bool, key: bytes) -> None:
     """No false alarm of flux; a mirror that stays on the receiver is a true one."""
     two = lay_out("radial", 2)
-    idle = replace(EXACT, boards=boards, work=AutomaticSettings(wanted=True, calibrate=False))
+    quiet = AutomaticSettings(wanted=True, calibrate=False)
+    idle = replace(EXACT, boards=boards, bus_key=key, work=quiet)
 
     async def work(live: LivePlant) -> None:
         plant, sensor = live.plant, live.world.flux

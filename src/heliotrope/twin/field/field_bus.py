@@ -1,26 +1,29 @@
 """A bus whose stations are rows of a vectorised field: frames in, frames out, in microseconds.
 
 One `FieldBus` is one cluster's bus. It answers QUERY_STATUS and QUERY_STEPS, takes SUN, and passes
-commands on to the `Field`. It has no noise and no gate; boards (`twin.boards`) on a `TwinBus` have
-both, and all other messages.
+commands on to the `Field`. It has no noise, and gates only where it is given the keys of its local
+controllers (`Gates`); boards (`twin.boards`) on a `TwinBus` have both, and all other messages.
 """
 
 import asyncio
 import struct
 from binascii import crc32
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.lcu import journal, messages, states, wire
 from heliotrope.links.link import LinkClosedError, SendOutcome
 from heliotrope.twin.field.field import LEASE_MS, Field
+from heliotrope.twin.field.gates import Gates, stored
 
 _HEADER = struct.Struct(wire.HEADER)
 _SUN, _AIM = struct.Struct("<Iiiihhh"), struct.Struct("<fff")
 _ACK = struct.Struct("<" + messages.codes_of(messages.NUMBER_OF["ACK"]))
+_BUS = struct.Struct("<" + messages.codes_of(messages.NUMBER_OF["BUS"]))
 _STEPS = struct.Struct("<" + messages.codes_of(messages.NUMBER_OF["STEPS"]))
 _NUMBERS = messages.NUMBER_OF
 #: `messages.name_of` searches a text, as suits a microcontroller.
@@ -36,7 +39,6 @@ _NEVER = 0xFFFFFFFF
 #: Size of a keyed message's head, and the place of the edition in it.
 _KEY_HEAD = struct.calcsize("<" + messages.HEADS[messages.KEY][0])
 _EDITION = slice(_KEY_HEAD - 4, _KEY_HEAD)
-_ITEMS = tuple(row[0] for row in journal.ITEMS)
 #: Messages of calibration with the states that accept them, and the states that accept the others.
 _TAKES_ALL = (states.LOCKED, states.FAULT)
 _TAKES_POSE = (*_TAKES_ALL, states.STOWED)
@@ -47,6 +49,12 @@ _TAKES = {
     "SET_POSITION": _TAKES_HARMLESS,
     "SET_DEFOCUS": _TAKES_HARMLESS,
 }
+#: Messages that need no gate: from anybody, and questions.
+_OPEN = frozenset(
+    name
+    for number, name in _NAMES.items()
+    if name != "QUERY_BUS" and messages.who_of(number) in (messages.ANYONE, messages.ASK)
+)
 #: Commands that the field knows.
 KNOWN = frozenset(
     {
@@ -75,6 +83,9 @@ class FieldBus:
         Indices of this cluster's heliostats in the field; their addresses are 1, 2, and so on.
     took
         Called with the name and the rows of each command; None: not called.
+    keys
+        Key of each local controller, in the same order: each then has a gate, and takes a key of
+        the bus. Without them every whole frame is obeyed, signed or not.
 
     Attributes
     ----------
@@ -84,7 +95,7 @@ class FieldBus:
     Raises
     ------
     InputError
-        Rows outside the field, or none.
+        Rows outside the field, or none; keys for another number of heliostats.
     """
 
     def __init__(
@@ -92,14 +103,18 @@ class FieldBus:
         field: Field,
         rows: range,
         took: "Callable[[str, range], None] | None" = None,
+        keys: Sequence[bytes] = (),
     ) -> None:
         if not rows or not 0 <= min(rows) <= max(rows) < len(field):
             raise InputError(f"field bus: rows {rows} are not within 0 to {len(field) - 1}")
+        if keys and len(keys) != len(rows):
+            raise InputError(f"field bus: {len(keys)} keys for {len(rows)} heliostats")
         self.plugged = True
         self._field = field
         self._rows = rows
         self._all = np.array(rows)
         self._took = took
+        self._gates = Gates(field, rows, keys) if keys else None
         self._closing = asyncio.Event()
         #: Payloads of every STATUS, and the edition of the field that they are valid for.
         self._told: list[bytes] = []
@@ -158,10 +173,16 @@ class FieldBus:
         raw = _unstuffed(data)
         if len(raw) < wire.HEADER_SIZE + wire.CRC_SIZE:
             return b""
-        _, to, _, sequence, number = _HEADER.unpack_from(raw)
+        version, to, _, sequence, number = _HEADER.unpack_from(raw)
         name = _NAMES.get(number, "")
+        if self._gates is not None and self._gates.look():
+            self._edition = -1
+        if self._gates is not None and name not in _OPEN:
+            return self._judged(self._gates, data)
+        end = wire.CRC_SIZE + (wire.MAC_SIZE if version == wire.SIGNED else 0)
+        payload = raw[wire.HEADER_SIZE : -end]
         if to == wire.BROADCAST:
-            self._broadcast(name, raw[wire.HEADER_SIZE : -wire.CRC_SIZE])
+            self._broadcast(name, payload, self._all)
             return b""
         place = to - 1
         if not 0 <= place < len(self._rows):
@@ -173,16 +194,44 @@ class FieldBus:
             axes = self._field.axes[row]
             counts = _STEPS.pack(*axes["count"].tolist(), *axes["goal"].tolist())
             return self._answer(place, sequence, "STEPS", counts)
-        return self._command(name, number, raw[wire.HEADER_SIZE : -wire.CRC_SIZE], place, sequence)
+        return self._command(name, number, payload, place, sequence)
 
-    def _broadcast(self, name: str, payload: bytes) -> None:
+    def _judged(self, gates: Gates, data: bytes) -> bytes:
+        """Pass a frame on to those whose gates let it through, and answer as they do."""
+        frame = next(iter(wire.Reader().feed(data)), None)
+        if frame is None:
+            return b""
+        name, number, sequence = frame.name, frame.number, frame.sequence
+        self._edition = -1  # what the flags tell may change
+        if frame.to == wire.BROADCAST:
+            good = [gates.judge(frame, k) == messages.DONE for k in range(len(self._rows))]
+            if any(good):
+                self._broadcast(name, frame.payload, self._all[good])
+            return b""
+        place = frame.to - 1
+        if not 0 <= place < len(self._rows):
+            return b""
+        if name == "QUERY_BUS":
+            return self._answer(place, sequence, "BUS", _BUS.pack(*gates.told(place)))
+        if name == "SET_BUS_KEY":
+            result = gates.take_key(frame, place)
+        else:
+            result = gates.judge(frame, place)
+            if result == messages.DONE and name != "SESSION":
+                mac = frame.mac if messages.who_of(number) == messages.KEY else b""
+                return self._command(name, number, frame.payload + mac, place, sequence)
+        if name == "SESSION":
+            return b""
+        return self._answer(place, sequence, "ACK", _ACK.pack(sequence, number, result))
+
+    def _broadcast(self, name: str, payload: bytes, rows: "npt.NDArray[np.intp]") -> None:
         if name == "SUN":
-            self._field.take_sun(_SUN.unpack(payload), self._all)
+            self._field.take_sun(_SUN.unpack(payload), rows)
         elif name in ("DEFOCUS", "STOW"):
             self._field.order(name, self._all)
             self._tell(name, self._rows)
         else:
-            self._field.hear(self._all)
+            self._field.hear(rows)
 
     def _tell(self, name: str, rows: range) -> None:
         if self._took is not None:
@@ -204,6 +253,9 @@ class FieldBus:
             made["f2"] = field.fault[self._all]
             made["f4"] = np.where(fresh, LEASE_MS - left, _NEVER)
             made["f5"], made["f6"], made["f8"] = 24_000, 25, 1
+            if self._gates is not None:
+                made["f1"] += self._gates.flags()
+                made["f8"] = self._gates.boots
             made["f7"] = field.journals.checksums[self._all]
             data, size = made.tobytes(), made.itemsize
             self._told = [data[i : i + size] for i in range(0, len(data), size)]
@@ -224,7 +276,8 @@ class FieldBus:
     def _command(self, name: str, number: int, payload: bytes, place: int, sequence: int) -> bytes:
         result, row = messages.REFUSED_STATE, self._rows[place]
         if name == "QUERY_STORED":
-            return self._answer(place, sequence, "STORED", payload[:1] + self._stored(row, payload))
+            found = stored(self._field, row, payload[0])
+            return self._answer(place, sequence, "STORED", payload[:1] + found)
         if name == "STANDBY" or messages.who_of(number) == messages.KEY:
             result = self._store(name, number, payload, row)
         elif name in KNOWN:
@@ -235,12 +288,6 @@ class FieldBus:
                 result = messages.DONE
             self._tell(name, range(row, row + 1))
         return self._answer(place, sequence, "ACK", _ACK.pack(sequence, number, result))
-
-    def _stored(self, row: int, payload: bytes) -> bytes:
-        place = payload[0] - 1
-        if not 0 <= place < len(_ITEMS):
-            return b""
-        return self._field.journals.items(row).get(_ITEMS[place], b"")
 
     def _store(self, name: str, number: int, payload: bytes, row: int) -> int:
         if name == "STANDBY":

@@ -28,6 +28,7 @@ from heliotrope.files.disk import Disk
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.links.clock import Clock
+from heliotrope.links.keys import KeyRing
 from heliotrope.links.link import Bus, running
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.armature import Armature
@@ -86,6 +87,9 @@ class WorldOptions:
         Whether each heliostat is a firmware-true board; for small plants.
     centroid
         Variance of centroids that are not photographed, m².
+    bus_key
+        Key with which the frames of every bus are signed; b"": none is, and a field of arrays
+        obeys every frame.
     """
 
     seed: int = 0
@@ -94,6 +98,7 @@ class WorldOptions:
     installed: Callable[[Mechanism], Mechanism] | None = None
     boards: bool = False
     centroid: float = 1e-5
+    bus_key: bytes = b""
 
     def __post_init__(self) -> None:
         if self.threads < 0 or not self.centroid >= 0.0:
@@ -184,10 +189,12 @@ class World:
             )
         span = range(rows[0], rows[0] + len(rows))
         near, far = near_pair(self.clock, ("plant", name))
+        key = self.options.bus_key
+        own = [key_of(self.names[row]) for row in span] if key else ()
         bus: Bus = (
             self.field.bus(span)
             if isinstance(self.field, BoardField)
-            else FieldBus(self.field, span)
+            else FieldBus(self.field, span, keys=own)
         )
         members = tuple(
             Member(self.names[row], i + 1, 1 + row, key_of(self.names[row]))
@@ -196,7 +203,8 @@ class World:
         every = 1 if len(self.names) <= _SMALL else _STEPS_EVERY
         config = ClusterConfig(name, self.design.site, members, steps_every=every, phase=phase)
         time = SystemTime(self.clock)
-        self._clusters.append(Cluster(config, bus, far, self.clock, time))
+        ring = KeyRing(key) if key else None
+        self._clusters.append(Cluster(config, bus, far, self.clock, time, bus_keys=ring))
         self._parts += [near, far, bus, time]
         self.links[name], self.buses[name] = near, bus
 
