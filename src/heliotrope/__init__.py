@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from heliotrope import geometry as geometry
     from heliotrope import optics as optics
+    from heliotrope import plot as plot
     from heliotrope import sun as sun
     from heliotrope.calibration import (
         Learned,
@@ -106,6 +107,7 @@ _MODULES = {
     "geometry": "heliotrope.geometry",
     "kinds": "heliotrope.mechanism.kinds",
     "optics": "heliotrope.optics",
+    "plot": "heliotrope.plot",
     "sun": "heliotrope.sun",
 }
 
@@ -135,6 +137,7 @@ __all__ = [
     "learn",
     "open",
     "optics",
+    "plot",
     "predict",
     "predict_flux",
     "prototype",
