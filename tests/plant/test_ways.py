@@ -5,6 +5,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,7 @@ from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.mechanism.tracking import track
 from heliotrope.optics import MirrorOptics, beams, find_entries
+from heliotrope.plant import joining
 from heliotrope.plant.aims import BeamCheck, _disc
 from heliotrope.plant.assigned import rest_on
 from heliotrope.plant.authority import RefusedError
@@ -597,6 +599,47 @@ def test_an_approach_is_refused_by_name_and_the_others_go(tmp_path: Path) -> Non
         plant.beams.volumes = ()
         for name in texts:
             plant.command(OPERATOR, token, "APPROACH", (name,))
+
+    play(tmp_path, scene)
+
+
+def test_an_approach_of_many_is_proven_and_sent_in_slices(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The proof of a whole field would hold up leases; a DEFOCUS ends what has not gone yet."""
+    monkeypatch.setattr(joining, "SLICE", 2)
+    proven: list[int] = []
+    prove = Ways.approach
+
+    def counted(self: Ways, rows: npt.NDArray[np.intp], *given: Any) -> dict[str, str]:
+        proven.append(len(rows))
+        return prove(self, rows, *given)
+
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        token = await bench.commanded()
+        rest_on(plant.standbys, (4.0, 0.0, 14.0))
+        blocked = plant.command(OPERATOR, token, "APPROACH", plant.field.names[:2]).blocked
+        monkeypatch.setattr(Ways, "approach", counted)
+        ticket = plant.command(OPERATOR, token, "APPROACH")
+        assert not proven
+        count = len(plant.field)
+        await bench.until(lambda: sum(proven) == count, 60.0)
+        assert max(proven) == 2
+        assert blocked.items() <= ticket.blocked.items()
+        assert 0 < len(ticket.blocked) < count
+        sent = {
+            n for c in bench.clusters.values() for m in c.commands("APPROACH") for n in m.heliostats
+        }
+        assert sent == set(plant.field.names) - ticket.blocked.keys() | (
+            set(plant.field.names[:2]) - blocked.keys()
+        )
+        ticket = plant.command(OPERATOR, token, "APPROACH")
+        plant.defocus(OPERATOR.name)
+        before = len(proven)
+        await bench.wait(2.0)
+        assert len(proven) == before
+        assert all("DEFOCUS" in text for text in ticket.refusals.values())
 
     play(tmp_path, scene)
 

@@ -55,7 +55,7 @@ from heliotrope.plant.doubts import Doubts
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.identity import Identities
-from heliotrope.plant.joining import JoinDispatcher, JoiningJob, JoinQueue
+from heliotrope.plant.joining import JoinDispatcher, JoiningJob, JoinQueue, in_slices
 from heliotrope.plant.lockouts import Lockout, locked_out
 from heliotrope.plant.orders import PlantOrders, whole
 from heliotrope.plant.parameters import ParameterSync, Tables, change_of_beam
@@ -197,7 +197,9 @@ class PlantController:
         )
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
         life, barred = self.settings.join_life, self.doubts.barred
-        self._joiner = JoinDispatcher(self._joining, self._orders, self._ways, life, barred)
+        self._joiner = JoinDispatcher(
+            self._joining, self._orders, self._ways, life, barred, self._examine
+        )
         self._sync = ParameterSync(
             self.field,
             self.wanted,
@@ -572,7 +574,8 @@ class PlantController:
                 # One that was given before it may have joined the queue after its acceptance.
                 self._joining.drop(f"superseded by {name}", frozenset(left))
         if left:
-            send = self._join if name in JOINING else self._orders.command
+            waits = name in JOINING or in_slices(name, left)
+            send = self._join if waits else self._orders.command
             send(ticket, name, numbers, left, token)
 
     def _examine(
@@ -586,6 +589,8 @@ class PlantController:
             If none may.
         """
         able, wrong = self._able(name, names)
+        if in_slices(name, able):
+            return able, wrong  # each slice is examined when its turn comes
         clear, blocked = self._ways.clear(name, numbers, able, self.now())
         return clear, wrong | blocked
 
