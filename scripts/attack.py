@@ -122,7 +122,9 @@ def plant(folder: Path, descriptors: int | None) -> Iterator[Target]:
     try:
         password = _password(process, log, folder / "data" / "first-password")
         viewer, operator = _tokens(port, password)
-        yield Target(port, urgent, viewer, operator, folder / "data", process, log, gauges)
+        cluster = int(gauges.with_name(f"{gauges.name}.port").read_text("ascii"))
+        data = folder / "data"
+        yield Target(port, urgent, cluster, viewer, operator, data, process, log, gauges)
     finally:
         process.send_signal(signal.SIGINT)
         time.sleep(1.0)

@@ -10,6 +10,7 @@ import socket
 import struct
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,10 +29,14 @@ FLOOD = b'{"name":[' + b",".join([_NESTED] * (16_000_000 // len(_NESTED))) + b"]
 
 @dataclass
 class Place:
-    """The plant under attack: its ports, tokens of a viewer and of an operator, its folder."""
+    """The plant under attack: its ports, tokens of a viewer and of an operator, its folder.
+
+    ``cluster`` is the port for clusters.
+    """
 
     port: int
     urgent: int
+    cluster: int
     token: str
     operator: str
     data: Path
@@ -358,6 +363,27 @@ def large_orders(place: Place, over: threading.Event) -> None:
     )
 
 
+# -- the port for clusters -----------------------------------------------------------------------
+
+
+def cluster_strangers(place: Place, over: threading.Event) -> None:
+    """Half handshakes, TLS where none is expected, empty frames, noise, huge frames, silence."""
+    half, noise = (100).to_bytes(4, "big") + bytes(40), bytes(range(256)) * 40
+    texts = (b"", half, b"\x16\x03\x01\x02" + bytes(500), bytes(200_000), noise, b"\xff" * 8)
+    held: deque[socket.socket] = deque()
+    with contextlib.ExitStack() as stack:
+        for text in itertools.cycle(texts):
+            with contextlib.suppress(OSError):
+                line = socket.create_connection(("127.0.0.1", place.cluster), timeout=1.0)
+                stack.callback(line.close)
+                held.append(line)
+                line.sendall(text)
+            if len(held) > 200:
+                held.popleft().close()
+            if over.wait(0.001):
+                return
+
+
 # -- programs on the plant's machine -------------------------------------------------------------
 
 
@@ -468,7 +494,7 @@ ATTACKS: dict[str, Attack] = {
         churn, resets, unread, pipelining, header_bombs, long_paths, unknown_paths, methods,
         not_http, foreign_hosts, foreign_sockets, stranger_streams, wrong_passwords, many_names,
         wrong_tokens, wrong_cookies, viewer_reads, viewer_orders, viewer_streams, operator_orders,
-        operator_stows, large_orders, local_strangers, local_idle, local_frames, local_blobs,
-        local_unread, local_orders,
+        operator_stows, large_orders, cluster_strangers, local_strangers, local_idle, local_frames,
+        local_blobs, local_unread, local_orders,
     )
 }  # fmt: skip

@@ -3,9 +3,11 @@
 Each 50 ms a line is added to the file: the time, the longest wait of the plant's loop since the
 line before, the longest time since a cluster's last lease, and the time since which every one of
 the ``COUNT`` simulated local controllers has heard DEFOCUS; POSIX s and s. Where ``FILE.withdraw``
-appears, the emergency is withdrawn, past all interfaces, and the file removed.
+appears, the emergency is withdrawn, past all interfaces, and the file removed. A simulated plant
+has no port for clusters: one is opened in its loop, and its number written to ``FILE.port``.
 """
 
+import asyncio
 import contextlib
 import sys
 import threading
@@ -19,6 +21,8 @@ import numpy as np
 
 from heliotrope.cli import main
 from heliotrope.errors import HeliotropeError
+from heliotrope.links.clock import SystemClock
+from heliotrope.links.tcp import TcpServer
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.clusters import ClusterEnd
 from heliotrope.plant.interface import PlantInterface
@@ -39,6 +43,20 @@ class Gauges:
         self._gap = 0.0
         self.loop: PacedLoop | None = None
         self.operations: Operations | None = None
+        self._listens: asyncio.Task[None] | None = None
+
+    async def listen(self) -> None:
+        """Open a port for clusters in the plant's loop, and keep it."""
+        server = TcpServer("127.0.0.1", 0, {"gauges": bytes(32)}, SystemClock())
+        async with asyncio.TaskGroup() as group:
+            group.create_task(server.run())
+            await server.listening()
+            file = self._file.with_name(f"{self._file.name}.port")
+            file.write_text(str(server.port), encoding="ascii")
+
+    def start(self) -> None:
+        """Begin `listen`, once the plant's loop runs."""
+        self._listens = asyncio.get_running_loop().create_task(self.listen())
 
     def lease(self, cluster: str) -> None:
         """Note a lease for a cluster."""
@@ -104,6 +122,7 @@ def attach(gauges: Gauges) -> None:
     def made(self: PacedLoop, *given: Any, **named: Any) -> None:
         make(self, *given, **named)
         gauges.loop = self
+        self.call_soon(gauges.start)
 
     def served(self: PlantInterface, operations: Operations, *given: Any) -> None:
         serve(self, operations, *given)

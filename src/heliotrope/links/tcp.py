@@ -51,6 +51,8 @@ class _Pipe(asyncio.Protocol):
 
     def __init__(self, largest: int, arrived: "Callable[[_Pipe], None] | None" = None) -> None:
         self.largest = largest
+        #: Whether it is a client that has not proved its identity; see `trust`.
+        self._stranger = arrived is not None
         self.address = ""
         self._arrived = arrived
         self._transport: asyncio.Transport | None = None
@@ -106,11 +108,19 @@ class _Pipe(asyncio.Protocol):
                 break
             self._frames.append(bytes(self._buffer[_LENGTH : _LENGTH + size]))
             del self._buffer[: _LENGTH + size]
+            if self._stranger and self._buffer:
+                # Cutting 200 kB into empty frames held the plant's loop for 0.1 s.
+                self.lose("received more than one frame before its proof was answered")
+                return
         if self._frames:
             self._readable.set()
         if len(self._frames) > _WAITING and not self._paused and self._transport is not None:
             self._paused = True
             self._transport.pause_reading()
+
+    def trust(self, largest: int) -> None:
+        """Take any number of frames up to a size from now on."""
+        self._stranger, self.largest = False, largest
 
     def pause_writing(self) -> None:
         """Pause writing: the transport's buffer is full."""
@@ -218,7 +228,7 @@ async def _greet(pipe: _Pipe, rings: Mapping[str, KeyRing], largest: int) -> tup
             break
     else:
         raise LinkError(f"{name!r} could not prove that it is a cluster of this plant")
-    pipe.largest = largest
+    pipe.trust(largest)
     pipe.write(_proof(key, b"server", server, client, title))
     return name, _derived(ring, server, client, title)
 
