@@ -3,10 +3,12 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from heliotrope.airborne.evaluate import projection, reading
+from heliotrope.airborne.evaluate.detection import Overlap, find_spots
 from heliotrope.airborne.evaluate.identification import rotation_angle
 from heliotrope.airborne.photo import LedCamera, Photo, read_photos, rotation_of_gimbal
 from heliotrope.airborne.simulate.rendered import Compared, fly_rendered, paper_field, paper_flight
@@ -128,3 +130,46 @@ def test_rows_without_an_end_are_ambiguous() -> None:
     found = projection.overlay(picture, camera, photo, rest)
     assert found.reason == ""
     assert rotation_angle(found.rotation, photo.rotation) < 1.0 * MRAD
+
+
+def light_of(
+    corners: list[tuple[np.ndarray, float]], spots: list[tuple[float, float]]
+) -> np.ndarray:
+    """Return a picture of squares (corners, light) over dark ground, with spots of the lamp."""
+    scale, size = 8, 110
+    fine = np.full((size * scale, size * scale), 0.13)
+    for outline, light in corners:
+        places = np.round((outline + 0.5) * scale - 0.5).astype(np.int32)
+        cv2.fillConvexPoly(fine, places, light)
+    image = fine.reshape(size, scale, size, scale).mean(axis=(1, 3))
+    y, x = np.mgrid[:size, :size]
+    for a, b in spots:
+        image += 0.9 * np.exp(-0.5 * ((x - a) ** 2 + (y - b) ** 2) / 0.3)
+    image = cv2.GaussianBlur(image, (0, 0), 0.8)
+    image += np.random.default_rng(5).normal(0.0, 0.004, image.shape)
+    share = np.clip(image, 0.0, 1.0)
+    curve = np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1 / 2.4) - 0.055)
+    return np.repeat(np.round(255.0 * curve).astype(np.uint8)[..., None], 3, axis=2)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.8, 1.6])
+@pytest.mark.parametrize("beside", [0.5, 0.56, 0.7])
+def test_light_of_a_mirror_beside_is_no_spot(off: float, beside: float) -> None:
+    """A corner between dark ground and a mirror behind; survey and kinematics leave it ``off``."""
+    square = np.array([[0.0, 0.0], [44.0, 0.0], [44.0, 40.0], [0.0, 40.0]])
+    front, behind = square + [8.0, 12.0], square + [50.0, 47.0]
+    known = front + [off, off]
+    labels = draw_labels(np.stack([known, behind]), np.array([10.0, 20.0]), (110, 110))
+
+    def found(spots: list[tuple[float, float]]) -> np.ndarray:
+        picture = light_of([(behind, beside), (front, 0.5)], spots)
+        seen, reasons = find_spots(picture, known[None], shown=Overlap(labels, np.array([1])))
+        assert reasons == ("",)
+        return seen.pixel
+
+    assert len(found([])) == 0
+    # The lamp is found all the same, 4 px from that corner too; near an edge its light is cut.
+    for place, error in (((47.0, 46.5), 0.4), ((30.0, 30.0), 0.1), ((10.7, 30.0), 0.8)):
+        np.testing.assert_allclose(found([place]), [place], atol=error)
+    # A spot of the mirror behind, whose light is also seen over the edge of the known outline.
+    assert len(found([(53.7 + off, 50.5 + off)])) == 0

@@ -5,7 +5,7 @@ otherwise edges and spots would be displaced.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,8 @@ _NEAR_CORNER = 2
 #: A spot exceeds its mirror by this many standard deviations of the noise, and by this share
 #: of full scale.
 _SPOT_SIGMAS, _SPOT_LEAST = 7.0, 0.02
+#: How far beside a mirror brighter light is looked for, px.
+_BESIDE = 4
 #: Half the side of the window in which a spot is measured, and the width of its weight, px.
 _WINDOW, _WEIGHT = 5, 1.8
 
@@ -424,19 +426,25 @@ def _spots_of(
     """Return centre, sigma, flux and clipped pixels of a mirror's spots, or why there are none."""
     import cv2
 
-    height, width = picture.shape[:2]
-    low = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 1, 0)
-    high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 2, [width, height])
-    if (high - low < 8).any():
-        return [], "too small: fewer than 8 pixels across"
+    tall, width = picture.shape[:2]
+    if (np.ptp(np.clip(outline, 0, [width, tall]), axis=0) < 5.0).any():
+        return [], "too small: fewer than 5 pixels across"
+    low = np.maximum(np.floor(outline.min(axis=0)).astype(int) - _BESIDE, 0)
+    high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + _BESIDE + 1, [width, tall])
     raw = picture[low[1] : high[1], low[0] : high[0]]
     inside = np.zeros(raw.shape[:2], np.uint8)
     cv2.fillConvexPoly(inside, np.round((outline - low) * 16).astype(np.int32), 1, shift=4)
+    other = np.zeros_like(inside)
     if shown is not None:
-        inside &= shown.labels[low[1] : high[1], low[0] : high[0]] == shown.own[k]
+        label = shown.labels[low[1] : high[1], low[0] : high[0]]
+        inside &= label == shown.own[k]
+        other = ((label > 0) & (label != shown.own[k])).astype(np.uint8)
+    # Beside another mirror a spot at the edge may be the other's; beside the ground it is not.
+    alone = np.where(cv2.dilate(other, _disc(MARGIN + 1)) > 0, np.uint8(0), inside)
     narrower = MARGIN if shown is not None else 1
     square = np.ones((3, 3), np.uint8)
     inside = np.asarray(cv2.erode(inside, square, iterations=narrower), np.uint8)
+    whole = np.asarray(inside | alone, np.uint8)
     # For three colours, operators are quicker than NumPy's reductions.
     bright = np.minimum(np.minimum(raw[..., 0], raw[..., 1]), raw[..., 2]) >= CLIPPED
     area = int(inside.sum())
@@ -454,13 +462,53 @@ def _spots_of(
     noise = 1.4826 * float(np.median(np.abs(values - np.median(values))))
     limit = max(_SPOT_SIGMAS * noise, _SPOT_LEAST)
     top = cv2.dilate(raised, np.ones((7, 7), np.uint8))
-    peaks = np.argwhere((raised >= top) & (raised > limit))
     found = []
-    for i, j in peaks:
-        one = _centroid(light, bright, inside, int(i), int(j), noise, float(raised[i, j]))
+    peaks = (raised >= top) & (raised > limit)
+    for i, j, excess, held in _own_peaks(light, raised, peaks, inside, whole):
+        one = _centroid(light, bright, held, i, j, noise, excess)
         if one is not None:
             found.append((one[0] + low, *one[1:]))
     return found, ""
+
+
+def _own_peaks(
+    light: FloatArray,
+    raised: npt.NDArray[np.float32],
+    peaks: Mask,
+    inside: npt.NDArray[np.uint8],
+    whole: npt.NDArray[np.uint8],
+) -> list[tuple[int, int, float, npt.NDArray[np.uint8]]]:
+    """Return row, column, height and mask of the peaks that are a mirror's own.
+
+    Where a brighter mirror adjoins, its blurred edge raises the corner of this one, most of all
+    between dark ground; and half of a spot on the mirror behind is seen over the edge of this one.
+    A true spot is the brightest place around it in the whole picture, whatever is shown there, and
+    that place is on the mirror: on the part that is searched, ``inside``, or in ``whole`` beside
+    the ground.
+    """
+    import cv2
+
+    if not peaks.any():
+        return []
+    smooth = cv2.GaussianBlur(light.astype(np.float32), (0, 0), 0.9)
+    around = cv2.dilate(smooth, _disc(_BESIDE - 1))
+    found: dict[tuple[int, int], tuple[float, npt.NDArray[np.uint8]]] = {}
+    for i, j in np.argwhere(peaks).tolist():
+        first = max(i - 2, 0), max(j - 2, 0)
+        part = smooth[first[0] : i + 3, first[1] : j + 3]
+        a, b = np.unravel_index(int(np.argmax(part)), part.shape)
+        top = first[0] + int(a), first[1] + int(b)
+        if whole[top] and smooth[top] >= around[top]:
+            # Only a peak beside the part that is searched needs more of the mirror.
+            found.setdefault(top, (float(raised[i, j]), inside if inside[top] else whole))
+    return [(*place, *one) for place, one in found.items()]
+
+
+@cache
+def _disc(radius: int) -> Picture:
+    """Return a disc of ones, (2 radius + 1,) squared."""
+    x = np.arange(-radius, radius + 1)
+    return np.asarray(np.hypot(x, x[:, None]) < radius + 0.5, np.uint8)
 
 
 def _mean(light: FloatArray, share: npt.NDArray[np.float32], sigma: float) -> FloatArray:
