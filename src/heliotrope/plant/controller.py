@@ -194,6 +194,7 @@ class PlantController:
             self.name,
             self.settings.lifetime,
             self.settings.patience,
+            self.settings.stow_rate,
         )
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
         life, barred = self.settings.join_life, self.doubts.barred
@@ -383,7 +384,10 @@ class PlantController:
         return self._safe(who, Act.DEFOCUS, heliostats)
 
     def stow(self, who: str, heliostats: Sequence[str] = ()) -> Ticket:
-        """Send some heliostats, or all, to stow; anybody may."""
+        """Send some heliostats, or all, to stow; anybody may.
+
+        Many go one after the other, see `PlantSettings.stow_rate`; an emergency sends all at once.
+        """
         return self._safe(who, Act.STOW, heliostats)
 
     def _safe(self, who: str, act: Act, heliostats: Sequence[str]) -> Ticket:
@@ -397,7 +401,7 @@ class PlantController:
             return last
         names = tuple(heliostats) or self.field.names
         self._joining.drop(f"{act.name} by {who}", frozenset(names))
-        ticket = self._sentinel.send_safe((who, "anybody"), act, names, "")
+        ticket = self._sentinel.send_safe((who, "anybody"), act, names, "", in_turn=True)
         self._last_safe = same, ticket
         return ticket
 
@@ -762,7 +766,7 @@ class PlantController:
         """
         wrong = {} if name == "LOCK" else self._identities.barred(names)
         if name in MOTIONS:
-            wrong = self._sync.differing(names) | wrong
+            wrong = self._sync.differing(names) | self._orders.to_stow(names) | wrong
         if name in JOINING:
             wrong |= self._sentinel.barred(names) | self.doubts.barred(names)
         if wrong and len(wrong) == len(names):

@@ -16,6 +16,7 @@ from heliotrope.plant.assigned import AssignedError
 from heliotrope.plant.audit import Audit, AuditError, Record
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.clusters import ClusterEnd, Clusters
+from heliotrope.plant.stowing import WAITS, StowQueue
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act
 
@@ -89,6 +90,8 @@ class PlantOrders:
         Prefix of identities; no two runs of a plant may have the same one.
     lifetime, patience
         Time allowed until a command is acknowledged, and from then until it is done, s.
+    stow_rate
+        Heliostats a second that `stow_in_turn` sends; 0: all at once.
 
     Attributes
     ----------
@@ -109,6 +112,7 @@ class PlantOrders:
         prefix: str,
         lifetime: float,
         patience: float,
+        stow_rate: float = 0.0,
     ) -> None:
         self._clock, self._audit, self._disk, self._clusters = clock, audit, disk, clusters
         self._prefix, self._lifetime, self._patience = prefix, lifetime, patience
@@ -120,6 +124,7 @@ class PlantOrders:
         self._owed: deque[Work] = deque()
         self._paying = False
         self._sent_at: dict[str, float] = {}
+        self._stowing = StowQueue(stow_rate)
         self._purged_at = clock.monotonic()
         self.confirmed_at = clock.monotonic()
         self.problem = ""
@@ -307,6 +312,10 @@ class PlantOrders:
         lifetime: float | None = None,
     ) -> None:
         """Send a command to some heliostats of a ticket; ``lifetime``, s, replaces the usual."""
+        heliostats = tuple(heliostats)
+        if name == "LOCK":
+            for other, names in self._stowing.take(heliostats).items():
+                other.advance(names, Stage.FAILED, "superseded by LOCK")
         life = self._lifetime if lifetime is None else lifetime
         for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part)
@@ -322,12 +331,38 @@ class PlantOrders:
         A repetition (``again``) gives no more time to acknowledge.
         """
         if not again:
+            self._stowing.take(heliostats)
             self._supersede(ticket, frozenset(heliostats))
-        self._sent_at[ticket.identity] = self._clock.monotonic()
+        # Further portions of a STOW must not put off the repetition of the first.
+        self._sent_at.setdefault(ticket.identity, self._clock.monotonic())
         for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part, again=again)
             named = () if len(part) == len(end.members) else part
             end.post(Emergency(identity, act.name, named), None, self._told(identity), urgent=True)
+
+    def stow_in_turn(self, ticket: Ticket, heliostats: Sequence[str]) -> tuple[str, ...]:
+        """Send STOW to heliostats in portions; return those that have been sent it.
+
+        Orders that they were given before are repeated until it is their turn. An order by
+        `emergency` meanwhile goes at once and takes the place of this one.
+        """
+        if not self._stowing.staggers(heliostats):
+            self.emergency(ticket, Act.STOW, heliostats)
+            return tuple(heliostats)
+        now = self._clock.monotonic()
+        self._sent_at[ticket.identity] = now
+        for other, names in self._stowing.put(ticket, heliostats).items():
+            other.advance(names, Stage.FAILED, f"superseded by {ticket.name}")
+        self._stow(self._stowing.due(now))
+        return tuple(name for name in heliostats if name not in self._stowing)
+
+    def to_stow(self, heliostats: Iterable[str]) -> dict[str, str]:
+        """Return which heliostats wait for their turn to go to stow: no motion is for them."""
+        return {name: WAITS for name in heliostats if name in self._stowing}
+
+    def _stow(self, parts: Mapping[Ticket, Sequence[str]]) -> None:
+        for ticket, names in parts.items():
+            self.emergency(ticket, Act.STOW, ticket.waiting(names))
 
     def repeat(self, ticket: Ticket, act: Act, heliostats: Sequence[str]) -> None:
         """Send DEFOCUS or STOW again to those heliostats whose clusters are connected."""
@@ -393,6 +428,7 @@ class PlantOrders:
         """End commands that were not answered in time; record the results of ended tickets."""
         for recording in self._recording.values():
             self._give_up_late(recording, now)
+        self._stow(self._stowing.due(now))
         ended = []
         for identity, ticket in self._open.items():
             ticket.expire(now)
@@ -418,7 +454,8 @@ class PlantOrders:
                 del self._sent_at[identity]
             elif now - at >= REPEAT:
                 self._sent_at[identity] = now
-                self.repeat(ticket, Act[ticket.name], ticket.unacknowledged())
+                left = [name for name in ticket.unacknowledged() if name not in self._stowing]
+                self.repeat(ticket, Act[ticket.name], left)
 
     async def end(self, now: float) -> None:
         """Record the state of every open ticket, at the end of the plant."""

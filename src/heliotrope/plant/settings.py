@@ -40,6 +40,10 @@ class PlantSettings:
         it, s.
     largest_change
         Largest change of a heliostat's beam by pushed parameters that nobody has confirmed, rad.
+    stow_rate
+        Heliostats a second that an ordinary STOW of more than these sends on their way, so that
+        their drives do not start together; 0: all at once. 10,000 take 50 s by the default, with
+        2 % of the field starting in a second. Emergencies and the safety table never wait.
     """
 
     lease: float = 3.0
@@ -57,12 +61,18 @@ class PlantSettings:
     sensors: frozenset[str] = frozenset()
     repeat: float = 1.0
     largest_change: float = 5e-3
+    stow_rate: float = 200.0
 
     def __post_init__(self) -> None:
         if not 0.0 < 2.0 * self.period <= self.lease < math.inf:
             raise InputError(
                 f"plant: a lease of {self.lease} s renewed every {self.period} s; it must last at "
                 "least two periods, so that one message may be lost"
+            )
+        if not (self.stow_rate == 0.0 or 1.0 <= self.stow_rate < math.inf):
+            raise InputError(
+                f"plant: {self.stow_rate:g} heliostats a second go to stow; give 1 or more, or 0 "
+                "for all at once"
             )
         if not 0.0 < self.beat <= 1.0 or not 0.0 < self.repeat < math.inf:
             raise InputError(

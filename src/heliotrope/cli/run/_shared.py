@@ -27,6 +27,7 @@ from heliotrope.lcu import states
 from heliotrope.plant.assembly import PlantAssembly
 from heliotrope.plant.interface import PlantInterface
 from heliotrope.plant.operations.pictures import Pictures, PictureSettings
+from heliotrope.plant.settings import PlantSettings
 from heliotrope.store.database import make_private, tighten
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry
@@ -61,6 +62,7 @@ class Shown:
     database: str | None = None
     minutes: float | None = None
     every: float = EVERY
+    plant: PlantSettings = field(default_factory=PlantSettings)
     evidence: Evidence = field(default_factory=Evidence)
     photographs: PictureSettings = field(default_factory=PictureSettings)
 

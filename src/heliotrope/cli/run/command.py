@@ -108,6 +108,14 @@ def run(
     every: Annotated[
         float, typer.Option(help="Seconds between printed lines.", rich_help_panel=_WORK)
     ] = 10.0,
+    stow_rate: Annotated[
+        float,
+        typer.Option(
+            help="Heliostats a second that an ordinary STOW of many sends to stow; 0: all at once. "
+            "Emergencies always send all at once.",
+            rich_help_panel=_WORK,
+        ),
+    ] = 200.0,
     host: Annotated[
         str,
         typer.Option(
@@ -236,6 +244,7 @@ def run(
     from heliotrope.cli.run._shared import Shown
     from heliotrope.errors import InputError
     from heliotrope.plant.operations.pictures import PictureSettings
+    from heliotrope.plant.settings import PlantSettings
 
     _one_plant(field, heliostats, speed, prototype=prototype)
     shown = Shown(
@@ -255,6 +264,7 @@ def run(
         database=database,
         minutes=minutes,
         every=every,
+        plant=PlantSettings(stow_rate=stow_rate),
         evidence=Evidence(syslog, syslog_authority, heads, heads_every),
         photographs=PictureSettings(
             min(30.0, photographs_days), photographs_days, 1e9 * photographs_gb

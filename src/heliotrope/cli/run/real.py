@@ -55,7 +55,9 @@ def run_real(design: Plant, choice: RealChoice, shown: Shown) -> None:
         for name in design.names:
             design.machine(name)
     if choice.check:
-        _check(design, choice, outside, _cameras(design, choice, shown, clock), clock)
+        _check(
+            design, _settings(choice, shown), outside, _cameras(design, choice, shown, clock), clock
+        )
         for text in _papers(outside, shown).lines():
             print(text)
         return
@@ -75,8 +77,9 @@ def _papers(outside: "_Outside", shown: Shown) -> "Papers":
     return papers
 
 
-def _settings(choice: RealChoice) -> AssemblySettings:
+def _settings(choice: RealChoice, shown: Shown) -> AssemblySettings:
     return AssemblySettings(
+        plant=shown.plant,
         # A heliostat that a person gives to automatic control is calibrated too.
         work=AutomaticSettings(wanted=not choice.idle),
         machines=MachineTables.WRITTEN if choice.configure else MachineTables.UNKNOWN,
@@ -85,14 +88,14 @@ def _settings(choice: RealChoice) -> AssemblySettings:
 
 def _check(
     design: Plant,
-    choice: RealChoice,
+    settings: AssemblySettings,
     outside: "_Outside",
     cameras: RealCameras | None,
     clock: SystemClock,
 ) -> None:
     """Build the whole plant without starting it, and print what it consists of."""
     ports = Ports(outside.all_links, clock, Forgetful(), cameras, outside.links.sensors)
-    PlantAssembly(design, ports, _settings(choice))
+    PlantAssembly(design, ports, settings)
     seen = 0 if cameras is None else sum(cameras.sees(t.name) for t in design.targets)
     print(
         f"{design.name}: {len(design):,} heliostats on {len(clusters_of(design))} clusters, "
@@ -170,7 +173,7 @@ async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outsid
         clock = SystemClock()
         ports = outside.ports(design, choice, shown, clock, keeper)
         kept = pictures(shown, folder)
-        live = PlantAssembly(design, replace(ports, pictures=kept), _settings(choice))
+        live = PlantAssembly(design, replace(ports, pictures=kept), _settings(choice, shown))
         if live.plant.unwatched:
             print(f"no readings for: {', '.join(live.plant.unwatched)}", flush=True)
         papers = _papers(outside, shown)

@@ -38,6 +38,7 @@ async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
     clock = VirtualClock(loop.time, choice.start)
     options = WorldOptions(choice.seed, rendered=not choice.exact, boards=choice.boards)
     settings = AssemblySettings(
+        plant=shown.plant,
         work=AutomaticSettings(wanted=not choice.idle, calibrate=not choice.idle),
         cycle=CYCLE,
         machines=MachineTables.HELD,

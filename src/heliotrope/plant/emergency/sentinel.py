@@ -182,11 +182,23 @@ class Sentinel:
         self._called = False
 
     def send_safe(
-        self, giver: tuple[str, str], act: Act, heliostats: Sequence[str], note: str
+        self,
+        giver: tuple[str, str],
+        act: Act,
+        heliostats: Sequence[str],
+        note: str,
+        *,
+        in_turn: bool = False,
     ) -> Ticket:
-        """Send DEFOCUS or STOW to some heliostats; ``giver`` is a name and a role."""
+        """Send DEFOCUS or STOW to some heliostats; ``giver`` is a name and a role.
+
+        An ordinary STOW of many goes ``in_turn``, but at once while an emergency holds.
+        """
         ticket = self._orders.accept((*giver, act.name), (), heliostats, note, late=True)
-        self._orders.emergency(ticket, act, heliostats)
+        if in_turn and act is Act.STOW and not self.on:
+            heliostats = self._orders.stow_in_turn(ticket, heliostats)
+        else:
+            self._orders.emergency(ticket, act, heliostats)
         self._sent_off.update(dict.fromkeys(heliostats, self._clock.monotonic()))
         return ticket
 

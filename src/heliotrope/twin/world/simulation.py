@@ -77,7 +77,9 @@ _WRONG = ("addresses", "clock", "site")
 #: Longest run: the sun must stay up.
 MOST_HOURS = 8.0
 #: With this few mirrors they join one at a time.
-SETTINGS = PlantSettings(join_rate=0.5, join_burst=1, sensors=frozenset({FLUX_READING}))
+SETTINGS = PlantSettings(
+    join_rate=0.5, join_burst=1, stow_rate=1.0, sensors=frozenset({FLUX_READING})
+)
 #: The same plant in the world "sensors".
 MEASURED = replace(SETTINGS, sensors=frozenset(READINGS))
 #: Without the rows on the share of failed nodes, which one of three or four already exceeds.
