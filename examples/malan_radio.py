@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from heliotrope.lcu import messages
-from heliotrope.lcu.wire import Frame, encode
+from heliotrope.lcu.wire import MAC_SIZE, SIGNED, Frame, encode
 
 HELIOSTATS = 10_000
 #: Least time without the sun after which a heliostat defocuses by itself, s.
@@ -73,10 +73,12 @@ RADIOS = (
 
 
 def size_of(name: str) -> int:
-    """Return the length of one of our frames on the wire, bytes."""
+    """Return the length of one of our frames on the wire, bytes; all but answers are signed."""
     number = next(row[0] for row in messages.MESSAGES if row[1] == name)
     payload = bytes(struct.calcsize("<" + messages.codes_of(number)))
-    return len(encode(Frame(1, 0, 1, number, payload)))
+    if messages.who_of(number) == messages.NODE:
+        return len(encode(Frame(1, 0, 1, number, payload)))
+    return len(encode(Frame(1, 0, 1, number, payload, bytes(MAC_SIZE), SIGNED)))
 
 
 class Channel:

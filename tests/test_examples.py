@@ -103,6 +103,8 @@ def test_malan_radio() -> None:
     assert ieee.airtime(127 - radio.MAC_BYTES) == pytest.approx(4.256e-3)
     # Twelve bytes at a spreading factor of 9: 144.384 ms (Semtech's formula; lora-modulation).
     assert radio.lora_airtime(12, 9) == pytest.approx(144.384e-3)
+    # A tag of 8 bytes on what the cluster says, none on answers (decision 0027).
+    assert [radio.size_of(name) for name in ("SUN", "QUERY_STATUS", "STATUS")] == [44, 22, 37]
     rng = np.random.default_rng(3)
     channel = radio.Channel(20_000, rng)
     lost = [1.0 - channel.heard(0.1).mean() for _ in range(50)]
