@@ -37,6 +37,7 @@ if TYPE_CHECKING:
         write_sightings,
     )
     from heliotrope.calibration.fit import fit
+    from heliotrope.calibration.learn import Forecast as Forecast
     from heliotrope.calibration.learn import compare_models as compare
     from heliotrope.calibration.learn import learn
     from heliotrope.calibration.sightings import sightings
@@ -62,6 +63,7 @@ __version__ = "0.1.0"
 
 #: The module of each name.
 _HOMES = {
+    "Forecast": "heliotrope.calibration.learn",
     "Heliostat": "heliotrope.field",
     "Heliostats": "heliotrope.field",
     "Learned": "heliotrope.calibration",
@@ -112,6 +114,7 @@ _MODULES = {
 }
 
 __all__ = [
+    "Forecast",
     "Heliostat",
     "Heliostats",
     "Learned",

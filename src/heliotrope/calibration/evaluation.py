@@ -11,6 +11,7 @@ from heliotrope.calibration.named import Field, members
 from heliotrope.calibration.paint_splits import KINDS, paint_split
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
+from heliotrope.frames import ACROSS, Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray, angle_between, as_numbers, bisector, reflect
 from heliotrope.values import Card, Value, span
 
@@ -29,7 +30,7 @@ NEIGHBOURHOOD = 0.1
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class BeamErrors(Value):
+class BeamErrors(Value, Framed):
     """Errors of M sightings under a mechanism.
 
     Attributes
@@ -50,6 +51,19 @@ class BeamErrors(Value):
     normal: FloatArray
     offset: FloatArray
     plane: FloatArray
+
+    def _labelled(self) -> Labelled:
+        row = ("sighting",)
+        return Labelled(
+            row,
+            {"sighting": np.arange(len(self.beam)), "across": ACROSS},
+            {
+                "beam": Variable(row, self.beam, "rad"),
+                "normal": Variable(row, self.normal, "rad"),
+                "offset": Variable((*row, "across"), self.offset, "rad"),
+                "plane": Variable((*row, "across"), self.plane, "m"),
+            },
+        )
 
     def _card(self) -> Card:
         found = summarise(self.beam)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError, UnknownNameError, kind_of
 from heliotrope.field.formats.measurements import Measurements
 from heliotrope.field.heliostats import Heliostats
+from heliotrope.frames import ENU, Framed, Labelled, Variable, times
 from heliotrope.geometry import FloatArray, as_float, as_numbers, azimuth_elevation, normalize
 from heliotrope.sun import Times, unix_seconds
 from heliotrope.values import Card, Value, amount, dots, span
@@ -26,7 +27,7 @@ _UNIT = 2e-15
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Sightings(Value):
+class Sightings(Value, Framed):
     """M sightings of N heliostats.
 
     Attributes
@@ -85,6 +86,34 @@ class Sightings(Value):
         sky = 0.5 * np.pi - elevation
         picture = dots(sky * np.sin(azimuth), sky * np.cos(azimuth), "suns from the zenith")
         return Card(f"{len(self)} of {some}, {when}", ("what", "range"), rows, picture)
+
+    def _labelled(self) -> Labelled:
+        row = ("sighting",)
+        named = [self.names[i] for i in self.heliostat] if self.names else self.heliostat
+        return Labelled(
+            row,
+            {
+                "sighting": np.arange(len(self)),
+                "drive": np.arange(1, self.counts.shape[-1] + 1),
+                "axis": ENU,
+                "axis_2": ENU,
+            },
+            {
+                "heliostat": Variable(row, np.asarray(named)),
+                "time": Variable(row, times(self.time)),
+                "count": Variable((*row, "drive"), self.counts),
+                "source": Variable((*row, "axis"), self.source),
+                "source_at_infinity": Variable(row, self.source_at_infinity),
+                "destination": Variable((*row, "axis"), self.destination),
+                "destination_at_infinity": Variable(row, self.destination_at_infinity),
+                "sigma": Variable(row, self.sigma, "rad"),
+                "source_covariance": Variable((*row, "axis", "axis_2"), self.source_covariance),
+                "destination_covariance": Variable(
+                    (*row, "axis", "axis_2"), self.destination_covariance
+                ),
+            },
+            frozenset({"source_covariance", "destination_covariance"}),
+        )
 
     def __len__(self) -> int:
         return len(self.heliostat)

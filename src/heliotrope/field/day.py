@@ -8,11 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope import sun as solar
-from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.errors import InputError
 from heliotrope.field.heliostat import Heliostat
 from heliotrope.field.plant import Plant
-from heliotrope.field.target import Receiver, Target
-from heliotrope.geometry import FloatArray, as_vectors
+from heliotrope.field.target import Receiver, Target, point_of
+from heliotrope.frames import ENU, Framed, Labelled, Variable
+from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.path import TrackedPath, track_path
 from heliotrope.mechanism.tracking import Steered
 from heliotrope.sun import Site
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TrackedDay(Value):
+class TrackedDay(Value, Framed):
     """The poses of a day.
 
     Attributes
@@ -51,6 +52,33 @@ class TrackedDay(Value):
         inner = self.path._card()  # noqa: SLF001 - the same record without names
         line = f"{who}, {self.time[0]:%Y-%m-%d %H:%M} to {self.time[-1]:%H:%M} UTC: {inner.line}"
         return Card(line, inner.header, inner.rows)
+
+    def _labelled(self) -> Labelled:
+        path, many = self.path, self.path.status.ndim > 1
+        row = ("time", "heliostat") if many else ("time",)
+        axes = path.angles.shape[-1]
+        labels: dict[str, npt.ArrayLike] = {
+            "time": self.time.tz_localize(None).to_numpy(),
+            "joint": np.arange(1, axes + 1),
+            "axis": ENU,
+        }
+        if many:
+            labels["heliostat"] = self.names or np.arange(path.status.shape[1])
+        return Labelled(
+            row,
+            labels,
+            {
+                "angle": Variable((*row, "joint"), path.angles, "rad"),
+                "count": Variable((*row, "joint"), path.counts),
+                "normal": Variable((*row, "axis"), path.normal),
+                "residual": Variable(row, path.residual, "rad"),
+                "reachable": Variable(row, path.reachable),
+                "branch": Variable(row, path.branch),
+                "over_the_top": Variable(row, path.over_the_top),
+                "sun": Variable(("time", "axis"), self.sun),
+            },
+            notes={} if many else {"heliostat": "".join(self.names)},
+        )
 
     def __len__(self) -> int:
         return len(self.time)
@@ -111,16 +139,9 @@ def track_day(
 
 
 def _aim(heliostat: Steered, aim: str | Target | Receiver | npt.ArrayLike | None) -> FloatArray:
-    if isinstance(aim, Target | Receiver):
-        return aim.center
     targets = heliostat.targets if isinstance(heliostat, Heliostat | Plant) else ()
-    if isinstance(aim, str):
-        for target in targets:
-            if target.name == aim:
-                return target.center
-        raise UnknownNameError("target", aim, [t.name for t in targets])
     if aim is not None:
-        return as_vectors(aim, "aim")
+        return point_of(aim, targets)
     if not targets and not isinstance(heliostat, Heliostat):
         raise InputError("aim: there is no target; give a point, east, north and up in m")
     first = targets[0].center if targets else None

@@ -1,13 +1,13 @@
 """Targets and receivers: the surfaces that beams are sent to."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import InputError
+from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray, as_vectors, normalize
 from heliotrope.values import Card, Value, amount
@@ -175,3 +175,30 @@ class Receiver(Value):
         object.__setattr__(self, "center", center)
         normal = normalize(self.normal, f"receiver {self.name}: normal")
         object.__setattr__(self, "normal", normal)
+
+
+def point_of(
+    aim: str | Target | Receiver | npt.ArrayLike, targets: Sequence[Target] = ()
+) -> FloatArray:
+    """Return an aim point, ENU metres, (3,) or (N, 3).
+
+    Parameters
+    ----------
+    aim
+        Name of one of the targets, a target or receiver (its centre), or points.
+    targets
+        Known by their names.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such target.
+    """
+    if isinstance(aim, Target | Receiver):
+        return aim.center
+    if isinstance(aim, str):
+        for target in targets:
+            if target.name == aim:
+                return target.center
+        raise UnknownNameError("target", aim, [target.name for target in targets])
+    return as_vectors(aim, "aim")

@@ -347,12 +347,22 @@ def _part(name: str, known: dict[str, Parameter]) -> tuple[str, ...]:
             raise UnknownNameError(
                 f"parameter (of model {name!r}) in this kind of mechanism:", missing[0], known
             )
-        return tuple(n for role in _BY_ROLE[name] for n in _role(role, known))
+        # A mechanism with one axis has no second one to lean.
+        roles = [role for role in _BY_ROLE[name] if len(_drives(known)) > 1 or role not in _SECOND]
+        return tuple(n for role in roles for n in _role(role, known))
     if name in _ROLES:
         return _role(name, known)
     if name in known:
         return (name,)
     raise UnknownNameError("model", name, [*MODELS, "full", *_ROLES])
+
+
+#: Roles that need two axes.
+_SECOND = ("non_orthogonality", "canting")
+
+
+def _drives(known: dict[str, Parameter]) -> set[int]:
+    return {p.code[1] for p in known.values() if p.code[0] == slot.MOVES_DRIVE}
 
 
 def _role(role: str, known: dict[str, Parameter]) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, kind_of, shown
+from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray, as_numbers, as_vectors, reflect
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive, direct
@@ -69,7 +70,7 @@ _TEXTS = {
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Tracking(Value):
+class Tracking(Value, Framed):
     """Solutions of one or both branches; B branches, D drives.
 
     Attributes
@@ -99,6 +100,33 @@ class Tracking(Value):
     residual: FloatArray
     iterations: npt.NDArray[np.int32]
     best: npt.NDArray[np.int8]
+
+    def _labelled(self) -> Labelled:
+        batch = self.best.shape
+        row = tuple(f"axis_{k}" for k in range(len(batch))) or ("row",)
+
+        def of(values: npt.ArrayLike) -> np.ndarray:
+            array = np.asarray(values)
+            return array if batch else array[None]
+
+        return Labelled(
+            row,
+            {
+                **{name: np.arange(n) for name, n in zip(row, batch or (1,), strict=True)},
+                "branch": np.arange(self.angles.shape[-2]),
+                "joint": np.arange(1, self.angles.shape[-1] + 1),
+                "axis": ENU,
+            },
+            {
+                "angle": Variable((*row, "branch", "joint"), of(self.angles), "rad"),
+                "count": Variable((*row, "branch", "joint"), of(self.counts)),
+                "normal": Variable((*row, "branch", "axis"), of(self.normal)),
+                "vertex": Variable((*row, "branch", "axis"), of(self.vertex), "m"),
+                "residual": Variable((*row, "branch"), of(self.residual), "rad"),
+                "served": Variable((*row, "branch"), of(self.served)),
+                "best": Variable(row, of(self.best)),
+            },
+        )
 
     def _card(self) -> Card:
         best = self.chosen(self.status)

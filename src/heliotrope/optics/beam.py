@@ -369,9 +369,11 @@ class ExpectedError:
 
         The angle is counter-clockwise from the right, rad.
         """
-        values, vectors = np.linalg.eigh(self.covariance)
+        known = np.asarray(np.isfinite(self.covariance).all(axis=(-1, -2)))
+        values, vectors = np.linalg.eigh(np.where(known[:, None, None], self.covariance, 0.0))
+        values = np.where(known[:, None], values, np.nan)
         axes = np.sqrt(CHI_SQUARE_90 * np.maximum(values, 0.0))
-        angle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+        angle = np.where(known, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]), np.nan)
         return axes[:, 1], axes[:, 0], np.asarray(np.mod(angle, np.pi))
 
 

@@ -9,6 +9,7 @@ dask.distributed and stays in its module.
 
 from heliotrope.calibration.learn.assessment import Assessment, HeliostatFigures, assess
 from heliotrope.calibration.learn.drift import Hyperparameters, Posterior, Process
+from heliotrope.calibration.learn.forecast import Forecast
 from heliotrope.calibration.learn.learning import (
     Learned,
     Prediction,
@@ -35,6 +36,7 @@ __all__ = [
     "Assessment",
     "Belief",
     "Event",
+    "Forecast",
     "HeliostatFigures",
     "Hyperparameters",
     "Learned",

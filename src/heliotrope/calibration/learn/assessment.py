@@ -17,6 +17,7 @@ from heliotrope.calibration.learn.learning import (
 )
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
+from heliotrope.frames import Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.axis_accuracy import AxisAccuracy, axis_accuracy
 from heliotrope.mechanism.tracking import track
@@ -92,7 +93,7 @@ class HeliostatFigures:
 
 
 @dataclass(frozen=True)
-class Assessment:
+class Assessment(Framed):
     """Figures of a field.
 
     Attributes
@@ -130,6 +131,20 @@ class Assessment:
     unexplained: npt.NDArray[np.intp]
     mean_explained: float
     unusable: npt.NDArray[np.intp]
+
+    def _labelled(self) -> Labelled:
+        row = ("heliostat",)
+        each = [h.document() for h in self.heliostats]
+        units = {"mrad": "mrad"}
+        names = [n for n in (each[0] if each else {}) if all(n in one for one in each)]
+        return Labelled(
+            row,
+            {"heliostat": [h.name for h in self.heliostats]},
+            {
+                n: Variable(row, np.array([one[n] for one in each]), units.get(n[-4:], ""))
+                for n in names
+            },
+        )
 
     def document(self) -> dict[str, Any]:
         """Return the figures for JSON, in mrad."""

@@ -12,6 +12,7 @@ Steps 1, 2 and 4 treat every heliostat by itself; only step 3 needs several.
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -35,12 +36,18 @@ from heliotrope.calibration.learn.unusable import find_unusable, is_usable
 from heliotrope.calibration.named import NOWHERE, Field, Members, Surroundings, members
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.target import Receiver, Target
+from heliotrope.frames import Framed, Labelled, Variable
+from heliotrope.frames import times as as_times
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.parallel import threads
-from heliotrope.sun import Times, unix_seconds
+from heliotrope.sun import Site, Times, unix_seconds
 from heliotrope.values import Card, Value, amount, dots, span
+
+if TYPE_CHECKING:
+    from heliotrope.calibration.learn.forecast import Forecast
 
 #: Fewest sightings of a heliostat from which the hyperparameters are learnt.
 FEWEST = 8
@@ -105,7 +112,7 @@ class Prediction(Value):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Learned(Value):
+class Learned(Value, Framed):
     """Result of learning N heliostats from M sightings.
 
     Attributes
@@ -209,6 +216,76 @@ class Learned(Value):
         picture = dots(places[:, 0], places[:, 1], "map")
         header = ("parameter", "median size", "median σ of the fit")
         return Card(", ".join(parts), header, rows, picture)
+
+    def forecast(
+        self,
+        heliostat: int | str,
+        times: Times,
+        target: str | Target | Receiver | npt.ArrayLike,
+        *,
+        site: Site | None = None,
+        steered: Mechanism | None = None,
+        sigma: float | None = None,
+    ) -> "Forecast":
+        """Return where a heliostat is expected to throw its beam, and how surely.
+
+        Parameters
+        ----------
+        heliostat
+            Name or row.
+        times
+            See `heliotrope.sun.Times`, (T,); a pandas index is one of them.
+        target
+            Name of a target of the plant learnt from, a target or receiver, or a point (m), (3,).
+        site
+            Place, if it was learnt from mechanisms alone.
+        steered
+            The mechanism by which the heliostat is steered, batch shape (); default: as learnt, at
+            the time of its last sighting used. With the nominal one the error is that before
+            calibration.
+        sigma
+            Standard deviation of a sighting's ray, rad of beam; default: the median of those of
+            this heliostat.
+
+        Raises
+        ------
+        InputError
+            If the place is unknown.
+        UnknownNameError
+            If there is no such heliostat or target.
+        """
+        # It stands on this module.
+        from heliotrope.calibration.learn import forecast
+
+        return forecast.forecast(
+            self, heliostat, times, target, site=site, steered=steered, sigma=sigma
+        )
+
+    def _labelled(self) -> Labelled:
+        row, count = ("heliostat",), len(self.members)
+        known = self.sightings.time[self.used & np.isfinite(self.sightings.time)]
+        last = float(known.max()) if len(known) else np.nan
+        values, spread = self.parameters_at(np.arange(count), last)
+        units = ", ".join(f"{n} {self.mechanism.parameter(n).unit}" for n in self.names)
+        return Labelled(
+            row,
+            {
+                "heliostat": self.heliostats or np.arange(count),
+                "parameter": self.names,
+                "parameter_2": self.names,
+            },
+            {
+                "value": Variable((*row, "parameter"), values),
+                "sigma": Variable(
+                    (*row, "parameter"), np.sqrt(np.diagonal(spread, axis1=-2, axis2=-1))
+                ),
+                "covariance": Variable((*row, "parameter", "parameter_2"), spread),
+                "noise": Variable(row, np.array([m.hyper.noise for m in self.members])),
+                "sightings": Variable(row, np.array([len(m.data) for m in self.members])),
+            },
+            frozenset({"covariance"}),
+            {"units of the parameters": units, "time": str(as_times(last))},
+        )
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,0 +1,138 @@
+"""Records of arrays as tables and as labelled arrays: pandas and xarray.
+
+A class says once which axes its arrays have (`Labelled`); a frame and a dataset follow from that.
+Units stand in ``attrs``: of each variable of a dataset (``units``), and in ``frame.attrs["units"]``
+by column. Times are UTC.
+"""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+#: Labels of a vector's components.
+ENU = ("east", "north", "up")
+#: Labels of the two directions across a beam, as seen from the mirror.
+ACROSS = ("right", "up")
+
+
+@dataclass(frozen=True)
+class Variable:
+    """An array with the names of its axes, and its unit ("" for none)."""
+
+    axes: tuple[str, ...]
+    values: npt.ArrayLike
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """Arrays with labelled axes.
+
+    Attributes
+    ----------
+    rows
+        The axes that make the rows of a frame; the others become columns.
+    labels
+        Labels of each axis.
+    variables
+        By name.
+    large
+        Names that only the dataset has, because they would be many columns.
+    notes
+        Attributes of the whole.
+    """
+
+    rows: tuple[str, ...]
+    labels: Mapping[str, npt.ArrayLike]
+    variables: Mapping[str, Variable]
+    large: frozenset[str] = frozenset()
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+
+class Framed:
+    """Base of records that can be given as a frame or as a dataset."""
+
+    @abstractmethod
+    def _labelled(self) -> Labelled:
+        """Return the arrays with their axes."""
+
+    def to_frame(self) -> "pd.DataFrame":
+        """Return a pandas frame with one row for each label; ``attrs["units"]`` holds units."""
+        import pandas as pd
+
+        given = self._labelled()
+        size = [len(np.asarray(given.labels[axis])) for axis in given.rows]
+        columns: dict[str, Any] = {}
+        units: dict[str, str] = {}
+        for name, one in given.variables.items():
+            if name in given.large:
+                continue
+            values, extra = np.asarray(one.values), [a for a in one.axes if a not in given.rows]
+            order = [one.axes.index(a) for a in (*given.rows, *extra) if a in one.axes]
+            values = values.transpose(order)
+            place = tuple(slice(None) if a in one.axes else None for a in given.rows)
+            values = values[place]
+            shape = (*size, *values.shape[len(size) :])
+            flat = np.broadcast_to(values, shape).reshape(int(np.prod(size)), -1)
+            labels = product(*([str(x) for x in np.asarray(given.labels[a])] for a in extra))
+            for k, parts in enumerate(labels):
+                column = "_".join((name, *parts))
+                columns[column] = np.array(flat[:, k])
+                units[column] = one.unit
+        parts = [_index(given.labels[axis]) for axis in given.rows]
+        index = parts[0] if len(parts) == 1 else pd.MultiIndex.from_product(parts)
+        index.names = list(given.rows)
+        frame = pd.DataFrame(columns, index=index)
+        frame.attrs = {"units": units, **given.notes}
+        return frame
+
+    def to_xarray(self) -> "xr.Dataset":
+        """Return an xarray dataset, which ``to_netcdf`` writes; needs the extra ``notebook``."""
+        try:
+            import xarray
+        except ImportError:
+            raise InputError(
+                "to_xarray needs the package xarray; install heliotrope[notebook]"
+            ) from None
+        given = self._labelled()
+        return xarray.Dataset(
+            {
+                name: (one.axes, np.asarray(one.values), {"units": one.unit} if one.unit else {})
+                for name, one in given.variables.items()
+            },
+            coords={axis: _plain(labels) for axis, labels in given.labels.items()},
+            attrs=dict(given.notes),
+        )
+
+
+def times(seconds: npt.ArrayLike) -> npt.NDArray[np.datetime64]:
+    """Return Unix seconds as UTC times; NaN becomes NaT."""
+    given = np.asarray(seconds, dtype=np.float64)
+    known = np.isfinite(given)
+    micro = np.round(np.where(known, given, 0.0) * 1e6).astype(np.int64).astype("datetime64[us]")
+    return np.where(known, micro.astype("datetime64[ns]"), np.datetime64("NaT", "ns"))
+
+
+def _plain(labels: npt.ArrayLike) -> np.ndarray:
+    values = np.asarray(labels)
+    return values.astype(str) if values.dtype == object else values
+
+
+def _index(labels: npt.ArrayLike) -> "pd.Index[Any]":
+    import pandas as pd
+
+    values = _plain(labels)
+    if values.dtype.kind == "M":
+        return pd.DatetimeIndex(values).tz_localize("UTC")
+    return pd.Index(values)
