@@ -159,6 +159,21 @@ def test_deviations_of_a_joined_plant_keep_their_heliostats() -> None:
     assert float(again[5].deviations["tilt_north"]) == 6e-3
 
 
+def test_the_flux_of_a_plant_on_its_receiver() -> None:
+    plant = ht.example_plant()
+    seen = ht.flux(plant, "2026-09-02T10:00Z", error=2e-3)
+    assert seen.heliostats == len(plant)
+    area = sum(h.width * h.height for h in plant)
+    assert 0.5 * area * 900.0 * 0.9 < seen.power < area * 900.0 * 0.9
+    wide = ht.flux(plant, "2026-09-02T10:00Z", error=20e-3)
+    assert wide.power < seen.power
+    assert wide.flux.max() < seen.flux.max()
+    with pytest.raises(InputError, match="one time"):
+        ht.flux(plant, ["2026-09-02T10:00Z"])
+    with pytest.raises(UnknownNameError, match="receiver"):
+        ht.flux(plant, "2026-09-02T10:00Z", "recever")
+
+
 class _Values:
     def __init__(self, parameters: dict[str, np.ndarray]) -> None:
         self.parameters = parameters

@@ -54,8 +54,19 @@ if TYPE_CHECKING:
     )
     from heliotrope.field.formats import open_plant as open  # noqa: A004 - used as ht.open
     from heliotrope.field.formats.plant_file import read_plant, write_plant
-    from heliotrope.mechanism import Mechanism, Tracking, track, track_path
+    from heliotrope.mechanism import (
+        Mechanism,
+        Tracking,
+        direct,
+        linear_grigoriev,
+        linear_guo,
+        linear_paint,
+        rotary,
+        track,
+        track_path,
+    )
     from heliotrope.mechanism import kinds as kinds
+    from heliotrope.optics import field_flux as flux
     from heliotrope.optics import image_offsets, predict_flux
     from heliotrope.sun import Site
 
@@ -78,19 +89,25 @@ _HOMES = {
     "calibrate": "heliotrope.calibration",
     "camera_target": "heliotrope.calibration",
     "compare": "heliotrope.calibration.learn",
+    "direct": "heliotrope.mechanism",
     "evaluate": "heliotrope.calibration",
     "example_plant": "heliotrope.field",
     "fit": "heliotrope.calibration.fit",
+    "flux": "heliotrope.optics",
     "image_offsets": "heliotrope.optics",
     "join": "heliotrope.calibration",
     "learn": "heliotrope.calibration.learn",
+    "linear_grigoriev": "heliotrope.mechanism",
+    "linear_guo": "heliotrope.mechanism",
+    "linear_paint": "heliotrope.mechanism",
+    "open": "heliotrope.field.formats",
     "predict": "heliotrope.calibration",
     "predict_flux": "heliotrope.optics",
     "prototype": "heliotrope.field",
     "read_field_sightings": "heliotrope.calibration",
     "read_plant": "heliotrope.field.formats.plant_file",
     "read_sightings": "heliotrope.calibration",
-    "open": "heliotrope.field.formats",
+    "rotary": "heliotrope.mechanism",
     "roughly_installed": "heliotrope.field",
     "sightings": "heliotrope.calibration.sightings",
     "split": "heliotrope.calibration",
@@ -103,7 +120,7 @@ _HOMES = {
     "write_sightings": "heliotrope.calibration",
 }
 #: Names that are shorter here than in their modules.
-_SHORT = {"compare": "compare_models", "open": "open_plant"}
+_SHORT = {"compare": "compare_models", "flux": "field_flux", "open": "open_plant"}
 #: Modules that are used as such.
 _MODULES = {
     "geometry": "heliotrope.geometry",
@@ -130,14 +147,19 @@ __all__ = [
     "calibrate",
     "camera_target",
     "compare",
+    "direct",
     "evaluate",
     "example_plant",
     "fit",
+    "flux",
     "geometry",
     "image_offsets",
     "join",
     "kinds",
     "learn",
+    "linear_grigoriev",
+    "linear_guo",
+    "linear_paint",
     "open",
     "optics",
     "plot",
@@ -147,6 +169,7 @@ __all__ = [
     "read_field_sightings",
     "read_plant",
     "read_sightings",
+    "rotary",
     "roughly_installed",
     "sightings",
     "split",

@@ -86,15 +86,17 @@ class Framed:
             shape = (*size, *values.shape[len(size) :])
             flat = np.broadcast_to(values, shape).reshape(int(np.prod(size)), -1)
             labels = product(*([str(x) for x in np.asarray(given.labels[a])] for a in extra))
-            for k, parts in enumerate(labels):
-                column = "_".join((name, *parts))
+            for k, names in enumerate(labels):
+                column = "_".join((name, *names))
                 columns[column] = np.array(flat[:, k])
                 units[column] = one.unit
         parts = [_index(given.labels[axis]) for axis in given.rows]
-        index = parts[0] if len(parts) == 1 else pd.MultiIndex.from_product(parts)
+        index: Any = parts[0] if len(parts) == 1 else pd.MultiIndex.from_product(parts)
         index.names = list(given.rows)
         frame = pd.DataFrame(columns, index=index)
-        frame.attrs = {"units": units, **given.notes}
+        frame.attrs["units"] = units
+        for key, note in given.notes.items():
+            frame.attrs[key] = note
         return frame
 
     def to_xarray(self) -> "xr.Dataset":
@@ -129,7 +131,7 @@ def _plain(labels: npt.ArrayLike) -> np.ndarray:
     return values.astype(str) if values.dtype == object else values
 
 
-def _index(labels: npt.ArrayLike) -> "pd.Index[Any]":
+def _index(labels: npt.ArrayLike) -> Any:
     import pandas as pd
 
     values = _plain(labels)

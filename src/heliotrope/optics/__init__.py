@@ -28,7 +28,7 @@ from heliotrope.optics.beam import (
     crossing,
     mean_concentration,
 )
-from heliotrope.optics.flux import CELLS, FluxView, air_loss, predict_flux
+from heliotrope.optics.flux import CELLS, FluxView, air_loss, field_flux, predict_flux
 from heliotrope.optics.glare import (
     DAYLIGHT,
     Eye,
@@ -92,6 +92,7 @@ __all__ = [
     "concentration",
     "crossing",
     "equal_facets",
+    "field_flux",
     "find_entries",
     "flat_top_beam",
     "gaussian_beam",
