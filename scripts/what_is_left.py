@@ -16,7 +16,8 @@ from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.learn import drift
 from heliotrope.calibration.learn.assessment import ENOUGH, assess
 from heliotrope.calibration.learn.drift import DAY, Process
-from heliotrope.calibration.learn.learning import Learned, learn, left_out_errors
+from heliotrope.calibration.learn.learned import Learned, left_out_errors
+from heliotrope.calibration.learn.learning import learn
 from heliotrope.calibration.sightings import Sightings, of_measurements
 from heliotrope.field.formats import measurements, paint
 from heliotrope.field.heliostats import Heliostats

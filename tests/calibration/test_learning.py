@@ -8,7 +8,8 @@ import pytest
 from heliotrope.calibration.evaluation import split
 from heliotrope.calibration.learn import drift, learning
 from heliotrope.calibration.learn.assessment import assess
-from heliotrope.calibration.learn.learning import Learned, learn
+from heliotrope.calibration.learn.learned import Learned
+from heliotrope.calibration.learn.learning import learn
 from heliotrope.calibration.learn.outliers import critical, generalised_esd
 from heliotrope.calibration.learn.regimes import find_regimes, regime_at
 from heliotrope.calibration.sightings import Sightings, sightings

@@ -12,6 +12,7 @@ from heliotrope.calibration import evaluation
 from heliotrope.calibration.learn import learning, models
 from heliotrope.calibration.learn import on_dask as cluster
 from heliotrope.calibration.learn.assessment import assess
+from heliotrope.calibration.learn.learned import Learned
 from heliotrope.calibration.report import results
 from heliotrope.calibration.report.content import CalibrationReport
 from heliotrope.calibration.report.page import write_report
@@ -28,7 +29,7 @@ NAMES = tuple(f"H{i}" for i in range(6))
 
 
 @pytest.fixture(scope="module")
-def learnt() -> learning.Learned:
+def learnt() -> Learned:
     nominal = field(6)
     seen, _ = measured(nominal, 5)
     spots = seen.destination.copy()
@@ -36,7 +37,7 @@ def learnt() -> learning.Learned:
     return learning.learn(nominal, dataclasses.replace(seen, destination=spots), "guo6")
 
 
-def test_json_reads_back(learnt: learning.Learned, tmp_path: Path) -> None:
+def test_json_reads_back(learnt: Learned, tmp_path: Path) -> None:
     found = results.at_moment(NAMES, learnt)
     ids = tuple(f"m{k}" for k in range(len(learnt.sightings)))
     results.write_json(tmp_path / "c.json", NAMES, learnt, found, ids)
@@ -67,9 +68,7 @@ def test_json_reads_back(learnt: learning.Learned, tmp_path: Path) -> None:
         (lambda d: d["heliostats"]["H2"]["values"].__setitem__(0, "x"), "expected a number"),
     ],
 )
-def test_json_that_is_wrong(
-    learnt: learning.Learned, tmp_path: Path, change: object, message: str
-) -> None:
+def test_json_that_is_wrong(learnt: Learned, tmp_path: Path, change: object, message: str) -> None:
     path = tmp_path / "c.json"
     found = results.at_moment(NAMES, learnt)
     results.write_json(path, NAMES, learnt, found, ("",) * len(learnt.sightings))
@@ -81,7 +80,7 @@ def test_json_that_is_wrong(
         results.read_json(path)
 
 
-def test_report_is_one_page_that_reads_back(learnt: learning.Learned, tmp_path: Path) -> None:
+def test_report_is_one_page_that_reads_back(learnt: Learned, tmp_path: Path) -> None:
     plant = example_plant()
     group = dataclasses.replace(
         plant.groups["azel"].take(range(6)), names=NAMES, mechanism=learnt.mechanism
@@ -168,7 +167,7 @@ def test_auto_finds_malans_worm() -> None:
     assert left[chosen.name] < 0.4e-3
 
 
-def test_neighbourhoods_are_held_out_whole(learnt: learning.Learned) -> None:
+def test_neighbourhoods_are_held_out_whole(learnt: Learned) -> None:
     seen = learnt.sightings
     mask = evaluation.split(seen, "neighbour", 0.7, 0)
     random = evaluation.split(seen, "random", 0.7, 0)
@@ -190,7 +189,7 @@ def test_neighbourhoods_are_held_out_whole(learnt: learning.Learned) -> None:
     np.testing.assert_array_equal(mask, evaluation.split(seen, "neighbour", 0.7, 0))
 
 
-def test_a_cluster_gives_the_same_bits(learnt: learning.Learned) -> None:
+def test_a_cluster_gives_the_same_bits(learnt: Learned) -> None:
     client = cluster.connect("local:2")
     done: list[tuple[int, int]] = []
     try:

@@ -8,7 +8,8 @@ from tests.support.machines import jacks
 
 from heliotrope.calibration.evaluation import split
 from heliotrope.calibration.learn.assessment import assess, unexplained_mirrors
-from heliotrope.calibration.learn.learning import learn, predict
+from heliotrope.calibration.learn.learned import predict
+from heliotrope.calibration.learn.learning import learn
 from heliotrope.calibration.learn.sequential import predict_by_stream, predict_in_turn
 from heliotrope.calibration.sightings import Sightings, sightings
 from heliotrope.geometry import direction, reflect

@@ -12,7 +12,7 @@ import pytest
 
 from heliotrope import sun
 from heliotrope.airborne.evaluate.sightings import to_sightings
-from heliotrope.calibration.learn.learning import Learned
+from heliotrope.calibration.learn.learned import Learned
 from heliotrope.calibration.sightings import camera_target, sightings
 from heliotrope.errors import TimeError
 

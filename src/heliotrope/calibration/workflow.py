@@ -16,7 +16,8 @@ from heliotrope.calibration import evaluation
 from heliotrope.calibration.evaluation import Split
 from heliotrope.calibration.learn import models
 from heliotrope.calibration.learn.assessment import Assessment, assess
-from heliotrope.calibration.learn.learning import FEWEST, Learned, Runner, learn
+from heliotrope.calibration.learn.learned import Learned
+from heliotrope.calibration.learn.learning import FEWEST, Runner, learn
 from heliotrope.calibration.learn.models import ScoredModel
 from heliotrope.calibration.learn.periodic import (
     PeriodicError,

@@ -10,13 +10,8 @@ dask.distributed and stays in its module.
 from heliotrope.calibration.learn.assessment import Assessment, HeliostatFigures, assess
 from heliotrope.calibration.learn.drift import Hyperparameters, Posterior, Process
 from heliotrope.calibration.learn.forecast import Forecast
-from heliotrope.calibration.learn.learning import (
-    Learned,
-    Prediction,
-    learn,
-    left_out_errors,
-    predict,
-)
+from heliotrope.calibration.learn.learned import Learned, Prediction, left_out_errors, predict
+from heliotrope.calibration.learn.learning import learn
 from heliotrope.calibration.learn.models import (
     ScoredModel,
     candidate_models,

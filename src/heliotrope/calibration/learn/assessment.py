@@ -7,14 +7,14 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.evaluation import ErrorSummary, summarise
-from heliotrope.calibration.learn.learning import (
-    FEWEST,
+from heliotrope.calibration.learn.learned import (
     Learned,
     Prediction,
     moved_by,
     predict,
     squared_distance,
 )
+from heliotrope.calibration.learn.learning import FEWEST
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.frames import Framed, Labelled, Variable

@@ -5,22 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope import sun as solar
-from heliotrope.calibration.learn.learning import Learned, predict
-from heliotrope.calibration.sightings import sightings
-from heliotrope.errors import InputError
-from heliotrope.field.target import Receiver, Target, point_of
 from heliotrope.frames import ACROSS, ENU, Framed, Labelled, Variable
 from heliotrope.frames import times as as_times
-from heliotrope.geometry import FloatArray, as_float
-from heliotrope.mechanism.chain import Mechanism
-from heliotrope.mechanism.tracking import track
+from heliotrope.geometry import FloatArray
 from heliotrope.optics.beam import ExpectedError
-from heliotrope.sun import Site, Times, unix_seconds
 from heliotrope.values import Card, Value, span
-
-#: Standard deviation of a sighting where none was learnt from, rad of beam.
-USUAL_SIGMA = 5e-4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -108,64 +97,3 @@ class Forecast(Value, Framed):
             },
             notes={"heliostat": self.heliostat},
         )
-
-
-def forecast(
-    learned: Learned,
-    heliostat: int | str,
-    times: Times,
-    target: str | Target | Receiver | npt.ArrayLike,
-    *,
-    site: Site | None = None,
-    steered: Mechanism | None = None,
-    sigma: float | None = None,
-) -> Forecast:
-    """Return the expected beams of one heliostat; see `Learned.forecast`."""
-    row = learned.row(heliostat)
-    place = site or learned.around.site
-    if place is None:
-        raise InputError(
-            "forecast: it was learnt from mechanisms alone, so the sun above them is unknown; give "
-            "site=Site(latitude, longitude, height), or learn from plant[name] or the plant"
-        )
-    when = np.atleast_1d(unix_seconds(times))
-    if when.ndim != 1:
-        raise InputError(f"times: shape {when.shape}; give a list of times, (T,)")
-    light, aim = solar.vector(when, place), point_of(target, learned.around.targets)
-    mine = learned.sightings.heliostat == row
-    if steered is None:
-        seen = learned.sightings.time[mine & learned.used]
-        last = float(np.nanmax(seen)) if np.isfinite(seen).any() else np.nan
-        steered = learned.mechanism_at([row], last)[0]
-    found = track(steered, light, aim)
-    good = np.asarray(found.reachable & (light[:, 2] > 0.0))
-    if sigma is None:
-        sigma = float(np.median(learned.sightings.sigma[mine])) if mine.any() else USUAL_SIGMA
-    made = sightings(
-        np.full(int(good.sum()), row),
-        found.best_counts[good].reshape(-1, found.counts.shape[-1]),
-        light[good],
-        aim,
-        time=when[good],
-        sigma=sigma,
-    )
-    expected = predict(learned, made)
-    good[good] = expected.usable
-    known = expected.usable
-
-    def spread(values: FloatArray) -> FloatArray:
-        whole = np.full((len(when), *values.shape[1:]), np.nan)
-        whole[good] = values[known]
-        return as_float(whole)
-
-    name = learned.heliostats[row] if learned.heliostats else str(row)
-    return Forecast(
-        name,
-        when,
-        light,
-        aim,
-        spread(made.counts),
-        spread(expected.plane),
-        spread(expected.covariance),
-        good,
-    )

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.learn import learning
+from heliotrope.calibration.learn.learned import Learned
 from heliotrope.calibration.named import Field, members
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError, UnknownNameError
@@ -189,7 +190,7 @@ def describe(scored: tuple[ScoredModel, ...]) -> tuple[str, ...]:
     return (f"{line}predictive density below the best: {listed}.",)
 
 
-def _scores(found: learning.Learned) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+def _scores(found: Learned) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """Log predictive density of each sighting, and the mask of outliers."""
     score = np.full(len(found.sightings), WORST)
     for i, member in enumerate(found.members):

@@ -10,16 +10,14 @@ from heliotrope.calibration.evaluation import BeamErrors
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn import stream
 from heliotrope.calibration.learn.drift import DAY
-from heliotrope.calibration.learn.learning import (
+from heliotrope.calibration.learn.learned import (
     Learned,
     Prediction,
-    Progress,
-    Runner,
-    learn,
     moved_by,
     predict,
     predict_with,
 )
+from heliotrope.calibration.learn.learning import Progress, Runner, learn
 from heliotrope.calibration.learn.stream import Belief
 from heliotrope.calibration.learn.unusable import is_usable
 from heliotrope.calibration.sightings import Sightings

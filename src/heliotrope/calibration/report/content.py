@@ -9,7 +9,7 @@ import numpy as np
 from heliotrope.calibration.evaluation import BeamErrors, ErrorSummary, beam_errors, summarise
 from heliotrope.calibration.fit.estimator import FitOutcome
 from heliotrope.calibration.learn.assessment import Assessment
-from heliotrope.calibration.learn.learning import Learned, left_out_errors
+from heliotrope.calibration.learn.learned import Learned, left_out_errors
 from heliotrope.calibration.report.results import FieldParameters, at_moment
 from heliotrope.calibration.uncertainty import BlindSpot, unobservable
 from heliotrope.errors import InputError

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from heliotrope import __version__
 from heliotrope.calibration.fit.estimator import FitOutcome
 from heliotrope.calibration.learn.drift import DAY
-from heliotrope.calibration.learn.learning import Learned
+from heliotrope.calibration.learn.learned import Learned
 from heliotrope.errors import InputError
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant

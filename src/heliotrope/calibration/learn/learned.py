@@ -1,0 +1,438 @@
+"""What was learnt of a field, and what it predicts: parameters at any time, beams, forecasts."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from threadpoolctl import threadpool_limits
+
+from heliotrope import sun as solar
+from heliotrope.calibration.evaluation import BeamErrors, beam_errors
+from heliotrope.calibration.fit.estimator import (
+    FieldFit,
+    parameter_rows,
+)
+from heliotrope.calibration.fit.residuals import linearise
+from heliotrope.calibration.learn.drift import DAY, Hyperparameters, Posterior
+from heliotrope.calibration.learn.forecast import Forecast
+from heliotrope.calibration.learn.regimes import regime_at
+from heliotrope.calibration.learn.unusable import is_usable
+from heliotrope.calibration.named import NOWHERE, Members, Surroundings
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.calibration.sightings import sightings as make_sightings
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.target import Receiver, Target, point_of
+from heliotrope.frames import Framed, Labelled, Variable
+from heliotrope.frames import times as as_times
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.tracking import track
+from heliotrope.optics.beam import CHI_SQUARE_90
+from heliotrope.sun import Site, Times, unix_seconds
+from heliotrope.values import Card, Value, amount, dots, span
+
+#: Standard deviation of a sighting where none was learnt from, rad of beam.
+USUAL_SIGMA = 5e-4
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Prediction(Value):
+    """Predicted against measured positions of M beams.
+
+    Attributes
+    ----------
+    errors
+        Predicted against measured, (M,).
+    plane
+        Predicted minus measured, rad of beam to the right of and above the destination, (M, 2).
+    covariance
+        Predicted covariance of ``plane``: parameters, drift and noise, rad², (M, 2, 2).
+    inside
+        Whether the error lies in the 90 % ellipse, (M,).
+    beam
+        Matrices that turn a whitened residual into ``plane``, (M, 2, 2).
+    values
+        The parameters' deviations at that time, (M, P).
+    usable
+        Whether the mechanism can say where the beam went, (M,); ``inside`` is false and
+        ``covariance`` NaN where it cannot. See `heliotrope.calibration.learn.unusable`.
+    """
+
+    errors: BeamErrors
+    plane: FloatArray
+    covariance: FloatArray
+    inside: npt.NDArray[np.bool_]
+    beam: FloatArray
+    values: FloatArray
+    usable: npt.NDArray[np.bool_]
+
+    def _card(self) -> Card:
+        good = self.usable
+        if not good.any():
+            return Card(f"{len(good)} beams, no usable beam")
+        line = f"{len(good)} beams, {(~good).sum()} unusable; errors "
+        line += (
+            f"{span(self.errors.beam[good], 1e3, 'mrad')}, {100 * self.inside[good].mean():.0f} "
+        )
+        return Card(f"{line}% within their 90 % ellipses")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Learned(Value, Framed):
+    """Result of learning N heliostats from M sightings.
+
+    Attributes
+    ----------
+    mechanism
+        Nominal, (N,).
+    sightings
+        All sightings given.
+    model
+        The constant parameters.
+    used
+        Mask of the sightings to learn from, (M,).
+    static
+        The robust fit of step 2.
+    hyper
+        Hyperparameters of the field.
+    members
+        Posterior of each heliostat.
+    regime
+        Regime of each sighting; −1 if not used, (M,).
+    outlier
+        Mask of the outliers among the sightings used, (M,).
+    unusable
+        Mask of the sightings that no parameters near the fit can produce, (M,); they are left out.
+    rows
+        For each heliostat the rows of its sightings, outliers included, in the order of its
+        member.
+    heliostats
+        Names, (N,); () if unknown.
+    around
+        The place of the heliostats, as far as it is known.
+    """
+
+    mechanism: Mechanism
+    sightings: Sightings
+    model: tuple[str, ...]
+    used: npt.NDArray[np.bool_]
+    static: FieldFit
+    hyper: Hyperparameters
+    members: tuple[Posterior, ...]
+    regime: npt.NDArray[np.int64]
+    outlier: npt.NDArray[np.bool_]
+    unusable: npt.NDArray[np.bool_]
+    rows: tuple[npt.NDArray[np.intp], ...]
+    heliostats: tuple[str, ...] = ()
+    around: Surroundings = NOWHERE
+
+    def row(self, heliostat: int | str) -> int:
+        """Return the row of a heliostat, by name or by row.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such heliostat.
+        """
+        if isinstance(heliostat, str):
+            if heliostat not in self.heliostats:
+                raise UnknownNameError("heliostat (learnt)", heliostat, self.heliostats)
+            return self.heliostats.index(heliostat)
+        if not 0 <= heliostat < len(self.members):
+            raise InputError(
+                f"heliostat {heliostat}: there are {len(self.members)}, from 0; give a row or name"
+            )
+        return heliostat
+
+    def __getitem__(self, heliostat: int | str) -> "Learned":
+        """Return one heliostat of the field, by name or by row."""
+        i = self.row(heliostat)
+        mine = np.flatnonzero(self.sightings.heliostat == i)
+        place = np.full(len(self.sightings), -1)
+        place[mine] = np.arange(len(mine))
+        whole = ("names", "lengths")
+        one = {k: v[[i]] for k, v in vars(self.static).items() if k not in whole}
+        return replace(
+            self,
+            mechanism=self.mechanism[np.array([i])],
+            sightings=self.sightings.of(i),
+            used=self.used[mine],
+            static=replace(self.static, lengths=self.static.lengths[mine], **one),
+            members=self.members[i : i + 1],
+            regime=self.regime[mine],
+            outlier=self.outlier[mine],
+            unusable=self.unusable[mine],
+            rows=(place[self.rows[i]],),
+            heliostats=self.heliostats[i : i + 1],
+        )
+
+    def _card(self) -> Card:
+        model, all_names = len(self.model), len(self.names)
+        seen = amount(int(self.used.sum()), "sighting")
+        parts = [
+            f"{amount(len(self.members), 'heliostat')} from {seen}",
+            amount(int(self.outlier.sum()), "outlier"),
+            f"{self.unusable.sum()} unusable",
+            amount(model, "constant parameter"),
+            f"{amount(all_names - model, 'parameter')} that only drift",
+        ]
+        static = self.static
+        rows = parameter_rows(static.names, np.abs(static.values), static.sigma)
+        places = self.mechanism.position
+        picture = dots(places[:, 0], places[:, 1], "map")
+        header = ("parameter", "median size", "median σ of the fit")
+        return Card(", ".join(parts), header, rows, picture)
+
+    def forecast(
+        self,
+        heliostat: int | str,
+        times: Times,
+        target: str | Target | Receiver | npt.ArrayLike,
+        *,
+        site: Site | None = None,
+        steered: Mechanism | None = None,
+        sigma: float | None = None,
+    ) -> Forecast:
+        """Return where a heliostat is expected to throw its beam, and how surely.
+
+        Parameters
+        ----------
+        heliostat
+            Name or row.
+        times
+            See `heliotrope.sun.Times`, (T,); a pandas index is one of them.
+        target
+            Name of a target of the plant learnt from, a target or receiver, or a point (m), (3,).
+        site
+            Place, if it was learnt from mechanisms alone.
+        steered
+            The mechanism by which the heliostat is steered, batch shape (); default: as learnt, at
+            the time of its last sighting used. With the nominal one the error is that before
+            calibration.
+        sigma
+            Standard deviation of a sighting's ray, rad of beam; default: the median of those of
+            this heliostat.
+
+        Raises
+        ------
+        InputError
+            If the place is unknown.
+        UnknownNameError
+            If there is no such heliostat or target.
+        """
+        return _forecast(self, heliostat, times, target, site, steered, sigma)
+
+    def _labelled(self) -> Labelled:
+        row, count = ("heliostat",), len(self.members)
+        known = self.sightings.time[self.used & np.isfinite(self.sightings.time)]
+        last = float(known.max()) if len(known) else np.nan
+        values, spread = self.parameters_at(np.arange(count), last)
+        units = ", ".join(f"{n} {self.mechanism.parameter(n).unit}" for n in self.names)
+        return Labelled(
+            row,
+            {
+                "heliostat": self.heliostats or np.arange(count),
+                "parameter": self.names,
+                "parameter_2": self.names,
+            },
+            {
+                "value": Variable((*row, "parameter"), values),
+                "sigma": Variable(
+                    (*row, "parameter"), np.sqrt(np.diagonal(spread, axis1=-2, axis2=-1))
+                ),
+                "covariance": Variable((*row, "parameter", "parameter_2"), spread),
+                "noise": Variable(row, np.array([m.hyper.noise for m in self.members])),
+                "sightings": Variable(row, np.array([len(m.data) for m in self.members])),
+            },
+            frozenset({"covariance"}),
+            {"units of the parameters": units, "time": str(as_times(last))},
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The P parameters, including those that only drift."""
+        return self.hyper.names
+
+    def regimes(self, heliostat: int, when: FloatArray) -> npt.NDArray[np.int64]:
+        """Return the regime of a heliostat at Unix times ``when`` (m,)."""
+        rows = self.rows[heliostat]
+        return regime_at(self.sightings.time[rows], self.regime[rows], when)
+
+    def parameters_at(self, heliostat: npt.ArrayLike, time: Times) -> tuple[FloatArray, FloatArray]:
+        """Return deviations (M, P) at Unix times (M,) and their covariance (M, P, P).
+
+        Parameters
+        ----------
+        heliostat
+            Rows, (M,).
+        time
+            See `heliotrope.sun.Times`, () or (M,); NaN: at an unknown time.
+
+        Raises
+        ------
+        InputError
+            A row that is not there.
+        TimeError
+            Something that is not a time, or has no time zone.
+        """
+        rows = np.asarray(heliostat, dtype=np.intp)
+        wrong = (rows < 0) | (rows >= len(self.members))
+        if wrong.any():
+            raise InputError(
+                f"heliostat: row {rows[wrong].flat[0]} is not learnt; rows go from 0 to "
+                f"{len(self.members) - 1}"
+            )
+        when = np.broadcast_to(unix_seconds(time, unknown=True), rows.shape)
+        size = len(self.names)
+        values, spread = np.empty((len(rows), size)), np.empty((len(rows), size, size))
+        with threadpool_limits(1, "blas"):
+            order = np.argsort(rows, kind="stable")
+            each, first = np.unique(rows[order], return_index=True)
+            for i, part in zip(each, np.split(order, first)[1:], strict=True):
+                # In parts, because memory grows with sightings × times × parameters.
+                for some in np.array_split(part, 1 + len(part) // 500):
+                    label = self.regimes(int(i), when[some])
+                    values[some], spread[some] = self.members[i].at(when[some] / DAY, label)
+        return values, spread
+
+    def mechanism_at(self, heliostat: npt.ArrayLike, time: Times) -> Mechanism:
+        """Return the mechanisms expected of ``heliostat`` (M,) at ``time`` (M,)."""
+        values, _ = self.parameters_at(heliostat, time)
+        return moved_by(self.mechanism, heliostat, self.names, values)
+
+
+def predict(learned: Learned, sightings: Sightings) -> Prediction:
+    """Return the predicted beams of sightings against the measured ones.
+
+    Parameters
+    ----------
+    learned
+        Of N heliostats.
+    sightings
+        M of these heliostats, at any time.
+    """
+    sightings = Members(learned.mechanism, learned.heliostats).rows_of(sightings)
+    values, spread = learned.parameters_at(sightings.heliostat, sightings.time)
+    return predict_with(learned, sightings, values, spread)
+
+
+def predict_with(
+    learned: Learned, sightings: Sightings, values: FloatArray, spread: FloatArray
+) -> Prediction:
+    """Return the predicted beams of sightings (M,) under given parameters.
+
+    Parameters
+    ----------
+    learned
+        Of N heliostats: their nominal mechanisms and their noise.
+    sightings
+        M of these heliostats.
+    values, spread
+        Deviations at each sighting, (M, P), and their covariance, (M, P, P).
+    """
+    rows = sightings.heliostat
+    moved = moved_by(learned.mechanism, rows, learned.names, values)
+    alone = sightings.renumbered(np.arange(len(rows)))
+    found = beam_errors(moved, alone)
+    line = linearise(moved, sightings, learned.names)
+    noise = np.array([m.hyper.noise**2 * m.hyper.heavy for m in learned.members])[rows]
+    usable = is_usable(line)
+    jacobian = np.where(usable[:, None, None], line.jacobian, 0.0)
+    white = jacobian @ spread @ np.swapaxes(jacobian, -1, -2)
+    white += noise[:, None, None] * np.eye(2)
+    covariance = line.beam @ white @ np.swapaxes(line.beam, -1, -2)
+    covariance[~usable] = np.nan
+    inside = squared_distance(found.offset, covariance) <= CHI_SQUARE_90
+    return Prediction(found, found.offset, covariance, inside, line.beam, values, usable)
+
+
+def squared_distance(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return squared lengths (M,) of errors (M, 2) in units of covariances (M, 2, 2); may be NaN.
+
+    In closed form, because a matrix of NaN has no inverse.
+    """
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    x, y = error[:, 0], error[:, 1]
+    return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))
+
+
+def moved_by(
+    mechanism: Mechanism, heliostat: npt.ArrayLike, names: tuple[str, ...], values: FloatArray
+) -> Mechanism:
+    """Mechanisms of rows ``heliostat`` (M,) with deviations ``values`` (M, P)."""
+    nominal = mechanism[np.asarray(heliostat, dtype=np.intp)]
+    return nominal.with_parameters({n: values[:, p] for p, n in enumerate(names)})
+
+
+def left_out_errors(learned: Learned) -> FloatArray:
+    """Return each beam error as predicted from the other sightings of its heliostat, (M, 2).
+
+    Predicted minus measured, rad to the right of and above the destination. Outliers and
+    sightings that were not used are predicted from all that were.
+    """
+    known = predict(learned, learned.sightings)
+    found = known.plane.copy()
+    for i, member in enumerate(learned.members):
+        part = learned.rows[i][~learned.outlier[learned.rows[i]]]
+        if len(part):
+            found[part] = -np.einsum("mab,mb->ma", known.beam[part], member.left_out()[1])
+    return found
+
+
+def _forecast(
+    learned: Learned,
+    heliostat: int | str,
+    times: Times,
+    target: str | Target | Receiver | npt.ArrayLike,
+    site: Site | None,
+    steered: Mechanism | None,
+    sigma: float | None,
+) -> Forecast:
+    row = learned.row(heliostat)
+    place = site or learned.around.site
+    if place is None:
+        raise InputError(
+            "forecast: it was learnt from mechanisms alone, so the sun above them is unknown; give "
+            "site=Site(latitude, longitude, height), or learn from plant[name] or the plant"
+        )
+    when = np.atleast_1d(unix_seconds(times))
+    if when.ndim != 1:
+        raise InputError(f"times: shape {when.shape}; give a list of times, (T,)")
+    light, aim = solar.vector(when, place), point_of(target, learned.around.targets)
+    mine = learned.sightings.heliostat == row
+    if steered is None:
+        seen = learned.sightings.time[mine & learned.used]
+        last = float(np.nanmax(seen)) if np.isfinite(seen).any() else np.nan
+        steered = learned.mechanism_at([row], last)[0]
+    found = track(steered, light, aim)
+    good = np.asarray(found.reachable & (light[:, 2] > 0.0))
+    if sigma is None:
+        sigma = float(np.median(learned.sightings.sigma[mine])) if mine.any() else USUAL_SIGMA
+    made = make_sightings(
+        np.full(int(good.sum()), row),
+        found.best_counts[good].reshape(-1, found.counts.shape[-1]),
+        light[good],
+        aim,
+        time=when[good],
+        sigma=sigma,
+    )
+    expected = predict(learned, made)
+    good[good] = expected.usable
+    known = expected.usable
+
+    def spread(values: FloatArray) -> FloatArray:
+        whole = np.full((len(when), *values.shape[1:]), np.nan)
+        whole[good] = values[known]
+        return as_float(whole)
+
+    name = learned.heliostats[row] if learned.heliostats else str(row)
+    return Forecast(
+        name,
+        when,
+        light,
+        aim,
+        spread(made.counts),
+        spread(expected.plane),
+        spread(expected.covariance),
+        good,
+    )
