@@ -16,7 +16,7 @@ from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver
 from heliotrope.field.volumes import Box, Sphere
-from heliotrope.geometry import FloatArray
+from heliotrope.geometry import FloatArray, reflect
 from heliotrope.lcu import names, states
 from heliotrope.lcu.stepper import BOTH, PRIMARY_FIRST, Axis, Stepper
 from heliotrope.links.clock import VirtualClock, gps_seconds, run_virtual
@@ -599,6 +599,35 @@ def test_an_approach_is_refused_by_name_and_the_others_go(tmp_path: Path) -> Non
         plant.beams.volumes = ()
         for name in texts:
             plant.command(OPERATOR, token, "APPROACH", (name,))
+
+    play(tmp_path, scene)
+
+
+def test_parameters_that_would_lead_the_present_beam_into_a_volume_are_not_written(
+    tmp_path: Path,
+) -> None:
+    """A poisoned calibration: by its parameters the way is free, and the true beam is elsewhere."""
+    standby = (-3.5, -12.0, 8.0)
+
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        plant.standbys[plant.field.place("P5A")] = standby
+        await stands(bench, "P5A", states.LOCKED, counts(plant, "P5A", standby))
+        group, row = DESIGN.find("P5A")
+        nominal, seen = group.mechanism[row], {True: 0, False: 0}
+        for lean in np.linspace(-0.2, 0.2, 41):
+            new = nominal.with_parameters({"canting": lean})
+            solved = track(new, plant.sun_vector(), standby)
+            # The oracle: where the present mirror shines in the pose that the new one takes.
+            pose = nominal.pose(np.round(solved.best_counts))
+            ray = reflect(plant.sun_vector(), pose.normal)
+            way = np.array(WALKWAY.center) - pose.vertex
+            inside = float(np.linalg.norm(way - ray * (way @ ray))) < WALKWAY.radius
+            why = plant._ways.rewriting("P5A", new.armature.table, new.drives.table)
+            seen[inside] += 1
+            assert not inside or "walkway" in why
+        assert min(seen.values()) > 0
+        assert plant._ways.rewriting("P5A", nominal.armature.table, nominal.drives.table) == ""
 
     play(tmp_path, scene)
 

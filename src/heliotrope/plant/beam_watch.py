@@ -183,7 +183,8 @@ class BeamWatch:
         """Return why new parameters may not be written where a heliostat stands, "" if they may.
 
         With the present parameters and with the new ones, its beam must be free where it stands
-        and on the way from there to its standby point.
+        and on the way from there to its standby point; and with the present ones on the way that
+        the new ones will lead it, since the new ones may be the wrong ones.
 
         Parameters
         ----------
@@ -195,12 +196,21 @@ class BeamWatch:
         row = self._field.place(heliostat)
         if not self._check.volumes or not np.isfinite(self._field.posed_at[row]):
             return ""
+        rows, light = np.array([row]), self._sun(0.0)
         present = self._check.armature.table[row].copy(), self._check.drives.table[row].copy()
         try:
             for tables in (present, (armature, drives)):
                 self._check.replace(row, *tables)
-                if wrong := self._from_here(np.array([row])):
+                if wrong := self._from_here(rows):
                     return wrong[heliostat].partition(";")[0]
+            counts, standbys = self._field.counts(rows), self.points.standbys[rows]
+            if not np.isfinite(standbys).all():
+                return ""
+            ends = self._check.poses(rows, standbys, light, counts).best_counts
+            self._check.replace(row, *present)
+            path = self._ways.motion(rows, counts, ends)
+            if wrong := self._check.moving(rows, path, light):
+                return wrong[heliostat].partition(";")[0]
         finally:
             self._check.replace(row, *present)
         return ""
