@@ -7,8 +7,8 @@ could be used, how many reflections were found on the right mirrors, and true er
 FLIGHT is a station of the default radial field (``heliotrope field layout radial --heliostats 300
 --width 3.2 --height 2.54``, then ``drone plan``), such as C1-4, or ``paper``, in HelioPoint's
 geometry: mirrors of four facets, 3.2 m by 2.5 m, at 13.5° of elevation and 214° of azimuth, 150 m
-away. Without any, it is the paper's flight and those of the five lowest stations. The flights have
-all errors of ``drone simulate`` by its defaults.
+away; ``paper:7`` has another seed. Without any, it is the paper's flight and those of the five
+lowest stations. The flights have all errors of ``drone simulate`` by its defaults.
 """
 
 import sys
@@ -81,7 +81,7 @@ def main() -> None:
     most = int(sys.argv[1]) if len(sys.argv) > 1 else 100
     names = sys.argv[2:]
     plan = None
-    if names != ["paper"]:
+    if not names or not all(name.startswith("paper") for name in names):
         size = HeliostatSize(3.2, 2.54, 0.5 * 2.54 + 0.7)
         plan = plan_flight(lay_out("radial", 300, mirror=size, site=SITE), PlanSettings())
         low = sorted(plan.stations, key=lambda s: float(s.pattern.direction[2]))[:5]
@@ -92,14 +92,17 @@ def main() -> None:
     )
     print(" σ_tot | in 90 % |\n|---|---|---|---|---|---|---|---|---|")
     for name in names:
-        if name == "paper":
-            flown, plant = paper_flight(lens(), SITE, REAL)
+        seed = 0
+        if name.startswith("paper"):
+            seed = int(name.partition(":")[2] or 0)
+            flown, plant = paper_flight(lens(), SITE, REAL, seed=seed)
         else:
             assert plan is not None
             flown, plant = planned(plan, name, most)
         with tempfile.TemporaryDirectory() as folder:
             print(
-                line(name, fly_rendered(flown, plant, Path(folder), conditions=LIGHT)), flush=True
+                line(name, fly_rendered(flown, plant, Path(folder), conditions=LIGHT, seed=seed)),
+                flush=True,
             )
 
 
