@@ -1,8 +1,8 @@
 """Links over TCP: a server for the plant, a client for each cluster.
 
 A frame is a length of 4 bytes (big-endian) and an envelope. COBS would let a reader find the
-next frame after lost bytes, but TCP loses none. A length above the limit is refused before anything
-of the frame is kept, and ends the connection.
+next frame after lost bytes, but TCP loses none. A length above the limit, or below that of a proof,
+is refused before anything of the frame is kept, and ends the connection.
 
 Handshake, each step one frame: server, 32 random bytes; client, 32 random bytes, its proof and
 its name; server, its proof. A proof is HMAC-SHA256 of a label, both random numbers and the name
@@ -101,8 +101,9 @@ class _Pipe(asyncio.Protocol):
         self._buffer += data
         while not self._lost and len(self._buffer) >= _LENGTH:
             size = int.from_bytes(self._buffer[:_LENGTH], "big")
-            if size > self.largest:
-                self.lose(f"received a frame of {size} bytes; the limit is {self.largest}")
+            if not _PROOF <= size <= self.largest:
+                limits = f"{_PROOF} to {self.largest}"
+                self.lose(f"received a frame of {size} bytes; a frame has {limits}")
                 return
             if len(self._buffer) < _LENGTH + size:
                 break
