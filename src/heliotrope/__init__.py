@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from heliotrope.calibration.learn import Forecast as Forecast
     from heliotrope.calibration.learn import compare_models as compare
     from heliotrope.calibration.learn import learn
+    from heliotrope.calibration.report import write_paint
     from heliotrope.calibration.sightings import sightings
     from heliotrope.field import (
         Heliostat,
@@ -115,6 +116,7 @@ _HOMES = {
     "track": "heliotrope.mechanism",
     "track_day": "heliotrope.field",
     "track_path": "heliotrope.mechanism",
+    "write_paint": "heliotrope.calibration.report",
     "write_plant": "heliotrope.field.formats.plant_file",
     "write_report": "heliotrope.calibration",
     "write_sightings": "heliotrope.calibration",
@@ -178,6 +180,7 @@ __all__ = [
     "track",
     "track_day",
     "track_path",
+    "write_paint",
     "write_plant",
     "write_report",
     "write_sightings",

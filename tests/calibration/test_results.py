@@ -13,7 +13,7 @@ from heliotrope.calibration.learn import learning, models
 from heliotrope.calibration.learn import on_dask as cluster
 from heliotrope.calibration.learn.assessment import assess
 from heliotrope.calibration.learn.learned import Learned
-from heliotrope.calibration.report import results
+from heliotrope.calibration.report import results, write_paint
 from heliotrope.calibration.report.content import CalibrationReport
 from heliotrope.calibration.report.page import write_report
 from heliotrope.calibration.sightings import Sightings, of_measurements
@@ -302,3 +302,23 @@ def test_an47_has_regimes() -> None:
     changes = len(np.unique(found.regime)) - 1 + len(found.members[0].data.steps)
     assert changes >= 1
     assert found.members[0].log_evidence() > plain.members[0].log_evidence()
+
+
+def test_what_was_learnt_returns_in_the_form_of_paint(tmp_path: Path) -> None:
+    """Read back, it points as it was learnt, but for what the form has no place for."""
+    plant = paint.read_plant(juelich())
+    (group,) = plant.groups.values()
+    seen, _ = of_measurements(measurements.read_measurements(juelich()), group)
+    model = ("tilt_up", "tilt_north", "elevation_bias", "azimuth_bias", "canting")
+    learned = learning.learn(plant["AA39"], seen["AA39"], model, processes=())
+    left = write_paint(tmp_path, plant, learned)
+    value = learned.parameters_at([0], float("nan"))[0][0]
+    assert list(left) == ["AA39"]
+    assert left["AA39"] == (f"canting {value[model.index('canting')]:.4g} rad",)
+    assert (tmp_path / "left-out.txt").read_text() == f"AA39: {left['AA39'][0]}\n"
+    file = tmp_path / "properties" / "AA39.json"
+    again = paint.to_heliostats([paint.read_heliostat(file)], plant.site.origin)
+    known = dict(zip(model[:4], value, strict=False))
+    counts = np.random.default_rng(0).uniform(1000, 65000, (20, 2))
+    wanted = plant["AA39"].nominal.with_parameters(known).pose(counts)
+    np.testing.assert_allclose(again.mechanism[0].pose(counts).normal, wanted.normal, atol=1e-10)

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heliotrope.errors import InputError
 from heliotrope.field.formats import measurements, paint
 from heliotrope.geometry import MRAD, geodetic_to_enu
 from support.data import juelich
@@ -72,7 +71,7 @@ def test_heliostat_survives_with_its_calibration(tmp_path: Path) -> None:
     }  # fmt: skip
     calibrated = group.with_parameters(changes)
     origin = plant.site.origin
-    paint.write_heliostat(calibrated, "AA39", origin, tmp_path / "AA39.json")
+    assert not paint.write_heliostat(calibrated, "AA39", origin, tmp_path / "AA39.json")
     again = paint.to_heliostats([paint.read_heliostat(tmp_path / "AA39.json")], origin)
     counts = np.random.default_rng(0).uniform(1000, 65000, (20, 2))
     wanted = calibrated.calibrated[group.index("AA39")].pose(counts)
@@ -82,15 +81,20 @@ def test_heliostat_survives_with_its_calibration(tmp_path: Path) -> None:
     assert (again.facets is None) == (group.facets is None)
 
 
-@pytest.mark.parametrize(
-    ("parameter", "text"), [("canting", "no place for canting"), ("azimuth_scale", "for scale")]
-)
-def test_what_has_no_place_is_refused(parameter: str, text: str, tmp_path: Path) -> None:
+def test_what_has_no_place_is_named(tmp_path: Path) -> None:
     plant = paint.read_plant(juelich())
-    calibrated = plant.groups["jacks"].with_parameters({parameter: 1e-3})
-    with pytest.raises(InputError, match=text):
-        paint.write_heliostat(calibrated, "AA39", plant.site.origin, tmp_path / "AA39.json")
-    assert not (tmp_path / "AA39.json").exists()
+    file, origin = tmp_path / "AA39.json", plant.site.origin
+    lost = {"canting": 1e-3, "azimuth_scale": 2e-3}
+    calibrated = plant.groups["jacks"].with_parameters({**lost, "azimuth_bias": 4e-3})
+    named = paint.write_heliostat(calibrated, "AA39", origin, file)
+    assert named == ("canting 0.001 rad", "azimuth_scale 0.002 1")
+    # All else is there, the zero of the second jack in its initial angle.
+    again = paint.to_heliostats([paint.read_heliostat(file)], origin)
+    rest = plant.groups["jacks"].with_parameters({"azimuth_bias": 4e-3})
+    counts = np.random.default_rng(0).uniform(1000, 65000, (20, 2))
+    wanted = rest.calibrated[rest.index("AA39")].pose(counts)
+    found = again.mechanism[0].pose(counts)
+    np.testing.assert_allclose(found.normal, wanted.normal, rtol=0, atol=1e-12)
 
 
 def test_both_styles_of_calibration_properties() -> None:

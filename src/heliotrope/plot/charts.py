@@ -9,6 +9,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError, UnknownNameError, kind_of
 from heliotrope.geometry import FloatArray, as_numbers
 from heliotrope.mechanism.parameters import shown_in
+from heliotrope.mechanism.path import TrackedPath
 from heliotrope.mechanism.tracking import Tracking
 from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.sun import Times, unix_seconds
@@ -86,7 +87,7 @@ def _date_axis(ax: "Axes") -> None:
 
 def day(
     times: Times,
-    tracked: Tracking,
+    tracked: Tracking | TrackedPath,
     *,
     joints: Sequence[str] = ("first drive", "second drive"),
     ax: "Axes | None" = None,
@@ -98,7 +99,8 @@ def day(
     times
         T times, as for `heliotrope.sun.vector`.
     tracked
-        Their solutions, batch shape (T,); the best branch is drawn.
+        Their solutions, batch shape (T,), of which the best branch is drawn; or a path, such as
+        ``track_day(…).path``.
     joints
         Names of the drives.
     ax
@@ -109,10 +111,10 @@ def day(
     InputError
         If there are not as many solutions as times.
     """
-    if not isinstance(tracked, Tracking):
+    if not isinstance(tracked, Tracking | TrackedPath):
         raise InputError(f"tracked: {kind_of(tracked)} is not a Tracking; give what track returns")
     dates = _dates(times)
-    angles = np.degrees(tracked.chosen(tracked.angles))
+    angles = np.degrees(tracked.angles if isinstance(tracked, TrackedPath) else tracked.best_angles)
     if angles.shape[:-1] != dates.shape:
         raise InputError(
             f"tracked: shape {angles.shape[:-1]} for {len(dates)} times; track one heliostat, "

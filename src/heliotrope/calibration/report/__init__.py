@@ -14,6 +14,7 @@ from heliotrope.calibration.report.results import (
     calibrated_plant,
     read_json,
     write_json,
+    write_paint,
     write_parquet,
 )
 
@@ -26,6 +27,7 @@ __all__ = [
     "calibrated_plant",
     "read_json",
     "write_json",
+    "write_paint",
     "write_parameters",
     "write_parquet",
     "write_report",

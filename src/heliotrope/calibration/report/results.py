@@ -263,6 +263,54 @@ def write_parquet(path: Path, mechanism_units: dict[str, str], results: FieldPar
     write_file(path, lambda part: frame.to_parquet(part, index=False))
 
 
+def write_paint(
+    folder: str | Path, plant: Plant, learned: Learned, time: float | None = None
+) -> dict[str, tuple[str, ...]]:
+    """Write what was learnt as heliostat properties in PAINT's form, which ARTIST reads too.
+
+    Parameters
+    ----------
+    folder
+        Gets ``properties/NAME.json`` for each heliostat learnt, and ``left-out.txt`` with the
+        parameters that have no place there.
+    plant
+        The plant that it was learnt from.
+    learned
+        Of heliostats with names.
+    time
+        Unix seconds; default: the time of the last sighting used.
+
+    Returns
+    -------
+    By heliostat, the parameters that have no place in the form, with their values.
+
+    Raises
+    ------
+    InputError
+        If nothing learnt has a name, or a mechanism is not of kind ``two_jacks``.
+    """
+    from heliotrope.field.formats import paint
+
+    if not learned.heliostats:
+        raise InputError(
+            "write_paint: it was learnt without names; learn from the plant, or plant[name]"
+        )
+    given = apply_to_plant(plant, at_moment(learned.heliostats, learned, time))
+    place = Path(folder)
+    try:
+        (place / "properties").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{place}: cannot be made ({error.strerror}); give a folder") from None
+    left: dict[str, tuple[str, ...]] = {}
+    for name in learned.heliostats:
+        group, _ = given.find(name)
+        file = place / "properties" / f"{name}.json"
+        left[name] = paint.write_heliostat(group, name, plant.site.origin, file)
+    lines = [f"{name}: {', '.join(lost)}" for name, lost in left.items() if lost]
+    write_text(place / "left-out.txt", "".join(f"{line}\n" for line in lines))
+    return left
+
+
 def calibrated_plant(plant: Plant, group: str, results: FieldParameters) -> Plant:
     """Return ``plant`` with the parameters in the heliostats of ``group``."""
     groups = dict(plant.groups)

@@ -19,7 +19,8 @@ from heliotrope.field.target import Receiver, Target
 from heliotrope.files import JsonNode, read_json, write_text
 from heliotrope.geometry import FloatArray, enu_to_geodetic, geodetic_to_enu
 from heliotrope.mechanism import kinds
-from heliotrope.mechanism.drives import Drive, linear_paint
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import SLOTS, Drive, linear_paint
 from heliotrope.sun import Site
 
 TOWER_FILE = "tower-measurements.json"
@@ -27,6 +28,8 @@ Origin = tuple[float, float, float]
 
 # θ₀ of the first joint counts from the horizontal, the file's from the vertical.
 _AXIS_1_ZERO = -0.5 * np.pi
+#: Numbers of a drive that PAINT has no place for.
+_LOST = ("scale", "worm_cos", "worm_sin", "sag")
 
 #: Length and breadth of the strokes of Jülich's marks, m, read off photographs.
 MARK_SIZE, MARK_STROKE = 0.735, 0.15
@@ -408,14 +411,22 @@ def read_calibration_properties(path: str | Path) -> CalibrationProperties:
     )
 
 
-def write_heliostat(heliostats: Heliostats, name: str, origin: Origin, path: str | Path) -> None:
+def write_heliostat(
+    heliostats: Heliostats, name: str, origin: Origin, path: str | Path
+) -> tuple[str, ...]:
     """Write the properties of one heliostat, its calibrated parameters folded in.
+
+    ARTIST reads them too. The zero of the second jack is folded into its initial angle.
+
+    Returns
+    -------
+    The parameters that have no place in the format, each with its value and unit; a plant file
+    keeps them.
 
     Raises
     ------
     InputError
-        If its mechanism is not of kind ``two_jacks``, or a calibrated parameter has no
-        place in the format; use the plant file then.
+        If its mechanism is not of kind ``two_jacks``.
     """
     if heliostats.mechanism.kind != "two_jacks":
         raise InputError(
@@ -424,12 +435,6 @@ def write_heliostat(heliostats: Heliostats, name: str, origin: Origin, path: str
     i = heliostats.index(name)
     one = heliostats.calibrated[i]
     joints = dict(zip(one.joints, one.angles, strict=True))
-    for lost in ("canting", "canting_secondary"):
-        if joints[lost] != 0.0:
-            raise InputError(
-                f"heliostat {name}: PAINT has no place for {lost} ({joints[lost]:.3g} rad); "
-                "write a plant file instead"
-            )
     latitude, longitude, height = (float(v) for v in enu_to_geodetic(one.position, origin))
     chain: dict[str, object] = {"actuators": [_actuator(one.drives.table[k], k) for k in (0, 1)]}
     for part, joint in (
@@ -462,20 +467,28 @@ def write_heliostat(heliostats: Heliostats, name: str, origin: Origin, path: str
             ],
         }
     write_text(path, json.dumps(document, indent=1) + "\n")
+    return _without_place(one)
+
+
+def _without_place(one: Mechanism) -> tuple[str, ...]:
+    """Return the parameters of a mechanism that PAINT has no place for, with their values."""
+    joints = dict(zip(one.joints, one.angles, strict=True))
+    lost = {name: float(joints[name]) for name in ("canting", "canting_secondary")}
+    for k, d in enumerate(one.driven):
+        drive = dict(zip(_LOST, one.drives.table[k, [SLOTS[name] for name in _LOST]], strict=True))
+        lost |= {
+            name if name == "sag" else f"{one.joints[d]}_{name}": float(value)
+            for name, value in drive.items()
+        }
+    return tuple(
+        f"{name} {value:.4g} {one.parameter(name).unit}" for name, value in lost.items() if value
+    )
 
 
 def _actuator(row: FloatArray, axis: int) -> dict[str, object]:
-    from heliotrope.mechanism.drives import SLOTS
-
     def of(name: str) -> float:
         return float(row[SLOTS[name]])
 
-    for name in ("scale", "worm_cos", "worm_sin", "sag") + (("bias",) if axis else ()):
-        if of(name) != 0.0:
-            raise InputError(
-                f"PAINT has no place for {name} ({of(name):.3g}) of axis {axis + 1}; "
-                "write a plant file instead"
-            )
     # SENSE stands before STROKE in the row; SLOTS names only what may be calibrated.
     sense = float(row[SLOTS["stroke_offset"] - 1])
     speed = of("speed")
@@ -490,6 +503,7 @@ def _actuator(row: FloatArray, axis: int) -> dict[str, object]:
         "pivot_radius": of("pivot_radius"),
         "radius_shift": 0.0,
         "clockwise_axis_movement": 1 if sense > 0 else 0,
-        "initial_angle": of("initial_angle") - (_AXIS_1_ZERO if axis == 0 else 0.0),
+        # The bias of the first axis has a place of its own, joint_tilt_e_2.
+        "initial_angle": of("initial_angle") + (of("bias") if axis else -_AXIS_1_ZERO),
         "movement_speed": speed if np.isfinite(speed) else 0.0,
     }
