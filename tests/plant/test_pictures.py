@@ -212,6 +212,33 @@ def test_a_heliostat_is_calibrated_when_it_is_asked_for(tmp_path: Path) -> None:
     live(work, tmp_path)
 
 
+def test_a_beam_is_searched_when_it_is_asked_for(tmp_path: Path) -> None:
+    """The search ends once the camera has seen the beam move with its aim; nothing is learnt."""
+
+    async def work(plant: LivePlant, pictures: Pictures) -> None:
+        operations, last = plant.operations, plant.names[-1]
+        for name in plant.names[:-1]:
+            operations.automatic.want([name], wanted=name == plant.names[0])
+        while not operations.calibration().on:
+            await asyncio.sleep(1.0)
+        operations.calibrate(OPERATOR, last, plant.design.targets[0].name, search=True)
+        found: list[CalibrationEntry] = []
+        while not found:
+            await asyncio.sleep(1.0)
+            found = [r for r in operations.calibration().results if r.heliostat == last]
+        text = found[0].text
+        assert text.startswith("searched: the beam misses its aim by "), text
+        # As far as the true mirror of the twin stands off.
+        said = float(text.split(", ")[1].split()[0])
+        assert said == pytest.approx(2e3 * found[0].truth_before, rel=0.2, abs=1.0)
+        rows = [row for row in listed(pictures, last) if row.text == text]
+        assert len(rows) >= 2
+        assert operations.heliostat(last).history == ()
+        assert plant.plant.beliefs.record(last) is None
+
+    live(work, tmp_path)
+
+
 def test_a_photograph_is_taken_when_it_is_asked_for(tmp_path: Path) -> None:
     async def work(plant: LivePlant, pictures: Pictures) -> None:
         operations, target = plant.operations, plant.design.targets[0].name

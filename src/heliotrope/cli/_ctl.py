@@ -356,10 +356,13 @@ def calibrate(
     context: typer.Context,
     heliostat: Annotated[str, typer.Argument(help="Heliostat.")],
     target: Annotated[str, typer.Option(help="Target; any if left out.")] = "",
+    search: Annotated[
+        bool, typer.Option("--search", help="Only search its beam with the camera.")
+    ] = False,
 ) -> None:
     """Have automatic control calibrate a heliostat next, as soon as a target is free."""
     with _client(context) as client:
-        order = {"heliostat": heliostat, "target": target}
+        order = {"heliostat": heliostat, "target": target, "search": search}
         found = client.ask("POST", "calibration/next", order)
     print(f"asked for: {', '.join(found['asked'])}")
 

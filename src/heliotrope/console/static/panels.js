@@ -95,7 +95,9 @@ function heliostatView(one) {
   return [
     h("h2", { className: stale }, one.name, h("span", { className: "hx-chip" }, one.live ? one.state : `stale: ${span(one.age)} old`)),
     canCommand() ? h("div", { className: "hx-row" }, h("button", { className: "hx-button", title: "Automatic control calibrates it as soon as a target is free",
-      onclick: () => act(() => api("POST", "calibration/next", { heliostat: one.name }), `calibrate ${one.name}`) }, "Calibrate now")) : "",
+      onclick: () => act(() => api("POST", "calibration/next", { heliostat: one.name }), `calibrate ${one.name}`) }, "Calibrate now"),
+    h("button", { className: "hx-button", title: "Automatic control searches its beam on a target until the camera sees it move with its aim; nothing is changed",
+      onclick: () => act(() => api("POST", "calibration/next", { heliostat: one.name, search: true }), `search ${one.name}`) }, "Search its beam")) : "",
     facts([["Cluster", one.cluster], ["Heard", one.live ? `${number(one.age, 1)} s ago` : `${span(one.age)} ago`],
       ["Fault", one.live ? one.fault : "unknown", one.live && one.fault !== "none" ? "bad" : stale], ["Aims at", one.on || "nothing"],
       ["Aim E, N, U (m)", point(one.aim)], ["Standby E, N, U (m)", point(one.standby)],

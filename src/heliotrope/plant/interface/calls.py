@@ -122,7 +122,7 @@ def _switch(desk: Desk, who: Person, given: orders.Switch, _: bytes) -> Any:
 
 
 def _calibrate(desk: Desk, who: Person, given: orders.OneCalibration, _: bytes) -> Any:
-    desk.operations.calibrate(who, given.heliostat, given.target)
+    desk.operations.calibrate(who, given.heliostat, given.target, search=given.search)
     return desk.operations.calibration()
 
 

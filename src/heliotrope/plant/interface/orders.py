@@ -87,10 +87,11 @@ class Picture(Strict):
 
 
 class OneCalibration(Strict):
-    """A heliostat to be calibrated next, and the target ("": any)."""
+    """A heliostat to be calibrated next, and the target ("": any); or only its beam searched."""
 
     heliostat: Name
     target: Annotated[str, Field(max_length=64)] = ""
+    search: bool = False
 
 
 class ParameterOrder(Strict):

@@ -181,7 +181,7 @@ class AutomaticControl:
         if not wanted and self._calibrating is not None:
             self._calibrating.withdraw(heliostats or self._plant.field.names)
 
-    def calibrate(self, heliostat: str, target: str = "") -> None:
+    def calibrate(self, heliostat: str, target: str = "", *, search: bool = False) -> None:
         """Calibrate a heliostat before all others; see `Operations.calibrate`."""
         row = self._plant.field.place(heliostat)
         if target:
@@ -193,7 +193,7 @@ class AutomaticControl:
             why = "automatic control does not have it"
         if why or self._calibrating is None:
             raise refusals.NO_CALIBRATION.error(heliostat=heliostat, why=why)
-        self._calibrating.ask(heliostat, target)
+        self._calibrating.ask(heliostat, target, search=search)
 
     @property
     def waits(self) -> str:

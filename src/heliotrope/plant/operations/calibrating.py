@@ -109,16 +109,19 @@ class Calibrating:
         self._book, self._keeping, self._truth = book, keeping, truth
         self._pictures = pictures
         self._running: dict[str, Running] = {}
-        self._asked: dict[str, str] = {}
+        self._asked: dict[str, tuple[str, bool]] = {}
 
     @property
     def asked(self) -> tuple[str, ...]:
         """Heliostats that persons want calibrated next, in the order in which they were asked."""
         return tuple(self._asked)
 
-    def ask(self, heliostat: str, target: str) -> None:
-        """Calibrate a heliostat before all others, on a target or, for "", on the next free one."""
-        self._asked[heliostat] = target
+    def ask(self, heliostat: str, target: str, *, search: bool = False) -> None:
+        """Calibrate a heliostat before all others, on a target or, for "", on the next free one.
+
+        With ``search`` its beam is only searched for.
+        """
+        self._asked[heliostat] = target, search
 
     def withdraw(self, heliostats: Sequence[str]) -> None:
         """Forget that persons wanted these heliostats calibrated."""
@@ -143,7 +146,7 @@ class Calibrating:
         photograph ends it. Then those for which a flight has brought a large change, which a
         photograph confirms.
         """
-        name = self._chosen(target, ready)
+        name, search = self._chosen(target, ready)
         if not name:
             return ""
         begun = self._now()
@@ -157,7 +160,8 @@ class Calibrating:
         row = self._plant.field.place(name)
         truth, sigma = self._truth.now(row), float(self._book.error[row])
         try:
-            result = await self._cycle.run(person, token, name, target, tell)
+            work = self._cycle.search if search else self._cycle.run
+            result = await work(person, token, name, target, tell)
         except RefusedError as error:
             result = CycleResult(name, CalibrationOutcome.REFUSED, str(error))
         except HeliotropeError as error:
@@ -168,17 +172,18 @@ class Calibrating:
         self._conclude(target, result, truth, begun, sigma)
         return name
 
-    def _chosen(self, target: str, ready: npt.NDArray[np.bool_]) -> str:
-        for name, where in self._asked.items():
+    def _chosen(self, target: str, ready: npt.NDArray[np.bool_]) -> tuple[str, bool]:
+        """Return the heliostat, and whether its beam is only searched for."""
+        for name, (where, search) in self._asked.items():
             if where in ("", target) and ready[self._plant.field.place(name)]:
                 del self._asked[name]
-                return name
+                return name, search
         changed = np.isin(self._plant.field.names, list(self._first()))
         for rows in (ready & self._plant.doubts.standing, ready & changed, ready):
             chosen = self._scheduler.next(target, rows) if rows.any() else None
             if chosen is not None:
-                return chosen.heliostat
-        return ""
+                return chosen.heliostat, False
+        return "", False
 
     def _now(self) -> float:
         return self._plant.clock.utc().timestamp()

@@ -325,8 +325,10 @@ class Operations:
         self.automatic.switch(on)
         self._tell(person, f"calibration switched {'on' if on else 'off'}")
 
-    def calibrate(self, person: Person, heliostat: str, target: str = "") -> None:
-        """Calibrate a heliostat as soon as a target ("": any) is free, before all others.
+    def calibrate(
+        self, person: Person, heliostat: str, target: str = "", *, search: bool = False
+    ) -> None:
+        """Calibrate a heliostat, or only search its beam, on the next free target, before others.
 
         Raises
         ------
@@ -336,8 +338,9 @@ class Operations:
             If there is no such heliostat or target.
         """
         _operator(person, "calibration")
-        self.automatic.calibrate(heliostat, target)
-        self._tell(person, f"asked for a calibration of {heliostat}{target and f' on {target}'}")
+        self.automatic.calibrate(heliostat, target, search=search)
+        what = "search for the beam" if search else "calibration"
+        self._tell(person, f"asked for a {what} of {heliostat}{target and f' on {target}'}")
 
     async def photograph(self, person: Person, target: str) -> CameraView:
         """Photograph a target now, with whatever beam is on it; return what is seen.

@@ -113,6 +113,7 @@ class CalibrationCycle:
         centring: Centring | None = None,
     ) -> None:
         self._plant, self.settings = plant, settings or CycleSettings()
+        self._camera, self._centring = camera, centring or Centring()
         self._photographing: Photographing = (
             Plain(camera, self.settings)
             if centring is None
@@ -162,6 +163,31 @@ class CalibrationCycle:
             await visit.aim(aim)
             await visit.command("TRACK")
         return result
+
+    async def search(
+        self, person: Person, token: int, heliostat: str, target: str, tell: Tell | None = None
+    ) -> CycleResult:
+        """Search the beam of one heliostat on a target, as a camera sees it; change nothing.
+
+        The parameters are those of `run`.
+        """
+        plant = self._plant
+        visit = Visit(plant, person, token, heliostat, plant.design.target(target))
+        tracked, aim = visit.state == states.TRACKING, plant.aims[visit.row].copy()
+        searching = Centred(self._camera, self.settings, self._centring)
+        async with visit:
+            await visit.go(self.settings.arrival)
+            missed, why = await searching.search(visit, tell or _nobody)
+        if tracked and np.isfinite(aim).all():
+            await visit.aim(aim)
+            await visit.command("TRACK")
+        if missed is None:
+            return CycleResult(heliostat, CalibrationOutcome.NO_BEAM, f"searched: {why}")
+        slant = np.linalg.norm(plant.beams.armature.origin_1[visit.row] - visit.target.center)
+        ways = f"{missed[0]:+.2f} m to the right and {missed[1]:+.2f} m up"
+        angle = 1e3 * float(np.linalg.norm(missed) / slant)
+        text = f"searched: the beam misses its aim by {ways}, {angle:.1f} mrad; nothing was changed"
+        return CycleResult(heliostat, CalibrationOutcome.UNCHANGED, text)
 
     def _missed(self, heliostat: str, taken: Photographs) -> float:
         """Return the beam error of photographs by what is believed now, rad RMS."""

@@ -135,6 +135,31 @@ class Centred:
             before = light.aim
         return taken
 
+    async def search(self, visit: Visit, tell: Tell) -> tuple[FloatArray | None, str]:
+        """Search for the beam until the camera sees it move with its aim; nothing is learnt.
+
+        Returns
+        -------
+            How far it misses its aim, right and up, m, (2,), None if it was not found; and why.
+        """
+        target = visit.target
+        light = await self._find(visit, np.asarray(target.center), tell)
+        if light is None:
+            tries = self._centring.most + 1
+            return None, f"no beam was seen on {target.name} in {tries} photographs"
+        corner = np.array(CORNERS[0]) * room_of(visit, self._centring)
+        goal = np.asarray(light.aim + corner @ target.axes)
+        tell("does it move with the aim?")
+        await self._go(visit, goal, light.aim)
+        shot = await photographed(self._camera, visit)
+        astray = self._astray(target, shot, goal, light)
+        if not astray and np.linalg.norm(goal - light.first) <= _SAME:
+            astray = "the target is too small to move a beam on it"
+        if astray or seen(target, shot) is None:
+            said = astray or "; ".join(shot.reasons)
+            return None, f"light was seen, but not that it moves with the aim: {said}"
+        return light.place - target.axes @ (light.first - target.center), ""
+
     async def _find(self, visit: Visit, before: FloatArray, tell: Tell) -> "_Light | None":
         """Search for the beam and bring it near the middle; None if it is nowhere.
 
