@@ -6,15 +6,15 @@ them into ENU.
 
 A facet is a rectangle with its own axes u (right) and v (up). Its surface lies
 
-.. math:: w(u, v) = (u^2 + v^2) / 4 f
+$$ w(u, v) = (u^2 + v^2) / 4 f $$
 
-above its plane, and a slope map adds measured deviations :math:`∂z/∂u, ∂z/∂v` of the slope. The
+above its plane, and a slope map adds measured deviations $∂z/∂u, ∂z/∂v$ of the slope. The
 corresponding heights are neglected: over half a metre 1 mrad is 0.5 mm, which turns a ray to a
 drone at 100 m by 5 µrad.
 
 A reflection lies where the surface's normal bisects the directions to lamp and camera, so where
 
-.. math:: g = (p + b_u / b_w, \; q + b_v / b_w) = 0
+$$ g = (p + b_u / b_w, \; q + b_v / b_w) = 0 $$
 
 with the slopes p, q and the bisector b in the facet's axes. In a cell of the slope map g is
 bilinear but for the change of the directions; its (at most two) roots start Newton's method.

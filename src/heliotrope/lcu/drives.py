@@ -3,7 +3,7 @@
 The law is that of ``heliotrope.mechanism.drives``:
 θ = bias + (1 + scale) φ + worm_cos cos u + worm_sin sin u + sag cos φ, where φ is linear in
 the steps (rotary) or follows the law of cosines (jack, with the constants of PAINT).
-:func:`reduced` folds a phase of the sag into the other numbers, so ten numbers and the bias
+`reduced` folds a phase of the sag into the other numbers, so ten numbers and the bias
 are enough.
 """
 

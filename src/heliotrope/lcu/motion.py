@@ -47,7 +47,7 @@ class Motion:
     Parameters
     ----------
     config
-        Settings; call :meth:`rebuild` after they change.
+        Settings; call `rebuild` after they change.
     sun
         The lease.
     sensor

@@ -8,7 +8,7 @@ hardware makes ``count`` pulses, waiting the interval after each. It plays the s
 axis one after the other; no Python runs per step.
 
 Counts are of segments emitted. An emitted segment is played, except at an emergency stop: then the
-hardware reports how many steps it did not make, and :meth:`Stepper.undone` takes them back.
+hardware reports how many steps it did not make, and `Stepper.undone` takes them back.
 """
 
 SCALE = 1024
@@ -40,7 +40,7 @@ def stopping(speed: int, change: int) -> int:
 
 
 def fastest(distance: int, change: int) -> int:
-    """Return the greatest speed whose :func:`stopping` distance is at most ``distance``."""
+    """Return the greatest speed whose `stopping` distance is at most ``distance``."""
     m = (root(8 * distance // change + 1) - 1) >> 1
     while change * m * (m + 1) // 2 > distance:
         m -= 1

@@ -4,8 +4,8 @@ An error of a point's lines of sight to lamp and camera turns its measured norma
 unit vectors from the mirror to the two, v their bisector, and δ the displacement of the mirror
 relative to the drone,
 
-.. math:: δv = -\frac{I - v v^T}{|s + t|}
-          \left(\frac{I - s s^T}{d_s} + \frac{I - t t^T}{d_t}\right) δ
+$$ δv = -\frac{I - v v^T}{|s + t|}
+\left(\frac{I - s s^T}{d_s} + \frac{I - t t^T}{d_t}\right) δ $$
 
 which with the lamp beside the camera is δ across the line of sight over the distance. An error
 common to all points of a mirror turns its orientation by as much, however many there are:

@@ -7,7 +7,7 @@ of its apparent width and height, relative; and for each heliostat flown in seve
 d of its surveyed position. A corner c of a mirror (vertex v, rotation M) is seen from the recorded
 position p at
 
-.. math:: X = (R e^{[φ]})^T (v + d + δ + M e^{[ψ]} (c + g c) - (p - b + t))
+$$ X = (R e^{[φ]})^T (v + d + δ + M e^{[ψ]} (c + g c) - (p - b + t)) $$
 
 in camera axes, at (X/Z, Y/Z) without distortion. Without g, a shadow beside the edges of all
 mirrors, which shifts them by a tenth of a pixel, would move the camera by a decimetre: mirrors that
@@ -23,8 +23,8 @@ are solved as such by SuperLU, which also gives the covariances; a least-squares
 normal matrix would not.
 
 Derivatives, with [X]_× for the matrix of the cross product:
-:math:`∂X/∂φ = [X]_×`, :math:`∂X/∂t = -R^T = -∂X/∂b`, :math:`∂X/∂δ = ∂X/∂d = R^T`,
-:math:`∂X/∂ψ = -R^T M [c]_×`, :math:`∂X/∂g = R^T M diag(c)`.
+$∂X/∂φ = [X]_×$, $∂X/∂t = -R^T = -∂X/∂b$, $∂X/∂δ = ∂X/∂d = R^T$,
+$∂X/∂ψ = -R^T M [c]_×$, $∂X/∂g = R^T M diag(c)$.
 """
 
 from collections.abc import Sequence

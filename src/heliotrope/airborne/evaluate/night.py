@@ -6,7 +6,7 @@ but not how all of them are turned together, for which there are no corners. Tha
 is chosen such that the mirrors stand as commanded on average. With N mirrors that deviate by σ
 from their commands, it is known to
 
-.. math:: C_ω = σ^2 \Big( \sum_i (I - n_i n_i^T) \Big)^{-1}
+$$ C_ω = σ^2 \Big( \sum_i (I - n_i n_i^T) \Big)^{-1} $$
 
 that is to about σ/√N, which is part of the standard deviation of every orientation.
 """

@@ -4,7 +4,7 @@ Each reflection measures one normal: the bisector of the directions to lamp and 
 mirror's shape gives the normal expected at that point. The small rotation ω, about the
 concentrator's own x and y axes, that turns the expected normal n into the measured one v is
 
-.. math:: ω = \frac{n × v}{|n × v|} \arcsin |n × v|
+$$ ω = \frac{n × v}{|n × v|} \arcsin |n × v| $$
 
 The orientation is corrected by the mean of all ω, over the points or over the mirror's area. As
 the points move on the mirror with the orientation, that is done twice; then outliers are rejected

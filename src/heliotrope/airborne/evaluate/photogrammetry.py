@@ -3,7 +3,7 @@ r"""Where photographs of coded targets were taken, from the images alone.
 A bundle adjustment with free points: the unknowns are the turn φ and the position p of each
 photograph, each corner X of each target, and what the camera file states wrongly (focal lengths,
 principal point, distortion). A corner is seen at OpenCV's projection of
-:math:`(R e^{[φ]})^T (X - p)`. Images do not tell where the whole lies, how it is turned, or how
+$(R e^{[φ]})^T (X - p)$. Images do not tell where the whole lies, how it is turned, or how
 large it is: RTK gives that, loosely. `compared` then fits the result into RTK's positions by a
 similarity, as HelioPoint's appendix A does, and what is left are the errors of RTK and of the
 photogrammetry.

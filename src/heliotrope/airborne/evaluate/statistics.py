@@ -5,7 +5,7 @@ slope deviations of a mirror are one fixed, smooth field, and points spread over
 better than chance would. The error of the mean over points, relative to the mean over the
 mirror V, is, with the covariance C of the field,
 
-.. math:: σ_E^2 = \bar C(x, x) - 2 \bar C(x, V) + \bar C(V, V) + τ^2 / n
+$$ σ_E^2 = \bar C(x, x) - 2 \bar C(x, V) + \bar C(V, V) + τ^2 / n $$
 
 (the extension variance: Matheron 1963, Economic Geology 58, 1246; Chilès & Delfiner 2012,
 *Geostatistics*, section 2.6) with τ the noise of one point. The field is taken as Gaussian with

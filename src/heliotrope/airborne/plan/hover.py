@@ -5,15 +5,15 @@ A point of the mirror at height x above its vertex (either direction of the mirr
 normal leans by the slope s(x) from the optical axis, meets a plane across the axis at distance D
 in
 
-.. math:: q(x) = x + D \, s(x) + D \, e
+$$ q(x) = x + D \, s(x) + D \, e $$
 
 for a mirror with a pointing error e. All of the mirror is seen by a drone that covers the range of
 x + D s(x), widened by D e on all sides. A facet of focal length f has s = -x / 2f within it, so
 that a step g of the drone moves the reflection by
 
-.. math:: g / |1 - D / 2f|
+$$ g / |1 - D / 2f| $$
 
-and n samples on a facet of w by h require :math:`g = \sqrt{w h / n} \, |1 - D / 2f|`. A pointing
+and n samples on a facet of w by h require $g = \sqrt{w h / n} \, |1 - D / 2f|$. A pointing
 error thus moves the reflection on a flat facet by D e: 0.75 m at 150 m and 5 mrad.
 """
 
