@@ -4,10 +4,60 @@
 source, and numpy's error model divides by zero without a branch. Kernels are plain
 functions without annotations: their docstrings say what they take, and the typed functions
 that call them check it.
+
+Compiling takes most of the time of a first use. An array that may be written and one that may
+not are two types to the compiler, hence `as_input`; and at a terminal one line says what is going
+on when the first kernel is compiled.
 """
 
+import sys
 from typing import Any
 
+import numpy as np
+from numba.core import event
+
 OPTIONS: dict[str, Any] = {"nogil": True, "cache": True, "error_model": "numpy"}
-#: For functions called in an innermost loop, where a call would cost more than the work.
-INLINED: dict[str, Any] = {**OPTIONS, "forceinline": True}
+#: For functions called in an innermost loop, where a call would cost more than the work. Python
+#: does not call them, and what would let it is a sixth of the time of compiling.
+INLINED: dict[str, Any] = {
+    **OPTIONS,
+    "forceinline": True,
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}
+
+
+def as_input(array: np.ndarray) -> np.ndarray:
+    """Return a contiguous array that a kernel reads, read-only, so that it is compiled once."""
+    # A copy only where it is needed; a view, because the caller may go on writing.
+    view = np.ascontiguousarray(array).view()
+    view.flags.writeable = False
+    return view
+
+
+class FirstCompilation(event.Listener):
+    """Says once, at a terminal, that kernels are being compiled."""
+
+    def __init__(self) -> None:
+        self.told = False
+
+    def on_start(self, event: Any) -> None:  # noqa: ARG002
+        """Say it when the first kernel is compiled; one that is loaded is not."""
+        if self.told:
+            return
+        self.told = True
+        if sys.stderr is not None and sys.stderr.isatty():
+            print(  # noqa: T201
+                "heliotrope: compiling kernels, once after an installation; "
+                "this takes up to a minute",
+                file=sys.stderr,
+                flush=True,
+            )
+
+    def on_end(self, event: Any) -> None:
+        """Do nothing."""
+
+
+#: The listener of this process.
+FIRST = FirstCompilation()
+event.register("numba:compile", FIRST)  # type: ignore[no-untyped-call]

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import TAU, FloatArray, as_angles, as_numbers
+from heliotrope.jit import as_input
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
@@ -356,7 +357,7 @@ class Mechanism(Value):
         joints, drives = len(self.joints), len(self.driven)
 
         def flat(array: FloatArray, *tail: int) -> FloatArray:
-            return np.ascontiguousarray(array).reshape(-1, *tail)
+            return as_input(array).reshape(-1, *tail)
 
         return (
             flat(self.position, 3),
@@ -388,8 +389,8 @@ class Mechanism(Value):
                 f"counts: shape {given.shape[:-1]} does not fit mechanisms of shape {self.shape}"
             ) from None
         index = np.arange(int(np.prod(self.shape, dtype=np.int64))).reshape(self.shape)
-        rows = np.ascontiguousarray(np.broadcast_to(index, shape)).ravel()
-        flat = np.ascontiguousarray(np.broadcast_to(given, (*shape, drives)))
+        rows = as_input(np.broadcast_to(index, shape)).reshape(-1)
+        flat = as_input(np.broadcast_to(given, (*shape, drives)))
         return flat.reshape(-1, drives), rows, shape
 
 

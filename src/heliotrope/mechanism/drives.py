@@ -32,6 +32,7 @@ from heliotrope.geometry import (
     as_numbers,
     common_batch,
 )
+from heliotrope.jit import as_input
 from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.mechanism.kernels.drives import angles_block, counts_block, slopes_block
 from heliotrope.parallel import run_blocks
@@ -129,10 +130,12 @@ class Drive(Value):
     def _run(self, block: Any, values: npt.ArrayLike, what: str) -> FloatArray:
         given = as_numbers(values, f"drive: {what}")
         shape = common_batch({"drive": self.shape, what: given.shape})
-        rows = np.broadcast_to(np.arange(_size(self.shape)).reshape(self.shape), shape).ravel()
-        flat = np.ascontiguousarray(np.broadcast_to(given, shape)).reshape(-1, 1)
-        table = np.ascontiguousarray(self.table).reshape(-1, 1, slot.DRIVE_SLOTS)
-        out = np.empty_like(flat)
+        rows = as_input(
+            np.broadcast_to(np.arange(_size(self.shape)).reshape(self.shape), shape)
+        ).reshape(-1)
+        flat = as_input(np.broadcast_to(given, shape)).reshape(-1, 1)
+        table = as_input(self.table).reshape(-1, 1, slot.DRIVE_SLOTS)
+        out = np.empty(flat.shape)
         run_blocks(lambda a, b: block(table, flat, rows, out, a, b), len(rows))
         return out.reshape(shape)
 

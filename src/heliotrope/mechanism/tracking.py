@@ -15,6 +15,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError, kind_of, shown
 from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray, as_numbers, as_vectors, reflect
+from heliotrope.jit import as_input
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive, direct
 from heliotrope.mechanism.kernels import slots as slot
@@ -264,7 +265,7 @@ def track(
     )
     arguments = (
         _flat(armature.table, slot.ARMATURE_SIZE), _flat(table, axes, slot.DRIVE_SLOTS),
-        _flat(s, 3), _flat(p, 3), np.empty((0, axes)) if now is None else _flat(now, axes),
+        _flat(s, 3), _flat(p, 3), _flat(np.empty((0, axes)) if now is None else now, axes),
         index, local, 2 if branch == "both" else int(branch), float(tolerance),
         int(max_iterations), newton, result.angles, result.counts, result.normal, result.vertex,
         result.status, result.iterations, result.residual, result.best,
@@ -392,4 +393,4 @@ def _current(current: npt.ArrayLike, axes: int) -> FloatArray:
 
 
 def _flat(array: FloatArray, *tail: int) -> FloatArray:
-    return np.ascontiguousarray(array).reshape(-1, *tail)
+    return as_input(array).reshape(-1, *tail)

@@ -120,7 +120,8 @@ def _normal_equations(problem, y, loss, scale, curved, hessian, gradient):
     """Cost at y with gradient (P,) and hessian (P, P), lower half, by y.
 
     The hessian is Gauss-Newton's with the weights of the loss, which the covariance is
-    made of; ``curved`` adds the curvature of the loss, which is the better step.
+    made of; ``curved`` (1.0 or 0.0: for each bool there would be a kernel) adds the curvature of
+    the loss, which is the better step.
     """
     base, codes, sigma, rows, data, squares, scratch, wrenches, jacobian = problem
     size = codes.shape[0]
@@ -142,7 +143,7 @@ def _normal_equations(problem, y, loss, scale, curved, hessian, gradient):
             continue
         value, weight, bend = loss_and_weights(square, loss)
         cost += value
-        if not curved:
+        if curved == 0.0:
             bend = 0.0
         residual_jacobian(drives, data[0], i, scratch, wrenches, jacobian)
         w_aa, w_ab, w_bb = weight + bend * a * a, bend * a * b, weight + bend * b * b
@@ -164,7 +165,7 @@ def _minimise(problem, y, loss, scale, near, arrays, limit):
     hessians, gradients, damped, factor, step, trial = arrays
     size = y.shape[0]
     damping, side = 0.0, 0
-    cost = _normal_equations(problem, y, loss, scale, True, hessians[0], gradients[0])
+    cost = _normal_equations(problem, y, loss, scale, 1.0, hessians[0], gradients[0])
     if not math.isfinite(cost):
         return cost, 0, False
     for iteration in range(limit):
@@ -189,7 +190,7 @@ def _minimise(problem, y, loss, scale, near, arrays, limit):
                 for p in range(size):
                     trial[p] = y[p] - step[p]
                 new = _normal_equations(
-                    problem, trial, loss, scale, True, hessians[1 - side], gradients[1 - side]
+                    problem, trial, loss, scale, 1.0, hessians[1 - side], gradients[1 - side]
                 )
                 if new <= cost or (distance <= UNSEEN and math.isfinite(new)):
                     break
@@ -197,7 +198,7 @@ def _minimise(problem, y, loss, scale, near, arrays, limit):
             new = np.nan
         if math.isnan(new):
             # Only rounding is left to gain.
-            _normal_equations(problem, y, loss, scale, True, hessian, gradient)
+            _normal_equations(problem, y, loss, scale, 1.0, hessian, gradient)
             return cost, iteration + 1, True
         for p in range(size):
             y[p] = trial[p]
@@ -293,7 +294,7 @@ def fit_block(
                     new = _median_scale(squares, keep, rows)
                     total_square = PRIOR_FREEDOM + 2.0 * kept * new * new * (free > 0.0)
                     scale = max(lowest_scale, math.sqrt(total_square / (PRIOR_FREEDOM + free)))
-            _normal_equations(problem, y, kind, scale, False, hessian, gradient)
+            _normal_equations(problem, y, kind, scale, 0.0, hessian, gradient)
         for p in range(size):
             x[i, p] = y[p] * sigma[i, p]
         scales[i], costs[i], iterations[i] = scale, cost, total

@@ -29,6 +29,7 @@ from heliotrope.geometry import (
     bisector,
     wrap_signed,
 )
+from heliotrope.jit import as_input
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism, Pose
 from heliotrope.mechanism.drives import SLOTS, Drive
@@ -371,14 +372,11 @@ def _data(s: Sightings, vertex: FloatArray, keep: npt.NDArray[np.bool_]) -> tupl
     if len(s):
         axes, whiten = whitening(s, vertex)
     return (
-        s.counts,
-        s.source,
-        s.source_at_infinity,
-        s.destination,
-        s.destination_at_infinity,
+        *map(as_input, (s.counts, s.source, s.source_at_infinity)),
+        *map(as_input, (s.destination, s.destination_at_infinity)),
         axes,
         whiten,
-        keep,
+        as_input(keep),
     )
 
 

@@ -1,0 +1,75 @@
+"""Compiling the kernels: once for each, and not in silence."""
+
+import io
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from numba import njit
+from numba.core import event
+
+import heliotrope as ht
+from heliotrope.jit import FIRST, FirstCompilation, as_input
+from heliotrope.mechanism import kinds
+from heliotrope.mechanism.kernels.block import track_block
+from heliotrope.mechanism.kernels.chain import jacobian_block, pose_block
+
+SUN, AIM = (0.0, -0.6, 0.8), (0.0, 0.0, 30.0)
+
+
+class Terminal(io.StringIO):
+    def __init__(self, *, terminal: bool) -> None:
+        super().__init__()
+        self.terminal = terminal
+
+    def isatty(self) -> bool:
+        return self.terminal
+
+
+@pytest.fixture
+def listening(monkeypatch: pytest.MonkeyPatch) -> Iterator[FirstCompilation]:
+    """A listener beside that of this process, which is kept quiet."""
+    monkeypatch.setattr(FIRST, "told", True)
+    listener = FirstCompilation()
+    event.register("numba:compile", listener)
+    yield listener
+    event.unregister("numba:compile", listener)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_terminal_is_told_once(
+    terminal: bool, listening: FirstCompilation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = Terminal(terminal=terminal)
+    monkeypatch.setattr("sys.stderr", told)
+    assert njit(lambda x: x + 1)(1) == 2
+    assert njit(lambda x: x + 2)(1) == 3
+    assert listening.told
+    lines = told.getvalue().splitlines()
+    assert len(lines) == terminal
+    assert all("compiling kernels, once after an installation" in line for line in lines)
+
+
+def test_arrays_that_may_be_written_or_not_are_one_type() -> None:
+    """Each kernel has one specialisation, however the arrays come."""
+    place = np.array([[0.0, 50.0, 0.0], [0.0, 60.0, 0.0]])
+    for mechanism in (kinds.azimuth_elevation(place), kinds.azimuth_elevation(place)[:, ...]):
+        for sun in (np.array(SUN), np.broadcast_to(SUN, (2, 3)), as_input(np.tile(SUN, (2, 1)))):
+            found = ht.track(mechanism, sun, AIM)
+            counts = found.chosen(found.counts)
+            for given in (counts, as_input(counts), counts[0], np.asfortranarray(counts)):
+                mechanism.pose(given)
+                mechanism.jacobian(given, ("tilt_north",))
+    for kernel in (track_block, pose_block, jacobian_block):
+        assert len(kernel.signatures) == 1, kernel.__name__
+
+
+def test_an_input_is_a_view_that_its_owner_may_still_write() -> None:
+    mine = np.zeros((2, 3))
+    seen = as_input(mine)
+    assert np.shares_memory(mine, seen)
+    mine[0, 0] = 1.0
+    assert seen[0, 0] == 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        seen[0, 0] = 2.0
+    assert as_input(np.zeros((3, 2)).T).flags.c_contiguous
