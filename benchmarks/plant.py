@@ -19,6 +19,7 @@ import numpy as np
 from benchmarks._run import BenchmarkError, Result, Row
 from heliotrope.field.example import azimuth_elevation
 from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver
 from heliotrope.field.volumes import Box, Cylinder, Volume
@@ -35,12 +36,15 @@ from heliotrope.links.messages import (
     encode,
 )
 from heliotrope.plant.agreement import Agreement
+from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.audit import JsonLines
 from heliotrope.plant.beam_watch import BeamWatch
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.doubts import Doubts
+from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.identity import Identities
-from heliotrope.sun import Site
+from heliotrope.plant.unsent import UnsentBeams
+from heliotrope.sun import Site, vector
 
 MEMBERS = 32
 #: A place that no beam of the benchmark reaches.
@@ -51,6 +55,8 @@ VOLUMES = (
 #: Budget: half a core for the plant and the twin together.
 BUDGET_S = 0.5
 ORDER_BUDGET_S = 1.0
+#: Time at which mirrors at rest are looked at, POSIX s: 2026-06-21 10:00 UTC.
+_MORNING = 1_782_036_000.0
 #: Turns of the loop until an order is with all links.
 _TURNS = 10_000
 #: Angles by which both axes turn away on DEFOCUS, rad.
@@ -273,6 +279,30 @@ class _Run:
         return out, answers
 
 
+def _at_rest(count: int) -> float:
+    """Return the CPU for a second of the look at beams that nobody sent, all heliostats at rest.
+
+    The mirrors stand still away from stow; a third of them is looked at in each second.
+    """
+    design = malan_plant(count)
+    check = BeamCheck(design, design.names)
+    field = FieldState({"C1": design.names})
+    field.heard[:] = field.counted_at[:] = 0.0
+    field.rows["state"] = states.IDLE
+    primary, secondary = design.machine(design.names[0]).stow
+    for end, place in (("primary", primary - 3000), ("secondary", secondary - 9000)):
+        field.rows[end] = field.rows[f"{end}_goal"] = place
+    light = vector(_MORNING, design.site)
+    beams = UnsentBeams(check, field, lambda _: light, check.machines)
+    beams.look(0.1)  # the first compiles
+    spent = []
+    for _ in range(9):
+        begin = time.process_time()
+        beams.look(0.1)
+        spent.append(time.process_time() - begin)
+    return min(sum(spent[i : i + 3]) / 3.0 for i in (0, 3, 6))
+
+
 def run(quick: bool) -> Result:
     """Return the figures."""
     found: list[tuple[float, float, float, float]] = []
@@ -301,6 +331,14 @@ def run(quick: bool) -> Result:
         {"work": "of it: the checks", "cpu_s": checks, "budget_s": CHECKS_BUDGET_S},
         {"work": "the same, two keep-out volumes", "cpu_s": volumes, "budget_s": BUDGET_S},
         {"work": "of it: the checks", "cpu_s": watched, "budget_s": CHECKS_BUDGET_S},
+        *(
+            {
+                "work": f"beams that nobody sent, {count:,} at rest",
+                "cpu_s": _at_rest(count),
+                "budget_s": CHECKS_BUDGET_S,
+            }
+            for count in ((640,) if quick else (10_000, 100_000))
+        ),
         {"work": "order to all links", "cpu_s": out, "budget_s": ORDER_BUDGET_S},
         {"work": "all answers to it", "cpu_s": answers, "budget_s": None},
     ]
