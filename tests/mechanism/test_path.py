@@ -156,3 +156,12 @@ def test_a_jack_at_its_end_is_named_when_it_follows_again() -> None:
 def test_a_path_needs_times() -> None:
     with pytest.raises(InputError, match=r"sun: shape \(3,\)"):
         track_path(machine((-200.0, 200.0), (-5.0, 95.0)), SUMMER[0], AIM)
+
+
+def test_a_joint_without_stops_goes_on_through_south() -> None:
+    free = (rotary(200, 2400), rotary(200, 2400))
+    azel = kinds.azimuth_elevation((0.0, 80.0, 0.0), pivot_height=1.0, drives=free)
+    path = track_path(azel, SUMMER, AIM, over_the_top=True)
+    assert not path.slews
+    assert (path.angles[:, 1] < np.pi / 2).all()
+    assert path.angles[:, 0].min() < np.pi < path.angles[:, 0].max()
