@@ -274,7 +274,7 @@ def _day(
         print_json({"heliostat": heliostat, "joints": joints, "day": rows})
         return
     print_table(
-        ["time", "branch", "azimuth", "elevation", "counts", "residual", ""],
+        ["time", "branch", "azimuth", "elevation", "counts", "residual", *(["slew"] * bool(slews))],
         [
             [
                 str(r["time"]),
@@ -283,7 +283,7 @@ def _day(
                 f"{r['elevation_deg']:.4f}°",
                 "  ".join(f"{c:.1f}" for c in path.counts[i]),
                 f"{r['residual_mrad']:.3g} mrad" + ("" if r["reachable"] else " !"),
-                f"slew: {r['slew']}" if r["slew"] else "",
+                *([str(r["slew"] or "")] * bool(slews)),
             ]
             for i, r in enumerate(rows)
         ],
