@@ -18,6 +18,7 @@ from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.plan.planning import SightingLimits, aim_at
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.calibration.sightings import Sightings, camera_target, join, sightings
+from heliotrope.calibration.uncertainty import expected_error
 from heliotrope.field.example import roughly_installed
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, reflect
@@ -278,8 +279,8 @@ class Days:
         off = beam_errors(self.truth[row], seen).offset
         if name not in self.records:
             return off, np.full((count, 2, 2), np.nan)
-        nominal = self.group.mechanism[np.array([self.group.index(name)])]
-        return off, self.records[name].expected(nominal, suns, aim).covariance
+        record = self.records[name]
+        return off, expected_error(believed, record.names, record.covariance, suns, aim).covariance
 
 
 def _half(squares: FloatArray) -> FloatArray:

@@ -171,6 +171,7 @@ def test_a_plant_runs_and_is_defocused() -> None:
         "of it: the checks",
         "the same, two keep-out volumes",
         "of it: the checks",
+        "beams that nobody sent, 640 at rest",
         "order to all links",
         "all answers to it",
     ]

@@ -43,7 +43,7 @@ def confirm(keeper: Keeper) -> None:
 
 def assert_same(found: Sightings, wanted: Sightings) -> None:
     for field in fields(Sightings):
-        a, b = getattr(found, field.name), getattr(wanted, field.name)
+        a, b = np.asarray(getattr(found, field.name)), np.asarray(getattr(wanted, field.name))
         assert a.dtype == b.dtype, field.name
         np.testing.assert_array_equal(a, b, err_msg=field.name)
 

@@ -362,7 +362,7 @@ class Bench:
 
     def sun(self, second: float) -> np.ndarray:
         """A sun in the south that goes west."""
-        hour = 7.27e-5 * (second - START_S)
+        hour = 7.27e-5 * (second - START_S) % (2.0 * np.pi)
         return np.array(direction(np.pi + hour, 0.7 + 0.2 * np.sin(hour)))
 
     def send(self, name: str, *values: object, to: int = ADDRESS) -> None:

@@ -16,11 +16,9 @@ from heliotrope import __version__
 from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome, parameter_rows
 from heliotrope.calibration.sightings import Sightings
-from heliotrope.calibration.uncertainty import expected_error
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
-from heliotrope.optics.beam import ExpectedError
 from heliotrope.values import Card, Value, amount
 
 Identities = npt.NDArray[np.int64]
@@ -260,12 +258,6 @@ class HeliostatCalibration(Value):
     def mechanism(self, nominal: Mechanism) -> Mechanism:
         """Return the calibrated mechanism, in the batch shape of the nominal one."""
         return nominal.with_parameters(self.parameters)
-
-    def expected(
-        self, nominal: Mechanism, sun: npt.ArrayLike, aim: npt.ArrayLike, noise: float = 0.0
-    ) -> ExpectedError:
-        """Return the expected beam error for suns and aims; see `uncertainty.expected_error`."""
-        return expected_error(self.mechanism(nominal), self.names, self.covariance, sun, aim, noise)
 
 
 def root_mean_square(values: FloatArray) -> float:
