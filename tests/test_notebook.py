@@ -1,5 +1,6 @@
-"""The notebook runs from top to bottom, and says what the published one says."""
+"""The notebooks run from top to bottom, and say what they promise."""
 
+import re
 from pathlib import Path
 
 import nbclient
@@ -7,35 +8,67 @@ import nbformat
 import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-
+STORED = [*EXAMPLES.glob("*.ipynb"), *EXAMPLES.glob("notebooks/*.ipynb")]
 
 # Asynchronous clean-up of Jupyter's sockets warns on some versions; it is not ours.
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_tracking_notebook() -> None:
-    notebook = nbformat.read(EXAMPLES / "tracking.ipynb", as_version=4)
-    client = nbclient.NotebookClient(
-        notebook, timeout=300, resources={"metadata": {"path": str(EXAMPLES)}}
-    )
-    client.execute()
-    texts = [
-        output.get("text", "")
-        for cell in notebook.cells
-        if cell.cell_type == "code"
-        for output in cell.outputs
-    ]
-    shown = "\n".join(texts)
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+class Executed:
+    """What a notebook showed: texts that it printed, and the number of its pictures by kind."""
+
+    def __init__(self, path: Path, folder: Path) -> None:
+        notebook = nbformat.read(path, as_version=4)
+        client = nbclient.NotebookClient(
+            notebook,
+            timeout=600,
+            startup_timeout=600,
+            resources={"metadata": {"path": str(folder)}},
+        )
+        client.execute()
+        shown = [out for c in notebook.cells if c.cell_type == "code" for out in c.outputs]
+        self.text = "\n".join(out.get("text", "") for out in shown)
+        kinds = [kind for out in shown for kind in out.get("data", {})]
+        self.charts = kinds.count("image/png")
+        self.scenes = sum("plotly" in kind for kind in kinds)
+
+    def numbers(self, pattern: str) -> list[float]:
+        """Return the numbers in the groups of a pattern that occurs once."""
+        (found,) = re.finditer(pattern, self.text)
+        return [float(part) for part in found.groups()]
+
+
+@pytest.mark.parametrize("path", STORED, ids=lambda path: path.stem)
+def test_a_notebook_is_stored_with_a_title_and_without_outputs(path: Path) -> None:
+    stored = nbformat.read(path, as_version=4)
+    nbformat.validate(stored)
+    assert stored.cells[0].cell_type == "markdown"
+    assert stored.cells[0].source.startswith("# ")
+    for cell in stored.cells:
+        assert not cell.get("outputs")
+        assert cell.get("execution_count") is None
+
+
+def test_tracking() -> None:
+    found = Executed(EXAMPLES / "tracking.ipynb", EXAMPLES)
     # Grigoriev's notebook prints these for HeliostatA after two steps (to 1e-4°, 1 cm).
-    assert "-36.876" in shown
-    assert "143.05" in shown
-    assert "→ take 0" in shown
-    pictures = [
-        output
-        for cell in notebook.cells
-        if cell.cell_type == "code"
-        for output in cell.outputs
-        if any("plotly" in kind for kind in output.get("data", {}))
-    ]
-    assert len(pictures) == 2
-    stored = nbformat.read(EXAMPLES / "tracking.ipynb", as_version=4)
-    assert all(not c.get("outputs") for c in stored.cells), "commit the notebook without outputs"
+    assert "-36.876" in found.text
+    assert "143.05" in found.text
+    assert "→ take 0" in found.text
+    assert found.scenes == 2
+
+
+def test_the_first_hour(tmp_path: Path) -> None:
+    found = Executed(EXAMPLES / "notebooks" / "first_hour.ipynb", tmp_path)
+    (nominal,) = found.numbers(r"nominal: ([\d.]+) mrad of beam")
+    (calibrated,) = found.numbers(r"calibrated: ([\d.]+) mrad of beam")
+    # 10 mrad of lean and 5 mrad of zero on either axis, twice in the beam; 10 mm at 30 m.
+    assert 10.0 < nominal < 60.0
+    assert calibrated < 1.0
+    (before,) = found.numbers(r"nominal: intercept ([\d.]+) %")
+    (after,) = found.numbers(r"calibrated: intercept ([\d.]+) %")
+    assert after > before + 5.0
+    assert (found.charts, found.scenes) == (5, 1)
