@@ -1,11 +1,16 @@
 """A researcher's first tasks: each is one script with one import and at most 12 lines."""
 
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import heliotrope as ht
+from heliotrope.imaging import write_image
+from heliotrope.imaging.synthetic import Scene, example_camera, example_target, exposed, render
+from heliotrope.optics.mirror_image import gaussian_beam
 from support.data import juelich
 
 FILES = Path(__file__).parent / "files"
@@ -102,32 +107,33 @@ scores = ht.compare(plant["BF57"], seen, models)
     assert scores["jacks"] > scores["zeros"]
 
 
-def test_an_own_centroid_becomes_a_sighting() -> None:
-    plant = ht.example_plant()
-    target, sigma, true = plant.targets[0], 0.25, np.array([0.31, -0.12])
-    right, up = np.meshgrid(np.linspace(-1.5, 1.5, 121), np.linspace(-1.5, 1.5, 121))
-    rng = np.random.default_rng(8)
-    background = 20.0 + 2.0 * right
-    shape = np.exp(-0.5 * ((right - true[0]) ** 2 + (up - true[1]) ** 2) / sigma**2)
+def test_an_own_centroid_becomes_a_sighting(tmp_path: Path) -> None:
+    target = example_target()
+    thrown = (("target", gaussian_beam((0.62, -0.31), 0.8, 0.5, angle=0.6), 800.0),)
+    scene = exposed(Scene(example_camera(target, size=(800, 600)), (target,), thrown))
+    time = datetime(2026, 9, 2, 10, 0, tzinfo=UTC)
+    write_image(render(scene, seed=3, time=time).frame, tmp_path / "17.png")
+    ht.write_plant(replace(ht.example_plant(), targets=(target,)), tmp_path / "plant.toml")
     found = run(
         """
 import heliotrope as ht
-plant = ht.example_plant()
-light = (picture - background).clip(0.0) * mask
-middle = [float((light * axis).sum() / light.sum()) for axis in (right, up)]
-place = plant.target("target").point(middle)
-time = "2026-09-02T10:00Z"
-sun = ht.sun.vector(time, plant.site)
-counts = ht.track(plant["P6A"], sun, place).best_counts
-seen = ht.sightings("P6A", counts, sun, place, time=time, destination_covariance=4e-6)
+def centroid(beam):
+    light = (beam.picture - beam.background).clip(0.0) * beam.mask
+    place = [(light * axis).sum() / light.sum() for axis in (beam.right, beam.up)]
+    arms = [beam.mask * (axis - m) for axis, m in zip((beam.right, beam.up), place)]
+    return place, [[(beam.noise / light.sum()) ** 2 * (a * b).sum() for a in arms] for b in arms]
+plant = ht.open(folder / "plant.toml")
+own = ht.imaging.PhotographSettings(centroid=centroid)
+photograph = ht.imaging.read_photograph(ht.imaging.read_image(picture), plant.targets, settings=own)
+seen = ht.imaging.sighting_of(photograph, "P6A", (-251959, 746419), plant.site)
 error = ht.beam_errors(plant["P6A"], seen)
 """,
-        picture=background + 100.0 * shape + rng.normal(0.0, 0.5, shape.shape),
-        background=background,
-        mask=shape > 0.02,
-        right=right,
-        up=up,
+        folder=tmp_path,
+        picture=tmp_path / "17.png",
     )
-    np.testing.assert_allclose(target.plane_coordinates(found["place"]), true, atol=5e-3)
-    assert found["seen"].names == ("P6A",)
-    assert found["error"].beam[0] < 1e-8
+    seen = found["seen"]
+    assert seen.names == ("P6A",)
+    assert seen.time[0] == time.timestamp()
+    place = target.plane_coordinates(seen.destination[0])
+    np.testing.assert_allclose(place, (0.62, -0.31), atol=0.02)
+    assert np.isfinite(found["error"].beam).all()

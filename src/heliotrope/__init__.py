@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from heliotrope import geometry as geometry
+    from heliotrope import imaging as imaging
     from heliotrope import optics as optics
     from heliotrope import plot as plot
     from heliotrope import sun as sun
@@ -126,6 +127,7 @@ _SHORT = {"compare": "compare_models", "flux": "field_flux", "open": "open_plant
 #: Modules that are used as such.
 _MODULES = {
     "geometry": "heliotrope.geometry",
+    "imaging": "heliotrope.imaging",
     "kinds": "heliotrope.mechanism.kinds",
     "optics": "heliotrope.optics",
     "plot": "heliotrope.plot",
@@ -156,6 +158,7 @@ __all__ = [
     "flux",
     "geometry",
     "image_offsets",
+    "imaging",
     "join",
     "kinds",
     "learn",

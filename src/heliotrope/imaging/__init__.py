@@ -13,7 +13,7 @@ Begin with `read_image` and `read_photograph`.
 """
 
 from heliotrope.imaging.annotate import annotate
-from heliotrope.imaging.campaign import Job, Outcome, process_many, to_sightings
+from heliotrope.imaging.campaign import Job, Outcome, process_many, sighting_of, to_sightings
 from heliotrope.imaging.files import find_images, read_image, write_image
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.lens import Lens, calibrate_chessboard
@@ -36,11 +36,13 @@ from heliotrope.imaging.photograph import (
 from heliotrope.imaging.pose import CameraFit, calibrate_marks, resection
 from heliotrope.imaging.sources import Source, average, keep, open_source
 from heliotrope.imaging.spots.background import EmptyTarget
+from heliotrope.imaging.spots.centroid import BeamPicture
 from heliotrope.imaging.spots.placed import PlacedSpot
 from heliotrope.imaging.spots.quality import Expectation, Limits, Reason
 from heliotrope.imaging.targets.finding import find_targets
 
 __all__ = [
+    "BeamPicture",
     "CameraFit",
     "EmptyTarget",
     "Entry",
@@ -77,6 +79,7 @@ __all__ = [
     "read_log",
     "read_photograph",
     "resection",
+    "sighting_of",
     "to_sightings",
     "write_image",
 ]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.calibration.sightings import Sightings, camera_target
 from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
@@ -30,7 +31,7 @@ from heliotrope.imaging.photograph import (
 )
 from heliotrope.imaging.spots.placed import PlacedSpot
 from heliotrope.imaging.targets.view import FaceView
-from heliotrope.sun import Site, vector
+from heliotrope.sun import Site, Times, vector
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -451,6 +452,67 @@ def to_sightings(
         centroid_covariance=np.array([r[3].covariance for r in rows]),
     )
     return seen, left_out
+
+
+def sighting_of(
+    photograph: Photograph,
+    heliostat: str,
+    counts: npt.ArrayLike,
+    site: Site,
+    *,
+    target: str = "",
+    time: Times | None = None,
+    sun: npt.ArrayLike | None = None,
+    sigma: float = BEAM_SIGMA,
+) -> Sightings:
+    """Return the sighting that one photograph gives, with its time and the sun at that time.
+
+    Parameters
+    ----------
+    photograph
+        A photograph that is already read.
+    heliostat, counts
+        Name of the heliostat of the beam, and its motor counts, (D,).
+    site
+        For the sun's direction.
+    target
+        Target that the beam was sent to; "" if exactly one has a spot.
+    time
+        See `heliotrope.sun.Times`; by default that of the frame.
+    sun
+        Direction to the apparent sun, ENU, (3,); by default that of the time.
+    sigma
+        Standard deviation of a beam in addition to that of its centroid, rad.
+
+    Raises
+    ------
+    InputError
+        If no spot can be trusted, or neither time nor sun is known.
+    """
+    frame = photograph.frame
+    name = frame.name or "photograph"
+    reading, refusal = meant(photograph, target)
+    if reading is None or not reading.good:
+        raise InputError(f"{name}: {refusal}; a sighting needs a spot that can be trusted")
+    moment = frame.time if time is None else time
+    spread = 0.0
+    if sun is None:
+        if moment is None:
+            raise InputError(f"{name}: its time is unknown; give time=, or the sun's direction")
+        if time is None and np.isfinite(frame.time_deviation):
+            spread = (_SUN_RATE * frame.time_deviation) ** 2
+        sun = vector(moment, site)
+    spot = reading.spots[0]
+    return camera_target(
+        heliostat,
+        counts,
+        sun,
+        spot.point,
+        time=np.nan if moment is None else moment,
+        sigma=sigma,
+        sun_covariance=spread,
+        centroid_covariance=spot.covariance_enu,
+    )
 
 
 def _unusable(outcome: Outcome, entry: Entry | None, index: Mapping[str, int]) -> str:

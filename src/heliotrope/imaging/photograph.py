@@ -13,6 +13,7 @@ from heliotrope.field.target import Target
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.spots import background as backgrounds
 from heliotrope.imaging.spots.background import Background, EmptyTarget, Way
+from heliotrope.imaging.spots.centroid import Centroid, with_centroid
 from heliotrope.imaging.spots.placed import PlacedSpot, place
 from heliotrope.imaging.spots.quality import Expectation, Limits, Reason, judge
 from heliotrope.imaging.spots.spot import find_spots
@@ -127,6 +128,10 @@ class PhotographSettings:
     gamma
         Exponent of the camera's response: a pixel is light to the power 1/gamma. 1 is linear, 2.2
         is close to sRGB. It is undone before anything is measured.
+    centroid
+        Function that gives place and covariance of the first spot on each target instead of the
+        program's own; see `heliotrope.imaging.spots.BeamPicture`. Where photographs are read in
+        several processes, it stands in a module that these can import.
     """
 
     limits: Limits = field(default_factory=Limits)
@@ -135,6 +140,7 @@ class PhotographSettings:
     expectations: Mapping[str, Expectation] = field(default_factory=dict)
     pictures: Pictures = field(default_factory=dict)
     gamma: float = 1.0
+    centroid: Centroid | None = None
 
 
 def read_photograph(
@@ -274,6 +280,8 @@ def _reading(
         own.sort(key=lambda s: float(np.linalg.norm(s.plane - place)))
         others = sorted(own[1:], key=lambda s: -s.spot.power)
         own = [own[0], *others]
+    if own and chosen.centroid is not None:
+        own[0] = with_centroid(own[0], found.target, seen.picture, seen.background, chosen.centroid)
     reasons = judge(
         None if found.view is None else found,
         [s.spot for s in own],

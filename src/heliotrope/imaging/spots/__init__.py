@@ -3,7 +3,7 @@
 - `background`: what a target looks like without beams, from one frame, from an empty frame or
   from a learnt model.
 - `spot`: centroid, covariance and shape of each spot.
-- `placed`: the place of a spot on its target.
+- `placed`: the place of a spot on its target; `centroid`: an own centroid instead.
 - `quality`: named reasons against a spot, with measured values and limits.
 """
 
@@ -14,6 +14,7 @@ from heliotrope.imaging.spots.background import (
     from_frame,
     from_model,
 )
+from heliotrope.imaging.spots.centroid import BeamPicture, Centroid
 from heliotrope.imaging.spots.placed import PlacedSpot, place
 from heliotrope.imaging.spots.quality import REASONS, Expectation, Limits, Reason, judge
 from heliotrope.imaging.spots.spot import Spot, find_spots
@@ -21,6 +22,8 @@ from heliotrope.imaging.spots.spot import Spot, find_spots
 __all__ = [
     "REASONS",
     "Background",
+    "BeamPicture",
+    "Centroid",
     "EmptyTarget",
     "Expectation",
     "Limits",

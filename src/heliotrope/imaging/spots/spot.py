@@ -118,7 +118,7 @@ def find_spots(picture: Rectified, background: Background) -> list[Spot]:
     Every pixel above the background belongs to the top from which it descends. Tops are
     separate beams if brightness falls between them.
     """
-    light = _light(picture, background)
+    light = beam_light(picture, background)
     soft = smooth(picture, light, max(0.07 / picture.step, 1.0))
     foot = _FOOT * background.deviation
     level = float(np.median(background.values[picture.paint]))
@@ -164,7 +164,7 @@ def _core(soft: Image, owned: Mask, foot: float) -> Mask:
     return np.asarray(labels == labels[top])
 
 
-def _light(picture: Rectified, background: Background) -> Image:
+def beam_light(picture: Rectified, background: Background) -> Image:
     """Return the light of beams, as paint of the usual reflectance would show it.
 
     On marks it is interpolated from their surroundings.
@@ -301,9 +301,16 @@ def _from_background(
     basis = background.basis[in_rows][:, in_columns]
     moved = stride**2 * np.einsum("iyx,yxk->ik", part, basis)
     fit = moved @ background.covariance @ moved.T
-    # Residuals of the fit are correlated over patches of this many pixels.
+    return np.asarray(fit + pixel_variance(picture, background) * spread)
+
+
+def pixel_variance(picture: Rectified, background: Background) -> float:
+    """Return the variance of a pixel's light, as if pixels were independent of each other.
+
+    Residuals of the background's fit are correlated over patches, and count for as many pixels.
+    """
     patch = max(background.patch / picture.step**2, 1.0)
-    return np.asarray(fit + (patch * background.deviation**2 + background.noise**2) * spread)
+    return patch * background.deviation**2 + background.noise**2
 
 
 def _edge(picture: Rectified, soft: Image, region: Mask) -> float:

@@ -1,0 +1,144 @@
+"""An own centroid: the picture of a beam in, its place and covariance out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError, kind_of
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.imaging.frame import Image
+from heliotrope.imaging.spots.background import Background
+from heliotrope.imaging.spots.placed import PlacedSpot, place
+from heliotrope.imaging.spots.spot import beam_light, pixel_variance
+from heliotrope.imaging.targets.rectify import Mask, Rectified
+
+
+@dataclass(frozen=True)
+class BeamPicture:
+    """A beam on its target, seen from the front: what an own centroid works on.
+
+    Brightness is of full scale; row 0 is at the top. Where other targets lie in the same plane,
+    the picture shows them too, because a beam may reach them.
+
+    Attributes
+    ----------
+    target
+        The target.
+    picture, background
+        Brightness with the beam, and without it as far as the frame shows, (H, W).
+    light
+        Their difference, as paint of the usual reflectance would show it, (H, W); on marks it is
+        interpolated.
+    mask
+        Pixels of this beam, tails included, (H, W).
+    paint
+        Pixels of bare paint, (H, W).
+    clipped
+        Share of each pixel at full scale, (H, W).
+    right, up
+        Metres right of and above the target's centre, (H, W).
+    noise
+        Standard deviation of a pixel's light, noise and uneven paint, as if pixels were
+        independent.
+    """
+
+    target: Target
+    picture: Image
+    background: Image
+    light: Image
+    mask: Mask
+    paint: Mask
+    clipped: Image
+    right: FloatArray
+    up: FloatArray
+    noise: float
+
+
+#: A function of a picture that gives the beam's place, metres right of and above the target's
+#: centre, (2,), and the covariance of that place, m², (2, 2).
+Centroid = Callable[[BeamPicture], tuple[npt.ArrayLike, npt.ArrayLike]]
+
+
+def with_centroid(
+    placed: PlacedSpot, target: Target, picture: Rectified, background: Background, own: Centroid
+) -> PlacedSpot:
+    """Return a spot at the place that an own centroid gives, with its covariance.
+
+    The covariance of the view is added, as to the program's own centroid; the shape of the spot
+    stays, and with it the checks of its quality.
+
+    Parameters
+    ----------
+    placed, target
+        A spot, and the target that it lies on.
+    picture, background
+        Its face.
+    own
+        The own centroid.
+
+    Raises
+    ------
+    InputError
+        If the own centroid gives no place on the target or no covariance.
+    """
+    across, upwards = np.meshgrid(*picture.axes)
+    points = picture.face.point(np.stack([across, upwards], axis=-1))
+    at = target.plane_coordinates(points)
+    given = own(
+        BeamPicture(
+            target,
+            picture.values,
+            background.values,
+            beam_light(picture, background),
+            placed.spot.region,
+            picture.paint,
+            picture.clipped,
+            at[..., 0],
+            at[..., 1],
+            float(np.sqrt(pixel_variance(picture, background))),
+        )
+    )
+    plane, covariance = _checked(given, target)
+    centroid = picture.face.plane(target.point(plane))
+    moved = place(picture, replace(placed.spot, centroid=centroid, covariance=covariance))
+    if moved.target is None or moved.target.name != target.name:
+        raise InputError(
+            f"own centroid: place {plane.tolist()} m is not on target {target.name}, "
+            f"{target.width:.4g} × {target.height:.4g} m; give metres right of and above its centre"
+        )
+    return replace(moved, flux=placed.flux)
+
+
+def _checked(given: object, target: Target) -> tuple[FloatArray, FloatArray]:
+    """Return place and covariance as arrays."""
+    if not (isinstance(given, tuple | list) and len(given) == 2):
+        raise InputError(
+            f"own centroid: it gave {kind_of(given)} for target {target.name}; return a place (2,) "
+            "in metres and its covariance (2, 2) in m²"
+        )
+    try:
+        plane, covariance = as_float(given[0]), as_float(given[1])
+    except (TypeError, ValueError):
+        raise InputError(
+            f"own centroid: place or covariance on target {target.name} is no array of numbers; "
+            "return a place (2,) in metres and its covariance (2, 2) in m²"
+        ) from None
+    if plane.shape != (2,) or not np.isfinite(plane).all():
+        raise InputError(
+            f"own centroid: place {plane.tolist()} on target {target.name}; return 2 finite "
+            "numbers, metres right of and above its centre"
+        )
+    good = covariance.shape == (2, 2) and bool(np.isfinite(covariance).all())
+    if good:
+        least, most = np.linalg.eigvalsh(0.5 * (covariance + covariance.T))
+        uneven = abs(covariance[0, 1] - covariance[1, 0])
+        good = bool(least >= 0.0 < most and uneven <= 1e-9 * most)
+    if not good:
+        raise InputError(
+            f"own centroid: covariance {covariance.tolist()} on target {target.name}; return a "
+            "symmetric and positive (2, 2) matrix in m²"
+        )
+    return plane, covariance
