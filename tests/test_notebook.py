@@ -7,6 +7,8 @@ import nbclient
 import nbformat
 import pytest
 
+from support.data import juelich
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 STORED = [*EXAMPLES.glob("*.ipynb"), *EXAMPLES.glob("notebooks/*.ipynb")]
 
@@ -72,3 +74,15 @@ def test_the_first_hour(tmp_path: Path) -> None:
     (after,) = found.numbers(r"calibrated: intercept ([\d.]+) %")
     assert after > before + 5.0
     assert (found.charts, found.scenes) == (5, 1)
+
+
+def test_juelich(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HELIOTROPE_DATA", str(juelich()))
+    found = Executed(EXAMPLES / "notebooks" / "juelich.ipynb", tmp_path)
+    (designed,) = found.numbers(r"as designed: median ([\d.]+) mrad")
+    (learned,) = found.numbers(r"learned: median ([\d.]+) mrad")
+    assert designed > 20.0
+    assert learned < 2.0
+    covered, tests = found.numbers(r"covered: (\d+) of (\d+)")
+    assert covered / tests > 0.7
+    assert found.charts == 5
