@@ -86,3 +86,19 @@ def test_juelich(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     covered, tests = found.numbers(r"covered: (\d+) of (\d+)")
     assert covered / tests > 0.7
     assert found.charts == 5
+
+
+def test_an_own_mechanism(tmp_path: Path) -> None:
+    found = Executed(EXAMPLES / "notebooks" / "own_mechanism.ipynb", tmp_path)
+    (difference,) = found.numbers(r"derivatives: ([\d.e+-]+)")
+    assert difference < 1e-6
+    (honest,) = found.numbers(r"standard deviation: ([\d.]+)")
+    assert 0.8 < honest < 1.2
+    (without,) = found.numbers(r"without the term: ([\d.]+) mrad")
+    (within,) = found.numbers(r"with the term: ([\d.]+) mrad")
+    # Two directions of 0.3 mrad each.
+    assert within < 0.45
+    assert without > 3.0 * within
+    (size,) = found.numbers(r"k: ([\d.]+) mrad")
+    assert abs(size - 8.0) < 1.0
+    assert (found.charts, found.scenes) == (3, 1)
