@@ -385,7 +385,7 @@ DEFECTS = (
     Defect((4,), "a cluster obeys two plants", _two_plants_obeyed, ("plant_twice",), 20.0,
            worlds=("twice", "calm"), first=3),
     Defect((12,), "new parameters are not verified", plant_defects.unverified, faults=(),
-           first=18, worlds=("visits",)),
+           worlds=("lights",)),
     Defect((12,), "every sighting counts ten times", plant_defects.counted_often, faults=(),
            first=5, worlds=("visits",)),
     Defect((12,), "a calibration is surer than it is", plant_defects.surer_than_it_is, faults=(),

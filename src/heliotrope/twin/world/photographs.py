@@ -1,4 +1,4 @@
-"""The camera of the world "visits": true centroids with noise, and photographs that lie.
+"""The camera of visits to targets: true centroids with noise, and photographs that lie.
 
 A beam wavers by as much as the settings of a visit say, so that the covariance of a calibration,
 which stands on them, is the true one, and `VisitObserver` can judge it.
@@ -18,8 +18,8 @@ from heliotrope.twin.cameras import ExactCamera, FieldSnapshot
 LIES = ("still", "passing", "before")
 #: Variance of a centroid in the plane of the target, m².
 _CENTROID = 1e-4
-#: Photographs in turn that show the same lie.
-_RUNS = (1, 3, 4, 6, 12)
+#: Photographs in turn that show the same lie; the same where lights stand for minutes.
+_RUNS, _LONG_RUNS = (1, 3, 4, 6, 12), (12, 24, 48)
 #: Greatest speed of another mirror's spot that crosses a target, m/s.
 _SPEED = 0.3
 
@@ -48,6 +48,9 @@ class LyingCamera:
         Share of the photographs with which lies begin.
     waver
         Standard deviation of a beam in each direction, beside that of its centroid, rad.
+    standing
+        Whether every lie is a light that stands still for minutes, as a lamp does, or the beam of a
+        mirror that was left there.
 
     Attributes
     ----------
@@ -55,9 +58,12 @@ class LyingCamera:
         Number of photographs of each kind that lied.
     """
 
-    def __init__(self, sight: FieldSnapshot, seed: int, share: float, waver: float) -> None:
+    def __init__(
+        self, sight: FieldSnapshot, seed: int, share: float, waver: float, *, standing: bool
+    ) -> None:
         self._true = ExactCamera(sight, _CENTROID, seed)
         self._sight, self._share, self._waver = sight, share, waver
+        self._standing = standing
         self._wind = np.random.default_rng([seed, 1])
         self._chance = random.Random(f"camera {seed}")
         self._lie: dict[str, _Lie] = {}
@@ -95,11 +101,12 @@ class LyingCamera:
         chance = self._chance
         size = 0.4 * np.array([target.width, target.height])
         place = size * np.array([chance.uniform(-1.0, 1.0), chance.uniform(-1.0, 1.0)])
-        kind = chance.choice(LIES)
+        kind = "still" if self._standing else chance.choice(LIES)
         speed = np.zeros(2)
         if kind == "passing":
             speed = np.array([chance.uniform(-_SPEED, _SPEED), chance.uniform(-_SPEED, _SPEED)])
-        return _Lie(kind, place, speed, now, chance.choice(_RUNS))
+        runs = _LONG_RUNS if self._standing else _RUNS
+        return _Lie(kind, place, speed, now, chance.choice(runs))
 
     def _shown(self, target: Target, true: Shot, before: Shot | None, lie: _Lie) -> Shot:
         if lie.kind == "before":

@@ -308,7 +308,7 @@ class Simulation:
         plan, clock = self.plan, self._clock
         boards = {board.outfit.name: board for board in self.boards}
         sight = FieldSnapshot(clock, mirrors_of(boards), lambda: self.sun(clock.monotonic()))
-        work = Work(plan.seed, sight, self._exits)
+        work = Work(plan.seed, sight, self._exits, lights="lights" in plan.worlds)
         day, names = DayObserver(self.begin, self.boards), tuple(boards)
         shift = Shift(
             work, self.operator, self.observer, self.beams, day, names, clock, plan.seed, 90.0

@@ -1,7 +1,8 @@
 """Automatic control in a run: raising, visits to targets, and the memory of both.
 
-The worlds "visits" and "day" run the whole plant, not its controller alone: `Operations` with
-automatic control and calibration visits. The store outlives the plant's program, as a disk does.
+The worlds "visits", "lights" and "day" run the whole plant, not its controller alone: `Operations`
+with automatic control and calibration visits. The store outlives the plant's program, as a disk
+does.
 """
 
 import contextlib
@@ -32,8 +33,10 @@ SETTINGS = AutomaticSettings(rate=1.0, losses=1, patience=20.0)
 VISIT = CycleSettings(shots=3, interval=2.0, arrival=60.0, least=3, model=CYCLE.model)
 #: A search that stays near its target.
 SEARCH = Centring(most=8)
-#: Share of the photographs with which lies begin.
-LIES = 0.2
+#: Share of the photographs with which lies begin, and of the runs whose visits search for the beam;
+#: the same in the world "lights": what is searched for and followed is never a light that stands.
+LIES, SEARCHES = 0.2, 0.5
+LIGHTS, SEARCHES_BY_LIGHTS = 0.5, 0.25
 
 
 class _Rounds:
@@ -72,6 +75,8 @@ class Work:
         True mirrors and sun.
     exits
         Closes the store at the end of the run.
+    lights
+        Whether lights stand on the targets for minutes.
 
     Attributes
     ----------
@@ -83,9 +88,12 @@ class Work:
         Of the plant's program; None while it does not run.
     """
 
-    def __init__(self, seed: int, sight: FieldSnapshot, exits: contextlib.ExitStack) -> None:
-        self.centred = random.Random(f"visits {seed}").random() < 0.5
-        self.camera = LyingCamera(sight, seed, LIES, VISIT.sigma)
+    def __init__(
+        self, seed: int, sight: FieldSnapshot, exits: contextlib.ExitStack, *, lights: bool
+    ) -> None:
+        searches, lies = (SEARCHES_BY_LIGHTS, LIGHTS) if lights else (SEARCHES, LIES)
+        self.centred = random.Random(f"visits {seed}").random() < searches
+        self.camera = LyingCamera(sight, seed, lies, VISIT.sigma, standing=lights)
         self._clock = sight.clock
         folder = exits.enter_context(tempfile.TemporaryDirectory())
         self._records = Keeper(Path(folder) / "records.sqlite", inline=True)

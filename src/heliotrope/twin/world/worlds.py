@@ -28,9 +28,10 @@ WORLDS = {
     "twice": "a second plant with the same keys runs for a while, on the same lines",
     "visits": "automatic control raises and calibrates the field, by photographs that may lie",
     "day": "automatic control meets the morning's or the evening's limit of the sun, at any place",
+    "lights": "as visits; lights stand on the targets for minutes, and most visits search no beam",
 }
 #: Worlds with automatic control.
-WORKING = ("visits", "day")
+WORKING = ("visits", "day", "lights")
 #: Worlds in which site, date, hour, and places are drawn.
 DRAWN = ("place", "day")
 #: Faults in a run with automatic control come this many times more seldom: a visit takes a minute.
