@@ -102,3 +102,15 @@ def test_an_own_mechanism(tmp_path: Path) -> None:
     (size,) = found.numbers(r"k: ([\d.]+) mrad")
     assert abs(size - 8.0) < 1.0
     assert (found.charts, found.scenes) == (3, 1)
+
+
+def test_a_campaign(tmp_path: Path) -> None:
+    found = Executed(EXAMPLES / "notebooks" / "campaign.ipynb", tmp_path)
+    (planned,) = found.numbers(r"planned, best first: ([\d.]+) mrad")
+    (noons,) = found.numbers(r"six noons: ([\d.]+) mrad")
+    assert planned < 0.2 * noons
+    (promised,) = found.numbers(r"before, ([\d.]+) mrad after")
+    (kept,) = found.numbers(r"found: ([\d.]+) mrad")
+    # 360 heliostats: the RMS itself is known to about 4 %.
+    assert 0.85 < kept / promised < 1.2
+    assert found.charts == 5
