@@ -240,3 +240,93 @@ def test_an_armature_with_its_drives_is_the_same_machine(name: str) -> None:
     np.testing.assert_allclose(other.normal, one.normal, atol=1e-12)
     np.testing.assert_allclose(other.vertex, one.vertex, atol=1e-9)
     np.testing.assert_allclose(made.armature.table, mechanism.armature.table, atol=1e-12)
+
+
+# -- own joints ---------------------------------------------------------------------------
+
+
+def test_an_own_joint_about_a_driven_axis_is_the_bias_of_its_drive() -> None:
+    mechanism = imperfect(every_kind()["azimuth_elevation"], seed=2)
+    more = kinds.with_joint(
+        mechanism, "creep", (2.0, 0.0, 0.0), after="elevation", prior=1e-3, origin=(0.3, 0.1, -0.2)
+    )
+    counts = random_counts(mechanism, 50, seed=3)
+    still = more.pose(counts)
+    np.testing.assert_allclose(still.normal, mechanism.pose(counts).normal, atol=1e-14)
+    np.testing.assert_allclose(still.vertex, mechanism.pose(counts).vertex, atol=1e-12)
+    # The elevation turns about east; on the axis itself the origin does not matter.
+    level = kinds.with_joint(mechanism, "creep", (1.0, 0.0, 0.0), after="elevation", prior=1e-3)
+    turned = level.with_parameters({"creep": 0.02}).pose(counts)
+    biased = mechanism.with_parameters({"elevation_bias": 0.02}).pose(counts)
+    np.testing.assert_allclose(turned.normal, biased.normal, atol=1e-13)
+    np.testing.assert_allclose(turned.vertex, biased.vertex, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_own_joint_has_the_derivative_of_a_screw(kind: str) -> None:
+    mechanism = imperfect(every_kind()[kind], seed=5)
+    for after in (None, mechanism.joints[1], mechanism.joints[-1]):
+        own = kinds.with_joint(
+            mechanism, "bend", (0.3, 0.5, -0.8), after=after, prior=2e-3, origin=(0.2, -0.1, 0.4)
+        ).with_parameters({"bend": 0.03})
+        counts = random_counts(mechanism, 50, seed=6)
+        names = ("bend", *(f"{own.joints[d]}_bias" for d in own.driven))
+        jacobian = own.jacobian(counts, names)
+        for p, name in enumerate(names):
+            normal, vertex = _richardson(own, counts, name)
+            np.testing.assert_allclose(jacobian.normal[:, p], normal, atol=1e-7)
+            np.testing.assert_allclose(jacobian.vertex[:, p], vertex, atol=1e-7)
+        angles = np.stack(
+            [own.drives[d].angles(counts[:, d]) for d in range(len(own.driven))], axis=-1
+        )
+        if len(own.driven) == 2:
+            np.testing.assert_allclose(
+                own.armature.pose(angles)[0], own.pose(counts).normal, atol=1e-12
+            )
+
+
+def test_a_mast_that_leans_at_its_foot_takes_the_mirror_along() -> None:
+    upright = kinds.azimuth_elevation((3.0, 4.0, 0.0), pivot_height=6.0)
+    mast = kinds.with_joint(upright, "mast_north", (-1.0, 0.0, 0.0), prior=5e-3)
+    pose = mast.with_parameters({"mast_north": 0.01}).pose([0.0, 0.5 * np.pi])
+    np.testing.assert_allclose(pose.normal, [0.0, np.sin(0.01), np.cos(0.01)], atol=1e-14)
+    wanted = [3.0, 4.0 + 6.0 * np.sin(0.01), 6.0 * np.cos(0.01)]
+    np.testing.assert_allclose(pose.vertex, wanted, atol=1e-13)
+
+
+def test_two_own_joints_of_many_mechanisms_keep_their_rows() -> None:
+    places = [(0.0, 50.0, 0.0), (10.0, 50.0, 0.0)]
+    many = kinds.azimuth_elevation(places, pivot_height=1.5)
+    many = kinds.with_joint(many, "yoke", (0.0, 1.0, 0.0), after="azimuth", prior=2e-3)
+    many = kinds.with_joint(
+        many, "foot", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], after="tilt_north", prior=1e-3
+    )
+    moved = many.with_parameters({"yoke": [0.01, 0.02], "foot": 0.005})
+    assert moved.parameter("yoke").prior == 2e-3
+    np.testing.assert_allclose(moved.angles[:, moved.joints.index("yoke")], [0.01, 0.02])
+    np.testing.assert_allclose(moved.angles[:, moved.joints.index("foot")], 0.005)
+    assert moved == moved[np.array([0, 1])]
+    assert [moved.joints[d] for d in moved.driven] == ["azimuth", "elevation"]
+    np.testing.assert_allclose(
+        moved[1].pose([0.3, 0.4]).normal, moved.pose([0.3, 0.4]).normal[1], atol=1e-15
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"after": "azimut"}, "did you mean azimuth"),
+        ({"name": "canting"}, "own joint 'canting': give a new name"),
+        ({"name": "sag"}, "own joint 'sag': give a new name"),
+        ({"name": "two words"}, "give a new name of letters"),
+        ({"axis": (0.0, 0.0, 0.0)}, "axis of bend"),
+        ({"prior": 0.0}, "prior of bend"),
+        ({"prior": 2.0}, "give radians"),
+        ({"axis": np.ones((3, 3))}, r"axis \(3, 3\)"),
+    ],
+)
+def test_a_wrong_own_joint_is_refused(changes: dict[str, object], text: str) -> None:
+    given: dict[str, object] = {"name": "bend", "axis": (1.0, 0.0, 0.0), "after": "azimuth"}
+    given |= {"prior": 1e-3} | changes
+    with pytest.raises(InputError, match=text):
+        kinds.with_joint(every_kind()["azimuth_elevation"], **given)  # type: ignore[arg-type]

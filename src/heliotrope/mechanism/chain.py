@@ -117,6 +117,8 @@ class Mechanism(Value):
     deviations
         Deviations of the parameters that it carries, by name, as `with_parameters` and
         `with_calibration` summed them up, rad, m or 1, each (...).
+    own
+        Rows of fixed joints that the parameter table does not know; see `kinds.with_joint`.
     """
 
     kind: str
@@ -131,6 +133,7 @@ class Mechanism(Value):
     vertex: FloatArray
     normal: FloatArray
     deviations: Mapping[str, FloatArray] = field(default_factory=dict)
+    own: tuple[Parameter, ...] = ()
 
     def _card(self) -> Card:
         joints = [self.joints[k] for k in self.driven]
@@ -181,7 +184,11 @@ class Mechanism(Value):
         """The parameter table of this kind, by name."""
         kinds = self.drives.table[..., slot.KIND].reshape(-1, len(self.driven))
         linear = tuple(bool((kinds[:, d] == slot.LINEAR).all()) for d in range(kinds.shape[1]))
-        return parameter_table.table(self.joints, self.driven, linear)
+        found = parameter_table.table(self.joints, self.driven, linear)
+        for row in self.own:
+            code = (slot.MOVES_JOINT, self.joints.index(row.name), 0)
+            found[row.name] = replace(row, code=code)
+        return found
 
     def parameter(self, name: str) -> Parameter:
         """Return the row of parameter ``name``.

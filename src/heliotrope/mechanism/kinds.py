@@ -11,6 +11,8 @@ Every two-axis kind is the same chain with other axes::
     vertex, normal
 """
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -28,6 +30,7 @@ from heliotrope.geometry import (
 from heliotrope.mechanism.armature import Armature, check_axes
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive, direct
+from heliotrope.mechanism.parameters import Parameter
 
 EAST, NORTH, UP = np.eye(3)
 _LEANS = {"east": EAST, "north": NORTH, "up": UP}
@@ -116,6 +119,88 @@ def two_axis(
         ("canting_secondary", a2, 0.0),
     ]
     return _assemble(kind, steps, (2, 4), p, orientation, drives, vertex, n)
+
+
+def with_joint(
+    mechanism: Mechanism,
+    name: str,
+    axis: npt.ArrayLike,
+    *,
+    prior: float,
+    after: str | None = None,
+    origin: npt.ArrayLike = (0.0, 0.0, 0.0),
+    cause: str = "own joint",
+) -> Mechanism:
+    """Return mechanisms with one more joint that no drive moves, a parameter of the same name.
+
+    Its angle is 0 until `Mechanism.with_parameters` or a fit moves it, so that nothing else
+    changes. Derivatives follow from the screw formula, as for every joint. A plant file keeps the
+    joint, but not its row of the parameter table.
+
+    Parameters
+    ----------
+    mechanism
+        Shape (...).
+    name
+        Unique among joints and parameters.
+    axis
+        In the frame that the joint ``after`` turns, (..., 3), any length; angles are right-handed
+        about it.
+    prior
+        Standard deviation of the angle before any measurement, rad.
+    after
+        Joint that it follows on the way from ground to mirror; None: it is the first.
+    origin
+        Point on the axis, from the origin of ``after`` or from the position, m, (..., 3).
+    cause
+        Physical cause, for the table.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no joint ``after``.
+    InputError
+        If the name is taken, the axis is zero, the prior is no angle above 0, or a shape does not
+        fit.
+    """
+    if after is not None and after not in mechanism.joints:
+        raise UnknownNameError(f"joint of a {mechanism.kind} mechanism", after, mechanism.joints)
+    if not name.isidentifier() or name in (*mechanism.joints, *mechanism.parameters):
+        raise InputError(
+            f"own joint {name!r}: give a new name of letters, digits and underscores; the joints "
+            f"are {', '.join(mechanism.joints)}"
+        )
+    sigma = as_numbers(prior, f"prior of {name}", 0.0, 0.5 * np.pi, "rad", "give radians")
+    if sigma.shape or not sigma > 0.0:
+        raise InputError(f"prior of {name}: {prior} rad; give one number above 0")
+    way, point = normalize(axis, f"axis of {name}"), as_vectors(origin, f"origin of {name}")
+    shapes = {"mechanism": mechanism.shape, "axis": way.shape[:-1], "origin": point.shape[:-1]}
+    if common_batch(shapes) != mechanism.shape:
+        raise InputError(
+            f"own joint {name}: axis {way.shape} and origin {point.shape} do not fit mechanisms of "
+            f"shape {mechanism.shape}; give one vector, or one for each"
+        )
+    place = 0 if after is None else mechanism.joints.index(after) + 1
+    origins = np.insert(mechanism.origins, place, point, axis=-2)
+    vertex = mechanism.vertex.copy()
+    # What follows stays where it is.
+    if place == len(mechanism.joints):
+        vertex -= point
+    else:
+        origins[..., place + 1, :] -= point
+    return replace(
+        mechanism,
+        joints=(*mechanism.joints[:place], name, *mechanism.joints[place:]),
+        driven=tuple(d + (d >= place) for d in mechanism.driven),
+        axes=np.insert(mechanism.axes, place, way, axis=-2),
+        origins=origins,
+        angles=np.insert(mechanism.angles, place, 0.0, axis=-1),
+        vertex=vertex,
+        own=(
+            *mechanism.own,
+            Parameter(name, "rad", cause, "right-handed about its axis", float(sigma)),
+        ),
+    )
 
 
 def _lean_names(end: FloatArray) -> tuple[str, str]:
