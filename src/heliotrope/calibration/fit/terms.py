@@ -1,0 +1,285 @@
+r"""Own error terms of drives, fitted beside the parameters of the mechanisms.
+
+A term adds k · f(φ) to the angle of one joint: f is a function of the angles φ that the nominal
+drives give for the counts, and k its coefficient, one of each heliostat. k · sin(azimuth) is one
+term, the errors of a drive in a look-up table are one for each row of the table.
+
+The kernels know nothing of terms. The counts that a mechanism without terms would need for the same
+angle stand in for those recorded, and a Gauss-Newton step of all unknowns moves the coefficients;
+the derivative by a coefficient is f times that by the bias of the drive, which the chain gives.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration.fit._fit_kernels import CAUCHY_WIDTH, HUBER_WIDTH
+from heliotrope.calibration.fit.estimator import FieldFit, Loss, fit
+from heliotrope.calibration.fit.residuals import linearise
+from heliotrope.calibration.named import Field, Members, members
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.geometry import FloatArray, as_float, as_numbers
+from heliotrope.mechanism.chain import Mechanism
+
+#: Most rounds of fit and step; terms of milliradians need three or four.
+_ROUNDS = 20
+#: The iteration ends when no coefficient changes by more than this share of its prior.
+_SETTLED = 1e-4
+#: Rounds of the inversion; an error of slope s shrinks by s in each.
+_INVERSION = 30
+
+
+@dataclass(frozen=True)
+class DriveTerm:
+    """An error of one drive that is linear in its coefficient.
+
+    Attributes
+    ----------
+    name
+        Name of the coefficient.
+    joint
+        Driven joint whose angle it adds to.
+    shape
+        Function of the angles of the D driven joints, rad, (..., D), that gives the error for a
+        coefficient of 1, (...).
+    prior
+        Standard deviation of the coefficient before any measurement, rad if the function has no
+        unit.
+    """
+
+    name: str
+    joint: str
+    shape: Callable[[FloatArray], npt.ArrayLike]
+    prior: float
+
+
+def table_terms(joint: str, drive: int, knots: npt.ArrayLike, prior: float) -> list[DriveTerm]:
+    """Return the terms of a look-up table: errors at knots, and straight lines between them.
+
+    Beyond the ends the error stays that of the end.
+
+    Parameters
+    ----------
+    joint, drive
+        Driven joint, and its place among the driven ones, from 0.
+    knots
+        Angles of the joint, rad, ascending, (K,).
+    prior
+        Standard deviation of the error at a knot, rad.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two knots, or they do not ascend.
+    """
+    at = as_numbers(knots, "knots")
+    if at.ndim != 1 or len(at) < 2 or not (np.diff(at) > 0.0).all():
+        raise InputError(f"knots of {joint}: shape {at.shape}; give at least 2 ascending angles")
+
+    def hat(k: int) -> Callable[[FloatArray], FloatArray]:
+        heights = np.eye(len(at))[k]
+        return lambda angles: np.interp(angles[..., drive], at, heights)
+
+    return [DriveTerm(f"{joint}_table_{k + 1}", joint, hat(k), prior) for k in range(len(at))]
+
+
+@dataclass(frozen=True)
+class TermFit:
+    """Parameters of N heliostats with K coefficients of own terms each.
+
+    Attributes
+    ----------
+    fitted
+        The parameters; their covariance accounts for the terms.
+    terms
+        The K terms.
+    values
+        Their coefficients, (N, K).
+    covariance
+        Covariance of the coefficients, (N, K, K).
+    mechanism
+        The nominal mechanisms with the parameters, but without the terms, (N,).
+    given
+        The heliostats as given; the terms are functions of the angles of their nominal drives.
+    """
+
+    fitted: FieldFit
+    terms: tuple[DriveTerm, ...]
+    values: FloatArray
+    covariance: FloatArray
+    mechanism: Mechanism
+    given: Members
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of the coefficients, (N, K)."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    def without_terms(self, seen: Sightings) -> Sightings:
+        """Return sightings with the counts at which ``mechanism`` stands as the terms move it."""
+        seen = self.given.rows_of(seen)
+        row = seen.heliostat
+        shapes = _shapes(self.terms, self.given.mechanism[row], seen.counts)
+        moved = _moved(self.mechanism[row], seen.counts, shapes, self.terms, self.values[row])
+        return replace(seen, counts=moved)
+
+    def to_send(self, heliostat: npt.ArrayLike, counts: npt.ArrayLike) -> FloatArray:
+        """Return the counts to send, (M, D), so that mechanism and terms together reach a pose.
+
+        Parameters
+        ----------
+        heliostat
+            Rows of the heliostats, () or (M,).
+        counts
+            Counts at which ``mechanism`` has the pose, (D,) or (M, D), as `track` gives them.
+        """
+        wanted = np.atleast_2d(as_float(counts))
+        row = np.broadcast_to(np.asarray(heliostat, dtype=np.intp), wanted.shape[:-1])
+        here, nominal, values = self.mechanism[row], self.given.mechanism[row], self.values[row]
+        sent = wanted.copy()
+        for _ in range(_INVERSION):
+            shapes = _shapes(self.terms, nominal, sent)
+            sent = sent + wanted - _moved(here, sent, shapes, self.terms, values)
+        return sent
+
+
+def fit_terms(
+    mechanism: Field,
+    sightings: Sightings,
+    model: str | tuple[str, ...],
+    terms: Sequence[DriveTerm],
+    *,
+    priors: Mapping[str, npt.ArrayLike] | None = None,
+    loss: Loss = "cauchy",
+    adapt_scale: bool = True,
+) -> TermFit:
+    """Return the maximum a posteriori parameters together with own terms of the drives.
+
+    Parameters
+    ----------
+    mechanism, sightings
+        Heliostats, and M sightings of them.
+    model, priors, loss, adapt_scale
+        For these see `heliotrope.calibration.fit.estimator.fit`.
+    terms
+        K terms. What a parameter explains as well, such as a constant beside a bias, is divided
+        according to the priors.
+
+    Raises
+    ------
+    InputError
+        If there is no term, two have one name, a prior is not above 0, or a function gives
+        something else than one finite number for each sighting.
+    UnknownNameError
+        If a joint is not driven; for the rest see `heliotrope.calibration.fit.estimator.fit`.
+    """
+    given = members(mechanism)
+    nominal, recorded = given.mechanism, given.rows_of(sightings)
+    _check(nominal, terms)
+    row, values = recorded.heliostat, np.zeros((len(nominal), len(terms)))
+    shapes = _shapes(terms, nominal[row], recorded.counts)
+    prior = np.array([term.prior for term in terms])
+    here = nominal
+    for _ in range(_ROUNDS):
+        counts = _moved(here[row], recorded.counts, shapes, terms, values[row])
+        seen = replace(recorded, counts=counts, names=())
+        fitted = fit(nominal, seen, model, priors=priors, loss=loss, adapt_scale=adapt_scale)
+        here = nominal.with_parameters(fitted.parameters)
+        step, covariance = _step(here, seen, fitted, terms, shapes, values, loss)
+        values = values + step
+        if (np.abs(step) < _SETTLED * prior).all():
+            break
+    p = len(fitted.names)
+    return TermFit(
+        replace(fitted, covariance=covariance[:, :p, :p]),
+        tuple(terms),
+        values,
+        covariance[:, p:, p:],
+        here,
+        given,
+    )
+
+
+def _check(mechanism: Mechanism, terms: Sequence[DriveTerm]) -> None:
+    driven = [mechanism.joints[d] for d in mechanism.driven]
+    names = [term.name for term in terms]
+    if not names:
+        raise InputError("terms: 0 given; give at least 1, or use fit")
+    for term in terms:
+        if names.count(term.name) > 1:
+            raise InputError(f"term {term.name}: the name occurs twice; give each its own")
+        if term.joint not in driven:
+            raise UnknownNameError(f"driven joint (of term {term.name})", term.joint, driven)
+        if not 0.0 < term.prior < np.inf:
+            raise InputError(f"term {term.name}: prior {term.prior}; give a number above 0")
+
+
+def _places(mechanism: Mechanism, terms: Sequence[DriveTerm]) -> list[int]:
+    """Return the drive of each term."""
+    driven = [mechanism.joints[d] for d in mechanism.driven]
+    return [driven.index(term.joint) for term in terms]
+
+
+def _shapes(terms: Sequence[DriveTerm], nominal: Mechanism, counts: FloatArray) -> FloatArray:
+    """Return the error by each term for a coefficient of 1, (M, K)."""
+    angles = nominal.drives.angles(counts)
+    columns = []
+    for term in terms:
+        try:
+            column = as_float(term.shape(angles))
+        except (TypeError, ValueError):
+            column = np.empty(0)
+        if column.shape != (len(counts),) or not np.isfinite(column).all():
+            raise InputError(
+                f"term {term.name}: its function gave shape {column.shape} for angles "
+                f"{angles.shape}; return one finite number for each row"
+            )
+        columns.append(column)
+    return np.stack(columns, axis=-1)
+
+
+def _moved(
+    mechanism: Mechanism,
+    counts: FloatArray,
+    shapes: FloatArray,
+    terms: Sequence[DriveTerm],
+    values: FloatArray,
+) -> FloatArray:
+    """Return the counts (M, D) at which mechanisms (M,) without terms stand as with them."""
+    angles = mechanism.drives.angles(counts)
+    for k, drive in enumerate(_places(mechanism, terms)):
+        angles[:, drive] += values[:, k] * shapes[:, k]
+    return mechanism.drives.counts(angles)
+
+
+def _step(
+    mechanism: Mechanism,
+    seen: Sightings,
+    fitted: FieldFit,
+    terms: Sequence[DriveTerm],
+    shapes: FloatArray,
+    values: FloatArray,
+    loss: Loss,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the Gauss-Newton step of the coefficients and the covariance of all unknowns."""
+    count, row, p = len(mechanism), seen.heliostat, len(fitted.names)
+    biases = tuple(f"{term.joint}_bias" for term in terms)
+    lines = linearise(mechanism[row], seen, (*fitted.names, *biases))
+    slopes = lines.jacobian.copy()
+    slopes[..., p:] *= shapes[:, None, :]
+    weight = fitted.scale[row] ** -2.0
+    if loss == "cauchy":
+        weight = weight / (1.0 + (fitted.lengths / CAUCHY_WIDTH) ** 2)
+    elif loss == "huber":
+        weight = weight * np.minimum(1.0, HUBER_WIDTH / np.maximum(fitted.lengths, HUBER_WIDTH))
+    own = np.broadcast_to([term.prior for term in terms], (count, len(terms)))
+    prior = np.concatenate([fitted.prior, own], axis=1) ** -2.0
+    off = np.concatenate([fitted.values - fitted.centre, values], axis=1)
+    hessian, gradient = prior[:, :, None] * np.eye(prior.shape[1]), prior * off
+    np.add.at(hessian, row, np.einsum("m,map,maq->mpq", weight, slopes, slopes))
+    np.add.at(gradient, row, np.einsum("m,map,ma->mp", weight, slopes, lines.residual))
+    covariance = as_float(np.linalg.inv(hessian))
+    return as_float(-np.einsum("npq,nq->np", covariance, gradient)[:, p:]), covariance
