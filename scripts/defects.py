@@ -38,7 +38,7 @@ def found(number: int) -> tuple[str, str, str, float, float]:
         broken = outcome.violation
         if broken is not None and broken.number in defect.numbers:
             took = time.process_time() - begin
-            return defect.name, str(broken.number), str(seed), outcome.seconds, took
+            return defect.name, str(broken.number), str(seed), broken.at, took
     return defect.name, "", "", 0.0, time.process_time() - begin
 
 
