@@ -34,7 +34,7 @@ from mutant_operators import ROOT, SOURCE, Mutant
 
 #: Runs of the simulation: name, seed, worlds, mean time between two faults, length, s.
 RUNS: tuple[tuple[str, int, tuple[str, ...], float, float], ...] = (
-    ("tour 2", 2, ("tour",), 12.0, 240.0),
+    ("tour 2", 2, ("tour",), 12.0, 300.0),
     ("held 41", 41, ("held",), 12.0, 180.0),
     ("calm 11", 11, ("calm",), 60.0, 180.0),
     ("calm held 42", 42, ("calm", "held"), 30.0, 180.0),

@@ -8,9 +8,10 @@ import pytest
 from heliotrope.cluster import _goals
 from heliotrope.cluster._broadcast import Broadcast
 from heliotrope.cluster._exchange import Exchange
-from heliotrope.lcu import messages
+from heliotrope.lcu import messages, states
 from heliotrope.lcu.controller import Controller
 from heliotrope.lcu.lease import SunLease
+from heliotrope.lcu.search import Spiral
 from heliotrope.links.messages import Stage
 from heliotrope.plant.emergency.order import EmergencyOrder
 
@@ -76,6 +77,33 @@ def _never_proven(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(EmergencyOrder, "is_done", lambda self, name: False)
 
 
+def _lock_follows(patch: pytest.MonkeyPatch) -> None:
+    """A mirror that is locked at standby goes on following the sun."""
+    line = "IDLE LOCK LOCKED hold"
+    assert line in states.TABLE
+    patch.setattr(states, "TABLE", states.TABLE.replace(line, "IDLE LOCK LOCKED"))
+
+
+def _search_stands(patch: pytest.MonkeyPatch) -> None:
+    """A search takes its time, and the beam stays on the aim."""
+    advance = Spiral.advance
+
+    def standing(self: Any) -> bool:
+        goes_on = advance(self)
+        self.offset[:] = [0.0, 0.0]
+        return bool(goes_on)
+
+    patch.setattr(Spiral, "advance", standing)
+
+
+#: Defects where a state has the right name and the mirror does something else: name, defect, and
+#: whether the normal tests leave it to the slow ones.
+TOUR_ROWS: tuple[tuple[str, Plant, bool], ...] = (
+    ("JOG acknowledged and forgotten", _accepted_and_forgotten("JOG"), True),
+    ("DIAGNOSE acknowledged and forgotten", _accepted_and_forgotten("DIAGNOSE"), True),
+    ("a locked mirror follows the sun", _lock_follows, True),
+    ("a search stands still", _search_stands, False),
+)
 #: Name, defect, worlds, and whether the normal tests leave it to the slow ones.
 ROWS: tuple[tuple[str, Plant, tuple[str, ...], bool], ...] = (
     ("TRACK acknowledged and forgotten", _accepted_and_forgotten("TRACK"), ("calm",), False),

@@ -400,4 +400,6 @@ DEFECTS = (
       for numbers, name, defect, only, pause, first in plant_defects.ROWS),
     *(Defect((16,), name, defect, faults=(), worlds=worlds, slow=slow)
       for name, defect, worlds, slow in quiet_defects.ROWS),
+    *(Defect((11, 12), name, defect, faults=(), worlds=("tour",), slow=slow)
+      for name, defect, slow in quiet_defects.TOUR_ROWS),
 )  # fmt: skip

@@ -46,6 +46,8 @@ ONWARDS = {
 LATCHING = frozenset(
     {"operator_emergency", "nodes_unacknowledged", "flux_after_emergency", "clock_jump"}
 )
+Point = tuple[float, ...]
+
 #: Somebody who looks at a mirror sees from this many steps on that it stands wrong.
 _SEEN_WRONG = 300
 
@@ -84,6 +86,8 @@ class Operator:
         Number of actions of each kind.
     refusal
         Why the plant refused last.
+    points
+        Points last accepted, ENU, m, by command (AIM, STANDBY) and heliostat.
     """
 
     def __init__(
@@ -103,6 +107,7 @@ class Operator:
         self.commands = True
         self.counts: Counter[str] = Counter()
         self.refusal = ""
+        self.points: dict[tuple[str, str], Point] = {}
         self._clock, self._observer, self._flux = clock, observer, flux
         self._beams, self._habits = beams, habits
         self._chance = random.Random(f"operator {seed}")
@@ -225,10 +230,11 @@ class Operator:
         names = heliostats or self._names
         self.counts["commands"] += 1
         try:
-            if what == "AIM":
-                ticket = plant.aim(who, mine, self._points(names, RECEIVER, 1.0))
-            elif what == "STANDBY":
-                ticket = plant.standby(who, mine, self._points(names, STANDBY, 0.5))
+            if what in ("AIM", "STANDBY"):
+                about, size = (RECEIVER, 1.0) if what == "AIM" else (STANDBY, 0.5)
+                points = self._points(names, about, size)
+                ticket = (plant.aim if what == "AIM" else plant.standby)(who, mine, points)
+                self.points.update({(what, name): point for name, point in points.items()})
             else:
                 numbers = self._values(what) if values is None else values
                 ticket = plant.command(who, mine, what, heliostats, numbers)

@@ -288,7 +288,9 @@ class Simulation:
         self._work = self._new_work() if works(plan.worlds) else None
         self._tour: Tour | None = None
         if TOUR in plan.worlds:
-            self._tour = Tour(self.operator, self.observer, self.boards, self._clock, plan.seed)
+            self._tour = Tour(
+                self.operator, self.observer, self.boards, self._clock, self.sun, plan.seed
+            )
         self._second = self._second_plant(fits) if "twice" in plan.worlds else None
         self.plant: PlantController | None = None
         self._program: list[asyncio.Task[None]] = []

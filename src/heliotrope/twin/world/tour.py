@@ -2,14 +2,18 @@
 
 An observer of faults finds nothing in a field that does nothing. Here each command must be carried
 out: it is accepted, ends as done in time, the board is in the state that it asks for, and the plant
-shows it; no alarm is raised. At the end the whole field is defocused by an emergency, which is
-proven, and comes back.
+shows it; no alarm is raised. A state is a name, so the true mirror is looked at too: its beam is on
+the point that the engineer gave (12), and its motors have turned as the command says. At the end
+the whole field is defocused by an emergency, which is proven, and comes back.
 """
 
 import asyncio
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+import numpy as np
+
+from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
 from heliotrope.mechanism.board_items import packed
@@ -17,11 +21,14 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act
 from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.outfit import LIMITS, RECEIVER, STANDBY
+from heliotrope.twin.invariants.invariants import OFF
 from heliotrope.twin.invariants.plant_observer import PlantObserver
-from heliotrope.twin.world.operator import ENGINEER, VIEWER, Operator
+from heliotrope.twin.invariants.quiet import NEAR, NEAR_M
+from heliotrope.twin.world.operator import ENGINEER, VIEWER, Operator, Point
 
 #: Name of the world, and how long it takes, s.
-TOUR, TOUR_LENGTH = "tour", 240.0
+TOUR, TOUR_LENGTH = "tour", 300.0
 #: Commands in turn, and the state that each ends in.
 STEPS = (
     ("AIM", "STOWED"), ("PARAMETERS", "STOWED"), ("APPROACH", "IDLE"), ("TRACK", "TRACKING"),
@@ -36,8 +43,18 @@ SOON, LATER = 20.0, 120.0
 FAR = ("APPROACH", "STOW")
 #: Pitch and radius of a search, rad, and the time that it takes, s.
 SPIRAL, SPIRAL_TAKES = (4e-3, 8e-3), 30.0
-#: Rest after a command, for the plant to be told, s.
-REST = 2.5
+#: Rest after a command, for the plant to be told, s; after LOCK, in which the sun moves by more
+#: steps than rough stepping waits for.
+REST, LOCKED_FOR = 2.5, 10.0
+#: Pause between two looks at a mirror that moves, s.
+LOOK = 0.2
+#: Steps of a JOG, and what the sun adds to them until it is carried out; least motion of each axis
+#: in a diagnosis, steps: it turns them by 0.02 rad.
+JOGGED, DRIFT, NUDGED = 200, 60, 1000
+#: A search comes to the last turn of its spiral: at least this share of its radius.
+OUTWARD = 0.7
+#: Commands that end with the beam at standby.
+TO_STANDBY = ("APPROACH", "IDLE", "STANDBY", "SEARCH")
 #: An emergency takes every beam off the receiver within this, s.
 OFF_WITHIN = 30.0
 
@@ -55,8 +72,10 @@ class Tour:
         The heliostats.
     clock
         True time.
+    sun
+        Returns the true direction to the sun, (3,), at a time in s.
     seed
-        Seed of the pauses.
+        Seed of the pauses and of the jogs.
 
     Attributes
     ----------
@@ -70,9 +89,10 @@ class Tour:
         observer: PlantObserver,
         boards: Sequence[Board],
         clock: Clock,
+        sun: Callable[[float], FloatArray],
         seed: int,
     ) -> None:
-        self._operator, self._observer, self._clock = operator, observer, clock
+        self._operator, self._observer, self._clock, self._sun = operator, observer, clock, sun
         self._boards = {board.outfit.name: board for board in boards}
         self._chance = random.Random(f"tour {seed}")
         self.over = False
@@ -99,8 +119,8 @@ class Tour:
         assert plant is not None, "the plant runs to the end of a tour"
         return plant
 
-    def _check(self, good: bool, saw: str) -> None:
-        self._observer.check(11, good, self._clock.monotonic(), saw)
+    def _check(self, good: bool, saw: str, number: int = 11) -> None:
+        self._observer.check(number, good, self._clock.monotonic(), saw)
 
     async def _lead(self, name: str) -> None:
         for what, state in STEPS:
@@ -118,22 +138,64 @@ class Tour:
 
     async def _done(self, what: str, name: str, state: str) -> None:
         """Give a command, and check that it is carried out and shown."""
-        if what in ("DEFOCUS", "STOW"):
-            ticket: Ticket | None = self._operator.safe(self._plant, what, name)
-        elif what == "PARAMETERS":
-            biases = packed("biases", (self._chance.gauss(0.0, 1e-4), 0.0))
-            ticket = self._operator.push(self._plant, name, {"biases": biases})
-        else:
-            values = SPIRAL if what == "SEARCH" else None
-            ticket = self._operator.give(self._plant, what, (name,), values=values)
+        board, jog = self._boards[name], [0, 0]
+        jog[self._chance.randrange(2)] = self._chance.choice([-JOGGED, JOGGED])
+        before = _turned(board)
+        ticket = self._given(what, name, jog)
         self._check(ticket is not None, f"{what} {name} was refused: {self._operator.refusal}")
         assert ticket is not None
-        good = await ticket.end(LATER if what in FAR else SOON)
-        self._check(good, f"{what} {name} is not done: {ticket.text}")
+        async with asyncio.TaskGroup() as group:
+            end = group.create_task(ticket.end(LATER if what in FAR else SOON))
+            swung = np.zeros(2)
+            while not end.done():
+                swung = np.maximum(swung, np.abs(_turned(board) - before))
+                await asyncio.sleep(LOOK)
+        self._check(end.result(), f"{what} {name} is not done: {ticket.text}")
         if what == "SEARCH":
-            await asyncio.sleep(SPIRAL_TAKES)
+            await self._searched(name)
         await asyncio.sleep(REST)
         self._shown(what, name, state)
+        self._lit(what, name)
+        moved = _turned(board) - before
+        if what == "JOG":
+            good = float(np.abs(moved - jog).max()) <= DRIFT
+            self._check(good, f"JOG {name} by {jog} steps: its motors have turned by {moved}")
+        elif what == "DIAGNOSE":
+            good = float(swung.min()) >= NUDGED
+            self._check(good, f"DIAGNOSE {name}: its motors have turned by {swung} steps at most")
+        elif what == "LOCK":
+            await self._stands(name)
+
+    def _given(self, what: str, name: str, jog: Sequence[int]) -> Ticket | None:
+        """Give a command; None if it is refused."""
+        if what in ("DEFOCUS", "STOW"):
+            return self._operator.safe(self._plant, what, name)
+        if what == "PARAMETERS":
+            biases = packed("biases", (self._chance.gauss(0.0, 1e-4), 0.0))
+            return self._operator.push(self._plant, name, {"biases": biases})
+        axis = 0 if jog[0] else 1
+        values = {"SEARCH": SPIRAL, "JOG": (float(axis), float(jog[axis]))}.get(what)
+        return self._operator.give(self._plant, what, (name,), values=values)
+
+    async def _searched(self, name: str) -> None:
+        """Check that the beam goes along the spiral, to its last turn and no further."""
+        board, point = self._boards[name], self._operator.points["AIM", name]
+        far, most = _far(board, point), 0.0
+        until = self._clock.monotonic() + SPIRAL_TAKES
+        while self._clock.monotonic() < until:
+            if board.state == states.SEARCHING:
+                most = max(most, self._miss(board, point))
+            await asyncio.sleep(LOOK)
+        low, high = OUTWARD * SPIRAL[1] * far, (SPIRAL[1] + NEAR) * far
+        saw = f"SEARCH {name}: its beam came {most:.2f} m from its aim, not {low:.2f} to {high:.2f}"
+        self._check(low <= most <= high, saw, 12)
+
+    async def _stands(self, name: str) -> None:
+        """Check that a locked mirror stands still."""
+        before = _turned(self._boards[name])
+        await asyncio.sleep(LOCKED_FOR)
+        moved = _turned(self._boards[name]) - before
+        self._check(not moved.any(), f"LOCK {name}: its motors have turned by {moved} steps since")
 
     def _shown(self, what: str, name: str, state: str) -> None:
         board = self._boards[name]
@@ -141,6 +203,26 @@ class Tour:
         self._check(true == state, f"{what} {name}: the board is {true}, not {state}")
         row = self._plant.field.of(name, self._clock.monotonic())
         self._check(row.state == state, f"{what} {name}: {state}, and the plant shows {row.state}")
+
+    def _lit(self, what: str, name: str) -> None:
+        """Check where the true beam is, or that the true mirror is at stow."""
+        board, points = self._boards[name], self._operator.points
+        if board.state == states.STOWED:
+            off = int(np.abs(_turned(board) - board.outfit.stow).max())
+            self._check(off <= LIMITS[2], f"{what} {name}: STOWED {off} steps from stow")
+        elif board.state == states.DEFOCUSED:
+            miss = self._miss(board, RECEIVER)
+            saw = f"{what} {name}: its beam is {miss:.1f} m from the middle of the receiver"
+            self._check(miss > OFF, saw, 12)
+        elif board.state == states.TRACKING or what in TO_STANDBY:
+            tracks = board.state == states.TRACKING
+            point = points["AIM", name] if tracks else points.get(("STANDBY", name), STANDBY)
+            miss, limit = self._miss(board, point), NEAR * _far(board, point) + NEAR_M
+            saw = f"{what} {name}: its beam is {miss:.2f} m beside its point, limit {limit:.2f} m"
+            self._check(miss <= limit, saw, 12)
+
+    def _miss(self, board: Board, point: Point) -> float:
+        return board.miss(self._sun(self._clock.monotonic()), (point[0], point[1], point[2]))
 
     async def _emergency(self) -> None:
         """Take the whole field off, and bring it back."""
@@ -159,3 +241,12 @@ class Tour:
         for name in self._boards:
             await self._done("REFOCUS", name, "TRACKING")
         self.over = True
+
+
+def _turned(board: Board) -> FloatArray:
+    """Return the true positions of the motors, steps, (2,)."""
+    return np.array([axis.turned for axis in board.axes], dtype=np.float64)
+
+
+def _far(board: Board, point: Point) -> float:
+    return float(np.linalg.norm(np.subtract(point, board.outfit.mechanism.position)))
