@@ -1,6 +1,7 @@
 """The plant file: what is written is read again, digit for digit."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -161,6 +162,24 @@ def with_text(folder: Path, text: str) -> Path:
     kept = [line for line in lines if not line.startswith(("keep_out =", "[eyes_m]"))]
     path.write_text("\n".join(kept) + text, encoding="utf-8")
     return path
+
+
+def test_the_parameter_of_an_own_joint_is_refused(tmp_path: Path) -> None:
+    """Written, it would make a file that cannot be read."""
+    plant = example_plant()
+    (name,) = plant.groups
+    group = plant.groups[name]
+    mast = kinds.with_joint(group.mechanism, "mast_north", (-1.0, 0.0, 0.0), prior=0.01)
+    still = replace(plant, groups={name: replace(group, mechanism=mast)})
+    plant_file.write_plant(still, tmp_path / "plant.toml")
+    again = plant_file.read_plant(tmp_path / "plant.toml").groups[name].mechanism
+    assert again.joints[0] == "mast_north"
+    leaning = replace(
+        still, groups={name: still.groups[name].with_parameters({"mast_north": 0.01})}
+    )
+    with pytest.raises(InputError, match="parameter mast_north belongs to an own joint"):
+        plant_file.write_plant(leaning, tmp_path / "leaning.toml")
+    assert not (tmp_path / "leaning.toml").exists()
 
 
 def test_keep_out_volumes_and_eyes_are_read_and_survive(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import FormatError, UnknownNameError
+from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.field.formats._plant_models import (
     ANGLE_UNITS,
     DRIVE_ANGLES,
@@ -432,6 +432,12 @@ def group_document(name: str, heliostats: Heliostats) -> tuple[dict[str, Any], d
         f = heliostats.facets
         document["facets"] = first(
             "facets", np.stack([f.center, f.half_width, f.half_height], axis=2)
+        )
+    strange = [row.name for row in m.own if row.name in heliostats.parameters]
+    if strange:
+        raise InputError(
+            f"group {name}: parameter {strange[0]} belongs to an own joint, which a plant file "
+            "cannot hold; write the plant without it"
         )
     for parameter, values in heliostats.parameters.items():
         columns[f"parameters.{_column(m, parameter)}"] = values
