@@ -10,7 +10,7 @@ PAGE = (ROOT / "docs" / "explanation" / "security.md").read_text(encoding="utf-8
 
 def rows(title: str) -> list[list[str]]:
     """Return the cells of the table of a chapter, without its head."""
-    chapter = PAGE.split(f"\n## {title}\n")[1].split("\n## ")[0]
+    chapter = re.split(r"\n###? ", PAGE.split(f"\n## {title}\n")[1])[0]
     lines = [line for line in chapter.splitlines() if line.startswith("|")]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
