@@ -9,8 +9,10 @@ from heliotrope.errors import InputError
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency
+from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.settings import PlantSettings
+from heliotrope.plant.visits.visit import Visit
 from heliotrope.safety import Act
 from support.plant_bench import OPERATOR, Bench, running
 
@@ -120,6 +122,20 @@ def test_what_waits_is_not_moved_but_locked(tmp_path: Path) -> None:
         assert ticket.refusals == {last: "superseded by LOCK"}
         assert last not in [one for _, one in sent(bench, "STOW")]
         assert len(sent(bench, "STOW")) == 17
+
+    play(tmp_path, scene)
+
+
+def test_a_visit_ends_instead_of_taking_its_mirror_out_of_the_turn(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        token = await bench.commanded()
+        last = bench.plant.field.names[-1]
+        visit = Visit(bench.plant, OPERATOR, token, last, bench.plant.design.targets[0])
+        ticket = bench.plant.stow("anybody")
+        with pytest.raises(RefusedError, match=f"{last}: it waits for its turn to go to stow"):
+            await visit.command("LOCK")
+        assert await ticket.end(20.0), ticket.text
+        assert bench.count(states.STOWED) == 18
 
     play(tmp_path, scene)
 

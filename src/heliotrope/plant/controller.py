@@ -390,6 +390,10 @@ class PlantController:
         """
         return self._safe(who, Act.STOW, heliostats)
 
+    def waits_to_stow(self, heliostat: str) -> bool:
+        """Return whether a heliostat waits for its turn to go to stow."""
+        return bool(self._orders.to_stow((heliostat,)))
+
     def _safe(self, who: str, act: Act, heliostats: Sequence[str]) -> Ticket:
         for name in heliostats:
             self.field.place(name)

@@ -43,8 +43,8 @@ class PlantSettings:
     stow_rate
         Heliostats a second that an ordinary STOW of more than these sends on their way, so that
         their drives do not start together; 0: all at once. At 200 a second 10,000 take 50 s, with
-        2 % of the field starting in a second. A LOCK takes one that waits out of its order.
-        Emergencies and the safety table never wait.
+        2 % of the field starting in a second. A person's LOCK takes one that waits out of its
+        order. Emergencies and the safety table never wait.
     """
 
     lease: float = 3.0

@@ -88,7 +88,16 @@ class Visit:
     async def command(
         self, name: str, values: tuple[float, ...] = (), limit: float = 120.0
     ) -> None:
-        """Give the heliostat a command and wait until it is done; see `obey`."""
+        """Give the heliostat a command and wait until it is done; see `obey`.
+
+        Raises
+        ------
+        RefusedError
+            As `obey`; or if the heliostat waits for its turn to go to stow, from which a LOCK would
+            take it.
+        """
+        if self.plant.waits_to_stow(self.heliostat):
+            raise RefusedError(f"{self.heliostat}: it waits for its turn to go to stow")
         ticket = self.plant.command(self.person, self.token, name, (self.heliostat,), values)
         await self.obey(ticket, limit)
 
