@@ -2,10 +2,13 @@
 
 import asyncio
 import dataclasses
+from datetime import UTC, datetime
 
 import pytest
 
 from heliotrope.cluster import _nodes
+from heliotrope.cluster._reports import Reports
+from heliotrope.cluster._watch import Watch
 from heliotrope.cluster.memory import Kept
 from heliotrope.lcu import messages, states, wire
 from heliotrope.links.clock import VirtualClock, run_virtual
@@ -22,6 +25,7 @@ from heliotrope.links.messages import (
 )
 from heliotrope.safety import Alarm, Severity
 from heliotrope.twin.boards.bus import BusFaults, TwinBus
+from heliotrope.twin.boards.clocks import SimulatedTime
 from support.clusters import AIM, TOKEN, Board, Field, boards_in, run
 
 ALL_STAGES = [Stage.ACCEPTED, Stage.SENT, Stage.ACKNOWLEDGED, Stage.DONE]
@@ -170,6 +174,18 @@ def test_a_clock_that_jumps_defocuses_until_somebody_acknowledges() -> None:
         await field.until(field.sun_is_fresh, 5.0)
 
     run(main, "TRACKING")
+
+
+def test_a_jump_before_the_first_second_is_seen_though_the_keeper_hides_it() -> None:
+    """Simulated run 910519: the time was only compared from one second to the next."""
+    clock = VirtualClock(lambda: 100.0, datetime(2026, 6, 21, 12, tzinfo=UTC))
+    before = SimulatedTime(clock).time()
+    watch = Watch("C", 0.0, Reports(), 100.0, before)
+    keeper = SimulatedTime(clock)
+    keeper.detects = False
+    keeper.jump(-3600.0)
+    watch.second(keeper.time(), 0.0, 100.7)
+    assert watch.verdict.dark
 
 
 def test_a_time_without_a_source_sends_no_sun() -> None:

@@ -73,8 +73,8 @@ class Watch:
         Longest autonomy that the plant may grant, s.
     reports
         Where alarms go.
-    now
-        Monotonic time, s.
+    now, present
+        Monotonic time, s, and the time that the next second's is compared with.
     line
         Returns whether current flows in the emergency line; None: there is no line.
 
@@ -94,6 +94,7 @@ class Watch:
         longest_autonomy: float,
         reports: Reports,
         now: float,
+        present: Time,
         line: Callable[[], bool] | None = None,
     ) -> None:
         self._cluster, self._longest, self._line = cluster, longest_autonomy, line
@@ -103,6 +104,7 @@ class Watch:
         self._lease: Reading | None = None
         self._over = -math.inf
         self._offset: float | None = None
+        self._step(present, now)
         self.token = 0
         self.verdict = Verdict()
         self.runs = Runs()
