@@ -101,3 +101,42 @@ def test_light_that_no_photograph_shows_to_move_is_not_kept(tmp_path: Path) -> N
     (result,) = results
     assert result.outcome is CalibrationOutcome.NO_PHOTOGRAPH, result.text
     assert "the light did not move with the aim" in result.rejected[-1]
+
+
+class Passing:
+    """A camera that sees a light which follows the aim once, and then is gone."""
+
+    def __init__(self, whole: WholePlant, stage: list[str]) -> None:
+        self._whole, self._stage, self.looks = whole, stage, list[float]()
+
+    async def photograph(self, target: Target, heliostat: str) -> Shot:
+        shot, plant = await self._whole.photograph(target, heliostat), self._whole.plant
+        aim = plant.aims[plant.field.place(heliostat)]
+        if self._stage[-1] == "first look":
+            self.looks.append(float(np.linalg.norm(aim - target.center)))
+        if self._stage[-1] in ("first look", "photograph 1", "photograph 2"):
+            return Shot(aim + np.array([0.2, 0.0, 0.2]), shot.at, 1e-4)
+        return Shot(np.full(3, np.nan), shot.at, 1e-4, ("no beam on the target",))
+
+
+def test_light_that_followed_its_aim_once_and_is_gone_is_not_kept(tmp_path: Path) -> None:
+    results: list[CycleResult] = []
+
+    async def main(clock: VirtualClock) -> None:
+        whole = WholePlant(clock, tmp_path, clusters=1, target=WIDE)
+        async with whole.alive():
+            plant, token = whole.plant, whole.token
+            assert await plant.command(ENGINEER, token, "APPROACH").end(400.0)
+            stage = [""]
+            camera = Passing(whole, stage)
+            cycle = CalibrationCycle(plant, camera, CycleSettings(interval=5.0), Centring(looks=2))
+            results.append(await cycle.run(ENGINEER, token, NAME, "white", stage.append))
+            assert plant.beliefs.seen(NAME) is None
+            # Each look begins in the middle, wherever the photographs before it ended.
+            assert np.allclose(camera.looks, 0.0, atol=0.05)
+            assert len(camera.looks) == 2
+
+    run_virtual(main, 1)
+    (result,) = results
+    assert result.outcome is CalibrationOutcome.NO_PHOTOGRAPH, result.text
+    assert "did not move with the aim often enough" in result.rejected[-1]

@@ -25,6 +25,8 @@ from heliotrope.plant.visits.visit import Visit
 CORNERS = ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0))
 #: Spare photographs: some may be cut off at the edge of the target.
 _SPARE = 2
+#: A light that was missed where it was expected has followed the aim this often, or is not used.
+_FOLLOWED = 2
 #: An aim this close to the one before is not sent, m.
 _SAME = 0.05
 
@@ -129,10 +131,9 @@ class Centred:
                 )
                 taken.found = False
                 return taken
-            await self._series(visit, light, taken, tell)
+            before = await self._series(visit, light, taken, tell)
             if taken.used:
                 break
-            before = light.aim
         return taken
 
     async def search(self, visit: Visit, tell: Tell) -> tuple[FloatArray | None, str]:
@@ -190,20 +191,28 @@ class Centred:
         await visit.arrived(self._settings.arrival)
         return _Light(moved, aim, place)
 
-    async def _series(self, visit: Visit, light: "_Light", taken: Photographs, tell: Tell) -> None:
-        """Take the photographs of the beam that was found; end at once if it is another's."""
+    async def _series(
+        self, visit: Visit, light: "_Light", taken: Photographs, tell: Tell
+    ) -> FloatArray:
+        """Take the photographs of the beam that was found; end at once if it is another's.
+
+        Returns the last aim.
+        """
         plant, settings = visit.plant, self._settings
         aim, room = light.aim, room_of(visit, self._centring)
-        stood = moved = False  # whether light was seen that did not move with the aim, and that did
+        # Whether the beam was missing where it was expected, and how often it followed its aim.
+        missed, moves = False, 0
+        last = light.aim
         for k in range(settings.shots + _SPARE):
             tell(f"photograph {k + 1}")
             due = plant.now() + settings.interval
             shot = await photographed(self._camera, visit)
             astray = self._astray(visit.target, shot, aim, light)
             good = not astray and not shot.reasons
-            stood |= bool(astray)
-            moved |= good and bool(np.linalg.norm(aim - light.aim) > _SAME)
+            missed |= bool(astray) or seen(visit.target, shot) is None
             if good:
+                moves += bool(np.linalg.norm(aim - last) > _SAME)
+                last = aim
                 taken.used.append((shot, await visit.counts_at(shot.at)))
             else:
                 taken.rejected.append(f"photograph {k + 1}: {astray or '; '.join(shot.reasons)}")
@@ -216,10 +225,11 @@ class Centred:
             aim = goal
             while plant.now() < due:
                 await visit.look()
-        if stood and not moved and taken.used:
-            # Any light agrees with the place where it was found.
+        if missed and moves < min(_FOLLOWED, settings.shots - 1):
+            # Any light agrees with the place where it was found, and a passing one with the next.
             taken.used.clear()
-            taken.rejected.append("the light did not move with the aim in any photograph")
+            taken.rejected.append("the light did not move with the aim often enough")
+        return aim
 
     def _astray(self, target: Target, shot: Shot, aim: FloatArray, light: "_Light") -> str:
         """Return why light is not the beam found first, "" if it is: a beam moves with its aim."""
