@@ -33,8 +33,9 @@ SETTLED = 15.0
 #: reached the cluster, s: both are sent every second.
 SUN_EVERY, STATUS_EVERY = 3.0, 5.0
 #: Time from an order that the plant sends to the state that it asks for, s; for APPROACH and STOW
-#: the slew of both axes, one after the other, at 8000 steps/s: a turn takes 50 s.
-SOON, APPROACH_WITHIN, STOW_WITHIN = 5.0, 100.0, 120.0
+#: the slew of both axes, one after the other, at 8000 steps/s: a turn takes 50 s. A way from the
+#: ground that crosses the keyhole, where the stops forbid the short turn, makes nearly two.
+SOON, APPROACH_WITHIN, STOW_WITHIN = 5.0, 150.0, 120.0
 #: From the state to the plant's knowledge of it, and to the proof of an emergency, s.
 TOLD_WITHIN, PROVEN_WITHIN = 8.0, 20.0
 #: Time for a beam to come to its point after an order or a change of state, s.
