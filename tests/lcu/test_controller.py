@@ -1,5 +1,6 @@
 """The controller of one heliostat, on a bench with a journal, motors, a cluster and a sun."""
 
+import copy
 import math
 import struct
 from binascii import crc32
@@ -309,6 +310,28 @@ def test_from_standby_a_defocus_turns_away_from_the_aim_and_not_onto_it(kind: st
     assert bench.state == "DEFOCUSED"
     assert nearest > OFF
     assert "UNREACHABLE" not in flags(bench)
+
+
+def test_from_an_aim_far_from_standby_a_defocus_does_not_turn_back_to_it() -> None:
+    """Simulated run 910267: from a target below, the usual sense led onto the receiver."""
+    bench = standing_by()
+    drives = bench.machine.drives
+    there = drives.angles(np.array(bench.made))
+    # An aim from which the usual turn, by 0.1 and 0.05 rad, would lead to standby, and one from
+    # which it leads there on no axis.
+    sun = bench.sun(bench.gps_ms() / 1000)
+    for turn, expected in (((-0.1, -0.05), (-0.1, -0.05)), ((0.02, -0.02), (0.1, 0.05))):
+        one = copy.deepcopy(bench)
+        normal, vertex = bench.machine.armature.pose(there + turn)
+        east, north, up = vertex + 100.0 * (2.0 * (normal @ sun) * normal - sun)
+        assert one.order("AIM", float(east), float(north), float(up)) == DONE
+        assert one.order("TRACK") == DONE
+        one.run(20)
+        begin = drives.angles(np.array(one.made))
+        assert one.order("DEFOCUS") == DONE
+        one.run(20)
+        assert one.state == "DEFOCUSED"
+        assert drives.angles(np.array(one.made)) - begin == pytest.approx(expected, abs=2e-3)
 
 
 @pytest.mark.parametrize("near", [0, 1])

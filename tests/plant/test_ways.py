@@ -384,6 +384,9 @@ def test_a_defocus_turns_the_other_way_before_a_stop() -> None:
     # From standby it turns away from the aim.
     aimed, at = np.array([0.6, 0.4]), np.array([0.5, 0.5])
     assert np.allclose(turned_away(at, machine, drives, aimed), [0.4, 0.6])
+    # From an aim it does not turn nearer to standby: from below, and from beside it.
+    standby = np.array([0.6, 0.52])
+    assert np.allclose(turned_away(at, machine, drives, None, standby), [0.4, 0.6])
 
 
 @pytest.mark.parametrize("field", [False, True])

@@ -260,20 +260,29 @@ class Motion:
         return low if angle - low > high - angle else high
 
     def _turn(self) -> tuple[float, float]:
-        """Return by how much a defocus turns: from standby, and on the way there, off the aim.
+        """Return by how much a defocus turns.
 
-        The usual sense may lead from standby onto the receiver, where the aim is.
+        From standby, and on the way there, it turns off the aim, since the usual sense may lead
+        the beam onto the receiver. From an aim, an axis that the usual sense would bring nearer to
+        standby, which is beside the receiver, turns the other way.
         """
         one, two = self.config.defocus
-        if self.kind not in (APPROACH, STANDBY) or self.aim is None:
+        tracks = self.kind in (TRACK, SEARCH)
+        other = self.config.standby if tracks else self.aim
+        if other is None or not (tracks or self.kind in (APPROACH, STANDBY)):
             return one, two
         unreachable = self.unreachable
-        pose = self.pose(self.aim, 0)
+        pose = self.pose(other, 0)
         self.unreachable = unreachable
         if pose is None:
             return one, two
         first, second = [self._near[i] - pose.angles[i] for i in (0, 1)]
-        return math.copysign(one, first), math.copysign(two, second)
+        if not tracks:
+            return math.copysign(one, first), math.copysign(two, second)
+        return (
+            one if abs(first + one) >= abs(first) else -one,
+            two if abs(second + two) >= abs(second) else -two,
+        )
 
     # Actions of the state table.
 

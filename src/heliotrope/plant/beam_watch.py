@@ -31,6 +31,8 @@ LOOK_PERIOD = 1.0
 _MOVES = 200
 #: States from which a mirror turns away from its aim.
 _AT_STANDBY = (states.APPROACHING, states.IDLE)
+#: States from which it does not turn nearer to its standby point.
+_AT_AIM = (states.TRACKING, states.SEARCHING)
 #: States whose motions were commanded: the whole way is looked at. Of every other state the present
 #: pose and the end of the motion are, as a way to safety is never held up.
 _COMMANDED = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)
@@ -321,8 +323,10 @@ class BeamWatch:
         if node["state"] == states.STOWING or (again and stands):
             return Act.STOW
         machine = self._machines.get(name)
-        aim = self.points.aims[row] if node["state"] in _AT_STANDBY else None
-        return way_out(self._check, machine, row, self._field.posed[row], self._sun(0.0), aim)
+        points, counts, sun = self.points, self._field.posed[row], self._sun(0.0)
+        aim = points.aims[row] if node["state"] in _AT_STANDBY else None
+        standby = points.standbys[row] if node["state"] in _AT_AIM else None
+        return way_out(self._check, machine, row, counts, sun, aim, standby)
 
     def _look(self, now: float) -> None:
         field = self._field

@@ -25,6 +25,7 @@ def way_out(
     counts: FloatArray,
     sun: FloatArray,
     aim: FloatArray | None = None,
+    standby: FloatArray | None = None,
 ) -> Act:
     """Return DEFOCUS or STOW: the one whose way ends outside, and is inside for the smaller turn.
 
@@ -40,6 +41,8 @@ def way_out(
         Unit vector to the sun, (3,).
     aim
         Aim of a heliostat at standby or on its way there, m, (3,), from which it turns away.
+    standby
+        Standby point of a heliostat that tracks, m, (3,), which it does not turn nearer to.
     """
     if machine is None:
         return Act.DEFOCUS
@@ -48,29 +51,44 @@ def way_out(
     end = as_float(drives.angles(np.asarray(machine.stow, dtype=np.float64)))
     corner = end.copy()
     corner[machine.azimuth_axis] = begin[machine.azimuth_axis]
-    aimed = None
-    if aim is not None and np.isfinite(aim).all():
-        found = check.poses(np.array([row]), aim[None], sun, counts[None])
-        aimed = as_float(found.best_angles[0])
+    aimed, stood = (_angles(check, row, point, counts, sun) for point in (aim, standby))
     ways = {
-        Act.DEFOCUS: np.stack([begin, turned_away(begin, machine, drives, aimed)]),
+        Act.DEFOCUS: np.stack([begin, turned_away(begin, machine, drives, aimed, stood)]),
         Act.STOW: np.stack([begin, corner, end]),
     }
     costs = {act: _cost(check, row, path, sun) for act, path in ways.items()}
     return min(ways, key=lambda act: (costs[act], act))
 
 
+def _angles(
+    check: BeamCheck, row: int, point: FloatArray | None, counts: FloatArray, sun: FloatArray
+) -> FloatArray | None:
+    """Return the angles at which a beam reaches a point; None without one."""
+    if point is None or not np.isfinite(point).all():
+        return None
+    found = check.poses(np.array([row]), point[None], sun, counts[None])
+    return as_float(found.best_angles[0])
+
+
 def turned_away(
-    begin: FloatArray, machine: Machine | None, drives: Drive, aimed: FloatArray | None = None
+    begin: FloatArray,
+    machine: Machine | None,
+    drives: Drive,
+    aimed: FloatArray | None = None,
+    standby: FloatArray | None = None,
 ) -> FloatArray:
     """Return the angles (2,) of the defocus from some angles, as a local controller chooses them.
 
-    From standby, and on the way there, it turns away from the angles of the aim (``aimed``). The
-    angle is turned the other way where a stop is near, as in `lcu.motion`.
+    From standby, and on the way there, it turns away from the angles of the aim (``aimed``). From
+    an aim, an axis that the usual sense would bring nearer to the angles of ``standby`` turns the
+    other way. So does one that is near a stop, as in `lcu.motion`.
     """
     offsets = as_float(Config().defocus if machine is None else machine.defocus)
     if aimed is not None and np.isfinite(aimed).all():
         offsets = np.copysign(offsets, begin - aimed)
+    elif standby is not None and np.isfinite(standby).all():
+        off = begin - standby
+        offsets = np.where(np.abs(off + offsets) < np.abs(off), -offsets, offsets)
     found = begin + offsets
     if machine is None:
         return found

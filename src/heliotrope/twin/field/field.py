@@ -272,13 +272,21 @@ class Field:
     def _sense(self, rows: Rows) -> None:
         """Choose in which sense heliostats turn away: `Motion._turn`."""
         self._senses[rows] = 1.0
-        able = among(self.kind[rows], APPROACH, STANDBY) & np.isfinite(self.aim[rows, 0])
-        rows = rows[able]
-        if len(rows):
-            angles, good = self._pose(rows, self.aim[rows], 0)
-            rows, angles = rows[good], angles[good]
-            off = self._angles_at(self.axes["count"][rows], rows) - angles
-            self._senses[rows] = np.copysign(1.0, off * self._defocus[rows])
+        ready = among(self.kind[rows], APPROACH, STANDBY) & np.isfinite(self.aim[rows, 0])
+        some, off = self._off(rows[ready], self.aim[rows[ready]])
+        self._senses[some] = np.copysign(1.0, off * self._defocus[some])
+        tracks = rows[among(self.kind[rows], TRACK)]
+        some, off = self._off(tracks, self.journals.standby[tracks])
+        nearer = np.abs(off + self._defocus[some]) < np.abs(off)
+        self._senses[some] = np.where(nearer, -1.0, 1.0)
+
+    def _off(self, rows: Rows, points: FloatArray) -> tuple[Rows, FloatArray]:
+        """Return which can reach a point each, and their angles less those there, rad."""
+        if not len(rows):
+            return rows, np.empty((0, 2))
+        angles, good = self._pose(rows, points, 0)
+        rows = rows[good]
+        return rows, self._angles_at(self.axes["count"][rows], rows) - angles[good]
 
     def _stow_directly(self, rows: Rows) -> None:
         if not len(rows):
