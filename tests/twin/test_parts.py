@@ -15,7 +15,9 @@ from heliotrope.errors import FormatError, InputError
 from heliotrope.lcu import ticks, wire
 from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of, run_virtual
 from heliotrope.links.link import LinkClosedError, SendOutcome
+from heliotrope.links.messages import Emergency, encode
 from heliotrope.plant.audit import AuditError, Record
+from heliotrope.safety import Alarm, Severity
 from heliotrope.sun import vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.bus import BusFaults, TwinBus
@@ -26,7 +28,10 @@ from heliotrope.twin.boards.outfit import RECEIVER, outfits
 from heliotrope.twin.invariants.invariants import InvariantError
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.runs import RunAccount
+from heliotrope.twin.invariants.sensors import LIMITS as SENSORS
+from heliotrope.twin.invariants.sensors import SensorObserver
 from heliotrope.twin.records import RecordsDisk
+from heliotrope.twin.world.pod import PlantEar
 from heliotrope.twin.world.scene import USUAL, scene_of
 from heliotrope.twin.world.simulation import SETTINGS, RunPlan, Simulation
 from heliotrope.twin.world.soak import run_many
@@ -355,3 +360,40 @@ def test_a_lease_that_comes_too_late_proves_nothing() -> None:
     assert runs.obeyed(["b-1.1"], 4.0) == ""
     runs.forget()
     assert runs.obeyed(["a-2.1"], 4.1) == ""
+
+
+def test_an_alarm_of_a_sensor_outlives_a_frozen_plant_but_not_a_killed_one() -> None:
+    """Simulated run 911317: a plant that was thawed had raised its alarm before."""
+    for killed in (False, True):
+        observer = SensorObserver(0.0, {})
+        observer.look(set(), 0.0, runs=True)
+        for name in SENSORS:
+            condition = SENSORS[name][0][0]
+            observer.alarmed(Alarm(condition, "", Severity.ALARM, "no reading", active=True))
+        observer.look(set(), 10.0, runs=True)
+        observer.look(set(), 20.0, runs=False)
+        if killed:
+            observer.ended(21.0)
+        observer.look(set(), 30.0, runs=True)
+        if killed:
+            with pytest.raises(InvariantError, match="no alarm names it"):
+                observer.look(set(), 60.0, runs=True)
+        else:
+            observer.look(set(), 60.0, runs=True)
+
+
+def test_what_a_killed_plant_still_posts_is_not_judged() -> None:
+    """Simulated run 911645: a visit that is cancelled takes its beam off the target."""
+    posted: list[int] = []
+
+    async def main(clock: VirtualClock) -> None:
+        pod = SimpleNamespace(addresses={"H1": 1})
+        plant = SimpleNamespace(posted=lambda members, message, now: posted.append(members))
+        ear = PlantEar(pod, plant, SimpleNamespace())  # type: ignore[arg-type]
+        data = encode(Emergency("r-1.1", "DEFOCUS", ("H1",)))
+        await ear.posted(data, 0.0)
+        ear.end()
+        await ear.posted(data, 1.0)
+
+    run_virtual(main)
+    assert posted == [1]

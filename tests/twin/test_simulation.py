@@ -83,12 +83,15 @@ def test_what_was_found_once_stays_mended(seed: int, seconds: float) -> None:
         (800085, 73.0, "calm place"),
         (800132, 77.0, "calm swarm held disk place sensors calibrations day"),
         (800195, 44.0, "frozen place sensors"),
+        (910267, 79.0, "place visits"),
+        (910519, 6.0, ""),
     ],
 )
 def test_what_any_world_found_once_stays_mended(seed: int, seconds: float, worlds: str) -> None:
     """An approach over the receiver; a scene; parameters not compared; two proofs of DEFOCUS;
     a defocus onto the receiver; an approach by the other pose; leases of one moment in any order;
-    SUN of a second in which the cluster stood still.
+    SUN of a second in which the cluster stood still; a defocus from a target onto the receiver; a
+    jump of the time before the first second.
     """
     outcome = run(RunPlan(seed, seconds, 4, pause=12.0, worlds=tuple(worlds.split())))
     assert outcome.good, f"{outcome.text}; {outcome.command}"

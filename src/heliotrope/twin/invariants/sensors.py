@@ -60,15 +60,23 @@ class SensorObserver:
         """Note an alarm of the plant."""
         (self._alarms.add if alarm.active else self._alarms.discard)(alarm.condition)
 
+    def ended(self, now: float) -> None:
+        """Note that the plant's program has ended, its alarms too; one that is frozen has them."""
+        self._alarms.clear()
+        self._rests(now)
+
+    def _rests(self, now: float) -> None:
+        """Begin anew: a plant that starts has given its sensors no time yet."""
+        self._since, self._value = dict.fromkeys(LIMITS), {}
+        self._started_at = now
+
     def look(self, carried: Set[str], now: float, *, runs: bool) -> None:
         """Judge all readings; ``carried``: clusters that the plant reaches."""
         for cluster in self._boards:
             if cluster not in carried:
                 self._cut_at[cluster] = now
-        if not runs:  # a plant that starts has given its sensors no time yet
-            self._since, self._value = dict.fromkeys(LIMITS), {}
-            self._alarms.clear()
-            self._started_at = now
+        if not runs:
+            self._rests(now)
             return
         for name, (alarms, limit, delay) in LIMITS.items():
             value, at = self._value.get(name, (0.0, self._started_at))

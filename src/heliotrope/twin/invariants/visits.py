@@ -58,7 +58,7 @@ class VisitObserver:
         self.checks: Counter[int] = Counter()
         self._start, self._followed = start, followed
         self._boards, self._targets = {b.outfit.name: b for b in boards}, tuple(targets)
-        self._judged: dict[str, object] = {}
+        self._judged: set[tuple[str, int, float]] = set()
         self._kept: dict[str, int] = {}
         self._slipped: set[str] = set()  # sightings from before tell nothing of now
 
@@ -69,7 +69,6 @@ class VisitObserver:
 
     def ended(self) -> None:
         """Note that the plant's program has ended; the next one knows what the store has kept."""
-        self._judged.clear()
         self._kept.clear()
 
     def look(self, plant: PlantController | None, sun: FloatArray, now: float) -> None:
@@ -80,14 +79,15 @@ class VisitObserver:
             if any(board.slip):
                 self._slipped.add(name)
             record = plant.beliefs.record(name)
-            if record is not None and self._judged.get(name) is not record:
-                self._judged[name] = record
+            # Once: when the store brings it back, the mirror may have slipped.
+            if record is not None and (name, record.version, record.at) not in self._judged:
+                self._judged.add((name, record.version, record.at))
                 self._believed(board, record, plant.beliefs.nominal(name)[0], sun, now)
             seen = plant.beliefs.seen(name)
             known = self._kept.get(name, 0)
             if seen is not None and len(seen.sightings) > known:
                 self._kept[name] = len(seen.sightings)
-                if self._followed:
+                if self._followed and name not in self._slipped:
                     self._own(
                         board, seen.sightings.take(np.arange(known, len(seen.sightings))), now
                     )

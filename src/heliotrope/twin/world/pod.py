@@ -248,6 +248,11 @@ class PlantEar:
         self._names: tuple[str, ...] = ()
         self._goes = asyncio.Event()
         self._goes.set()
+        self._ended = False
+
+    def end(self) -> None:
+        """Judge nothing more: what a killed program does while its tasks end leaves no line."""
+        self._ended = True
 
     def hang(self, *, on: bool) -> None:
         """Freeze the plant's program, or let it go on, while the connection stays up."""
@@ -258,6 +263,8 @@ class PlantEar:
 
     async def posted(self, data: bytes, now: float) -> None:
         """Judge a message that the plant hands to the link, which waits while it is frozen."""
+        if self._ended:
+            return
         self._plant.posted(len(self._addresses), decode(data), now)
         await self._goes.wait()
 

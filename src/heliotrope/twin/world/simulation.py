@@ -440,6 +440,9 @@ class Simulation:
 
     def crash_plant(self, now: float) -> None:
         """Kill the plant's program wherever it is; the network tells the clusters."""
+        for pod in self.pods:
+            if pod.ear is not None:
+                pod.ear.end()
         if self._work is not None:
             self._work.control.ends()
             self._work.observer.ended()
@@ -455,6 +458,8 @@ class Simulation:
         self.instruments.plant = None
         self.observer.ended(now)
         self.beams.ended()
+        self.readings.ended(now)
+
         if self.quiet is not None:
             self.quiet.ended()
         for pod in self.pods:
@@ -501,7 +506,12 @@ class Simulation:
             if self._measured:
                 tasks.append(self.instruments.run())
             others = [group.create_task(each) for each in tasks]
-            await self._turn(damage, group)
+            try:
+                await self._turn(damage, group)
+            finally:
+                self._frozen(on=False)  # a frozen program could not end
+                for pod in self.pods:
+                    pod.freeze(on=False)
             if self._tour is not None and self.plan.seconds >= TOUR_LENGTH:
                 saw = f"the tour is not over after {self.plan.seconds:g} s"
                 self.observer.check(11, self._tour.over, self._clock.monotonic(), saw)
