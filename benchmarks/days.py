@@ -280,7 +280,8 @@ class Days:
         if name not in self.records:
             return off, np.full((count, 2, 2), np.nan)
         record = self.records[name]
-        return off, expected_error(believed, record.names, record.covariance, suns, aim).covariance
+        covariance = record.covariance_at(self.now.timestamp())
+        return off, expected_error(believed, record.names, covariance, suns, aim).covariance
 
 
 def _half(squares: FloatArray) -> FloatArray:

@@ -5,6 +5,7 @@ checks, local controllers, store, pages) hold a reference to that same record; n
 again. `CalibrationOutcome` is the outcome of an attempt, whether or not it made a record.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Self
@@ -15,6 +16,8 @@ import numpy.typing as npt
 from heliotrope import __version__
 from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome, parameter_rows
+from heliotrope.calibration.growth import Growth, default_growth
+from heliotrope.calibration.learn.drift import DAY
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
@@ -79,7 +82,8 @@ class HeliostatCalibration(Value):
     names, values
         Parameters, and their deviations from the nominal mechanism, rad, m or 1, (P,).
     covariance
-        Covariance of the values, with the noise scaled to the residuals, (P, P).
+        Covariance of the values at the time of the fit, with the noise scaled to the residuals,
+        (P, P).
     prior
         Standard deviations of the priors that the covariance stands on, (P,).
     before, after
@@ -107,6 +111,9 @@ class HeliostatCalibration(Value):
         Version of the program.
     version
         1, 2, ... for each heliostat; 0 before it is numbered.
+    growth
+        How the covariance grows after the fit. It belongs to the group: a fit gives the default of
+        its kind, the plant's beliefs what is known of the group, and no store keeps it here.
 
     Raises
     ------
@@ -136,6 +143,7 @@ class HeliostatCalibration(Value):
     pushed: tuple[str, ...] = ()
     code: str = __version__
     version: int = 0
+    growth: Growth = field(default_factory=Growth)
 
     def __post_init__(self) -> None:
         count, used = len(self.names), np.shape(self.sightings)[0]
@@ -236,6 +244,7 @@ class HeliostatCalibration(Value):
             note,
             pushed,
             version=version,
+            growth=default_growth(nominal),
         )
 
     def _card(self) -> Card:
@@ -252,12 +261,35 @@ class HeliostatCalibration(Value):
 
     @property
     def sigma(self) -> FloatArray:
-        """Standard deviations of the values, (P,)."""
+        """Standard deviations of the values at the time of the fit, (P,)."""
         return np.asarray(np.sqrt(np.diagonal(self.covariance)))
+
+    def sigma_at(self, time: float) -> FloatArray:
+        """Return the standard deviations of the values at a POSIX time, (P,)."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance_at(time))))
+
+    def covariance_at(self, time: npt.ArrayLike) -> FloatArray:
+        """Return the covariance of the values at POSIX times (...), (..., P, P).
+
+        It grows with the time since the fit as the group's parameters drift. For many records of
+        one group see `covariances_at`.
+        """
+        days = (np.asarray(time, dtype=np.float64) - self.at) / DAY
+        return self.growth.grown(self.covariance, self.names, days)
 
     def mechanism(self, nominal: Mechanism) -> Mechanism:
         """Return the calibrated mechanism, in the batch shape of the nominal one."""
         return nominal.with_parameters(self.parameters)
+
+
+def covariances_at(records: Sequence[HeliostatCalibration], time: float) -> FloatArray:
+    """Return the covariances of K records at a POSIX time, (K, P, P).
+
+    The records have the same parameters and one growth, as those of a group have.
+    """
+    first, days = records[0], np.array([(time - record.at) / DAY for record in records])
+    whole = np.stack([record.covariance for record in records])
+    return first.growth.grown(whole, first.names, days)
 
 
 def root_mean_square(values: FloatArray) -> float:

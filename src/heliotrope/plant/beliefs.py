@@ -6,11 +6,12 @@ calibration recalled from the store comes the same way.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.growth import Growth, default_growth
 from heliotrope.calibration.record import HeliostatCalibration, Identities
 from heliotrope.calibration.sightings import Sightings, join
 from heliotrope.field.plant import Plant
@@ -70,6 +71,9 @@ class Beliefs:
         self._seen: dict[str, Seen] = {}
         self._subscribers: list[Subscriber] = []
         self._number: Numbering = _unkept
+        self._growth: dict[str, Growth] = {}
+        for group in design.groups.values():
+            self._growth |= dict.fromkeys(group.names, default_growth(group.mechanism))
 
     def subscribe(self, subscriber: Subscriber, *, held: bool = True) -> None:
         """Call a function with each new calibration and, if ``held``, now with the current ones."""
@@ -103,6 +107,10 @@ class Beliefs:
     def record(self, heliostat: str) -> HeliostatCalibration | None:
         """Return the current calibration; None before the first."""
         return self._records.get(heliostat)
+
+    def growth(self, heliostat: str) -> Growth:
+        """Return how the covariance of a heliostat's calibration grows with time."""
+        return self._growth[heliostat]
 
     def seen(self, heliostat: str) -> Seen | None:
         """Return the known sightings; None if there are none."""
@@ -139,11 +147,16 @@ class Beliefs:
         self._seen[heliostat] = Seen(known.sightings, identities, known.targets, known.missed)
         return self._seen[heliostat]
 
-    def take(self, record: HeliostatCalibration) -> None:
-        """Make a calibration the current one, and pass it to all subscribers."""
+    def take(self, record: HeliostatCalibration) -> HeliostatCalibration:
+        """Make a calibration the current one, pass it to all subscribers, and return it.
+
+        Its covariance grows from now on as its group drifts.
+        """
+        record = replace(record, growth=self.growth(record.heliostat))
         self._records[record.heliostat] = record
         for subscriber in self._subscribers:
             subscriber(record)
+        return record
 
     def recall(
         self,

@@ -5,7 +5,7 @@ from collections import deque
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.record import HeliostatCalibration
+from heliotrope.calibration.record import HeliostatCalibration, covariances_at
 from heliotrope.calibration.uncertainty import expected_error, precision
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism import parameters as parameter_table
@@ -31,7 +31,8 @@ class CalibrationBook:
     Attributes
     ----------
     error
-        Predicted standard deviation of the normal (two-dimensional) at the aim, rad, (N,).
+        Predicted standard deviation of the normal (two-dimensional) at the aim, rad, (N,). It
+        grows with the time since the calibration.
     measured, calibrated_at, sightings
         See `FieldFrame`.
     results, quality
@@ -88,6 +89,7 @@ class CalibrationBook:
         light = self._plant.sun_vector()
         if not light[2] > 0.0:
             return
+        now = self._plant.clock.utc().timestamp()
         # Heliostats of one group with the same parameters are computed together.
         parts: dict[tuple[int, tuple[str, ...]], list[HeliostatCalibration]] = {}
         for record in records:
@@ -98,7 +100,7 @@ class CalibrationBook:
             places = np.array([group.index(r.heliostat) for r in members], dtype=np.intp)
             values = np.stack([record.values for record in members])
             rows = np.array([self._plant.field.place(r.heliostat) for r in members], dtype=np.intp)
-            covariance = np.stack([record.covariance for record in members])
+            covariance = covariances_at(members, now)
             parameters = dict(zip(names, values.T, strict=True))
             mechanism = group.mechanism[places].with_parameters(parameters)
             found = expected_error(mechanism, names, covariance, light, self._aims(rows))

@@ -107,7 +107,7 @@ class TypedParameters:
         for name in group.mechanism.parameters:
             known, sigma = group.mechanism.parameter(name), float("nan")
             if record is not None and name in record.names:
-                sigma = float(record.sigma[record.names.index(name)])
+                sigma = float(record.sigma_at(self._utc())[record.names.index(name)])
             value, file = now.get(name, 0.0), in_file.get(name, 0.0)
             states.append(ParameterState(name, known.unit, file, value, sigma, known.prior))
         version = 0 if record is None else record.version
@@ -136,6 +136,9 @@ class TypedParameters:
     def _file(self, heliostat: str) -> dict[str, float]:
         group, row = self._plant.design.find(heliostat)
         return {name: float(values[row]) for name, values in group.parameters.items()}
+
+    def _utc(self) -> float:
+        return self._plant.clock.utc().timestamp()
 
     def _now(self, heliostat: str) -> dict[str, float]:
         record = self._plant.beliefs.record(heliostat)
@@ -198,7 +201,8 @@ class TypedParameters:
         if version not in known:
             raise UnknownNameError(f"version of {heliostat}", str(version), map(str, known))
         note = f"version {version} again: {reason.strip()}"
-        record = replace(known[version], note=note, pushed=())
+        old = replace(known[version], growth=self._plant.beliefs.growth(heliostat))
+        record = replace(old, covariance=old.covariance_at(self._utc()), note=note, pushed=())
         return self._write(person, token, record, reason, f"version {version} again")
 
     def _typed(
@@ -216,7 +220,7 @@ class TypedParameters:
             kept = [name for name in last.names if name not in typed]
             to = np.array([names.index(name) for name in kept], dtype=np.intp)
             at = np.array([last.names.index(name) for name in kept], dtype=np.intp)
-            covariance[np.ix_(to, to)] = last.covariance[np.ix_(at, at)]
+            covariance[np.ix_(to, to)] = last.covariance_at(self._utc())[np.ix_(at, at)]
         numbers = np.array([values[name] for name in names])
         return HeliostatCalibration(
             heliostat, 0.0, names, numbers, covariance, prior, provenance=Provenance.PERSON
@@ -236,7 +240,7 @@ class TypedParameters:
             raise InputError(f"{name}: it has these parameters already; nothing was changed")
         record = replace(
             given,
-            at=plant.clock.utc().timestamp(),
+            at=self._utc(),
             person=person.name,
             pushed=changed,
             version=1 if last is None else last.version + 1,

@@ -178,7 +178,8 @@ class Viewer:
             values, sigmas = {key: float(v[row]) for key, v in group.parameters.items()}, {}
         else:
             values = record.parameters
-            sigmas = dict(zip(record.names, record.sigma.tolist(), strict=True))
+            sigma = record.sigma_at(self._plant.clock.utc().timestamp())
+            sigmas = dict(zip(record.names, sigma.tolist(), strict=True))
         found = {}
         for key in dict.fromkeys((*self._automatic.book.model_of(name), *values)):
             known = group.mechanism.parameter(key)

@@ -1,7 +1,7 @@
 """Knowledge of the heliostats of a plant, and its decay with time.
 
 The covariance of a heliostat's parameters is that of its calibration, or of the priors before the
-first. The zeros of the drives creep, so the covariance grows with the time since the calibration.
+first. The zeros of the drives drift, so the covariance grows with the time since the calibration.
 The effect of parameter errors on the beam over the year is a quadratic form that changes slowly
 over the field: it is computed for a sample of heliostats; the others take it from the nearest.
 """
@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from heliotrope.calibration.learn.drift import DAY, zeros
+from heliotrope.calibration.growth import Growth, default_growth
+from heliotrope.calibration.learn.drift import DAY
 from heliotrope.calibration.plan import gain as _gain
 from heliotrope.calibration.plan.planning import Aimed, SightingLimits, aim_at, sighting_jacobian
 from heliotrope.calibration.record import HeliostatCalibration
@@ -80,8 +81,6 @@ class Knowledge:
         Parameters: a name of the table, or names.
     priors
         Standard deviations that replace those of the table, by name.
-    creep
-        Creep of the drives' zeros in a day, rad; it grows with the root of time.
 
     Attributes
     ----------
@@ -100,7 +99,6 @@ class Knowledge:
         *,
         model: str | tuple[str, ...],
         priors: Mapping[str, float],
-        creep: float,
     ) -> None:
         self.mechanism = heliostats.calibrated
         known = self.mechanism.parameters
@@ -116,20 +114,19 @@ class Knowledge:
         suns = suns_of_year(site, year, days=6)
         self._form = error_form(self.mechanism[sample], aim, suns, self.names)
         self._like = _nearest(heliostats.position, heliostats.position[sample])
-        self._noise = np.zeros((len(self.names), len(self.names)))
-        for zero in set(zeros(self.mechanism)) & set(self.names):
-            place = self.names.index(zero)
-            self._noise[place, place] = creep**2
+        # Drift adds to the variances alone: of the form the diagonal is enough.
+        self._weight = np.diagonal(self._form, axis1=-2, axis2=-1)
+        self._growths: tuple[Growth, ...] = (default_growth(self.mechanism),)
+        self._grows = np.zeros(count, dtype=np.intp)
         self.first = self._squares(self._prior, np.arange(count))
         self._known = self.first.copy()
-        self._rate = np.einsum("npq,qp->n", self._form, self._noise)[self._like]
 
     def copy(self) -> "Knowledge":
         """Return a copy to change independently."""
         other = object.__new__(Knowledge)
         other.__dict__ |= self.__dict__
         other.covariance, other.since = self.covariance.copy(), self.since.copy()
-        other._known = self._known.copy()
+        other._known, other._grows = self._known.copy(), self._grows.copy()
         return other
 
     def _squares(self, covariance: FloatArray, rows: Rows) -> FloatArray:
@@ -138,16 +135,35 @@ class Knowledge:
 
     def expected(self, now: float) -> FloatArray:
         """Return the expected squared beam error over the year, rad², (n,)."""
-        age = np.nan_to_num(np.maximum(now - self.since, 0.0)) / DAY
-        return np.asarray(np.minimum(self._known + self._rate * age, self.first))
+        rows = np.arange(len(self.since))
+        added = np.einsum("np,np->n", self._weight[self._like], self._added(rows, now))
+        return np.asarray(np.minimum(self._known + added, self.first))
 
     def faded(self, rows: Rows, now: float) -> FloatArray:
         """Return the covariance of heliostats at a time, (K, P, P); never beyond the prior."""
-        age = np.nan_to_num(np.maximum(now - self.since[rows], 0.0)) / DAY
-        grown = self.covariance[rows] + age[:, None, None] * self._noise
-        lost = self._known[rows] + self._rate[rows] * age >= self.first[rows]
+        added = self._added(rows, now)
+        grown = self.covariance[rows] + added[:, :, None] * np.eye(len(self.names))
+        more = np.einsum("np,np->n", self._weight[self._like[rows]], added)
+        lost = self._known[rows] + more >= self.first[rows]
         grown[lost] = self._prior[rows[lost]]
         return np.asarray(grown)
+
+    def _added(self, rows: Rows, now: float) -> FloatArray:
+        """Return the growth of the variances since the last calibration, (K, P)."""
+        days, kind = np.nan_to_num(now - self.since[rows]) / DAY, self._grows[rows]
+        found = np.empty((len(rows), len(self.names)))
+        for k, growth in enumerate(self._growths):
+            mine = kind == k
+            found[mine] = growth.variances(self.names, days[mine])
+        return found
+
+    def _grow_as(self, row: int, growth: Growth) -> None:
+        """Let a heliostat drift as its record says; its group shares one object."""
+        if growth not in self._growths:
+            used = np.unique(np.delete(self._grows, row))
+            self._growths = (*(self._growths[k] for k in used), growth)
+            self._grows = np.searchsorted(used, self._grows)
+        self._grows[row] = self._growths.index(growth)
 
     def look(
         self,
@@ -209,6 +225,7 @@ class Knowledge:
         covariance[mine, :] = covariance[:, mine] = 0.0
         covariance[np.ix_(mine, mine)] = record.covariance[np.ix_(theirs, theirs)]
         self.covariance[row] = covariance
+        self._grow_as(row, record.growth)
         self._set(np.array([row], dtype=np.intp), record.at)
 
     def doubt(self, row: int, factor: float) -> None:
@@ -273,7 +290,6 @@ class FieldKnowledge:
                 year,
                 model=settings.model,
                 priors=settings.priors,
-                creep=settings.creep,
             )
             for group in groups
         ]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from heliotrope.calibration.learn.drift import DAY, START_DAYS, START_RAD
+from heliotrope.calibration.learn.drift import DAY
 from heliotrope.calibration.plan.planning import SightingLimits
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
@@ -55,8 +55,6 @@ class Settings:
         Age of a calibration from which its heliostat comes before all gains, s.
     retry
         Wait after a visit that failed, s; doubled each time, a day at most.
-    creep
-        Creep of the drives' zeros in a day, rad: the error grows with the root of time.
     glare
         Least angle between the sun and a camera's line to its target, rad.
     most_hidden
@@ -77,8 +75,6 @@ class Settings:
     worth: float = 0.1
     most_age: float = 30.0 * DAY
     retry: float = 900.0
-    #: An Ornstein-Uhlenbeck process begins as a random walk of this step.
-    creep: float = START_RAD["slow"] * float(np.sqrt(2.0 / START_DAYS["slow"]))
     glare: float = float(np.radians(10.0))
     most_hidden: float = 0.35
     least_dni: float = 300.0
@@ -96,11 +92,8 @@ class Settings:
         for name in ("worth", "most_hidden"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise InputError(f"schedule: {name} {getattr(self, name)} must be 0 to below 1")
-        if not self.creep >= 0.0 or (self.look is not None and not self.look > 0.0):
-            raise InputError(
-                f"schedule: creep {self.creep} rad and look {self.look} s; give 0 or more, and "
-                "above 0 or None"
-            )
+        if self.look is not None and not self.look > 0.0:
+            raise InputError(f"schedule: look {self.look} s; give above 0, or None")
 
     @property
     def visit(self) -> float:

@@ -303,8 +303,7 @@ class CalibrationCycle:
         )
         if found.revealed is not None:
             self._plant.beliefs.flights.learn(visit.heliostat, *found.revealed)
-        self._plant.beliefs.take(record)
-        return record
+        return self._plant.beliefs.take(record)
 
     async def _push(self, visit: Visit, mechanism: Mechanism, why: str) -> tuple[str, ...]:
         """Write the items that differ, and read them back; ``why`` is for the audit."""

@@ -1,0 +1,103 @@
+r"""Growth of a calibration's covariance with time: what the drives do after the last photograph.
+
+The parameters drift as `heliotrope.calibration.learn.drift` describes. A mirror that goes on with
+the values of its calibration misses, after a time Δ, by what its processes have moved since:
+
+$$ \langle (d(t + Δ) - d(t))^2 \rangle = 2 a^2 (1 - e^{-Δ/τ}) + r Δ s^2 , $$
+
+the structure function of an Ornstein-Uhlenbeck process of standard deviation a and time constant
+τ, and the steps of standard deviation s that come r times a day.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration.learn import drift
+from heliotrope.calibration.learn.drift import Hyperparameters
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.mechanism.chain import Mechanism
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Growth of the variances of parameters with time; without arguments nothing grows.
+
+    Equal figures make equal objects: the mirrors of a group are computed together.
+
+    Attributes
+    ----------
+    source
+        Where the figures come from, for people.
+    processes, variance, tau
+        Parameter, variance and time constant (days) of each process, C.
+    stepping, rate
+        Parameters that step, Z, and the growth of their variances in a day, (Z,).
+    """
+
+    source: str = "nothing grows"
+    processes: tuple[str, ...] = ()
+    variance: tuple[float, ...] = ()
+    tau: tuple[float, ...] = ()
+    stepping: tuple[str, ...] = ()
+    rate: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, hyper: Hyperparameters, source: str) -> "Growth":
+        """Return the growth under hyperparameters.
+
+        A process of hours is left out: it is over before the next visit, and is part of the noise
+        of each sighting.
+        """
+        slow = [c for c, process in enumerate(hyper.processes) if process.group != "hours"]
+        steps = np.flatnonzero(hyper.step > 0.0)
+        return cls(
+            source,
+            tuple(hyper.processes[c].parameter for c in slow),
+            tuple((hyper.amplitude[slow] ** 2).tolist()),
+            tuple(hyper.tau[hyper.group[slow]].tolist()),
+            tuple(hyper.names[p] for p in steps),
+            tuple((hyper.rate * hyper.step[steps] ** 2).tolist()),
+        )
+
+    def variances(self, names: Sequence[str], days: npt.ArrayLike) -> FloatArray:
+        """Return what is added to the variances of parameters after days, (..., P).
+
+        Parameters
+        ----------
+        names
+            P parameters; those that do not drift keep their variance.
+        days
+            Since the calibration, (...); a time before it adds nothing.
+        """
+        since = np.maximum(as_float(days), 0.0)[..., None]
+        of_processes = 2.0 * as_float(self.variance) * -np.expm1(-since / as_float(self.tau))
+        return as_float(
+            of_processes @ _places(self.processes, names)
+            + since * (as_float(self.rate) @ _places(self.stepping, names))
+        )
+
+    def grown(
+        self, covariance: npt.ArrayLike, names: Sequence[str], days: npt.ArrayLike
+    ) -> FloatArray:
+        """Return covariances (..., P, P) after days (...)."""
+        added = self.variances(names, days)
+        return as_float(as_float(covariance) + added[..., None] * np.eye(len(names)))
+
+
+def default_growth(mechanism: Mechanism) -> Growth:
+    """Return the growth that a kind of mechanism has before anything was learnt of its field."""
+    hyper = drift.start(mechanism, drift.zeros(mechanism))
+    tau, rate = drift.START_DAYS["slow"], drift.step_rate(())
+    wander = f"zeros wander by {1e3 * drift.START_RAD['slow']:g} mrad over {tau:.0f} days"
+    steps = f"step by {1e3 * drift.STEP_RAD:g} mrad in {1.0 / rate:.0f}"
+    return Growth.of(replace(hyper, rate=rate), f"default: {wander} and {steps}")
+
+
+def _places(parameters: tuple[str, ...], names: Sequence[str]) -> FloatArray:
+    """Return the matrix that adds figures of parameters to those of the same name, (C, P)."""
+    wanted = np.array(names, dtype=np.str_)
+    given = np.array(parameters, dtype=np.str_)
+    return as_float(given[:, None] == wanted)

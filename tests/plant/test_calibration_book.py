@@ -1,0 +1,83 @@
+"""The calibration of every heliostat, for people: predicted errors grow until the next visit."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from typing import cast
+
+import numpy as np
+import pytest
+
+from heliotrope.calibration.learn import drift
+from heliotrope.calibration.record import HeliostatCalibration
+from heliotrope.field.example import example_plant
+from heliotrope.geometry import MRAD, FloatArray, direction
+from heliotrope.plant.beliefs import Beliefs
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.calibration_book import CalibrationBook
+
+NAME = "P1A"
+
+
+class Names:
+    """The rows of a field."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names = tuple(names)
+        self.place = self.names.index
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+class Scene:
+    """What the book asks of a plant; the sun stands still, so only age changes a prediction."""
+
+    def __init__(self) -> None:
+        self.design = example_plant()
+        self.beliefs, self.clock = Beliefs(self.design), self
+        self.field = Names(self.design.names)
+        self.at = datetime(2026, 6, 21, 10, 0, tzinfo=UTC)
+        self.sun = direction(np.radians(150.0), np.radians(50.0))
+
+    def utc(self) -> datetime:
+        return self.at
+
+    def sun_vector(self) -> FloatArray:
+        return self.sun
+
+    def default_aims(self, names: list[str]) -> dict[str, FloatArray]:
+        return dict.fromkeys(names, self.design.receivers[0].center)
+
+    def calibrate(self, name: str) -> HeliostatCalibration:
+        zeros = drift.zeros(self.beliefs.nominal(name))
+        covariance, prior = np.diag(np.full(2, (0.2 * MRAD) ** 2)), np.full(2, 10 * MRAD)
+        at = self.at.timestamp()
+        record = HeliostatCalibration(name, at, zeros, np.zeros(2), covariance, prior)
+        return self.beliefs.take(record)
+
+
+def test_the_predicted_error_grows_until_the_mirror_is_measured_again() -> None:
+    scene = Scene()
+    book, errors = CalibrationBook(cast("PlantController", scene), "malan8"), []
+    row = scene.field.place(NAME)
+    scene.calibrate(NAME)
+    for _ in range(4):
+        errors.append(float(book.error[row]))
+        scene.at += timedelta(days=10)
+        book.refresh()
+    assert (np.diff(errors) > 0.05 * MRAD).all()
+    # The zeros alone are believed: both have grown by the same variance.
+    grown = np.sqrt(0.2**2 + 2.0 * (1.0 - np.exp(-0.1)) + 0.03) / 0.2
+    assert errors[3] / errors[0] == pytest.approx(grown, rel=1e-6)
+    scene.calibrate(NAME)
+    assert book.error[row] == pytest.approx(errors[0], rel=1e-6)
+
+
+def test_the_last_predictions_stay_over_the_night() -> None:
+    scene = Scene()
+    book = CalibrationBook(cast("PlantController", scene), "malan8")
+    scene.calibrate(NAME)
+    before = book.error.copy()
+    scene.sun, scene.at = -scene.sun, scene.at + timedelta(hours=12)
+    book.refresh()
+    np.testing.assert_array_equal(book.error, before)
