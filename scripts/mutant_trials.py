@@ -2,19 +2,17 @@
 
 `Bench` is a plugin of pytest. Instead of running the tests that were collected it forks a child
 for each trial, plants the mutant in the child's memory by exchanging the code of one function, and
-runs the tests, or the simulation, that reach it. A mutant outside functions, or in one that runs
-at import, gets a tree of sources and an interpreter of its own. `Reach` says which tests and runs
-reach which lines; it is measured once (`measured`) with the package coverage.
+runs the tests, or the simulation, that feel it. A mutant outside functions, or in one that runs
+at import, gets a tree of sources and an interpreter of its own. A pass with probes for the whole
+sample, in a child too, tells first which tests and runs feel each mutant (`mutant_probes.py`).
 """
 
 import ast
 import contextlib
 import gc
 import hashlib
-import importlib.util
 import json
 import os
-import re
 import resource
 import shutil
 import signal
@@ -29,6 +27,7 @@ from types import CodeType, FunctionType
 from typing import Any
 
 import mutant_operators as operators
+import mutant_probes as probes
 import pytest
 from mutant_operators import ROOT, SOURCE, Mutant
 
@@ -43,7 +42,9 @@ RUNS: tuple[tuple[str, int, tuple[str, ...], float, float], ...] = (
 )
 HELIOSTATS = 3
 #: Tests of one mutant together, at most, s; those left over are not run.
-MOST_TESTS = 120.0
+MOST_TESTS = 10.0
+#: Tests that run the code in another interpreter, where no mutant is.
+ELSEWHERE = ("--ignore-glob=*micropython*",)
 #: Time of the processor after which a test or a run hangs: this and so much more than it takes
 #: unchanged; of a run; wall time for those that wait for ever, on a machine that does more. s.
 SPARE, FACTOR, RUN_LIMIT, WALL = 5.0, 1.5, 30.0, 300.0
@@ -68,10 +69,12 @@ def simulate(name: str) -> bool:
 
     limit(RUN_LIMIT)
     seed, worlds, pause, seconds = next(each[1:] for each in RUNS if each[0] == name)
-    return not run(RunPlan(seed, seconds, HELIOSTATS, pause, worlds=worlds)).good
+    good = run(RunPlan(seed, seconds, HELIOSTATS, pause, worlds=worlds)).good
+    limit(0.0)
+    return not good
 
 
-# -- what reaches a line -----------------------------------------------------------------------
+# -- what feels a mutant ----------------------------------------------------------------------
 
 
 def stamp() -> str:
@@ -85,118 +88,53 @@ def stamp() -> str:
 
 @dataclass
 class Reach:
-    """Which tests and which runs of the simulation reach a line.
+    """Which tests and which runs of the simulation can notice a mutant.
 
     Attributes
     ----------
     seconds
-        Time of each test.
-    lines
-        Names of the tests and runs for each file below `SOURCE` and line; "" is the import.
+        Time of each test and run.
+    executed, felt
+        Names of the tests and runs that execute the mutant of a key, and that feel it.
     """
 
     seconds: dict[str, float] = field(default_factory=dict)
-    lines: dict[str, dict[int, set[str]]] = field(default_factory=dict)
+    executed: dict[str, set[str]] = field(default_factory=dict)
+    felt: dict[str, set[str]] = field(default_factory=dict)
 
     @classmethod
-    def read(cls, path: Path) -> "Reach | None":
-        """Read what `keep` wrote; None if it is not there or the sources have changed since."""
+    def read(cls, path: Path) -> "Reach":
+        """Read what `keep` wrote; empty if it is not there or the sources have changed since."""
         told = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         if told.get("sources") != stamp():
-            return None
-        names = told["names"]
-        lines = {
-            file: {int(line): {names[i] for i in some} for line, some in found.items()}
-            for file, found in told["lines"].items()
-        }
-        return cls(told["seconds"], lines)
+            return cls()
+        executed, felt = (
+            {key: set(names) for key, names in told[which].items()}
+            for which in ("executed", "felt")
+        )
+        return cls(told["seconds"], executed, felt)
 
     def keep(self, path: Path) -> None:
         """Write to a file."""
-        names = sorted(
-            {name for found in self.lines.values() for s in found.values() for name in s}
+        executed, felt = (
+            {key: sorted(names) for key, names in some.items()}
+            for some in (self.executed, self.felt)
         )
-        number = {name: i for i, name in enumerate(names)}
-        lines = {
-            file: {line: sorted(number[name] for name in some) for line, some in found.items()}
-            for file, found in self.lines.items()
-        }
-        told = {"sources": stamp(), "seconds": self.seconds, "names": names, "lines": lines}
+        told = {"sources": stamp(), "seconds": self.seconds, "executed": executed, "felt": felt}
         path.write_text(json.dumps(told), encoding="utf-8")
 
-    def at(self, places: Sequence[tuple[str, int]]) -> set[str]:
-        """Return what reaches one of some lines."""
-        found: set[str] = set()
-        for file, line in places:
-            found |= self.lines.get(file, {}).get(line, set())
-        return found
+    def begin(self, mutants: Sequence[Mutant]) -> None:
+        """Prepare to note what feels some mutants."""
+        for each in mutants:
+            self.executed[each.key], self.felt[each.key] = set(), set()
+        probes.taken()
 
-    def naming(self, word: str) -> list[tuple[str, int]]:
-        """Return the lines of all files that name something."""
-        pattern = re.compile(rf"\b{re.escape(word)}\b")
-        return [
-            (file, number)
-            for file in self.lines
-            if (SOURCE / file).exists()
-            for number, text in enumerate((SOURCE / file).read_text("utf-8").splitlines(), 1)
-            if pattern.search(text)
-        ]
-
-
-def reaching(mutant: Mutant, reach: Reach) -> tuple[set[str], bool]:
-    """Return the names of what reaches a mutant, and whether the import does.
-
-    A mutant outside functions is reached by what executes a line that uses its name: the name of
-    the constant, the attribute or the argument.
-    """
-    tree = ast.parse((SOURCE / mutant.file).read_text(encoding="utf-8"))
-    node = next(n for place, n in enumerate(operators.walk(tree)) if place == mutant.place)
-    chain = _above(tree, node)
-    inside = next((a for a in reversed(chain[:-1]) if _is_body(a, chain)), None)
-    if inside is not None:
-        shown = node.test if isinstance(node, ast.If) else node
-        last = getattr(shown, "end_lineno", mutant.line) or mutant.line
-        found = reach.at([(mutant.file, n) for n in range(mutant.line, last + 1)])
-        if not found:
-            statement = next(a for a in reversed(chain) if isinstance(a, ast.stmt))
-            found = reach.at([(mutant.file, statement.lineno)])
-        return found - {""}, "" in found
-    words = _words(chain)
-    places = [place for word in words for place in reach.naming(word)]
-    found = reach.at(places) - {""}
-    if not found:
-        found = {n for some in reach.lines.get(mutant.file, {}).values() for n in some} - {""}
-    return found, True
-
-
-def _above(tree: ast.AST, node: ast.AST) -> list[ast.AST]:
-    """Return the nodes from the tree's root to one node."""
-    if tree is node:
-        return [tree]
-    for child in ast.iter_child_nodes(tree):
-        found = _above(child, node)
-        if found:
-            return [tree, *found]
-    return []
-
-
-def _is_body(node: ast.AST, chain: Sequence[ast.AST]) -> bool:
-    if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-        return False
-    return any(each in chain for each in node.body)
-
-
-def _words(chain: Sequence[ast.AST]) -> list[str]:
-    """Return the names that a mutant outside functions is used by."""
-    for node in reversed(chain):
-        match node:
-            case ast.AnnAssign(target=ast.Name(id=name)):
-                return [name]
-            case ast.Assign(targets=targets):
-                return [n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)]
-            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name):
-                return [name]
-    return []
+    def note(self, mutants: Sequence[Mutant], name: str, seconds: float) -> None:
+        """Note what a test or run has executed and felt."""
+        self.seconds[name] = round(seconds, 3)
+        for numbers, by in zip(probes.taken(), (self.executed, self.felt), strict=True):
+            for number in numbers:
+                by[mutants[number].key].add(name)
 
 
 # -- planting ----------------------------------------------------------------------------------
@@ -271,6 +209,8 @@ class Trial:
     begin: float = field(default_factory=time.monotonic)
     folder: str = field(default_factory=lambda: tempfile.mkdtemp(prefix="mutant-"))
     then: "Trial | None" = None
+    executed: int = 0
+    computed: float = 0.0
 
     @property
     def found(self) -> str:
@@ -299,8 +239,8 @@ class Bench:
     ----------
     todo
         Kinds of trials, "unit" or "simulation", and mutants.
-    reach
-        What reaches them; None: the tests that name a module, and all runs.
+    kept
+        File of what feels them; measured first where it is not known.
     processes
         Children at once.
     end
@@ -312,14 +252,15 @@ class Bench:
     def __init__(
         self,
         todo: Sequence[tuple[str, Mutant]],
-        reach: Reach | None,
+        kept: Path,
         processes: int,
         end: float,
         keep: Keep,
     ) -> None:
         self._todo = list(todo)
-        self._reach, self._processes, self._end, self._keep = reach, processes, end, keep
-        self._seconds = {} if reach is None else reach.seconds
+        self._kept, self._processes, self._end, self._keep = kept, processes, end, keep
+        self._reach = Reach.read(kept)
+        self._at_import = probes.called_outside_functions()
         self._failures = _Failures()
         self._running: dict[int, Trial] = {}
         self._ready: list[Trial] = []
@@ -341,6 +282,9 @@ class Bench:
         gc.collect()
         gc.freeze()
         signal.signal(signal.SIGTERM, self._stop)
+        unknown = {m.key: m for _, m in self._todo if m.key not in self._reach.felt}
+        if unknown:
+            self._measure(list(unknown.values()))
         while self._fill() or self._running:
             self._reap()
         return True
@@ -350,6 +294,55 @@ class Bench:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(pid, signal.SIGKILL)
         os._exit(1)
+
+    # -- the pass with probes --------------------------------------------------------------
+
+    def _measure(self, mutants: Sequence[Mutant]) -> None:
+        """Run all tests and runs once with probes for all mutants, in a child."""
+        child = os.fork()
+        if child == 0:
+            try:
+                self._probe(mutants)
+            except BaseException as error:  # noqa: BLE001 - whatever it is, the child ends here
+                print(f"the pass with probes failed: {error!r}", file=sys.stderr, flush=True)
+                os._exit(1)
+            os._exit(0)
+        self._running[child] = Trial("probes inside", mutants[0], [], 0.0)
+        status = os.waitpid(child, 0)[1]
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child, signal.SIGKILL)  # what a test left running
+        shutil.rmtree(self._running.pop(child).folder, ignore_errors=True)
+        if status != 0:
+            raise SystemExit("the pass with probes failed")
+        self._reach = Reach.read(self._kept)
+
+    def _probe(self, mutants: Sequence[Mutant]) -> None:
+        os.setsid()
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        probes.install()
+        for file, tree in probes.probed(mutants).items():
+            path = SOURCE / file
+            plain = compile(path.read_text(encoding="utf-8"), str(path), "exec", dont_inherit=True)
+            new = compile(tree, str(path), "exec", dont_inherit=True)
+            for found in filter(None, map(self._patch, changes(plain, new))):
+                for function in found[0]:
+                    function.__code__ = found[1]
+        assert self._config is not None
+        self._reach.begin(mutants)
+        items = list(self._items.values())
+        for item, after in zip(items, [*items[1:], None], strict=True):
+            begin = time.monotonic()
+            self._config.hook.pytest_runtest_protocol(item=item, nextitem=after)
+            self._reach.note(mutants, item.nodeid, time.monotonic() - begin)
+            if self._failures.any:
+                print(f"fails unchanged, with probes: {item.nodeid}", file=sys.stderr, flush=True)
+                self._failures.any = False
+        for name in self._kills:
+            begin = time.monotonic()
+            if simulate(name):
+                raise SystemExit(f"the simulation finds something in unchanged code: {name}")
+            self._reach.note(mutants, name, time.monotonic() - begin)
+        self._reach.keep(self._kept)
 
     # -- the parent ------------------------------------------------------------------------
 
@@ -364,44 +357,39 @@ class Bench:
         return True
 
     def _begin(self, kind: str, mutant: Mutant) -> None:
-        """Plan a trial; what reaches nothing is told at once."""
+        """Plan a trial; what nothing feels is told at once."""
         plain, new = compiled(mutant)
         if _same(plain, new):
             return
-        if self._reach is None:
-            found, at_import = self._near(mutant) | set(self._kills), True
-        else:
-            found, at_import = reaching(mutant, self._reach)
-        where = "outside" if at_import or not self._patches(plain, new) else "inside"
+        chain = probes.chain_to(
+            ast.parse((SOURCE / mutant.file).read_text(encoding="utf-8")), mutant.place
+        )
+        function = probes.function_of(chain)
+        felt, executed = self._reach.felt[mutant.key], self._reach.executed[mutant.key]
+        if not function and not probes.words(chain):
+            felt = executed = self._own(mutant) | set(self._kills)
+        inside = function and function not in self._at_import and self._patches(plain, new)
         if kind == "unit":
-            # What the import makes of it, a table or a constant, others use: all tests of the
-            # package may find it.
-            wide = at_import and self._reach is not None
-            own = self._own(mutant) if wide else set()
-            names, spare = self._shortest(mutant, (found | own) & set(self._items))
+            names, spare = self._shortest(mutant, felt & set(self._items))
         else:
-            names = sorted(found & set(self._kills), key=self._chance, reverse=True)
+            names = sorted(felt & set(self._kills), key=self._worth, reverse=True)
             spare = 10.0 * len(names)
-        trial = Trial(f"{kind} {where}", mutant, names, spare)
+        trial = Trial(f"{kind} {'inside' if inside else 'outside'}", mutant, names, spare)
+        trial.executed = len(executed & set(self._kills if kind == "simulation" else self._items))
         if names:
             self._ready.append(trial)
         else:
             self._tell(trial, kind, "")
 
-    def _chance(self, run: str) -> float:
-        return (self._kills[run] + 1.0) / (self._tries[run] + 2.0)
+    def _worth(self, run: str) -> float:
+        """Return how much a run finds for its time."""
+        chance = (self._kills[run] + 1.0) / (self._tries[run] + 2.0)
+        return chance / max(0.1, self._reach.seconds.get(run, 1.0))
 
     def _own(self, mutant: Mutant) -> set[str]:
         """Return the tests of a mutant's package."""
         start = f"tests/{Path(mutant.file).parts[0]}/"
         return {name for name in self._items if name.startswith(start)}
-
-    def _near(self, mutant: Mutant) -> set[str]:
-        """Return the tests of a mutant's package whose file names its module."""
-        word = Path(mutant.file).stem.strip("_")
-        files = {name.split("::")[0] for name in self._own(mutant)}
-        near = {file for file in files if word in (ROOT / file).read_text(encoding="utf-8")}
-        return {name for name in self._own(mutant) if name.split("::")[0] in near}
 
     def _shortest(self, mutant: Mutant, tests: set[str]) -> tuple[list[str], float]:
         """Return tests, the shortest first, and the time that they take.
@@ -409,7 +397,7 @@ class Bench:
         Of a test with parameters one comes first, and the others after all tests had their turn:
         they mostly find the same.
         """
-        seconds = self._seconds
+        seconds = self._reach.seconds
         own = f"tests/{Path(mutant.file).parts[0]}/"
         order = sorted(
             tests - self._flaky, key=lambda n: seconds.get(n, 1.0) * (1 + (own not in n))
@@ -431,16 +419,17 @@ class Bench:
 
     def _patches(self, plain: CodeType, new: CodeType) -> list[tuple[list[FunctionType], CodeType]]:
         """Return the functions to change and their new code; none if it cannot be done so."""
-        found = []
-        for each in changes(plain, new):
-            if each is None:
-                return []
-            one, two = each
-            live = self._functions.get((one.co_filename, one.co_firstlineno, one.co_qualname))
-            if not live or one.co_freevars != two.co_freevars:
-                return []
-            found.append((live, two))
-        return found
+        found = [self._patch(each) for each in changes(plain, new)]
+        return [] if None in found else [each for each in found if each is not None]
+
+    def _patch(
+        self, change: tuple[CodeType, CodeType] | None
+    ) -> tuple[list[FunctionType], CodeType] | None:
+        if change is None:
+            return None
+        one, two = change
+        live = self._functions.get((one.co_filename, one.co_firstlineno, one.co_qualname))
+        return (live, two) if live and one.co_freevars == two.co_freevars else None
 
     def _fork(self, trial: Trial) -> None:
         trial.begin = time.monotonic()
@@ -454,8 +443,9 @@ class Bench:
         self._running[child] = trial
 
     def _reap(self) -> None:
-        child, status = os.waitpid(-1, os.WNOHANG)
+        child, status, used = os.wait4(-1, os.WNOHANG)
         if child:
+            self._running[child].computed += used.ru_utime + used.ru_stime
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(child, signal.SIGKILL)  # what a test left running
             self._judge(self._running.pop(child), good=status == 0)
@@ -477,7 +467,8 @@ class Bench:
             first = trial.then
             assert first is not None
             left = [name for name in first.names if name not in self._flaky]
-            again = Trial(first.kind, first.mutant, left, first.spare)
+            again = Trial(first.kind, first.mutant, left, first.spare, executed=first.executed)
+            again.computed = first.computed + trial.computed
             if left:
                 self._ready.insert(0, again)
             else:
@@ -494,8 +485,8 @@ class Bench:
         first = trial.then or trial
         self._keep({
             "mutant": trial.mutant.key, "package": Path(trial.mutant.file).parts[0], "trial": kind,
-            "reached": len(first.names), "by": by,
-            "seconds": round(time.monotonic() - trial.begin, 1),
+            "executed": first.executed, "felt": len(first.names), "by": by,
+            "seconds": round(trial.computed + (first.computed if trial.then else 0.0), 1),
         })  # fmt: skip
 
     # -- the children ----------------------------------------------------------------------
@@ -529,7 +520,7 @@ class Bench:
         items = [self._items[name] for name in trial.names]
         for item, after in zip(items, [*items[1:], None], strict=True):
             trial.begins(item.nodeid)
-            limit(SPARE + FACTOR * self._seconds.get(item.nodeid, 20.0))
+            limit(SPARE + FACTOR * self._reach.seconds.get(item.nodeid, 20.0))
             self._config.hook.pytest_runtest_protocol(item=item, nextitem=after)
             if self._failures.any:
                 os._exit(1)
@@ -547,15 +538,15 @@ class Bench:
 
 def try_all(
     todo: Sequence[tuple[str, Mutant]],
-    reach: Reach | None,
+    kept: Path,
     processes: int,
     end: float,
     keep: Keep,
 ) -> None:
     """Try mutants; see `Bench`."""
-    bench = Bench(todo, reach, processes, end, keep)
+    bench = Bench(todo, kept, processes, end, keep)
     os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
-    pytest.main([*OPTIONS, *folders()], plugins=[bench])
+    pytest.main([*OPTIONS, *ELSEWHERE, *folders()], plugins=[bench])
 
 
 class _Noting:
@@ -584,66 +575,6 @@ def _alone(kind: str, names: list[str], folder: str, spare: float) -> int:
         return 0
     files = sorted({name.split("::")[0] for name in names})
     return int(pytest.main([*OPTIONS, "-x", *files], plugins=[_Noting(trial)]))
-
-
-# -- measuring what reaches --------------------------------------------------------------------
-
-
-class _Contexts:
-    def __init__(self, measure: Any) -> None:
-        self._measure = measure
-        self.seconds: dict[str, float] = {}
-
-    @pytest.hookimpl(hookwrapper=True)
-    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
-        self._measure.switch_context(item.nodeid)
-        begin = time.monotonic()
-        yield
-        self.seconds[item.nodeid] = round(time.monotonic() - begin, 3)
-
-
-def measured(kept: Path) -> Reach | None:
-    """Run all unit tests and runs of the simulation once, and return what reaches which line.
-
-    None if the package coverage is not installed.
-    """
-    if importlib.util.find_spec("coverage") is None:
-        return None
-    import coverage  # type: ignore[import-not-found,unused-ignore]
-
-    data = str(kept.with_suffix(".coverage"))
-    measure = coverage.Coverage(data_file=data, source=[str(SOURCE)], config_file=False)
-    measure.start()
-    contexts = _Contexts(measure)
-    pytest.main([*OPTIONS, *folders()], plugins=[contexts])
-    for name, *_ in RUNS:
-        measure.switch_context(name)
-        if simulate(name):
-            raise SystemExit(f"the simulation finds something in unchanged code: {name}")
-    measure.stop()
-    measure.save()
-    reach = reach_of(data, contexts.seconds)
-    reach.keep(kept)
-    return reach
-
-
-def reach_of(data: str, seconds: dict[str, float]) -> Reach:
-    """Return what a file of coverage holds."""
-    import coverage  # type: ignore[import-not-found,unused-ignore]
-
-    found = coverage.CoverageData(data)
-    found.read()
-    lines: dict[str, dict[int, set[str]]] = {}
-    for path in found.measured_files():
-        file = str(Path(path).relative_to(SOURCE))
-        lines[file] = {n: {*map(_name, some)} for n, some in found.contexts_by_lineno(path).items()}
-    return Reach(seconds, lines)
-
-
-def _name(context: str) -> str:
-    return (
-        context.rsplit("|", 1)[0] if context.endswith(("|run", "|setup", "|teardown")) else context
-    )
 
 
 if __name__ == "__main__":

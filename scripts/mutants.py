@@ -1,12 +1,11 @@
 """Mutation score of the control code: small errors planted one at a time, and what finds them.
 
 Each mutant is one change to one expression or statement of `lcu`, `links`, `cluster`, `plant` or
-`safety` (`mutant_operators.py`). The unit tests that reach it run on it, and the runs of the
-simulation that reach it (`mutant_trials.py`). Run as
+`safety` (`mutant_operators.py`). The unit tests that feel it run on it, and the runs of the
+simulation that feel it (`mutant_trials.py`). Run as
 ``python scripts/mutants.py --sample 500 --progress out/mutants.jsonl``; a run that was stopped goes
-on where it was. What reaches a line is measured first, where the package coverage is installed, and
-again when the sources have changed; without it, the tests that name a module run, and all runs of
-the simulation.
+on where it was. Which tests and runs feel a mutant is measured first, in one pass with probes for
+the whole sample (`mutant_probes.py`), and again when the sources or the tests have changed.
 """
 
 import argparse
@@ -38,17 +37,17 @@ def interval(hits: int, tries: int) -> str:
 
 def table(lines: Sequence[dict[str, Any]]) -> str:
     """Return the table, the shares and the survivors as Markdown."""
-    rows = [
-        "| package | mutants | by unit tests | simulation | either | survived | not executed |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    heads = ("package", "mutants", "by unit tests", "simulation", "either", "survived",
+             "not executed", "not felt")  # fmt: skip
+    rows = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     names = [p for p in PACKAGES if any(line["package"] == p for line in lines)]
     for name in [*names, "all"]:
         some = [line for line in lines if name in (line["package"], "all")]
         count = _counted(some)
         rows.append(
             f"| {name} | {len(some)} | {count['unit']} | {count['simulation']} | {count['either']} "
-            f"| {len(some) - count['either']} | {len(some) - count['executed']} |"
+            f"| {len(some) - count['either']} | {len(some) - count['executed']} "
+            f"| {count['executed'] - count['felt']} |"
         )
     count, all_ = _counted(lines), len(lines)
     rows += [
@@ -57,7 +56,11 @@ def table(lines: Sequence[dict[str, Any]]) -> str:
         f"- by the simulation: {interval(count['simulation'], all_)}",
         "- by the simulation, of those it executes: "
         + interval(count["simulation"], count["executed"]),
+        "- by the simulation, of those it feels: " + interval(count["simulation"], count["felt"]),
     ]
+    if lines:
+        mean = sum(line["seconds"] for line in lines) / all_
+        rows.append(f"- computed: {mean:.1f} s of one core a mutant, without the pass with probes")
     survived = [line["mutant"] for line in lines if not (line["unit"] or line["simulation"])]
     return "\n".join([*rows, "", *(f"- survived: `{each}`" for each in survived)])
 
@@ -65,7 +68,7 @@ def table(lines: Sequence[dict[str, Any]]) -> str:
 def _counted(lines: Sequence[dict[str, Any]]) -> Counter[str]:
     count = Counter[str]()
     for line in lines:
-        for name in ("unit", "simulation", "executed"):
+        for name in ("unit", "simulation", "executed", "felt"):
             count[name] += line[name]
         count["either"] += line["unit"] or line["simulation"]
     return count
@@ -79,7 +82,8 @@ def joined(todo: Sequence[Mutant], known: Trials) -> list[dict[str, Any]]:
         if unit is not None and run is not None:
             lines.append({
                 "mutant": each.key, "package": unit["package"], "unit": bool(unit["by"]),
-                "simulation": bool(run["by"]), "executed": bool(run["reached"]),
+                "simulation": bool(run["by"]), "executed": bool(run["executed"]),
+                "felt": bool(run["felt"]), "seconds": unit["seconds"] + run["seconds"],
             })  # fmt: skip
     return lines
 
@@ -115,9 +119,8 @@ def main() -> None:
     if todo:
         import mutant_trials
 
-        reach = mutant_trials.Reach.read(given.reach) or mutant_trials.measured(given.reach)
         end = time.monotonic() + 60.0 * given.minutes
-        mutant_trials.try_all(todo, reach, given.processes, end, keep)
+        mutant_trials.try_all(todo, given.reach, given.processes, end, keep)
     done = joined(sample, known)
     print(f"{len(done)} of {len(sample)} mutants tried, seed {given.seed}\n\n{table(done)}")
 

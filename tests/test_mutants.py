@@ -1,6 +1,7 @@
 """The mutants of `scripts/mutants.py`: what is changed, what is spared, and the table."""
 
 import ast
+import builtins
 import importlib
 import json
 import sys
@@ -25,10 +26,10 @@ def late(age: int, known: bool = True) -> bool:
 
 @pytest.fixture(scope="module")
 def scripts() -> Iterator[Any]:
-    """The three scripts, as they find each other when one of them runs."""
+    """The scripts, as they find each other when one of them runs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(Path(__file__).parents[1] / "scripts"))
-        names = ("mutant_operators", "mutant_trials", "mutants")
+        names = ("mutant_operators", "mutant_probes", "mutant_trials", "mutants")
         yield SimpleNamespace(**{name: importlib.import_module(name) for name in names})
         for name in names:
             del sys.modules[name]
@@ -88,36 +89,125 @@ def test_the_function_that_differs_is_found_and_what_is_outside_functions_is_tol
     assert set(map(tuple, changes.values())) == {("late", "late")}
 
 
-def test_a_mutant_is_reached_by_what_executes_it_or_uses_its_name(scripts: Any) -> None:
-    trials, operators = scripts.mutant_trials, scripts.mutant_operators
-    file = "lcu/ticks.py"
-    source = (operators.SOURCE / file).read_text(encoding="utf-8")
-    all_ = operators.mutants_of(file, source)
-    inside = next(m for m in all_ if "later - earlier" in source.splitlines()[m.line - 1])
-    outside = next(m for m in all_ if source.splitlines()[m.line - 1].startswith("PERIOD"))
-    uses = [n for n, text in enumerate(source.splitlines(), 1) if "PERIOD" in text]
-    lines = {inside.line: {"a test"}, outside.line: {""}, uses[2]: {"a run"}}
-    assert inside.line != uses[2]
-    reach = trials.Reach(lines={file: lines})
-    assert trials.reaching(inside, reach) == ({"a test"}, False)
-    assert trials.reaching(outside, reach) == ({"a test", "a run"}, True)
+PROBED = """
+LIMIT = 6
+
+class Watch:
+    def __init__(self):
+        self.seen = 0
+
+    def late(self, ages, first, known):
+        if known and first < 3:
+            self.seen += 1
+        for age in ages:
+            if self.of(age) <= 4:
+                return age - 2
+        match first:
+            case 5:
+                self.of(1)
+        return len(ages) + first > 30
+
+    def of(self, age):
+        return age * LIMIT
+"""
 
 
-def test_what_reaches_a_line_is_kept_until_the_sources_change(
+@pytest.fixture
+def probed(scripts: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """`PROBED` with probes for all its mutants, and a function that tells which were seen."""
+    (tmp_path / "a.py").write_text(PROBED, encoding="utf-8")
+    probes, operators = scripts.mutant_probes, scripts.mutant_operators
+    for name in ("_mutant_hit", "_mutant_compared", "_mutant_applied"):
+        monkeypatch.setattr(builtins, name, None, raising=False)  # put back at the end
+    monkeypatch.setattr(probes, "SOURCE", tmp_path)
+    mutants = operators.mutants_of("a.py", PROBED)
+    probes.install()
+    space: dict[str, Any] = {}
+    exec(compile(probes.probed(mutants)["a.py"], "a.py", "exec"), space)
+    watch = space["Watch"]()
+
+    def seen(*arguments: Any) -> tuple[Any, set[str], set[str]]:
+        probes.taken()
+        value = watch.late(*arguments)
+        lines = PROBED.splitlines()
+        executed, felt = (
+            {f"{lines[mutants[n].line - 1].strip()}: {mutants[n].change}" for n in numbers}
+            for numbers in probes.taken()
+        )
+        return value, executed, felt
+
+    return seen
+
+
+def test_a_probe_feels_a_mutant_only_where_its_value_differs(probed: Any) -> None:
+    value, executed, felt = probed([], 0, False)
+    condition = "if known and first < 3:"
+    assert value is False
+    assert {f"{condition}: And to Or", f"{condition}: 3 to 4"} <= executed
+    assert f"{condition}: And to Or" in felt
+    assert f"{condition}: 3 to 4" not in felt  # as nothing is known
+    assert probed([], 3, True)[2] >= {f"{condition}: 3 to 4", f"{condition}: Lt to LtE"}
+    last = "return len(ages) + first > 30"
+    assert f"{last}: Gt to GtE" in executed - felt
+    assert f"{last}: Gt to GtE" in probed([1], 29, True)[2]
+
+
+def test_operands_with_effects_are_computed_once(probed: Any) -> None:
+    condition = "if self.of(age) <= 4:"
+    value, executed, felt = probed([0], 9, True)
+    assert value == -2
+    assert f"{condition}: LtE to Lt" in executed - felt
+    assert f"{condition}: 4 to 5" in executed - felt
+    assert f"{condition}: condition negated" in felt
+    # A constant of the module is felt by whoever uses its name.
+    assert "LIMIT = 6: 6 to 7" in felt
+    assert "self.of(1): call left out" not in executed
+    assert "self.of(1): call left out" in probed([], 5, True)[2]
+    assert "self.seen += 1: assignment left out" in probed([], 1, True)[2]
+
+
+def test_what_is_called_as_the_sources_are_imported_is_known(scripts: Any) -> None:
+    found = scripts.mutant_probes.called_outside_functions()
+    assert "namedtuple" in found or "dataclass" in found
+    assert "late" not in found
+
+
+def test_what_feels_a_mutant_is_noted_for_each_test(
+    scripts: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reach, mutant = scripts.mutant_trials.Reach(), scripts.mutant_operators.Mutant("a", 1, 2, "x")
+    reach.begin([mutant])
+    for name, seen in (("one", ({0}, {0})), ("two", ({0}, set())), ("three", (set(), set()))):
+        monkeypatch.setattr(scripts.mutant_probes, "taken", lambda seen=seen: seen)
+        reach.note([mutant], name, 0.25)
+    assert reach.executed == {mutant.key: {"one", "two"}}
+    assert reach.felt == {mutant.key: {"one"}}
+    assert reach.seconds == dict.fromkeys(("one", "two", "three"), 0.25)
+
+
+def test_what_feels_a_mutant_is_kept_until_the_sources_change(
     scripts: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trials, path = scripts.mutant_trials, tmp_path / "reach.json"
-    assert trials.Reach.read(path) is None
-    kept = trials.Reach({"a test": 0.5}, {"lcu/a.py": {3: {"a test", ""}}})
+    assert trials.Reach.read(path) == trials.Reach()
+    kept = trials.Reach({"a test": 0.5}, {"a mutant": {"a test", "a run"}}, {"a mutant": {"a run"}})
     kept.keep(path)
     assert trials.Reach.read(path) == kept
     monkeypatch.setattr(trials, "stamp", lambda: "changed")
-    assert trials.Reach.read(path) is None
+    assert trials.Reach.read(path) == trials.Reach()
 
 
 def test_the_table_counts_and_names_survivors(scripts: Any) -> None:
     lines = [
-        {"mutant": name, "package": package, "unit": unit, "simulation": run, "executed": seen}
+        {
+            "mutant": name,
+            "package": package,
+            "unit": unit,
+            "simulation": run,
+            "executed": seen,
+            "felt": run,
+            "seconds": 3.0,
+        }
         for name, package, unit, run, seen in (
             ("lcu/a.py:1", "lcu", True, False, True),
             ("lcu/b.py:2", "lcu", False, False, False),
@@ -125,8 +215,9 @@ def test_the_table_counts_and_names_survivors(scripts: Any) -> None:
         )
     ]
     text = scripts.mutants.table(lines)
-    assert "| lcu | 2 | 1 | 0 | 1 | 1 | 1 |" in text
-    assert "| all | 3 | 2 | 1 | 2 | 1 | 1 |" in text
+    assert "| lcu | 2 | 1 | 0 | 1 | 1 | 1 | 1 |" in text
+    assert "| all | 3 | 2 | 1 | 2 | 1 | 1 | 1 |" in text
+    assert "- computed: 3.0 s of one core a mutant" in text
     assert "- by the simulation, of those it executes: 50 % (9 to 91 %)" in text
     assert text.endswith("- survived: `lcu/b.py:2`")
 
@@ -140,7 +231,7 @@ def test_an_interval_is_wilsons(scripts: Any) -> None:
 def test_trials_are_joined_and_the_later_counts(scripts: Any, tmp_path: Path) -> None:
     mutant = scripts.mutant_operators.Mutant("lcu/a.py", 3, 7, "1 to 2")
     path = tmp_path / "mutants.jsonl"
-    line = {"mutant": mutant.key, "package": "lcu", "reached": 2, "seconds": 0.1}
+    line = {"mutant": mutant.key, "package": "lcu", "executed": 2, "felt": 1, "seconds": 0.1}
     told = [
         {**line, "trial": "unit", "by": ""},
         {**line, "trial": "simulation", "by": "calm 11"},
@@ -151,3 +242,4 @@ def test_trials_are_joined_and_the_later_counts(scripts: Any, tmp_path: Path) ->
     path.write_text("".join(json.dumps(each) + "\n" for each in told), encoding="utf-8")
     (joined,) = scripts.mutants.joined([mutant], scripts.mutants.read(path))
     assert (joined["unit"], joined["simulation"], joined["executed"]) == (True, True, True)
+    assert joined["seconds"] == pytest.approx(0.2)

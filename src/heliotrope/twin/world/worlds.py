@@ -44,6 +44,8 @@ MIX = (
     "twice",
     "visits", "day",
 )  # fmt: skip
+#: Share of runs that `mixed` gives the world "lights" beside those that it draws.
+LIGHTS_SHARE = 0.04
 
 
 def checked(worlds: Sequence[str]) -> None:
@@ -60,10 +62,12 @@ def checked(worlds: Sequence[str]) -> None:
 
 
 def mixed(seed: int) -> tuple[str, ...]:
-    """Return worlds of `MIX` drawn from a seed: none, some or all of them."""
+    """Return worlds drawn from a seed: none, some or all of `MIX`, and seldom "lights"."""
     chance = random.Random(f"worlds {seed}")
     share = chance.choice([0.0, 0.2, 0.5, 0.8])
     found = [name for name in MIX if chance.random() < share]
+    if random.Random(f"lights {seed}").random() < LIGHTS_SHARE:
+        found.append("lights")
     # Automatic control of a second plant is not judged.
     return tuple(name for name in found if name != "twice" or not works(found))
 
