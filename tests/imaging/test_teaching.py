@@ -795,7 +795,7 @@ class Browser:
         return found["result"].get("value")
 
     def until(self, expression: str) -> None:
-        for _ in range(400):
+        for _ in range(3000):
             if self.value(expression):
                 return
             threading.Event().wait(0.02)

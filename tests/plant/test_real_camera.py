@@ -112,6 +112,25 @@ def test_a_beam_is_seen_where_it_is(plant: Plant, frame: Frame, tmp_path: Path) 
     assert list((tmp_path / "m").glob("*.npz"))
 
 
+def test_a_view_taken_at_work_counts_for_the_next_photograph(plant: Plant, frame: Frame) -> None:
+    target, known = plant.targets[0], plant.cameras[0]
+    cameras = RealCameras(plant, Path(), SystemClock(), sources=Scripted(frame))
+    with pytest.raises(FetchError, match="camera camera: it has given no frame yet"):
+        cameras.frame(target.name)
+    cameras.start(unheard)
+    try:
+        at = target.plane_coordinates(looked(cameras, target.name).point)
+        assert np.array_equal(cameras.frame(target.name).pixels, frame.pixels)
+        # The marks stand 0.1 m further left than they were believed: so does the beam.
+        left = 0.1 * target.axes[0]
+        marks = tuple(replace(m, point=m.point - left) for m in target.marks)
+        cameras.take_view(known, replace(target, marks=marks), {})
+        moved = target.plane_coordinates(looked(cameras, target.name).point)
+        assert moved - at == pytest.approx([-0.1, 0.0], abs=0.02)
+    finally:
+        cameras.close()
+
+
 def test_a_camera_that_falls_silent_is_told_and_left_alone(plant: Plant, frame: Frame) -> None:
     script, told = Scripted(frame), list[Alarm]()
     cameras = RealCameras(plant, Path(), SystemClock(), patience=0.3, sources=script)

@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from heliotrope.field.plant import Plant
@@ -68,6 +69,7 @@ class LivePlant:
         assigned: Assigned | None = None,
         extra: Callable[[], Mapping[str, Any]] = dict,
         pictures: Pictures | None = None,
+        marks: Path | None = None,
     ) -> None:
         chosen = options or LiveOptions()
         self.design, self.clock = design, clock
@@ -75,7 +77,7 @@ class LivePlant:
         ports = self.world.ports(
             audit=audit, disk=disk, records=records, assigned=assigned, facts=extra
         )
-        ports = replace(ports, pictures=pictures)
+        ports = replace(ports, pictures=pictures, marks=marks)
         self.assembly = PlantAssembly(design, ports, chosen.settings())
         self.plant, self.operations = self.assembly.plant, self.assembly.operations
         self.names, self.cameras, self.field = (

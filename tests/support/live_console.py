@@ -92,11 +92,12 @@ class LiveConsole:
         child: Patience | None = None,
         settings: ConsoleSettings | None = None,
         keep_outs: tuple[Box, ...] = (GATE,),
+        marks: Path | None = None,
     ) -> None:
         self.folder, self.address = folder, ""
         self._made, self._child = (heliostats, speed), child
         self._settings = settings or ConsoleSettings(port=0, page=page)
-        self._keep_outs = keep_outs
+        self._keep_outs, self._marks = keep_outs, marks
         self._options = LiveOptions(rendered=rendered, boards=boards)
         self._ready, self._over = threading.Event(), threading.Event()
         self._problem: BaseException | None = None
@@ -131,6 +132,7 @@ class LiveConsole:
             audit=JsonLines(self.folder / "audit.jsonl", clock.utc()),
             records=self.keeper,
             extra=lambda: {"speed": speed},
+            marks=self._marks,
         )
         self.interface = PlantInterface(self.live.operations, self.keeper.people, self.folder)
         settings = self._settings

@@ -14,6 +14,8 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 STATIC = Path(__file__).with_name("static")
+#: The page's only script from another package, which its own page of `camera teach` has too.
+CLICKING = Path(__file__).parents[1] / "imaging" / "targets" / "clicking.js"
 #: Number of files that are kept, and the largest of them, bytes.
 _MOST, _LARGEST = 200, 4 << 20
 #: Smaller answers are not compressed, bytes.
@@ -25,7 +27,7 @@ _FOREVER = "public, max-age=31536000, immutable"
 
 def _tag() -> str:
     digest = hashlib.sha256()
-    for file in sorted(STATIC.iterdir()):
+    for file in (*sorted(STATIC.iterdir()), CLICKING):
         digest.update(file.read_bytes())
     return digest.hexdigest()[:12]
 

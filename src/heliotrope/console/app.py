@@ -17,7 +17,7 @@ from starlette.staticfiles import StaticFiles
 from heliotrope import __version__
 from heliotrope.console import accounts, api, commands, factor
 from heliotrope.console._attempts import Attempts
-from heliotrope.console._files import KEPT, PLAIN, STATIC, Files
+from heliotrope.console._files import CLICKING, KEPT, PLAIN, STATIC, Files
 from heliotrope.console.auth import Caller, Console, introduced
 from heliotrope.console.by_proxy import ByProxy
 from heliotrope.console.connections import FOUND
@@ -135,7 +135,9 @@ def _invalid(request: Request, error: Exception) -> Response:
 
 def _routes(settings: ConsoleSettings) -> Routes:
     """Return the routes that the guard admits."""
-    files = [f"{place}/{file.name}" for place in (KEPT, PLAIN) for file in STATIC.iterdir()]
+    files = [
+        f"{place}/{file.name}" for place in (KEPT, PLAIN) for file in (*STATIC.iterdir(), CLICKING)
+    ]
     page = ["/"] * settings.page
     own = {"/api/v1/openapi.json": Role.VIEWER}
     if settings.page:
@@ -145,7 +147,13 @@ def _routes(settings: ConsoleSettings) -> Routes:
 
 def _pages(app: FastAPI) -> None:
     """Add the page's files and the sign-in page, which does without the frame."""
+
+    async def clicking(request: Request) -> Response:
+        del request
+        return FileResponse(CLICKING, media_type="text/javascript; charset=utf-8")
+
     for place in (KEPT, PLAIN):
+        app.add_route(f"{place}/{CLICKING.name}", clicking, include_in_schema=False)
         app.mount(place, StaticFiles(directory=STATIC), name=place)
 
     @app.get("/login", include_in_schema=False)

@@ -6,11 +6,11 @@ open to everybody who is signed in; everything else needs an operator.
 """
 
 from fastapi import APIRouter, HTTPException, Request
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, Response
 
 from heliotrope.calibration.flights import LARGEST, FlightDocument
 from heliotrope.console import models
-from heliotrope.console.api import REFUSALS, Named, answer
+from heliotrope.console.api import REFUSALS, Identity, Named, answer
 from heliotrope.console.auth import Anyone, Engineer, Here, Operator, refused, settle
 from heliotrope.errors import InputError
 from heliotrope.plant.authority import OPERATOR_COMMANDS, Role
@@ -173,6 +173,35 @@ async def set_parameters(
 async def take_photograph(console: Here, who: Operator, name: Named) -> JSONResponse:
     """Photograph a target now, with whatever beam is on it."""
     return answer(await console.plant.ask("take_photograph", who.person, name=name))
+
+
+@router.post(
+    "/targets/{name}/marks/picture", response_model=models.PictureToMark, tags=["calibration"]
+)
+async def begin_marks(console: Here, who: Engineer, name: Named) -> JSONResponse:
+    """Hold the newest picture of a target's camera, so that its corners can be marked."""
+    return answer(await console.plant.ask("begin_marks", who.person, name=name))
+
+
+@router.get(
+    "/pictures-to-mark/{identity}",
+    tags=["calibration"],
+    response_class=Response,
+    responses={200: {"content": {"image/jpeg": {}}}},
+)
+async def picture_to_mark(console: Here, who: Engineer, identity: Identity) -> Response:
+    """Return a picture that is held to be marked, as the camera took it."""
+    _, jpeg = await console.plant.fetch("picture_to_mark", who.person, identity=identity)
+    return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
+
+
+@router.post("/targets/{name}/marks", response_model=models.MarksView, tags=["calibration"])
+async def mark_corners(
+    console: Here, who: Engineer, name: Named, order: orders.Clicks
+) -> JSONResponse:
+    """Try corner markers clicked in a picture; with save the camera works by them from now on."""
+    given = order.model_dump()
+    return answer(await console.plant.ask("mark_corners", who.person, name=name, **given))
 
 
 @router.post("/clusters/{name}/frames", response_model=models.many(models.BusFrame), tags=["logs"])

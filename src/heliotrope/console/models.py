@@ -19,7 +19,7 @@ from pydantic import BaseModel, Field, create_model
 from heliotrope.optics import flux
 from heliotrope.plant import lockouts
 from heliotrope.plant.interface.orders import Name, Strict
-from heliotrope.plant.operations import typed_parameters, views
+from heliotrope.plant.operations import marking, typed_parameters, views
 
 _MADE: dict[type, type[BaseModel]] = {}
 
@@ -257,5 +257,6 @@ EventRow, PacketRow = model_of(views.EventRow), model_of(views.PacketRow)
 BusFrame, FlightView = model_of(views.BusFrame), model_of(views.FlightView)
 CalibrationView, Planned = model_of(views.CalibrationView), model_of(views.Planned)
 PictureRow = model_of(views.PictureRow)
+PictureToMark, MarksView = model_of(marking.PictureToMark), model_of(marking.MarksView)
 ParametersView = model_of(typed_parameters.ParametersView)
 Lockout, EmergencyView = model_of(lockouts.Lockout), model_of(views.EmergencyView)

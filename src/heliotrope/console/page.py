@@ -23,7 +23,9 @@ TABS = (
     ("logs", "Logs"), ("schedule", "Schedule"),
 )  # fmt: skip
 #: Modules of the page, in order of their dependencies.
-_SCRIPTS = ("live", "dom", "palette", "orders", "map", "panels", "people", "console")
+_SCRIPTS = (
+    "live", "dom", "palette", "orders", "map", "clicking", "marking", "panels", "people", "console",
+)  # fmt: skip
 _EMERGENCY = f"""
 <div id="emergency-box">
   <span id="emergency-said" role="status"></span>

@@ -24,6 +24,7 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.pictures import KeptCamera
 from heliotrope.plant.operations.views import CalibrationEntry, Planned
@@ -145,6 +146,7 @@ class PlantAssembly:
             settings=chosen.work,
             extra=ports.facts,
             pictures=ports.pictures,
+            marking=None if cameras is None else self._marking(cameras),
         )
         if chosen.machines is not MachineTables.UNKNOWN:
             self._rest_on_machines()
@@ -158,6 +160,11 @@ class PlantAssembly:
 
     def _seen(self, cameras: Cameras) -> list[str]:
         return [target.name for target in self.design.targets if cameras.sees(target.name)]
+
+    def _marking(self, cameras: Cameras) -> Marking:
+        made = Marking(cameras, self.plant, self.logbook, self.ports.marks)
+        made.resume()
+        return made
 
     def _schedule(self, cycle: CalibrationCycle) -> PlantSchedule:
         scheduler = Scheduler(

@@ -12,7 +12,7 @@ changes over the day is not taken for a beam.
 import asyncio
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
@@ -22,6 +22,7 @@ from heliotrope.errors import FetchError, HeliotropeError, InputError, UnknownNa
 from heliotrope.field.camera import Camera
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.memory import Memory
 from heliotrope.imaging.photograph import Photograph, PhotographSettings, read_photograph
@@ -208,6 +209,32 @@ class RealCameras:
         """Return the last photograph of a target, for people."""
         return self._views.view(target)
 
+    def eye(self, target: str) -> Camera:
+        """Return the camera of a target, as it is known; see `plant.ports.Cameras`."""
+        return self._eye(target).camera
+
+    def frame(self, target: str) -> Frame:
+        """Return the newest frame that shows a target; see `plant.ports.Cameras`."""
+        eye = self._eye(target)
+        if eye.feed.newest is None:
+            why = eye.feed.problem or "look at the camera and its network"
+            raise FetchError(f"camera {eye.camera.name}: it has given no frame yet; {why}")
+        return eye.feed.newest
+
+    def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
+        """Read later photographs by a camera and a target's marks; see `plant.ports.Cameras`."""
+        old = self._eye(target.name)
+        targets = tuple(target if t.name == target.name else t for t in old.targets)
+        new = _Eye(camera, targets, old.feed)
+        self._eyes = {name: new if eye is old else eye for name, eye in self._eyes.items()}
+        known = {**self._settings.pictures, **pictures}
+        self._settings = replace(self._settings, pictures=known)
+
+    def _eye(self, target: str) -> _Eye:
+        if target not in self._eyes:
+            raise UnknownNameError("target with a camera", target, list(self._eyes))
+        return self._eyes[target]
+
     def sees(self, target: str) -> bool:
         """Return whether a camera looks at a target."""
         return target in self._eyes
@@ -239,9 +266,7 @@ class RealCameras:
 
     async def look(self, target: str) -> Shot:
         """Photograph a target; see `photograph`."""
-        if target not in self._eyes:
-            raise UnknownNameError("target with a camera", target, list(self._eyes))
-        eye = self._eyes[target]
+        eye = self._eye(target)
         frame = await self._frame(eye, target)
         loop = asyncio.get_running_loop()
         seen, jpeg = await loop.run_in_executor(self._pool, self._read, eye, frame)

@@ -8,11 +8,14 @@ records.
 from collections.abc import Callable, Mapping
 from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
 
+from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
 from heliotrope.files.disk import Disk
 from heliotrope.geometry import FloatArray
+from heliotrope.imaging.frame import Frame
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Link
 from heliotrope.plant.assigned import Assigned
@@ -62,6 +65,30 @@ class Cameras(Protocol):
         """Return the last photograph of the target, for people."""
         ...
 
+    def eye(self, target: str) -> Camera:
+        """Return the camera of the target, as it is known.
+
+        Raises
+        ------
+        UnknownNameError
+            If no camera looks at it.
+        """
+        ...
+
+    def frame(self, target: str) -> Frame:
+        """Return the newest frame that shows the target.
+
+        Raises
+        ------
+        FetchError, InputError
+            If there is none.
+        """
+        ...
+
+    def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
+        """Read later photographs by a camera, a target with its marks, and taught pictures."""
+        ...
+
 
 class Sensors(Protocol):
     """Sensors that feed readings of the safety table."""
@@ -97,6 +124,9 @@ class Ports:
         written in the loop, as virtual time needs it.
     pictures
         Keeps photographs of calibrations; it is closed with the plant. None: they are not kept.
+    marks
+        Plant file that keeps the views of targets that persons mark; None: they end with the
+        program.
     records
         Store of sightings, events and holds; None: they end with the program.
     assigned
@@ -118,6 +148,7 @@ class Ports:
     sensors: Sensors | None = None
     disk: Disk | None = field(default=None, kw_only=True)
     pictures: Pictures | None = field(default=None, kw_only=True)
+    marks: Path | None = field(default=None, kw_only=True)
     records: Records | None = field(default=None, kw_only=True)
     assigned: Assigned | None = field(default=None, kw_only=True)
     beside: Callable[[], AbstractAsyncContextManager[object]] = field(

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.errors import FetchError, InputError, UnknownNameError
+from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, reflect
 from heliotrope.imaging.frame import Frame
@@ -205,6 +206,17 @@ class ExactCamera:
         """Return the last picture of a target."""
         return self._views.get(target, CameraView(target, 0, 0.0, b""))
 
+    def eye(self, target: str) -> Camera:
+        """Raise `UnknownNameError`: exact centroids come from no camera."""
+        raise UnknownNameError("target with a camera that takes pictures", target, ())
+
+    def frame(self, target: str) -> Frame:
+        """Raise `UnknownNameError`: there are no pictures."""
+        raise UnknownNameError("target with a camera that takes pictures", target, ())
+
+    def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
+        """Do nothing: there are no pictures."""
+
     async def photograph(self, target: Target, heliostat: str) -> Shot:
         """Return where a heliostat's beam is on a target.
 
@@ -318,6 +330,9 @@ class RenderedCamera:
         self._chance = np.random.default_rng(seed)
         self._pool = ThreadPoolExecutor(threads, "camera") if threads else None
         self._views, self._empty = Views(), dict[str, Frame]()
+        #: Frames, and cameras and targets as they are known; the scenes have the true ones.
+        self._frames = dict[str, Frame]()
+        self._known = {name: (s.camera, s.targets[0]) for name, s in self._scenes.items()}
         self.taken = 0
         self.last: Frame | None = None
 
@@ -340,6 +355,29 @@ class RenderedCamera:
     def view(self, target: str) -> CameraView:
         """Return the last photograph of a target, for people."""
         return self._views.view(target)
+
+    def eye(self, target: str) -> Camera:
+        """Return the camera of a target, as it is known; see `plant.ports.Cameras`."""
+        if target not in self._known:
+            raise UnknownNameError("target with a camera", target, list(self._known))
+        return self._known[target][0]
+
+    def frame(self, target: str) -> Frame:
+        """Return the last frame of a target; see `plant.ports.Cameras`."""
+        camera = self.eye(target)
+        if target not in self._frames:
+            raise FetchError(f"camera {camera.name}: no photograph of {target} yet; take one")
+        return self._frames[target]
+
+    def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
+        """Read later photographs by a camera and a target's marks; the true ones stay."""
+        self._known = {
+            name: (camera if known.name == camera.name else known, there)
+            for name, (known, there) in self._known.items()
+        }
+        self._known[target.name] = camera, target
+        known = {**self._settings.pictures, **pictures}
+        self._settings = replace(self._settings, pictures=known)
 
     async def look(self, target: str) -> None:
         """Photograph a target before a beam comes, as background for later photographs.
@@ -385,6 +423,7 @@ class RenderedCamera:
             raise UnknownNameError("target", name, list(self._scenes))
         at = await self._sight.exposure()
         scene, utc = self._scenes[name], self._sight.clock.utc()
+        (camera, target), settings = self._known[name], self._settings
         mirrors, sun = self._sight.mirrors(), self._sight.sun()
         seed = int(self._chance.integers(1 << 32))
         self.taken += 1
@@ -397,9 +436,9 @@ class RenderedCamera:
             frame = render(lit, seed, name=title, time=utc).frame
             seen = read_photograph(
                 frame,
-                scene.targets,
-                scene.camera,
-                settings=self._settings,
+                (target,),
+                camera,
+                settings=settings,
                 without=self._empty.get(name),
             )
             return seen, picture_of(seen)
@@ -408,7 +447,7 @@ class RenderedCamera:
             seen, jpeg = work()
         else:
             seen, jpeg = await asyncio.get_running_loop().run_in_executor(self._pool, work)
-        self.last = seen.frame
+        self.last = self._frames[name] = seen.frame
         self._views.keep(name, utc.timestamp(), seen, jpeg)
         return seen, at
 

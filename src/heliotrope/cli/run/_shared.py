@@ -81,6 +81,11 @@ class Shown:
         if self.console:
             self.settings()
 
+    @property
+    def marks(self) -> Path | None:
+        """Plant file that keeps the views of targets that persons mark; None: nothing does."""
+        return None if self.data is None else self.data / "marks" / "plant.toml"
+
     def settings(self) -> Any:
         """Return the settings of the console.
 

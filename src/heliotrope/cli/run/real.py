@@ -173,7 +173,8 @@ async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outsid
         clock = SystemClock()
         ports = outside.ports(design, choice, shown, clock, keeper)
         kept = pictures(shown, folder)
-        live = PlantAssembly(design, replace(ports, pictures=kept), _settings(choice, shown))
+        ports = replace(ports, pictures=kept, marks=shown.marks)
+        live = PlantAssembly(design, ports, _settings(choice, shown))
         if live.plant.unwatched:
             print(f"no readings for: {', '.join(live.plant.unwatched)}", flush=True)
         papers = _papers(outside, shown)

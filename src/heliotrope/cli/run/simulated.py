@@ -55,5 +55,5 @@ async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
         )
         # A record takes long in a time that runs faster, so there the loop waits for it.
         kept = pictures(shown, folder, waits=choice.speed > 1.0)
-        live = PlantAssembly(design, replace(ports, pictures=kept), settings)
+        live = PlantAssembly(design, replace(ports, pictures=kept, marks=shown.marks), settings)
         await at_work(live, keeper, shown, folder, ending, choice.speed)

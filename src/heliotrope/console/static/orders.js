@@ -4,11 +4,11 @@ import { ask, count, h } from "./dom.js";
 
 export const say = (text, bad) => store.emit("said", { text, bad });
 
-// Runs an action and shows its result.
-export async function act(what, name) {
+// Runs an action and shows its result; one that is not `plain` says it itself.
+export async function act(what, name, plain = true) {
   try {
     const done = await what();
-    if (done?.identity) follow(done); else say(`${name}: done`);
+    if (done?.identity) follow(done); else if (plain) say(`${name}: done`);
     return done;
   } catch (error) { say(`${name}: ${error.message}`, true); return null; }
 }

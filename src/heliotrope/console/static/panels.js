@@ -3,6 +3,7 @@ import { api, me, store } from "./live.js";
 import { cividis, colourOf, dark } from "./palette.js";
 import { ask, chart, clock, count, degrees, facts, h, mrad, number, refreshed, span, table } from "./dom.js";
 import { act } from "./orders.js";
+import { markCorners } from "./marking.js";
 
 const look = (name) => { const row = store.index.get(name); if (row !== undefined) store.select([row], row); };
 const canCommand = () => me.role !== "viewer";
@@ -136,7 +137,9 @@ export function targets(box) {
   for (const name of store.field.targets) {
     const image = h("img", { alt: `Photograph of ${name}` }), said = h("p", { className: "hx-reading" }), at = h("span", { className: "hx-chip" }, "no photograph yet");
     box.append(h("h3", {}, name, at), canCommand() ? h("div", { className: "hx-row" }, h("button", { className: "hx-button",
-      onclick: () => act(() => api("POST", `targets/${encodeURIComponent(name)}/photograph`), `photograph ${name}`) }, "Photograph now")) : "", h("div", { className: "hx-photo" }, image), said);
+      onclick: () => act(() => api("POST", `targets/${encodeURIComponent(name)}/photograph`), `photograph ${name}`) }, "Photograph now"),
+      me.role === "engineer" ? h("button", { className: "hx-button", title: "Click the corners and marks of the target in its camera's picture: the perspective of later photographs",
+        onclick: () => act(() => markCorners(name), `mark corners of ${name}`, false) }, "Mark corners…") : "") : "", h("div", { className: "hx-photo" }, image), said);
     shown.set(name, { image, said, at });
     off.push(refreshed(async () => {
       if (!store.head?.cameras?.[name]) return;

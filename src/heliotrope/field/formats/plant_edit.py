@@ -138,6 +138,20 @@ def edit(
     return Edited(tuple(shown), (*strange, *new), version)
 
 
+def keep_version(path: str | Path, change: str, *, now: datetime | None = None) -> str:
+    """Store a plant file as it is, before another part of the program changes it.
+
+    Returns the name of the version; ``change`` says in words what ends it.
+
+    Raises
+    ------
+    FormatError
+        If the file cannot be used.
+    """
+    files = _Files(Path(path))
+    return _keep(files.place, files.table, change, "", now)
+
+
 def versions(path: str | Path) -> list[Version]:
     """Return the stored versions of a plant file, oldest first."""
     found = []

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler
+from pathlib import Path
 from socketserver import ThreadingTCPServer
 from typing import Any, cast
 
@@ -19,7 +20,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.targets.teaching import known_points
+from heliotrope.imaging.targets.teaching import places_of, shown_pixels
 
 #: Longest answer, bytes; a point takes a few hundred.
 _LONGEST = 1 << 20
@@ -227,19 +228,11 @@ def click_points(
     InputError
         If the person cancels.
     """
-    known = {name: p for name, p in known_points(target).items() if name not in given}
-    points = np.array(list(known.values())).reshape(-1, 3)
-    plane = target.plane_coordinates(points)
-    corners = target.plane_coordinates(target.corners)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    share = np.clip((plane - low) / (high - low), 0.0, 1.0)
-    places = {name: (float(x), float(1.0 - y)) for name, (x, y) in zip(known, share, strict=True)}
-    # As bright as possible: faint frames are hard to click in.
-    pixels = frame.pixels.astype(np.float32)
-    top = max(float(np.percentile(pixels, 99.9)), 1.0)
-    shown = np.clip(pixels * (255.0 / top), 0.0, 255.0).astype(np.uint8)
-    aspect = float((high - low)[0] / (high - low)[1])
-    return ask(shown, places, given, f"{title}: target {target.name}", announce, aspect=aspect)
+    places, aspect = places_of(target)
+    asked = {name: place for name, place in places.items() if name not in given}
+    return ask(
+        shown_pixels(frame), asked, given, f"{title}: target {target.name}", announce, aspect=aspect
+    )
 
 
 def _page(
@@ -261,7 +254,9 @@ def _page(
     }
     # Inside a script element only "<" could end it.
     text = json.dumps(data, ensure_ascii=False).replace("<", "\\u003c")
-    return _HTML.replace("@NONCE@", nonce).replace("@DATA@", text).encode()
+    code = Path(__file__).with_name("clicking.js").read_text("utf-8").replace("export ", "")
+    page = _HTML.replace("@NONCE@", nonce).replace("@CLICKING@", code)
+    return page.replace("@DATA@", text).encode()
 
 
 _HTML = r"""<!doctype html>
@@ -311,153 +306,35 @@ _HTML = r"""<!doctype html>
     <button id="cancel">Cancel</button><button id="done">Done</button>
   </div>
   <div id="said" role="status"></div>
-  <small>Wheel: closer. Drag: move. Arrows: nudge the last point by a quarter of a pixel, with
-  Shift by four. S: skip, Backspace: undo, Enter: done.</small>
+  <small>Wheel: closer. Drag: move. Space: put the point in the middle. Arrows: nudge the last point
+  by a quarter of a pixel, with Shift by 4, with Ctrl by 40. S: skip, Backspace: undo,
+  Enter: done.</small>
 </aside>
 <script id="data" type="application/json" nonce="@NONCE@">@DATA@</script>
 <script nonce="@NONCE@">
 "use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
-const [width, height] = data.size;
-const found = new Map();          // name -> [x, y], centre of the first pixel is 0, 0
-const history = [];
-let now = 0, last = null, mouse = null, over = false;
-const view = { scale: 1, x: 0, y: 0 };
 const image = new Image();
 document.querySelector("h1").textContent = data.title;
-
-const fit = (canvas) => {
-  const ratio = window.devicePixelRatio || 1;
-  const [w, h] = [canvas.clientWidth, canvas.clientHeight];
-  canvas.width = Math.round(w * ratio);
-  canvas.height = Math.round(h * ratio);
-  const pen = canvas.getContext("2d");
-  pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-  pen.clearRect(0, 0, w, h);
-  return [pen, w, h];
-};
-const toPixel = (sx, sy) => [(sx - view.x) / view.scale - 0.5, (sy - view.y) / view.scale - 0.5];
-const inside = ([x, y]) => x >= -0.5 && y >= -0.5 && x <= width - 0.5 && y <= height - 0.5;
-const cross = (pen, x, y, colour, size = 9) => {
-  for (const [line, ink] of [[4, "#000"], [2, colour]]) {
-    pen.lineWidth = line;
-    pen.strokeStyle = ink;
-    pen.beginPath();
-    for (const [a, b] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
-      pen.moveTo(x + 3 * a, y + 3 * b);
-      pen.lineTo(x + size * a, y + size * b);
-    }
-    pen.stroke();
-  }
-};
-const label = (pen, text, x, y) => {
-  pen.font = "12px system-ui, sans-serif";
-  pen.lineWidth = 3;
-  pen.strokeStyle = "#000";
-  pen.strokeText(text, x, y);
-  pen.fillStyle = "#fff";
-  pen.fillText(text, x, y);
-};
-const paint = (pen, scale, x, y) => {
-  pen.imageSmoothingEnabled = scale < 2;
-  pen.drawImage(image, x, y, width * scale, height * scale);
-};
-const marks = (pen, scale, x, y, named) => {
-  const one = ([name, at], colour) => {
-    const [sx, sy] = [(at[0] + 0.5) * scale + x, (at[1] + 0.5) * scale + y];
-    cross(pen, sx, sy, colour);
-    if (named) label(pen, name, sx + 10, sy - 6);
-  };
-  data.given.forEach((g) => one([g.name, g.at], "#8fd3ff"));
-  found.forEach((at, name) => one([name, at], name === last ? "#ffe14d" : "#5dff7a"));
-};
-const drawPicture = () => {
-  const [pen] = fit(byId("picture"));
-  paint(pen, view.scale, view.x, view.y);
-  marks(pen, view.scale, view.x, view.y, true);
-};
-const drawGlass = () => {
-  const [pen, w, h] = fit(byId("glass"));
-  const at = mouse || found.get(last);
-  if (!at) return;
-  const scale = Math.max(8, 2 * view.scale);
-  const [x, y] = [w / 2 - (at[0] + 0.5) * scale, h / 2 - (at[1] + 0.5) * scale];
-  paint(pen, scale, x, y);
-  marks(pen, scale, x, y, false);
-  cross(pen, w / 2, h / 2, "#ff5050", 14);
-};
-const drawSketch = () => {
-  const [pen, w, h] = fit(byId("sketch"));
-  const a = Math.min(w - 16, (h - 16) * data.aspect), b = a / data.aspect;
-  const box = [(w - a) / 2, (h - b) / 2, a, b];
-  pen.strokeStyle = "#59616b";
-  pen.strokeRect(...box);
-  data.points.forEach((point, k) => {
-    const x = box[0] + point.place[0] * box[2], y = box[1] + point.place[1] * box[3];
-    pen.beginPath();
-    pen.arc(x, y, k === now ? 6 : 3, 0, 7);
-    pen.fillStyle = k === now ? "#1f5fa8" : found.has(point.name) ? "#3f9c54" : "#b4bac1";
-    pen.fill();
-  });
-};
-const tell = () => {
-  const ask = byId("ask"), hint = document.createElement("span");
-  const point = data.points[now];
-  ask.textContent = point ? `Click on ${point.name}` : "That was all";
-  hint.textContent = point ? `${now + 1} of ${data.points.length}` : "Look once more, then Done";
-  ask.append(hint);
-  const list = document.querySelector("ol");
-  list.textContent = "";
-  const row = (name, at, kind, pick) => {
-    const item = document.createElement("li"), where = document.createElement("span");
-    item.className = kind;
-    item.textContent = name;
-    where.textContent = at ? `${at[0].toFixed(2)}, ${at[1].toFixed(2)}` : "–";
-    item.append(where);
-    if (pick) item.addEventListener("click", pick);
-    list.append(item);
-    if (kind === "now") item.scrollIntoView({ block: "nearest" });
-  };
-  data.points.forEach((p, k) =>
-    row(p.name, found.get(p.name), k === now ? "now" : "", () => { now = k; draw(); }));
-  data.given.forEach((g) => row(g.name, g.at, "given", null));
-  byId("undo").disabled = !history.length;
-  byId("skip").disabled = now >= data.points.length;
-  byId("done").disabled = found.size + data.given.length < data.fewest;
-  const missing = data.fewest - found.size - data.given.length;
+@CLICKING@
+const parts = { picture: byId("picture"), glass: byId("glass"), sketch: byId("sketch"),
+  ask: byId("ask"), list: document.querySelector("ol") };
+const told = () => {
+  const missing = data.fewest - found.size - data.given.length, may = free();
+  byId("undo").disabled = !may.undo;
+  byId("skip").disabled = !may.skip;
+  byId("done").disabled = missing > 0;
   byId("done").title = missing > 0 ? `${missing} more needed` : "";
 };
-const draw = () => { if (!over) { drawPicture(); drawGlass(); drawSketch(); tell(); } };
-const next = () => {
-  now += 1;
-  while (now < data.points.length && found.has(data.points[now].name)) now += 1;
-};
-const put = (at) => {
-  const point = data.points[now];
-  if (!point || !inside(at)) return;
-  history.push([now, last, found.get(point.name)]);
-  found.set(point.name, at);
-  last = point.name;
-  next();
-  draw();
-};
-const undo = () => {
-  if (!history.length) return;
-  const [k, before, at] = history.pop();
-  const name = data.points[k].name;
-  if (at) found.set(name, at); else found.delete(name);
-  [now, last] = [k, before];
-  draw();
-};
-const skip = () => { if (now < data.points.length) { next(); draw(); } };
+const { found, view, toPixel, undo, skip, start, close, free } = clicking(parts, data, image, told);
 const send = async (place, body) => {
   byId("said").textContent = "";
   try {
     const reply = await fetch(place, { method: "POST", body });
     const text = (await reply.text()).trim();
     if (!reply.ok) { byId("said").textContent = text; return; }
-    over = true;
+    close();
     document.querySelector("aside").textContent =
       place === "cancel" ? "Cancelled; nothing is written. This page can be closed."
         : "Thank you. The command goes on; this page can be closed.";
@@ -473,65 +350,9 @@ byId("skip").addEventListener("click", skip);
 byId("cancel").addEventListener("click", () => send("cancel", ""));
 byId("done").addEventListener("click", done);
 
-const canvas = byId("picture");
-let down = null;
-canvas.addEventListener("mousedown", (e) => {
-  down = { x: e.offsetX, y: e.offsetY, ox: view.x, oy: view.y, moved: false };
-});
-window.addEventListener("mousemove", (e) => {
-  if (over) return;
-  const box = canvas.getBoundingClientRect();
-  const [x, y] = [e.clientX - box.left, e.clientY - box.top];
-  if (down) {
-    down.moved ||= Math.hypot(x - down.x, y - down.y) > 4;
-    if (down.moved) {
-      [view.x, view.y] = [down.ox + x - down.x, down.oy + y - down.y];
-      drawPicture();
-    }
-  }
-  const at = toPixel(x, y);
-  mouse = e.target === canvas && inside(at) ? at : null;
-  drawGlass();
-});
-window.addEventListener("mouseup", (e) => {
-  if (down && !down.moved && e.target === canvas && e.button === 0) {
-    put(toPixel(e.offsetX, e.offsetY));
-  }
-  down = null;
-});
-canvas.addEventListener("wheel", (e) => {
-  e.preventDefault();
-  const factor = Math.exp(-0.002 * Math.max(-200, Math.min(200, e.deltaY)));
-  const scale = Math.min(64, Math.max(0.02, view.scale * factor));
-  view.x = e.offsetX - (e.offsetX - view.x) * (scale / view.scale);
-  view.y = e.offsetY - (e.offsetY - view.y) * (scale / view.scale);
-  view.scale = scale;
-  draw();
-}, { passive: false });
 window.addEventListener("keydown", (e) => {
-  if (over || e.ctrlKey || e.metaKey || e.altKey) return;
-  const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
-  const step = steps[e.key], at = found.get(last);
-  if (step && at) {
-    const size = e.shiftKey ? 4 : 0.25;
-    const moved = [at[0] + size * step[0], at[1] + size * step[1]];
-    if (inside(moved)) found.set(last, moved);
-    mouse = null;
-    draw();
-  } else if (e.key === "Backspace") undo();
-  else if (e.key === "s" || e.key === "S") skip();
-  else if (e.key === "Enter" && e.target.tagName !== "BUTTON") done();
-  else return;
-  e.preventDefault();
+  if (e.key === "Enter" && e.target.tagName !== "BUTTON") { e.preventDefault(); done(); }
 });
-const start = () => {
-  const [w, h] = [canvas.clientWidth, canvas.clientHeight];
-  view.scale = Math.min((w - 20) / width, (h - 20) / height);
-  view.x = (w - width * view.scale) / 2;
-  view.y = (h - height * view.scale) / 2;
-  draw();
-};
-window.addEventListener("resize", draw);
 image.addEventListener("load", start);
 image.src = "picture.png";
 </script>

@@ -133,6 +133,24 @@ def known_points(target: Target) -> dict[str, FloatArray]:
     return points
 
 
+def places_of(target: Target) -> tuple[dict[str, Pixel], float]:
+    """Return the places of `known_points` from the left and from above, 0 to 1, and the aspect."""
+    known = known_points(target)
+    plane = target.plane_coordinates(np.array(list(known.values())))
+    corners = target.plane_coordinates(target.corners)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    share = np.clip((plane - low) / (high - low), 0.0, 1.0)
+    places = {name: (float(x), float(1.0 - y)) for name, (x, y) in zip(known, share, strict=True)}
+    return places, float((high - low)[0] / (high - low)[1])
+
+
+def shown_pixels(frame: Frame) -> npt.NDArray[np.uint8]:
+    """Return a frame as bright as possible: in a faint one points are hard to click."""
+    pixels = frame.pixels.astype(np.float32)
+    top = max(float(np.percentile(pixels, 99.9)), 1.0)
+    return np.asarray(np.clip(pixels * (255.0 / top), 0.0, 255.0), dtype=np.uint8)
+
+
 def teach(
     plant: Plant,
     target: str,

@@ -81,6 +81,10 @@ async def _kept_one(desk: Desk, _: Person, identity: int) -> WithBlob:
     return WithBlob({"identity": identity}, await desk.kept_picture(identity))
 
 
+async def _to_mark(desk: Desk, _: Person, identity: int) -> WithBlob:
+    return WithBlob({"number": identity}, await desk.marking.picture(identity))
+
+
 def _withdraw(desk: Desk, who: Person, *_: Any) -> Any:
     desk.operations.withdraw(who)
     return desk.operations.emergency_view()
@@ -223,6 +227,15 @@ _ORDERS = {
     ),
     "take_photograph": Call(
         Role.OPERATOR, orders.Named, lambda _d, _who, given, _b: given.name, Desk.photographed
+    ),
+    "begin_marks": Call(
+        Role.ENGINEER, orders.Named, lambda d, who, a, _: d.marking.begin(who, a.name)
+    ),
+    "picture_to_mark": Call(
+        Role.ENGINEER, orders.KeptOne, lambda _d, _who, given, _b: given.identity, _to_mark
+    ),
+    "mark_corners": Call(
+        Role.ENGINEER, orders.Marks, lambda _d, _who, given, _b: given, Desk.mark_corners
     ),
     "bus_frames": Call(
         Role.ENGINEER, orders.Named, lambda _d, _who, given, _b: given.name, Desk.bus_frames

@@ -19,6 +19,7 @@ from heliotrope.plant.authority import Person
 from heliotrope.plant.interface import orders
 from heliotrope.plant.interface.tickets import Tickets, state_of
 from heliotrope.plant.operations import bus_frames
+from heliotrope.plant.operations.marking import Marking, MarksView
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.typed_parameters import ParametersView
 from heliotrope.plant.operations.views import BusFrame, CameraView, FlightView, PictureRow
@@ -201,6 +202,27 @@ class Desk:
         if pictures is None:
             raise UnknownNameError("kept photograph", str(identity), ())
         return await _answer(lambda then: pictures.read(identity, then))
+
+    # -- corner markers ---------------------------------------------------------------------
+
+    @property
+    def marking(self) -> Marking:
+        """Takes views that persons mark.
+
+        Raises
+        ------
+        InputError
+            If no camera of the plant takes pictures.
+        """
+        if self.operations.marking is None:
+            raise InputError("mark corners: this plant has no camera of its targets")
+        return self.operations.marking
+
+    async def mark_corners(self, who: Person, given: orders.Marks) -> MarksView:
+        """Try the points that an engineer clicked, or take their view."""
+        token = self.token_of(who) if given.save else None
+        points = {name: (x, y) for name, (x, y) in given.points.items()}
+        return await self.marking.mark(who, given.name, given.number, points, token)
 
     # -- flights --------------------------------------------------------------------------
 

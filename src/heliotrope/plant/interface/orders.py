@@ -103,6 +103,24 @@ class ParameterOrder(Strict):
     reason: Annotated[Words, Field(min_length=1)]
 
 
+#: A pixel of a picture, right and down.
+PixelOf = Annotated[list[Coordinate], Field(min_length=2, max_length=2)]
+
+
+class Clicks(Strict):
+    """Points clicked in a picture to mark, and whether their view is to be used from now on."""
+
+    number: Annotated[int, Field(ge=1, le=2**53)]
+    points: Annotated[dict[Name, PixelOf], Field(max_length=200)]
+    save: bool = False
+
+
+class Marks(Clicks):
+    """`Clicks` on the way to the plant: with the target."""
+
+    name: Name
+
+
 class KeptOf(Strict):
     """The newest kept photographs of a heliostat ("": those that persons asked for)."""
 

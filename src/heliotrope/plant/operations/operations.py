@@ -33,6 +33,7 @@ from heliotrope.plant.lockouts import Lockout
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.security import SecurityLog
 from heliotrope.plant.operations.typed_parameters import TypedParameters
@@ -114,10 +115,12 @@ class Operations:
         Returns further rows of the summary, such as the speed of a twin.
     pictures
         Keeps photographs with their results; None: they are not kept.
+    marking
+        Takes views that persons mark; None: there is no camera.
 
     Attributes
     ----------
-    plant, logbook, automatic, security, pictures, parameters
+    plant, logbook, automatic, security, pictures, parameters, marking
         See their classes.
     """
 
@@ -134,8 +137,9 @@ class Operations:
         settings: AutomaticSettings | None = None,
         extra: Callable[[], Mapping[str, Any]] | None = None,
         pictures: Pictures | None = None,
+        marking: Marking | None = None,
     ) -> None:
-        self.plant, self.logbook, self.pictures = plant, logbook, pictures
+        self.plant, self.logbook, self.pictures, self.marking = plant, logbook, pictures, marking
         self._cameras, self._extra = dict(cameras or {}), extra
         self.automatic = AutomaticControl(
             plant,
