@@ -20,14 +20,11 @@ from heliotrope import sun as solar
 from heliotrope.calibration.plan import _allocation
 from heliotrope.calibration.plan import gain as _gain
 from heliotrope.calibration.plan.fleets import Fleet
-from heliotrope.calibration.plan.planning import SightingLimits, aim_at, sighting_jacobian
-from heliotrope.calibration.uncertainty import CHUNK
+from heliotrope.calibration.plan.planning import SightingLimits
+from heliotrope.calibration.plan.scaled_field import ScaledField, TargetView
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
-from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.drives import SLOTS
-from heliotrope.mechanism.tracking import track
 from heliotrope.sun import Site
 
 #: Most memory for the derivatives of a day that is planned as a whole, bytes.
@@ -234,18 +231,8 @@ def _cells(
     return cells, int(up.sum())
 
 
-@dataclass(frozen=True)
-class _TargetView:
-    """Some heliostats aimed at one target at one instant; ``slope`` is scaled and padded."""
-
-    able: npt.NDArray[np.bool_]
-    slope: FloatArray
-    seconds: FloatArray
-    counts: FloatArray
-
-
 class _Schedule:
-    """State of a campaign: covariances by scaled parameters, padded to the largest P."""
+    """State of a campaign."""
 
     def __init__(
         self,
@@ -258,69 +245,17 @@ class _Schedule:
         worth: float,
         count: int | None,
     ) -> None:
-        self.fleets, self.site, self.targets = fleets, site, targets
+        self.site, self.targets = site, targets
         self.timing, self.limits = timing, limits
         self.ahead, self.worth, self.limit = ahead, worth, count
-        sizes = [len(f) for f in fleets]
-        self.offsets = np.concatenate([[0], np.cumsum(sizes)])
-        total, most = int(self.offsets[-1]), max(len(f.names) for f in fleets)
-        self.covariance = np.broadcast_to(np.eye(most), (total, most, most)).copy()
-        self.form = np.zeros((total, most, most))
-        self.scale = np.ones((total, most))
-        for k, fleet in enumerate(fleets):
-            part, p = slice(self.offsets[k], self.offsets[k + 1]), len(fleet.names)
-            scale = 1.0 / np.sqrt(np.diagonal(fleet.information, axis1=1, axis2=2))
-            both = scale[:, :, None] * scale[:, None]
-            self.covariance[part, :p, :p] = np.linalg.inv(fleet.information * both)
-            self.form[part, :p, :p] = fleet.form * both
-            self.scale[part, :p] = scale
-        self.square = np.einsum("npq,nqp->n", self.form, self.covariance)
-        self.counted = int(self.form.any(axis=(1, 2)).sum())
-        if not self.counted:
-            raise InputError("campaign: no heliostat can serve its aim; check aims and stops")
+        self.field = ScaledField(fleets, limits)
+        self.covariance, self.form = self.field.covariance, self.field.form
+        self.square = self.field.squares()
+        self.counted, total = self.field.counted, len(self.field)
         self.before = float(np.sqrt(self.square.sum() / self.counted))
-        self.armatures = [f.mechanism.armature.table for f in fleets]
         self.version = np.zeros(total, dtype=np.int64)
         self.free = np.full(total, -np.inf)
         self.rows: list[tuple[Any, ...]] = []
-
-    def view(self, k: int, rows: slice, sun: FloatArray, target: Target) -> _TargetView:
-        """Heliostats ``rows`` of fleet ``k`` aimed at a target."""
-        fleet = self.fleets[k]
-        some, armature = fleet.mechanism[rows], Armature(self.armatures[k][rows])
-        home = track(armature, sun, fleet.aim[rows], drives=some.drives)
-        stand = home.best_counts
-        stand = np.where(np.isfinite(stand), stand, 0.0)
-        aimed = aim_at(some, sun, target, self.limits, current=stand)
-        speed = some.drives.table[..., SLOTS["speed"]]
-        able, p = aimed.able, len(fleet.names)
-        seconds = np.full(len(able), np.inf)
-        seconds[able] = (np.abs(aimed.counts - stand) / speed)[able].max(axis=-1)
-        slope = np.zeros((len(able), 2, self.form.shape[-1]))
-        slope[able, :, :p] = sighting_jacobian(
-            some[np.flatnonzero(able)],
-            aimed.counts[able],
-            np.broadcast_to(sun, (int(able.sum()), 3)),
-            target,
-            fleet.names,
-            fleet.sigma,
-        )
-        part = slice(self.offsets[k] + rows.start, self.offsets[k] + rows.stop)
-        return _TargetView(able, slope * self.scale[part, None], seconds, aimed.counts)
-
-    def field_view(self, sun: FloatArray, target: Target) -> _TargetView:
-        """All heliostats aimed at a target, fleet after fleet."""
-        parts = [
-            self.view(k, slice(a, min(a + CHUNK, len(fleet))), sun, target)
-            for k, fleet in enumerate(self.fleets)
-            for a in range(0, len(fleet), CHUNK)
-        ]
-        return _TargetView(
-            *(
-                np.concatenate([getattr(part, f.name) for part in parts])
-                for f in fields(_TargetView)
-            )
-        )
 
     @property
     def full(self) -> bool:
@@ -334,7 +269,7 @@ class _Schedule:
         for first in range(0, len(cells), look):
             some = cells[first : first + look]
             suns = [solar.vector(c + self._shift, self.site) for c in some]
-            views = [[self.field_view(s[len(s) // 2], t) for t in self.targets] for s in suns]
+            views = [[self.field.view(s[len(s) // 2], t) for t in self.targets] for s in suns]
             options = [
                 self._option(v, len(c)) for c, row in zip(some, views, strict=True) for v in row
             ]
@@ -357,7 +292,7 @@ class _Schedule:
         """From the arrival of a beam to the middle of the exposure, s."""
         return self.timing.settle + 0.5 * self.timing.exposure
 
-    def _option(self, view: _TargetView, room: int) -> _allocation.Option:
+    def _option(self, view: TargetView, room: int) -> _allocation.Option:
         rows = np.flatnonzero(view.able)
         # A heliostat returns to its aim before it comes again.
         again = self.timing.slot + 2.0 * view.seconds[rows]
@@ -386,9 +321,7 @@ class _Schedule:
             if arrive - queue.view.seconds[i] < ready:
                 waiting.append(entry)
                 continue
-            k = int(np.searchsorted(self.offsets, i, side="right")) - 1
-            row = i - int(self.offsets[k])
-            own = self.view(k, slice(row, row + 1), sun, self.targets[j])
+            own = self.field.one(i, sun, self.targets[j])
             # The queue is of the middle of the interval; the slot itself may be out of reach.
             if not own.able[0]:
                 continue
@@ -401,7 +334,7 @@ class _Schedule:
         for entry in waiting:
             heappush(queue.heap, entry)
 
-    def _take(self, i: int, j: int, arrive: float, own: _TargetView) -> None:
+    def _take(self, i: int, j: int, arrive: float, own: TargetView) -> None:
         way, done = float(own.seconds[0]), arrive + self.timing.slot
         self.covariance[i] = _gain.updated(self.covariance[i], own.slope[0])
         self.square[i] = max(0.0, float(np.sum(self.form[i] * self.covariance[i])))
@@ -458,7 +391,7 @@ class _Queue:
     def __init__(
         self,
         schedule: _Schedule,
-        view: _TargetView,
+        view: TargetView,
         option: _allocation.Option,
         wanted: list[int] | None,
     ) -> None:
