@@ -17,6 +17,7 @@ from heliotrope.cli._store import app as store_app
 from heliotrope.cli.calibrate import calibrate
 from heliotrope.cli.camera import app as camera_app
 from heliotrope.cli.cluster import cluster
+from heliotrope.cli.commission import commission
 from heliotrope.cli.demo import demo
 from heliotrope.cli.drone.commands import app as drone_app
 from heliotrope.cli.evaluate import evaluate
@@ -69,6 +70,7 @@ app.add_typer(camera_app, name="camera")
 app.command()(image)
 app.command()(calibrate)
 app.command()(plan)
+app.command()(commission)
 app.command()(evaluate)
 app.add_typer(drone_app, name="drone")
 app.command(cls=GroupedCommand)(run)

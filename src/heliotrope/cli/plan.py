@@ -93,10 +93,10 @@ def plan(
     if picture is not None:
         check_picture(picture)
     plant = open_plant(field)
-    _check_outputs((csv, picture), field, sightings)
+    check_outputs((csv, picture), field, sightings)
     order = _PlanOrder(
-        span=_span(begin, end, days),
-        targets=_targets(plant, target),
+        span=span_of(begin, end, days),
+        targets=targets_of(plant, target),
         every=parse_duration(every).total_seconds(),
         timing=Timing(*(parse_duration(t).total_seconds() for t in (settle, exposure, clear))),
         count=count,
@@ -104,8 +104,8 @@ def plan(
         picture=picture,
         as_json=as_json,
     )
-    sigma = 1e-3 * _above(sigma_mrad, "--sigma-mrad")
-    made = _made(plant, sightings)
+    sigma = 1e-3 * above(sigma_mrad, "--sigma-mrad")
+    made = made_so_far(plant, sightings)
     with progress("computing the errors over the year", as_json) as step:
         fleets = fleets_of(
             plant,
@@ -154,7 +154,7 @@ class _PlanOrder:
                 print(f"{what}: {path}")
 
 
-def _check_outputs(outputs: tuple[Path | None, ...], field: Path, sightings: Path | None) -> None:
+def check_outputs(outputs: tuple[Path | None, ...], field: Path, sightings: Path | None) -> None:
     """Refuse an output that cannot be written, or that would replace an input."""
     from heliotrope.files.documents import read_toml
 
@@ -171,14 +171,15 @@ def _check_outputs(outputs: tuple[Path | None, ...], field: Path, sightings: Pat
             raise InputError(f"{file}: this file is an input; give another name to write to")
 
 
-def _span(begin: str, end: str | None, days: float | None) -> tuple[datetime, datetime]:
+def span_of(begin: str, end: str | None, days: float | None) -> tuple[datetime, datetime]:
+    """Return beginning and end of a plan; without either, it lasts a week."""
     start = parse_time(begin)
     if end is not None and days is not None:
         raise InputError("give --to or --days, not both")
     if end is not None:
         stop = parse_time(end)
     else:
-        length = 7.0 if days is None else _above(days, "--days")
+        length = 7.0 if days is None else above(days, "--days")
         if length > 3660.0:
             raise InputError(f"--days {length:g}: give at most 3660")
         try:
@@ -190,20 +191,23 @@ def _span(begin: str, end: str | None, days: float | None) -> tuple[datetime, da
     return start, stop
 
 
-def _above(value: float, what: str) -> float:
+def above(value: float, what: str) -> float:
+    """Return a number of the command line that must be above 0."""
     if not (math.isfinite(value) and value > 0.0):
         raise InputError(f"{what} {value:g}: give a number above 0")
     return value
 
 
-def _targets(plant: "Plant", wanted: list[str] | None) -> "tuple[Target, ...]":
+def targets_of(plant: "Plant", wanted: list[str] | None) -> "tuple[Target, ...]":
+    """Return the targets by name, or all."""
     found = tuple(plant.target(name) for name in dict.fromkeys(wanted or ())) or plant.targets
     if not found:
         raise InputError("this plant has no target; a measurement with a camera needs one")
     return found
 
 
-def _made(plant: "Plant", path: Path | None) -> "Sightings | None":
+def made_so_far(plant: "Plant", path: Path | None) -> "Sightings | None":
+    """Return the sightings of a table, and say which were left out."""
     if path is None:
         return None
     from heliotrope.calibration.sighting_table import read_sightings

@@ -2,11 +2,17 @@
 
 `plan_sightings` chooses among the `candidate_sightings` of one heliostat, `plan_each` does so for
 several that share targets, `plan_campaign` schedules a whole field; `fleets_of` prepares the
-heliostats of a plant. Tables and pictures are in `calibration.plan.report`, updates of a covariance
-by one more sighting in `calibration.plan.gain`.
+heliostats of a plant. `plan_commission` plans the first days of a new field, up to a goal. Tables
+and pictures are in `calibration.plan.report`, updates of a covariance by one more sighting in
+`calibration.plan.gain`.
 """
 
 from heliotrope.calibration.plan.campaign import CalibrationCampaign, Timing, plan_campaign
+from heliotrope.calibration.plan.commission import (
+    CommissionPlan,
+    CommissionTerms,
+    plan_commission,
+)
 from heliotrope.calibration.plan.fleets import Fleet, fleets_of, plan_each
 from heliotrope.calibration.plan.planning import (
     Aimed,
@@ -24,6 +30,8 @@ __all__ = [
     "Aimed",
     "CalibrationCampaign",
     "CandidateSightings",
+    "CommissionPlan",
+    "CommissionTerms",
     "Fleet",
     "SightingLimits",
     "SightingPlan",
@@ -32,6 +40,7 @@ __all__ = [
     "candidate_sightings",
     "fleets_of",
     "plan_campaign",
+    "plan_commission",
     "plan_each",
     "plan_sightings",
     "sighting_jacobian",

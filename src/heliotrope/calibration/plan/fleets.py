@@ -82,6 +82,7 @@ def fleets_of(
     model: str = "auto",
     made: Sightings | None = None,
     sigma: float = 5e-4,
+    installed: float | None = None,
     progress: Progress | None = None,
 ) -> list[Fleet]:
     """Return the heliostats of a plant, one fleet for each of its groups.
@@ -100,6 +101,9 @@ def fleets_of(
         Sightings made so far; rows are those of ``plant.names``.
     sigma
         Standard deviation of a measured beam direction, rad.
+    installed
+        Expected beam error of a group before any sighting, rad RMS: its priors are scaled to it.
+        Default: the priors of the table as they are.
     progress
         Called with (groups done, all groups).
 
@@ -127,8 +131,18 @@ def fleets_of(
         seen = None if made is None else _of(made, [place[n] for n in labels], len(place))
         known = precision(mechanism, names, seen)
         form = error_form(mechanism, aim, suns, names)
+        if installed is not None:
+            prior = precision(mechanism, names)
+            known = known + (_mean_square(prior, form) / installed**2 - 1.0) * prior
         found.append(Fleet(mechanism, names, known, form, aim, sigma, labels))
     return found
+
+
+def _mean_square(information: FloatArray, form: FloatArray) -> float:
+    """Expected squared beam error of heliostats that can serve their aim, rad²."""
+    counts = form.any(axis=(1, 2))
+    square = np.einsum("npq,nqp->n", form[counts], np.linalg.inv(information[counts]))
+    return float(square.mean()) if counts.any() else np.nan
 
 
 def _of(made: Sightings, rows: list[int], total: int) -> Sightings:

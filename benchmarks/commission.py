@@ -1,0 +1,288 @@
+"""A commissioning plan beside what comes true: the plan's visits made by simulated mirrors.
+
+Every visit of the plan is made at its time: the mirror aims by what is believed, its true mechanism
+sends the beam, the photograph has the noise of the plan, and the real fit takes all its sightings.
+"true" are percentiles over the mirrors of their true beam errors over the suns of the year.
+"""
+
+import time
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+import numpy as np
+
+from benchmarks._run import Result, Row
+from heliotrope import sun as solar
+from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.fit.estimator import fit
+from heliotrope.calibration.plan.commission import (
+    CommissionPlan,
+    CommissionTerms,
+    Visit,
+    mirrors_of,
+    plan_commission,
+)
+from heliotrope.calibration.plan.fleets import Fleet, fleets_of
+from heliotrope.calibration.plan.percentiles import error_percentiles
+from heliotrope.calibration.plan.planning import aim_at
+from heliotrope.calibration.sightings import Sightings, camera_target, drone, join, sightings
+from heliotrope.calibration.uncertainty import suns_of_year
+from heliotrope.field.layouts import malan_plant
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray, reflect, tangent_axes
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.tracking import track
+
+START = datetime(2026, 9, 1, 22, 0, tzinfo=UTC).timestamp()
+INSTALLED, GOAL, DAYS = 15e-3, 6e-4, 3
+#: Accuracy of a pose that a drone measured, rad of beam, and the spread of its directions.
+_FLOWN, _POSES = 8e-4, 9
+
+
+@dataclass
+class Commissioned:
+    """Mirrors that follow a plan.
+
+    Attributes
+    ----------
+    plant, fleet
+        The plant, and what was known of its heliostats before.
+    truth, believed
+        Mechanisms, (N,).
+    covariance
+        Of the fitted parameters, (N, P, P).
+    """
+
+    plant: Plant
+    fleet: Fleet
+    terms: CommissionTerms
+    truth: Mechanism
+    chance: np.random.Generator
+
+    def __post_init__(self) -> None:
+        self.nominal = self.believed = self.fleet.mechanism
+        self.covariance = np.linalg.inv(self.fleet.information)
+        spread = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)).mean(axis=0)
+        self.priors = dict(zip(self.fleet.names, spread.tolist(), strict=True))
+        self.values = np.zeros((len(self.truth), len(self.fleet.names)))
+        self.made: Sightings | None = None
+        self.suns = suns_of_year(self.plant.site, 2026, days=4, hours=2.0)
+
+    @classmethod
+    def begin(
+        cls, plant: Plant, fleet: Fleet, terms: CommissionTerms, seed: int = 0
+    ) -> "Commissioned":
+        """Return mirrors whose true parameters are drawn from what is known of them."""
+        chance = np.random.default_rng(seed)
+        spread = np.sqrt(np.diagonal(np.linalg.inv(fleet.information), axis1=1, axis2=2))
+        drawn = spread * chance.standard_normal(spread.shape)
+        truth = fleet.mechanism.with_parameters(dict(zip(fleet.names, drawn.T, strict=True)))
+        return cls(plant, fleet, terms, truth, chance)
+
+    def fly(self) -> None:
+        """Measure every mirror as a drone does: poses over the sky, before there is any sun."""
+        count = len(self.truth)
+        points = self.chance.uniform((-1.0, -1.0, 0.4), (1.0, 1.0, 1.2), (count * _POSES, 3))
+        towards = points / np.linalg.norm(points, axis=1)[:, None]
+        rows = np.repeat(np.arange(count), _POSES)
+        place = self.nominal.position[rows] + 150.0 * towards
+        solved = track(self.nominal[rows], towards, place)
+        good = np.flatnonzero(solved.reachable)
+        rows, place, counts = rows[good], place[good], solved.best_counts[good]
+        pose = self.truth[rows].pose(counts)
+        # A drone sees the normal: it hovers on it, up to the noise.
+        away = np.linalg.norm(place - pose.vertex, axis=1)[:, None]
+        noise = self.chance.standard_normal((len(rows), 2)) * 0.5 * _FLOWN
+        normal = pose.normal + np.einsum("nk,nkx->nx", noise, tangent_axes(pose.normal))
+        seen = pose.vertex + away * normal / np.linalg.norm(normal, axis=1)[:, None]
+        self._learn(drone(rows, counts, seen, seen, sigma=_FLOWN))
+
+    def visit(self, visits: list[Visit]) -> None:
+        """Make visits, and fit their mirrors."""
+        parts = []
+        for visit in visits:
+            rows = visit.heliostats
+            when = np.full(len(rows), 0.5 * (visit.begin + visit.end))
+            suns = solar.vector(when, self.plant.site)
+            target = self.plant.targets[visit.target]
+            aimed = aim_at(self.believed[rows], suns, target, self.terms.limits)
+            pose = self.truth[rows].pose(aimed.counts)
+            ray = reflect(suns, pose.normal)
+            sigma = self.terms.accuracy(visit.joint)
+            noise = sigma * self.chance.standard_normal((len(rows), 2))
+            ray = ray + np.einsum("nk,nkx->nx", noise, tangent_axes(ray))
+            seen = target.intersect(pose.vertex, ray / np.linalg.norm(ray, axis=1)[:, None])
+            good = np.isfinite(seen).all(axis=1) & aimed.able
+            parts.append(
+                camera_target(
+                    rows[good],
+                    aimed.counts[good],
+                    suns[good],
+                    seen[good],
+                    time=when[good],
+                    sigma=sigma,
+                )
+            )
+        if parts:
+            self._learn(join(parts))
+
+    def _learn(self, new: Sightings) -> None:
+        self.made = new if self.made is None else join([self.made, new])
+        rows = np.unique(new.heliostat)
+        number = np.full(len(self.truth), -1, dtype=np.intp)
+        number[rows] = np.arange(len(rows))
+        mine = self.made.take(np.flatnonzero(number[self.made.heliostat] >= 0))
+        found = fit(
+            self.nominal[rows],
+            mine.renumbered(number[mine.heliostat]),
+            self.fleet.names,
+            priors=self.priors,
+            loss="square",
+            adapt_scale=False,
+        )
+        self.covariance[rows] = found.covariance
+        self.values[rows] = found.values
+        self.believed = self.nominal.with_parameters(
+            dict(zip(self.fleet.names, self.values.T, strict=True))
+        )
+
+    def true(self) -> FloatArray:
+        """Return the true RMS beam error of the mirrors over the suns of the year, rad, (N,)."""
+        total, count = np.zeros((2, len(self.truth)))
+        aim = self.fleet.aim
+        for sun in self.suns:
+            solved = track(self.believed, sun, aim)
+            good = np.flatnonzero(solved.reachable)
+            seen = sightings(
+                np.arange(len(good)),
+                solved.best_counts[good],
+                np.broadcast_to(sun, (len(good), 3)),
+                aim[good],
+            )
+            off = beam_errors(self.truth[good], seen).offset
+            total[good] += np.sum(off**2, axis=-1)
+            count[good] += 1.0
+        mean = total[count > 0] / count[count > 0]
+        return np.asarray(np.sqrt(mean + self.terms.floor**2))
+
+    def percentiles(self) -> tuple[FloatArray, FloatArray]:
+        """Return the believed and the true 50th and 90th percentile, rad, (2,) each."""
+        believed = error_percentiles(
+            self.fleet.form, self.covariance, (0.5, 0.9), self.terms.floor**2
+        )
+        return believed, np.quantile(self.true(), (0.5, 0.9))
+
+
+def come_true(
+    plan: CommissionPlan, mirrors: Commissioned, looks: int = 6
+) -> list[tuple[float, FloatArray, FloatArray, FloatArray]]:
+    """Make the visits of a plan; return time, predicted, believed and true percentiles.
+
+    Parameters
+    ----------
+    plan, mirrors
+        The plan, and the mirrors.
+    looks
+        Comparisons, spread evenly over the intervals.
+    """
+    found = []
+    when = np.unique(np.linspace(0, len(plan.time) - 1, looks + 1).round().astype(int))[1:]
+    begins = np.array([visit.begin for visit in plan.visits])
+    for k in range(1, len(plan.time)):
+        now = np.flatnonzero((begins >= plan.time[k - 1]) & (begins < plan.time[k]))
+        mirrors.visit([plan.visits[i] for i in now])
+        if k in when:
+            found.append((float(plan.time[k]), plan.percentiles[k], *mirrors.percentiles()))
+    return found
+
+
+@dataclass(frozen=True)
+class _Case:
+    """A way to commission a field; ``flown`` has a drone's flight before the first day."""
+
+    name: str
+    terms: CommissionTerms
+    flown: bool = False
+
+
+def _cases(quick: bool) -> list[_Case]:
+    alone = CommissionTerms(goal=GOAL)
+    joint = {
+        n: replace(alone, together=n, steps=16 if n <= 25 else 32, first_alone=True)
+        for n in (25, 50)
+    }
+    found = replace(joint[25], first_alone=False, likely=0.2)
+    cases = [
+        _Case("one at a time", alone),
+        _Case("one at a time, one photograph", replace(alone, shots=1)),
+        _Case("25 together, first visits alone", joint[25]),
+        _Case("25 together, first visits too", found),
+        _Case("50 together, first visits too", replace(joint[50], first_alone=False, likely=0.2)),
+        _Case("25 together after a drone", joint[25], flown=True),
+        _Case("50 together after a drone", joint[50], flown=True),
+    ]
+    return cases[3:4] if quick else cases
+
+
+def _row(case: _Case, plant: Plant, fleet: Fleet, quick: bool) -> Row:
+    mirrors = Commissioned.begin(plant, fleet, case.terms)
+    if case.flown:
+        mirrors.fly()
+        fleet = replace(fleet, information=np.linalg.inv(mirrors.covariance))
+    begin = time.perf_counter()
+    plan = plan_commission(
+        [fleet],
+        plant.site,
+        plant.targets,
+        START,
+        START + DAYS * 86400.0,
+        size=2.5,
+        measured=case.flown,
+        terms=case.terms,
+    )
+    planned = time.perf_counter() - begin
+    looks = come_true(plan, mirrors, 1 if quick else 3)
+    _, predicted, believed, true = looks[-1]
+    later = [v for v in plan.visits if not v.first]
+    busy = sum(v.end - v.begin for v in later)
+    return {
+        "case": case.name,
+        "visits": len(plan.visits),
+        "sightings": mirrors_of(plan.visits),
+        "never_measured": plan.unseen,
+        "later_mirrors_an_hour_and_target": round(3600.0 * mirrors_of(later) / max(busy, 1.0)),
+        "goal_after_h_of_sun": _sun_hours(plan),
+        "predicted_50_90_mrad": _pair(predicted),
+        "believed_50_90_mrad": _pair(believed),
+        "true_50_90_mrad": _pair(true),
+        "true_over_predicted_90": round(float(true[1] / predicted[1]), 3),
+        "plan_s": round(planned, 1),
+    }
+
+
+def _pair(values: FloatArray) -> str:
+    return f"{1e3 * values[0]:.2f} {1e3 * values[1]:.2f}"
+
+
+def _sun_hours(plan: CommissionPlan) -> float | None:
+    """Hours of sun until the goal."""
+    if plan.reached is None:
+        return None
+    used = sum(max(0.0, min(end, plan.reached) - begin) for begin, end in plan.days)
+    return round(used / 3600.0, 1)
+
+
+def run(quick: bool) -> Result:
+    """Compare the predictions of several plans with what comes true."""
+    plant = malan_plant(120 if quick else 10_000)
+    (fleet,) = fleets_of(plant, year=2026, model="malan8", installed=INSTALLED)
+    rows = [_row(case, plant, fleet, quick) for case in _cases(quick)]
+    ratios = [float(row["true_over_predicted_90"] or 0.0) for row in rows]
+    worst = max(ratios, key=lambda r: abs(np.log(max(r, 1e-9))))
+    return Result(
+        rows,
+        f"{len(plant):,} mirrors at {1e3 * INSTALLED:.0f} mrad: the true 90th percentile is "
+        f"{worst:.2f} of the predicted one at worst",
+        {"heliostats": len(plant), "days": DAYS, "goal_mrad": 1e3 * GOAL},
+        within_budget=abs(worst - 1.0) <= 0.2,
+    )

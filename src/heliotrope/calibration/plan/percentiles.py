@@ -1,0 +1,56 @@
+"""Percentiles of the beam errors of a field, predicted from what is known of its mirrors.
+
+The true squared error of a mirror, averaged over the suns of the year, is eᵀ F e with e ~ N(0, C):
+a sum of squares with mean tr(F C) and variance 2 tr((F C)²). A gamma distribution of this mean and
+variance stands for it (Satterthwaite 1946, for sums of mean squares); the field is their mixture.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import gammainc
+
+from heliotrope.geometry import FloatArray
+
+#: Halvings of the interval: to 1e-6 of the field's largest error.
+_STEPS = 24
+
+
+def error_percentiles(
+    form: FloatArray, covariance: FloatArray, shares: Sequence[float], common: float = 0.0
+) -> FloatArray:
+    """Return percentiles of the field's RMS beam errors over the suns of the form, rad.
+
+    Parameters
+    ----------
+    form, covariance
+        (N, P, P); heliostats with form 0 do not count.
+    shares
+        0 to 1; 0.5 is the median.
+    common
+        Squared error that every mirror has besides, rad².
+
+    Notes
+    -----
+    Within 3 % of percentiles of drawn errors, from one parameter left to all
+    (`tests/calibration/test_commission.py`).
+    """
+    product = form @ covariance
+    mean = np.trace(product, axis1=1, axis2=2)
+    spread = 2.0 * np.einsum("npq,nqp->n", product, product)
+    counts = (mean > 0.0) & (spread > 0.0)
+    if not counts.any():
+        return np.full(len(shares), np.sqrt(common))
+    shape, scale = mean[counts] ** 2 / spread[counts], spread[counts] / mean[counts]
+    found = []
+    for share in shares:
+        low, high = 0.0, float(mean.max()) * 100.0
+        # The errors of a field span decades: halve the root of the interval, not the interval.
+        for _ in range(_STEPS):
+            middle = (0.5 * (np.sqrt(low) + np.sqrt(high))) ** 2
+            if float(np.mean(gammainc(shape, middle / scale))) < share:
+                low = middle
+            else:
+                high = middle
+        found.append(np.sqrt(high + common))
+    return np.array(found)

@@ -1,0 +1,204 @@
+"""Commissioning: nothing in two places, the prediction beside drawn and simulated mirrors."""
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.commission import START, Commissioned, come_true
+
+from heliotrope import sun
+from heliotrope.calibration.plan import commission_report
+from heliotrope.calibration.plan.commission import (
+    CommissionPlan,
+    CommissionTerms,
+    chance_on_target,
+    mirrors_of,
+    plan_commission,
+)
+from heliotrope.calibration.plan.fleets import Fleet, fleets_of
+from heliotrope.calibration.plan.percentiles import error_percentiles
+from heliotrope.errors import InputError
+from heliotrope.field.layouts import malan_plant
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
+
+DAY, HALF = 86400.0, 43200.0
+TOGETHER = CommissionTerms(together=6, first_alone=False, likely=0.3, goal=1e-5, every=3600.0)
+
+
+@pytest.fixture(scope="module")
+def plant() -> Plant:
+    return malan_plant(60)
+
+
+@pytest.fixture(scope="module")
+def fleet(plant: Plant) -> Fleet:
+    return fleets_of(plant, year=2026, model="malan8", installed=15e-3)[0]
+
+
+def _plan(plant: Plant, fleet: Fleet, terms: CommissionTerms, span: float = DAY) -> CommissionPlan:
+    return plan_commission(
+        [fleet], plant.site, plant.targets, START, START + span, size=2.5, terms=terms
+    )
+
+
+@pytest.fixture(scope="module")
+def joint(plant: Plant, fleet: Fleet) -> CommissionPlan:
+    return _plan(plant, fleet, TOGETHER)
+
+
+def test_priors_are_scaled_to_the_installation(fleet: Fleet) -> None:
+    square = np.einsum("npq,nqp->n", fleet.form, np.linalg.inv(fleet.information))
+    assert np.sqrt(square.mean()) == pytest.approx(15e-3, rel=1e-9)
+
+
+@pytest.mark.parametrize("rank", [1, 2, 8])
+def test_percentiles_are_those_of_drawn_errors(rank: int) -> None:
+    """From one unknown parameter, a chi-square of one degree, to eight of like size."""
+    chance = np.random.default_rng(rank)
+    count = 20_000
+    root = chance.normal(0.0, 1.0, (count, 8, rank)) * chance.lognormal(0.0, 0.5, (count, 1, 1))
+    covariance = 1e-6 * root @ np.swapaxes(root, 1, 2)
+    slope = chance.normal(0.0, 1.0, (8, 8))
+    form = np.broadcast_to(slope.T @ slope, (count, 8, 8))
+    error = 1e-3 * np.einsum("npr,nr->np", root, chance.standard_normal((count, rank)))
+    drawn = np.sqrt(np.einsum("np,npq,nq->n", error, form, error))
+    found = error_percentiles(form, covariance, (0.5, 0.9))
+    np.testing.assert_allclose(found, np.quantile(drawn, (0.5, 0.9)), rtol=0.03)
+
+
+def test_what_every_mirror_has_stays_when_everything_is_known() -> None:
+    found = error_percentiles(np.eye(3)[None], np.zeros((1, 3, 3)), (0.5, 0.9), common=4e-8)
+    np.testing.assert_allclose(found, 2e-4)
+
+
+def test_no_target_and_no_heliostat_is_taken_twice(plant: Plant, joint: CommissionPlan) -> None:
+    assert {v.target for v in joint.visits} == {0, 1}
+    assert max(len(v.heliostats) for v in joint.visits) == TOGETHER.together
+    spans = [(v.begin, v.end, ("target", v.target)) for v in joint.visits]
+    spans += [(v.begin, v.end, ("mirror", i)) for v in joint.visits for i in v.heliostats.tolist()]
+    by_place: dict[tuple[str, int], list[tuple[float, float]]] = {}
+    for begin, end, place in spans:
+        by_place.setdefault(place, []).append((begin, end))
+    for rows in by_place.values():
+        rows.sort()
+        assert all(b[0] >= a[1] - 1e-6 for a, b in pairwise(rows))
+    for visit in joint.visits:
+        assert len(set(visit.heliostats.tolist())) == len(visit.heliostats)
+        assert visit.end - visit.begin >= (TOGETHER.joint if visit.joint else TOGETHER.alone)
+    times = np.array([t for v in joint.visits for t in (v.begin, v.end)])
+    low = float(sun.position(times, plant.site).elevation.min())
+    assert low >= TOGETHER.limits.min_elevation - 1e-3
+
+
+def test_the_time_of_targets_is_accounted_for(joint: CommissionPlan) -> None:
+    whole = 2.0 * sum(end - begin for begin, end in joint.days)
+    assert sum(joint.seconds.values()) == pytest.approx(whole, rel=1e-9)
+    used = sum(v.end - v.begin for v in joint.visits)
+    assert used == pytest.approx(whole - joint.seconds["idle"], rel=1e-9)
+
+
+def test_the_curve_falls_and_begins_at_the_installation(joint: CommissionPlan) -> None:
+    assert joint.rms[0] == pytest.approx(15e-3, rel=1e-6)
+    assert (np.diff(joint.percentiles, axis=0) <= 1e-9).all()
+    assert joint.percentiles[-1, 1] < 1e-3
+
+
+def test_the_prediction_comes_true(plant: Plant, fleet: Fleet, joint: CommissionPlan) -> None:
+    """True mechanisms, aimed by what is believed, and the real fit: median of 60 mirrors."""
+    mirrors = Commissioned.begin(plant, fleet, TOGETHER, seed=4)
+    before = np.quantile(mirrors.true(), 0.5)
+    assert before == pytest.approx(joint.percentiles[0, 0], rel=0.25)
+    _, predicted, believed, true = come_true(joint, mirrors, looks=1)[-1]
+    np.testing.assert_allclose(believed, predicted, rtol=0.15)
+    # Percentiles of 60 mirrors scatter by 8 to 12 %.
+    np.testing.assert_allclose(true, predicted, rtol=0.3)
+
+
+def test_visits_together_are_more_and_bring_more(plant: Plant, fleet: Fleet) -> None:
+    quarter = replace(TOGETHER, every=900.0)
+    many = _plan(plant, fleet, quarter, HALF)
+    alone = _plan(plant, fleet, replace(quarter, together=1), HALF)
+    assert mirrors_of(many.visits) > 2 * mirrors_of(alone.visits)
+    assert many.percentiles[-1, 1] < alone.percentiles[-1, 1]
+    assert not any(v.joint for v in alone.visits)
+
+
+def test_first_visits_are_made_alone_unless_allowed(plant: Plant, fleet: Fleet) -> None:
+    wary = _plan(plant, fleet, replace(TOGETHER, first_alone=True), HALF)
+    assert not any(v.joint for v in wary.visits if v.first)
+    assert any(v.joint for v in wary.visits if not v.first)
+
+
+def test_the_goal_ends_the_plan(plant: Plant, fleet: Fleet, joint: CommissionPlan) -> None:
+    goal = 1.5e-3
+    plan = _plan(plant, fleet, replace(TOGETHER, goal=goal))
+    assert plan.reached == plan.time[-1] < joint.time[-1]
+    assert plan.percentiles[-1, 1] <= goal < plan.percentiles[-2, 1]
+    assert "goal of 1.50 mrad reached on day 1, 2026-09-02" in commission_report.sentence(plan)
+
+
+def test_the_floor_and_the_clouds_are_told(plant: Plant, fleet: Fleet) -> None:
+    plan = _plan(plant, fleet, replace(TOGETHER, repeat=8e-4, goal=6e-4, clear=0.5), HALF)
+    assert plan.percentiles[-1, 0] >= plan.terms.floor
+    assert "1.13 mrad stay however often" in commission_report.sentence(plan)
+    begin, end = plan.days[0]
+    assert sum(plan.seconds.values()) == pytest.approx(2.0 * 0.5 * (end - begin), rel=1e-9)
+
+
+def test_slow_visits_leave_heliostats_unmeasured(plant: Plant, fleet: Fleet) -> None:
+    plan = _plan(plant, fleet, CommissionTerms(settle=3000.0, every=7200.0), HALF)
+    assert plan.unseen == 60 - mirrors_of(v for v in plan.visits if v.first) > 0
+    text = commission_report.sentence(plan)
+    assert f"{plan.unseen} heliostats never measured" in text
+
+
+def test_a_beam_that_may_miss_is_less_likely_on_the_target(plant: Plant) -> None:
+    def chance(spread: float) -> FloatArray:
+        count = len(plant)
+        wide = np.full(count, 2.5)
+        return chance_on_target(plant.targets[0], plant.position, wide, np.full(count, spread**2))
+
+    assert (chance(1e-4) > 0.999).all()
+    assert (chance(30e-3) < chance(15e-3)).all()
+
+
+def test_tables_and_page_hold_every_visit(
+    plant: Plant, joint: CommissionPlan, tmp_path: Path
+) -> None:
+    targets = [t.name for t in plant.targets]
+    rows = commission_report.visit_rows(joint, plant.names, targets)
+    hours = commission_report.hour_rows(joint, targets)
+    assert len(rows) == mirrors_of(joint.visits) == sum(row["mirrors"] for row in hours)
+    document = commission_report.document(joint, plant.names, targets)
+    assert sum(len(v["heliostats"]) for v in document["visits"]) == len(rows)
+    commission_report.write_page(tmp_path / "page.html", joint, plant.name, targets)
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert commission_report.sentence(joint) in page
+    assert "data:image/png;base64," in page
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"together": 0}, "0 mirrors together"),
+        ({"likely": 0.0}, "likely 0.0: give 0 to 1, not 0"),
+        ({"worth": 1.0}, "worth 1.0: give a share"),
+        ({"sigma": 0.0}, "sigma 0.0 must be above 0"),
+        ({"repeat": -1.0}, "repeat -1.0 must be 0 or more"),
+    ],
+)
+def test_terms_that_make_no_sense_are_refused(change: dict[str, float], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        CommissionTerms(**change)  # type: ignore[arg-type]
+
+
+def test_a_span_without_sun_or_targets_is_refused(plant: Plant, fleet: Fleet) -> None:
+    with pytest.raises(InputError, match="the sun never reaches 15°"):
+        _plan(plant, fleet, TOGETHER, 3600.0)
+    with pytest.raises(InputError, match="give a span of up to a year"):
+        _plan(plant, fleet, TOGETHER, 400.0 * DAY)
+    with pytest.raises(InputError, match="at least one target"):
+        plan_commission([fleet], plant.site, (), START, START + DAY)
