@@ -6,6 +6,7 @@
 - `photograph`: read one photograph; `campaign`: many, into sightings; `memory`: models of empty
   targets; `log`: facts about photographs; `annotate`: draw the result.
 - `lens`: calibrate lenses; `pose`: locate cameras. The camera model is `heliotrope.field.camera`.
+- `coded`: many beams on one target at once, told apart by coded movements.
 - `motion`: did a beam move between two frames?
 - `synthetic`: rendered frames with exact truth. Simulations import it themselves.
 

@@ -1,0 +1,202 @@
+"""Beams fitted to the pictures of their movements."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.coded._bells import moved, slope_derivatives
+from heliotrope.imaging.coded._tops import Top
+from heliotrope.imaging.coded.beams import ExpectedBeam
+from heliotrope.imaging.coded.stack import Light, Stack, light_of
+
+#: Least significance of a movement.
+SIGNIFICANT = 8.0
+#: Codes that lost photographs must keep this share of their independence.
+_INDEPENDENT = 0.02
+#: Window of the fit, in standard deviations of the beam.
+_WINDOW = 3.5
+#: Share of the correction by moments that counts as error.
+_CORRECTED = 0.25
+#: A beam's moments change by at most this factor in a step, and its width in all.
+_CHANGE, _WIDEST = 1.5, 4.0
+_STEPS = 6
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A beam that moves by its code.
+
+    Attributes
+    ----------
+    power
+        Brightness m².
+    place
+        m, (2,).
+    moments
+        Second moments, m², (2, 2).
+    covariance
+        Of the place, m², (2, 2).
+    power_sigma
+        Standard deviation of ``power``.
+    """
+
+    power: float
+    place: FloatArray
+    moments: FloatArray
+    covariance: FloatArray
+    power_sigma: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """All beams of a stack.
+
+    Attributes
+    ----------
+    fits
+        M; None if nothing follows the code.
+    light
+        Light of the photographs.
+    mean
+        Mean picture, as if no beam moved, (N,).
+    """
+
+    fits: tuple[Fit | None, ...]
+    light: Light
+    mean: FloatArray
+
+
+def regression(moves: FloatArray, weights: FloatArray) -> FloatArray | None:
+    """Return the rows (2 M, K) that turn pixels' series into changes per metre of movement.
+
+    None if the codes depend on each other over the photographs that count.
+    """
+    codes = moves.reshape(len(moves), -1)
+    codes = codes - weights @ codes / weights.sum()
+    normal = codes.T @ (weights[:, None] * codes)
+    size = np.sqrt(np.diag(normal))
+    if not (size > 0.0).all():
+        return None
+    if np.linalg.eigvalsh(normal / np.outer(size, size))[0] < _INDEPENDENT:
+        return None
+    # Against the weighted mean, which the regression takes away from the series, too.
+    rows = np.linalg.solve(normal, codes.T * weights)
+    return np.asarray(rows - rows.sum(axis=1, keepdims=True) * weights / weights.sum())
+
+
+def fitted(
+    stack: Stack,
+    values: FloatArray,
+    empty: FloatArray | None,
+    moves: FloatArray,
+    expected: Sequence[ExpectedBeam],
+    tops: Sequence[Top],
+) -> Fitted:
+    """Fit the beams of a stack by Gauss and Newton.
+
+    The residual is exact: what the photographs show beyond beams that moved as ordered. Each
+    mirror is improved from its own two pictures of that residual.
+    """
+    points = np.stack(np.meshgrid(*stack.axes), axis=-1)[stack.seen]
+    fits: list[Fit | None] = [
+        Fit(top.power, top.place, np.array(beam.second_moments, dtype=np.float64), np.eye(2))
+        if top.significance >= SIGNIFICANT
+        else None
+        for top, beam in zip(tops, expected, strict=True)
+    ]
+    start = list(fits)
+    for step in range(_STEPS + 1):
+        change = np.zeros_like(values)
+        for i, fit in enumerate(fits):
+            if fit is not None:
+                change += fit.power * moved(points, fit.place, fit.moments, moves[:, i])
+        light = light_of(values, empty, change)
+        rows = regression(moves, light.weights)
+        if rows is None:
+            # The light of a photograph near the limit has changed: nothing is proven.
+            return Fitted((None,) * len(fits), light, light.mean)
+        rest = light.pictures - change
+        mean = light.weights @ rest / light.weights.sum()
+        rest -= mean
+        pictures = (rows @ rest).reshape(len(fits), 2, -1)
+        last = step == _STEPS
+        variance = _variance(rest, light.weights) if last else np.empty(0)
+        for i, fit in enumerate(fits):
+            first = start[i]
+            if fit is None or first is None:
+                continue
+            window = _window(points, fit)
+            if last:
+                noise = variance[window] * float((rows[2 * i : 2 * i + 2] ** 2).sum(axis=1).mean())
+                fits[i] = _measured(points[window], pictures[i][:, window], fit, noise, stack.step)
+            else:
+                fits[i] = _improved(points[window], pictures[i][:, window], fit, first)
+    return Fitted(tuple(fits), light, mean)
+
+
+def _variance(rest: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the variance of a pixel in one photograph of the usual light, (N,)."""
+    used = weights > 0.0
+    spread = (weights[used, None] * rest[used] ** 2).sum(axis=0)
+    return np.asarray(spread / max(int(used.sum()) - 1, 1))
+
+
+def _window(points: FloatArray, fit: Fit) -> npt.NDArray[np.bool_]:
+    d = points - fit.place
+    return np.asarray(np.einsum("ni,ni->n", d @ np.linalg.inv(fit.moments), d) < _WINDOW**2)
+
+
+def _improved(points: FloatArray, picture: FloatArray, fit: Fit, first: Fit) -> Fit:
+    """Return a fit improved by one step, which is bounded."""
+    if len(points) < 12:
+        return fit
+    terms = slope_derivatives(points, fit.place, fit.moments, fit.power).reshape(6, -1)
+    scale = np.sqrt((terms**2).sum(axis=1))
+    scale[scale == 0.0] = 1.0
+    step = np.linalg.lstsq((terms / scale[:, None]).T, picture.ravel(), rcond=1e-6)[0] / scale
+    radius = float(np.sqrt(0.5 * np.trace(fit.moments)))
+    length = float(np.hypot(*step[1:3]))
+    place = fit.place + step[1:3] * min(1.0, 0.5 * radius / max(length, 1e-12))
+    moments = fit.moments + np.array([[step[3], step[4]], [step[4], step[5]]])
+    power = float(np.clip(fit.power + step[0], fit.power / 1.5, fit.power * 1.5))
+    return replace(fit, power=power, place=place, moments=_bounded(moments, fit, first))
+
+
+def _bounded(moments: FloatArray, fit: Fit, first: Fit) -> FloatArray:
+    """Return moments that differ from the last and the first ones by no more than a factor."""
+    for base, factor in ((fit.moments, _CHANGE**2), (first.moments, _WIDEST**2)):
+        root = np.linalg.cholesky(base)
+        inverse = np.linalg.inv(root)
+        values, vectors = np.linalg.eigh(inverse @ moments @ inverse.T)
+        values = np.clip(values, 1.0 / factor, factor)
+        moments = root @ (vectors * values) @ vectors.T @ root.T
+    return np.asarray(0.5 * (moments + moments.T))
+
+
+def _measured(
+    points: FloatArray, picture: FloatArray, fit: Fit, noise: FloatArray, step: float
+) -> Fit:
+    """Return a fit with its covariance, its place corrected by the moments of what it leaves.
+
+    With x from the fitted place, ∫ x² Gₓ = ∫ 2 x y G_y = 2 p x̄ for any shape; 4 : 3 is the best
+    weight of the two in a round window with even noise.
+    """
+    x, y = (points - fit.place).T
+    area = step**2 / fit.power
+    cross = 3.0 / 7.0 * x * y
+    levers = area * np.array([[2.0 / 7.0 * x**2, cross], [cross, 2.0 / 7.0 * y**2]])
+    shift = np.einsum("ian,an->i", levers, picture)
+    by_moments = np.einsum("ian,n,jan->ij", levers, noise, levers)
+    terms = slope_derivatives(points, fit.place, fit.moments, fit.power).reshape(6, -1)
+    scale = np.maximum(np.sqrt((terms**2).sum(axis=1)), 1e-300)
+    inverse = np.linalg.pinv((terms / scale[:, None]).T) / scale[:, None]
+    by_fit = (inverse * np.tile(noise, 2)) @ inverse.T
+    return replace(
+        fit,
+        place=fit.place + shift,
+        covariance=by_moments + _CORRECTED**2 * np.outer(shift, shift),
+        power_sigma=float(np.sqrt(by_fit[0, 0])),
+    )

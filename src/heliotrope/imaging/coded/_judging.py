@@ -1,0 +1,120 @@
+"""What a stack proves about each mirror."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.coded._fitting import Fit
+from heliotrope.imaging.coded._still import StillLight
+from heliotrope.imaging.coded._tops import Top
+from heliotrope.imaging.coded.beams import ExpectedBeam, SeparatedBeam, Verdict
+
+#: A second top that moves by the same code, as a share of the first.
+_SECOND = 0.45
+#: Square of the distance within which 99.9 % of a two-dimensional Gaussian lie.
+_GATE = 2.0 * float(np.log(1000.0))
+#: A gain farther from 1 than this, and than this many σ, is wrong.
+_GAIN, _GAIN_SIGMAS = 0.3, 3.0
+#: A mirror that does not move has this share of the usual beam at its expected place.
+_STANDS = 0.4
+#: Error of powers by the shape of beams, relative.
+_SHAPE = 0.05
+
+
+def lost(beam: ExpectedBeam, verdict: Verdict, power: float = 0.0) -> SeparatedBeam:
+    """Return a beam that was not found."""
+    unknown = np.full((2, 2), np.nan)
+    gain = 0.0 if verdict is Verdict.STUCK else float("nan")
+    return SeparatedBeam(
+        beam.heliostat, verdict, np.full(2, np.nan), unknown, unknown, power, gain, float("nan")
+    )
+
+
+def judged(
+    expected: Sequence[ExpectedBeam],
+    tops: Sequence[Top],
+    fits: Sequence[Fit | None],
+    still: StillLight | None,
+) -> tuple[SeparatedBeam, ...]:
+    """Return each mirror's beam with its verdict.
+
+    Parameters
+    ----------
+    expected, tops, fits
+        M mirrors.
+    still
+        Light at rest; None where other light hides it.
+    """
+    return tuple(_one(i, expected, tops, fits, still) for i in range(len(expected)))
+
+
+def _one(
+    index: int,
+    expected: Sequence[ExpectedBeam],
+    tops: Sequence[Top],
+    fits: Sequence[Fit | None],
+    still: StillLight | None,
+) -> SeparatedBeam:
+    beam, fit = expected[index], fits[index]
+    if fit is None:
+        stands = still is not None and _stands(beam, float(still.powers[index]), still)
+        return lost(beam, Verdict.STUCK if stands else Verdict.FAINT)
+    gain, sigma = _gain(index, fit, beam, still)
+    verdict, other = Verdict.PROVEN, ""
+    if not _within(fit, beam):
+        verdict = Verdict.ELSEWHERE
+        for j, (candidate, found) in enumerate(zip(expected, fits, strict=True)):
+            missing = found is None or not _within(found, candidate)
+            if j != index and missing and _within(fit, candidate):
+                verdict, other = Verdict.EXCHANGED, candidate.heliostat
+                break
+    elif tops[index].second > _SECOND or _wrong(gain, sigma):
+        verdict = Verdict.JOINED
+    return SeparatedBeam(
+        beam.heliostat,
+        verdict,
+        fit.place,
+        fit.covariance,
+        fit.moments,
+        fit.power,
+        gain,
+        sigma,
+        other,
+    )
+
+
+def _wrong(gain: float, sigma: float) -> bool:
+    """Return whether light rests at a beam's place, or more of it moves than is there."""
+    return bool(abs(gain - 1.0) > max(_GAIN, _GAIN_SIGMAS * sigma))
+
+
+def _stands(beam: ExpectedBeam, power: float, still: StillLight) -> bool:
+    """Return whether light rests where a mirror's beam is expected."""
+    if power > _STANDS * still.usual:
+        return True
+    away = [_distance(place - beam.place, beam.covariance) for place in still.uncoded]
+    return bool(min(away, default=np.inf) < _GATE)
+
+
+def _gain(
+    index: int, fit: Fit, beam: ExpectedBeam, still: StillLight | None
+) -> tuple[float, float]:
+    """Return the light that moves over the light that is there, and its standard deviation."""
+    if still is None:
+        there, share = beam.power, beam.power_sigma
+    else:
+        there = float(still.powers[index])
+        share = float(still.sigmas[index]) / max(there, 1e-300)
+    if not there > 0.0:
+        return float("nan"), float("nan")
+    gain = fit.power / there
+    return gain, gain * float(np.sqrt(share**2 + (fit.power_sigma / fit.power) ** 2 + _SHAPE**2))
+
+
+def _within(fit: Fit, beam: ExpectedBeam) -> bool:
+    return _distance(fit.place - beam.place, fit.covariance + beam.covariance) < _GATE
+
+
+def _distance(away: FloatArray, covariance: FloatArray) -> float:
+    return float(away @ np.linalg.solve(covariance, away))

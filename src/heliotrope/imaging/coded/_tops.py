@@ -1,0 +1,78 @@
+"""The place of a beam in the pictures of its movement, by a matched filter."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.coded._bells import slopes
+from heliotrope.imaging.coded.stack import Stack
+
+#: Two tops of one code are at least this many standard deviations of a beam apart.
+_APART = 3.0
+
+
+@dataclass(frozen=True)
+class Top:
+    """The strongest beam that moves by a code.
+
+    Attributes
+    ----------
+    place
+        m, (2,).
+    power
+        Brightness m².
+    significance
+        Power in robust standard deviations of the filter over the surface.
+    second
+        Power of the next strongest one, as a share.
+    """
+
+    place: FloatArray
+    power: float
+    significance: float
+    second: float
+
+
+def find_top(stack: Stack, picture: FloatArray, moments: FloatArray) -> Top:
+    """Return the strongest beam in the two pictures (2, N) of a movement.
+
+    Parameters
+    ----------
+    stack
+        Prepared; its seen pixels are the N.
+    picture
+        Change per metre of movement along each axis.
+    moments
+        Expected second moments of the beam, m², (2, 2).
+    """
+    from scipy.signal import fftconvolve
+
+    reach = int(np.ceil(3.0 * np.sqrt(np.trace(moments)) / stack.step))
+    line = stack.step * np.arange(-reach, reach + 1)
+    right, up = np.meshgrid(line, -line)
+    template = slopes(np.stack([right.ravel(), up.ravel()], axis=-1), np.zeros(2), moments).reshape(
+        2, *right.shape
+    )
+    full = np.zeros((2, *stack.seen.shape))
+    full[:, stack.seen] = picture
+    # A convolution turns the template, which is odd.
+    score = -sum(fftconvolve(full[a], template[a], mode="same") for a in range(2))
+    norm = (template**2).sum()
+    power = np.asarray(score / norm)
+    best = np.unravel_index(int(np.argmax(power)), power.shape)
+    x, y = stack.axes
+    place = np.array([x[best[1]], y[best[0]]])
+    spread = float(np.sqrt(0.5 * np.trace(moments)))
+    away = np.hypot(x[None, :] - place[0], y[:, None] - place[1]) > _APART * spread
+    beside = power[away & stack.seen]
+    # The filter's own noise, where this beam is not: half of the pixels lie within 0.674 σ.
+    noise = float(np.median(np.abs(beside))) / 0.674 if beside.size else np.inf
+    top = float(power[best])
+    second = float(beside.max(initial=0.0)) if beside.size else 0.0
+    return Top(
+        place,
+        top,
+        top / max(noise, 1e-300),
+        second / top if top > 0.0 else 0.0,
+    )

@@ -1,0 +1,59 @@
+"""Codes: small movements of many mirrors that no sum of other mirrors' movements imitates."""
+
+import numpy as np
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
+
+#: Fewest and most photographs of a stack.
+_FEWEST, _MOST = 8, 1024
+
+
+def photographs_for(mirrors: int) -> int:
+    """Return the fewest photographs with orthogonal codes for a number of mirrors.
+
+    Each mirror takes two rows of a Hadamard matrix, one for each axis; the row of ones stays free.
+    """
+    if mirrors < 1:
+        raise InputError(f"codes: {mirrors} mirrors; give 1 or more")
+    return max(_FEWEST, 1 << (2 * mirrors).bit_length())
+
+
+def coded_movements(mirrors: int, photographs: int | None = None) -> FloatArray:
+    """Return the movements of mirrors over photographs, -1 or 1, (photographs, mirrors, 2).
+
+    Columns are rows of Sylvester's Hadamard matrix without the row of ones: mean-free and
+    orthogonal to each other. A beam that moves along both axes at once also changes with the
+    product of its two codes, which is a row of the matrix, too: the rows are chosen so that it is
+    the same unused row for all mirrors. The photographs are shuffled, always alike.
+
+    Parameters
+    ----------
+    mirrors
+        Number of mirrors.
+    photographs
+        Power of two; None: `photographs_for`.
+
+    Raises
+    ------
+    InputError
+        If there are too few photographs for orthogonal codes, or they are no power of two.
+    """
+    from scipy.linalg import hadamard
+
+    least = photographs_for(mirrors)
+    count = least if photographs is None else photographs
+    if count < least or count > _MOST or count & (count - 1):
+        raise InputError(
+            f"codes: {count} photographs for {mirrors} mirrors; give a power of two from {least} "
+            f"to {_MOST}"
+        )
+    # Neighbouring photographs differ in all codes, so that a cloud over a few of them, or a slow
+    # drift, is like none of the codes.
+    order = np.random.default_rng(count).permutation(count)
+    rows = hadamard(count).astype(np.float64)[:, order]
+    # Rows j and j + count/2 have the same product for each j: the row count/2.
+    first = 1 + np.arange(mirrors)
+    return np.ascontiguousarray(
+        np.stack([rows[first], rows[first + count // 2]], axis=-1).transpose(1, 0, 2)
+    )

@@ -1,0 +1,124 @@
+"""From a stack of photographs and the codes of its mirrors to the beam of each mirror.
+
+The regression of each pixel's series on the codes gives two pictures for each mirror: the change
+by its movement along either axis. Orthogonal codes separate them even where beams overlap, and
+light that rests is in none of them. A beam of power p at x₀ has the pictures G = -p ∇f(x - x₀);
+their moments give power, ∫ x Gₓ = p, and place, ½ ∫ x² Gₓ = p x₀, without any assumption about its
+shape. A Gaussian is fitted first, which takes care of the finite size of the movements and of
+codes that lost photographs; the moments of what it leaves correct its place.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.coded._fitting import fitted, regression
+from heliotrope.imaging.coded._judging import judged, lost
+from heliotrope.imaging.coded._still import still_light
+from heliotrope.imaging.coded._tops import find_top
+from heliotrope.imaging.coded.beams import ExpectedBeam, SeparatedBeam, Verdict
+from heliotrope.imaging.coded.stack import Stack, light_of
+
+
+@dataclass(frozen=True)
+class Separation:
+    """A stack taken apart.
+
+    Attributes
+    ----------
+    beams
+        One for each mirror, in the order given.
+    factors
+        Light of each photograph, 1 at the median, (K,).
+    used
+        Photographs used, (K,).
+    uncoded
+        Places of other beams that rest on the surface, m, (U, 2).
+    """
+
+    beams: tuple[SeparatedBeam, ...]
+    factors: FloatArray
+    used: npt.NDArray[np.bool_]
+    uncoded: FloatArray
+
+    @property
+    def proven(self) -> tuple[SeparatedBeam, ...]:
+        """Beams that may become sightings."""
+        return tuple(beam for beam in self.beams if beam.verdict is Verdict.PROVEN)
+
+
+def separate(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) -> Separation:
+    """Take a stack of photographs apart into the beam of each mirror.
+
+    Parameters
+    ----------
+    stack
+        K photographs.
+    moves
+        Displacements on the surface that were ordered, m, (K, M, 2).
+    expected
+        M mirrors.
+
+    Raises
+    ------
+    InputError
+        If shapes do not fit, or mirrors have no orthogonal codes.
+
+    Notes
+    -----
+    The covariance holds noise of the pixels as it is seen over the photographs, and a quarter of
+    the correction for the beam's shape. The error of the rectified pictures themselves (camera,
+    survey) is to be added, as for ordinary spots.
+    """
+    count = len(expected)
+    _check(stack, moves, count)
+    work = stack.prepared()
+    values = work.values[:, work.seen]
+    empty = None if work.empty is None else work.empty[work.seen]
+    light = light_of(values, empty, None)
+    rows = regression(moves, light.weights)
+    if rows is None:
+        return Separation(
+            tuple(lost(beam, Verdict.CLOUD) for beam in expected),
+            light.factors,
+            light.weights > 0.0,
+            np.empty((0, 2)),
+        )
+    pictures = (rows @ light.pictures).reshape(count, 2, -1)
+    tops = [
+        find_top(work, picture, np.asarray(beam.second_moments, dtype=np.float64))
+        for picture, beam in zip(pictures, expected, strict=True)
+    ]
+    result = fitted(work, values, empty, moves, expected, tops)
+    still = None
+    if empty is not None:
+        places = [
+            (np.asarray(beam.place), np.asarray(beam.second_moments))
+            if fit is None
+            else (fit.place, fit.moments)
+            for beam, fit in zip(expected, result.fits, strict=True)
+        ]
+        still = still_light(work, result.mean, places, [f.power for f in result.fits if f])
+    return Separation(
+        judged(expected, tops, result.fits, still),
+        result.light.factors,
+        result.light.weights > 0.0,
+        np.empty((0, 2)) if still is None else still.uncoded,
+    )
+
+
+def _check(stack: Stack, moves: FloatArray, count: int) -> None:
+    if moves.shape != (len(stack.values), count, 2) or not np.isfinite(moves).all():
+        raise InputError(
+            f"separation: moves of shape {moves.shape} for {len(stack.values)} photographs of "
+            f"{count} mirrors; give finite displacements (photographs, mirrors, 2)"
+        )
+    if regression(moves, np.ones(len(moves))) is None:
+        raise InputError(
+            f"separation: the codes of {count} mirrors over {len(moves)} photographs depend on "
+            "each other; take codes from coded_movements"
+        )

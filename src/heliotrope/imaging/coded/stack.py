@@ -1,0 +1,174 @@
+"""Photographs of one surface on which many beams move, and the light in each photograph."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.targets.rectify import Mask
+
+#: A photograph with less than this share of the usual light is left out.
+DARK = 0.5
+#: Pixels across the longer side that beams of decimetres need.
+_ACROSS = 96
+
+
+@dataclass(frozen=True)
+class Stack:
+    """K photographs of one surface, seen from its front.
+
+    Attributes
+    ----------
+    values
+        Brightness, in proportion to the light, (K, H, W); row 0 at the top.
+    step
+        Size of a pixel, m.
+    first
+        Place of the first pixel's centre, metres right of and above the surface's centre, (2,).
+    seen
+        Pixels that measure light: on the surface, on no mark, never at full scale, (H, W).
+    exposures
+        Exposure times gain of each photograph, (K,); None: all alike.
+    empty
+        Brightness without beams at an exposure of 1 (of the photographs, if all are alike),
+        (H, W). None: other light than that of the coded beams is on the surface, as on a receiver
+        in production.
+    """
+
+    values: FloatArray
+    step: float
+    first: FloatArray
+    seen: Mask
+    exposures: FloatArray | None = None
+    empty: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        shape = self.values.shape
+        if len(shape) != 3 or min(shape) < 2:
+            raise InputError(f"stack: values of shape {shape}; give (photographs, rows, columns)")
+        for name, array, wanted in (
+            ("seen", self.seen, shape[1:]),
+            ("empty", self.empty, shape[1:]),
+            ("exposures", self.exposures, shape[:1]),
+            ("first", self.first, (2,)),
+        ):
+            if array is not None and np.shape(array) != wanted:
+                raise InputError(f"stack: {name} has shape {np.shape(array)}; give {wanted}")
+        if not (np.isfinite(self.step) and self.step > 0.0):
+            raise InputError(f"stack: step {self.step} m must be above 0")
+        if not np.isfinite(self.values[:, self.seen]).all():
+            raise InputError("stack: brightness is not finite at a seen pixel; mask such pixels")
+        if self.exposures is not None and not (np.asarray(self.exposures) > 0.0).all():
+            raise InputError("stack: an exposure must be above 0")
+
+    @property
+    def axes(self) -> tuple[FloatArray, FloatArray]:
+        """Metres right of the centre of columns (W,), and above it of rows (H,)."""
+        _, rows, columns = self.values.shape
+        return (
+            self.first[0] + self.step * np.arange(columns),
+            self.first[1] - self.step * np.arange(rows),
+        )
+
+    def prepared(self) -> "Stack":
+        """Return the stack at one exposure, on a grid that is just fine enough for beams."""
+        values = np.asarray(self.values, dtype=np.float64)
+        if self.exposures is not None:
+            values = values / np.asarray(self.exposures)[:, None, None]
+        factor = max(1, max(values.shape[1:]) // _ACROSS)
+        rows, columns = (n // factor for n in values.shape[1:])
+        weight = self.seen[: rows * factor, : columns * factor].astype(np.float64)
+        known = _binned(weight, factor)
+
+        def shrunk(pictures: FloatArray) -> FloatArray:
+            cut = pictures[..., : rows * factor, : columns * factor]
+            total = _binned(np.where(weight > 0.0, cut, 0.0), factor)
+            return np.asarray(total / np.maximum(known, 1e-12))
+
+        shift = 0.5 * (factor - 1) * self.step
+        return Stack(
+            shrunk(values),
+            self.step * factor,
+            np.asarray(self.first) + np.array([shift, -shift]),
+            # The middle of half-masked pixels is unknown.
+            known > 0.999,
+            None,
+            None if self.empty is None else shrunk(np.asarray(self.empty, dtype=np.float64)),
+        )
+
+
+def _binned(pictures: FloatArray, factor: int) -> FloatArray:
+    *more, rows, columns = pictures.shape
+    return np.asarray(
+        pictures.reshape(*more, rows // factor, factor, columns // factor, factor).mean(
+            axis=(-3, -1)
+        )
+    )
+
+
+@dataclass(frozen=True)
+class Light:
+    """Light of the coded beams in K photographs, as at the usual sun.
+
+    Attributes
+    ----------
+    pictures
+        Brightness by beams over ``factors``, N seen pixels, (K, N).
+    factors
+        Light of the beams in each photograph, 1 at its median, (K,).
+    weights
+        Of each photograph, 0 if it is left out, (K,).
+    """
+
+    pictures: FloatArray
+    factors: FloatArray
+    weights: FloatArray
+
+    @property
+    def mean(self) -> FloatArray:
+        """The mean picture, (N,)."""
+        return np.asarray(self.weights @ self.pictures / self.weights.sum())
+
+
+def light_of(values: FloatArray, empty: FloatArray | None, moved: FloatArray | None) -> Light:
+    """Return the light of beams in each photograph.
+
+    Each photograph is the empty surface times its daylight plus the beams times their light;
+    two factors for each photograph by least squares.
+
+    Parameters
+    ----------
+    values
+        Brightness of seen pixels, (K, N).
+    empty
+        Without beams, (N,).
+    moved
+        Change of brightness by the movements known so far, (K, N).
+    """
+    count = len(values)
+    change = np.zeros_like(values) if moved is None else moved
+    mean = np.median(values, axis=0) if empty is None else np.median(values - empty, axis=0)
+    day = np.ones(count)
+    pictures = values
+    for _ in range(3):
+        beams = mean + change
+        own, with_beams = (beams**2).sum(axis=1), (beams * values).sum(axis=1)
+        if empty is None:
+            factors = with_beams / own
+        else:
+            # The normal equations of two unknowns.
+            cross, plain, with_empty = beams @ empty, empty @ empty, values @ empty
+            determinant = own * plain - cross**2
+            factors = (plain * with_beams - cross * with_empty) / determinant
+            day = (own * with_empty - cross * with_beams) / determinant
+        usual = float(np.median(factors))
+        factors = factors / (usual if usual > 0.0 else 1.0)
+        weights = np.where(factors > DARK, factors**2, 0.0)
+        if not weights.any():
+            weights = np.ones(count)
+        safe = np.where(weights > 0.0, factors, 1.0)
+        lit = values if empty is None else values - day[:, None] * empty
+        pictures = lit / safe[:, None]
+        mean = weights @ (pictures - change) / weights.sum()
+    return Light(pictures, factors, weights)
