@@ -10,6 +10,7 @@ def main() -> None:
     import numpy as np
 
     from heliotrope.calibration.fit.estimator import fit
+    from heliotrope.calibration.learn.present import fitting_present
     from heliotrope.calibration.sightings import sightings
     from heliotrope.mechanism import kinds
     from heliotrope.mechanism.tracking import track
@@ -20,7 +21,9 @@ def main() -> None:
     counts = tracking.best_counts
     mechanism.jacobian(counts, ("tilt_north", "position_up"))
     mechanism.drives.radians_per_count(counts)
-    fit(mechanism, sightings([0], counts, sun, aim), "malan8")
+    seen = sightings([0], counts, sun, aim, time=0.0)
+    for _ in fitting_present(mechanism, seen, fit(mechanism, seen, "malan8")):
+        pass
 
 
 if __name__ == "__main__":

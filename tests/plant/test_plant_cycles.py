@@ -365,7 +365,7 @@ def test_a_large_change_that_no_photograph_confirms_is_withdrawn(tmp_path: Path,
         assert (plant.beams.armature.table[plant.field.place(NAME)] == old_table).all()
 
     settings = CycleSettings(shots=5, interval=5.0, least=2, left=1.0)
-    cycle(tmp_path, scene, settings, azimuth_bias=1e-3)
+    cycle(tmp_path, scene, settings, learns=True, azimuth_bias=1e-3)
     assert refused
     for result in results:
         assert result.outcome is CalibrationOutcome.NOT_VERIFIED

@@ -16,6 +16,7 @@ import numpy as np
 from heliotrope.calibration.fit.estimator import FieldFit, fit
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn import models, periodic
+from heliotrope.calibration.learn.present import fitting_present
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism import parameters as parameter_table
@@ -51,6 +52,16 @@ class OwnModel:
         The values are deviations from ``nominal``, so that they alone make the mechanism.
         """
         return self.completed(fit(self.start(nominal), sightings, self.parameters))
+
+    def fitting(
+        self, nominal: Mechanism, sightings: Sightings
+    ) -> Generator[None, None, tuple[FieldFit, FieldFit]]:
+        """Return the fit of constants and the one that follows the drift; see `present`."""
+        start = self.start(nominal)
+        constants = fit(start, sightings, self.parameters)
+        yield
+        followed = yield from fitting_present(start, sightings, constants)
+        return self.completed(constants), self.completed(followed)
 
     def start(self, nominal: Mechanism) -> Mechanism:
         """Return the mechanism from which the parameters are fitted."""

@@ -1,12 +1,14 @@
 """The calibration cycle: from photographs of one mirror's beam to a better mirror.
 
 A heliostat goes to a calibration target, is photographed there, and returns. Its new sightings join
-those already known; all of them together are fitted once. A fit that is better than the present
+those already known; all of them together are fitted once, and the drift is followed through them to
+the present (`calibration.learn.present`). A fit that is better than the present
 calibration is pushed to the local controller, read back, and taken as the heliostat's calibration.
 Nothing is pushed after too few sightings, a fit that did not converge, values far from what an
 installation can be, or a fit that misses by more than before: the heliostat then keeps what it has.
-A first calibration and a large change are confirmed by one more photograph before they are taken;
-if it contradicts them, the old parameters are pushed back.
+A first calibration, a large change, and one by photographs that the present calibration did not
+expect are confirmed by one more photograph before they are taken; if it contradicts them, the old
+parameters are pushed back.
 """
 
 from dataclasses import dataclass, replace
@@ -28,8 +30,8 @@ from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.visits.fitting import JudgedFit, change_of, fit_heliostat
-from heliotrope.plant.visits.model_of_each import ModelOfEach
+from heliotrope.plant.visits.fitting import JudgedFit, change_of, fitting, surprise_of
+from heliotrope.plant.visits.model_of_each import ModelOfEach, stepwise
 from heliotrope.plant.visits.photographs import (
     Centred,
     Photographing,
@@ -234,11 +236,11 @@ class CalibrationCycle:
                 measured,
             )
         model = await self._models.of(name, beliefs.nominal(name), every)
-        found = fit_heliostat(beliefs, self.settings, model, name, every)
+        found = await stepwise(fitting(beliefs, self.settings, model, name, every))
         pushed: tuple[str, ...] = ()
         if not found.problem:
             with self._plant.doubts.unverified(name):
-                found, pushed = await self._try(visit, found, taken, tell)
+                found, pushed = await self._try(visit, found, here, taken, tell)
         if found.problem and (not old or found.outcome is CalibrationOutcome.NOT_VERIFIED):
             # No earlier sighting supports these, or a later photograph contradicts them: drop them.
             text = f"unchanged: {found.problem}"
@@ -265,15 +267,18 @@ class CalibrationCycle:
         )
 
     async def _try(
-        self, visit: Visit, found: JudgedFit, taken: Photographs, tell: Tell
+        self, visit: Visit, found: JudgedFit, here: Sightings, taken: Photographs, tell: Tell
     ) -> tuple[JudgedFit, tuple[str, ...]]:
         """Push a fit and verify it; return it, with why it was withdrawn, and the items pushed."""
         name, plant = visit.heliostat, self._plant
         present, new = plant.beliefs.present(name), found.mechanism
-        large = change_of(present, new, found.seen) > self.settings.large
+        settings, last = self.settings, plant.beliefs.record(name)
+        # Photographs that the calibration did not expect show a step of the mirror, or other light.
+        sure = last is not None and surprise_of(last, found.nominal, here) <= settings.agreement
+        sure = sure and change_of(present, new, found.seen) <= settings.large
         try:
             pushed = await self._push(visit, new[0], f"fit of {len(found.seen)} sightings")
-            if not (large or plant.beliefs.record(name) is None):
+            if sure:
                 return found, pushed
             plant.want(name, new[0])
             shots = [shot for shot, _ in taken.used]

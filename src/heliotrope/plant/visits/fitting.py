@@ -4,14 +4,17 @@ One heliostat is fitted after a visit, many after a flight. Both use all that is
 its photographs, and its rows of flights with the errors that they share with other mirrors.
 """
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
 from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.fit.common import CommonFit, fit_common
 from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome
+from heliotrope.calibration.fit.residuals import linearise
+from heliotrope.calibration.learn.drift import DAY
 from heliotrope.calibration.learn.own_model import OwnModel
 from heliotrope.calibration.record import (
     CalibrationOutcome,
@@ -28,6 +31,11 @@ from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.flights import Flights
 from heliotrope.plant.visits.settings import CycleSettings
 
+#: Largest error of the last day's photographs that a fit that follows the drift may leave, in sigma
+#: of a photograph: two axes, and the motion of the mirror within hours.
+EXPLAINED = 2.0
+#: A new fit may miss by more than the present one by this share of a sigma, added in squares.
+ROOM = 0.25
 #: Outcomes of fits whose sightings contradict each other or the installation.
 WRONG = frozenset(
     {
@@ -54,6 +62,7 @@ class JudgedFit:
         The sightings, photographs first, without the errors that flights share.
     before, after
         Beam errors under the present and the fitted mechanism, weighted by the sightings, rad RMS.
+        A fit that follows the drift need not explain the past: the last day's photographs count.
     outcome, problem
         Why the fit is rejected, "" if it is not.
     name
@@ -114,13 +123,39 @@ def fit_heliostat(
     beliefs: Beliefs, settings: CycleSettings, model: OwnModel, name: str, photographed: Sightings
 ) -> JudgedFit:
     """Return the fit of one heliostat, by a model, to its photographs and its rows of flights."""
+    steps = fitting(beliefs, settings, model, name, photographed)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return cast("JudgedFit", end.value)
+
+
+def fitting(
+    beliefs: Beliefs, settings: CycleSettings, model: OwnModel, name: str, photographed: Sightings
+) -> Generator[None, None, JudgedFit]:
+    """Fit as `fit_heliostat`, in steps of some ten ms between which others may work.
+
+    Photographs alone are followed through the drift to the latest of them, and the last day's must
+    be explained: what the belief takes for mistakes may be a mirror that has moved an hour ago. If
+    constants explain them better, these are proposed. Rows of flights share errors with other
+    mirrors, so a mirror that has some gets constants, in one joint fit.
+    """
     nominal, nothing = beliefs.nominal(name), np.zeros(0, np.int64)
     if name in beliefs.flights:
         return _fit_group(
             beliefs, beliefs.flights, settings, model, (name,), nominal, (photographed,)
         )[0]
-    fitted = model.fit(nominal, photographed)
-    return _judged(beliefs, settings, model, name, nominal, fitted, photographed, nothing)
+    constants, followed = yield from model.fitting(nominal, photographed)
+    recent = photographed.take(np.flatnonzero(photographed.time >= photographed.time.max() - DAY))
+    left = [
+        root_mean_square(beam_errors(nominal.with_parameters(one.parameters), recent).beam)
+        for one in (constants, followed)
+    ]
+    if left[1] <= max(left[0], EXPLAINED * settings.sigma):
+        found = _judged(beliefs, settings, model, name, nominal, followed, recent, nothing)
+        return replace(found, seen=photographed)
+    return _judged(beliefs, settings, model, name, nominal, constants, photographed, nothing)
 
 
 def fit_flights(
@@ -271,7 +306,8 @@ def _judge(
             f"the fit leaves {1e3 * after:.1f} mrad RMS, above {1e3 * settings.left:g} mrad; "
             "look at the photographs: is it this heliostat's beam?"
         )
-    if not after <= settings.gain * before:
+    # Motion within hours is not followed, so a photograph's own sigma leaves some room.
+    if not after <= settings.gain * np.hypot(before, ROOM * settings.sigma):
         return CalibrationOutcome.NO_BETTER, (
             f"the fit misses by {1e3 * after:.2f} mrad RMS, not below {settings.gain:g} times "
             f"the {1e3 * before:.2f} mrad before"
@@ -283,3 +319,28 @@ def change_of(present: Mechanism, new: Mechanism, made: Sightings) -> float:
     """Return the largest change of the beam by new parameters at the counts of sightings, rad."""
     normals = [m[made.heliostat].pose(made.counts).normal for m in (present, new)]
     return 2.0 * float(angle_between(*normals).max())
+
+
+def surprise_of(record: HeliostatCalibration, nominal: Mechanism, made: Sightings) -> float:
+    """Return how far sightings lie from what a calibration expects of them now, at most.
+
+    Parameters
+    ----------
+    record
+        The present calibration, whose covariance has grown since it was made.
+    nominal
+        The mechanism of the design, batch shape (1,).
+    made
+        New sightings, heliostat row 0.
+
+    Returns
+    -------
+    float
+        The largest distance, in standard deviations of itself.
+    """
+    line = linearise(record.mechanism(nominal)[made.heliostat], made, record.names)
+    spread = np.eye(2) + line.jacobian @ record.covariance_at(made.time) @ np.swapaxes(
+        line.jacobian, -1, -2
+    )
+    square = np.einsum("mi,mij,mj->m", line.residual, np.linalg.inv(spread), line.residual)
+    return float(np.sqrt(square.max()))

@@ -1,13 +1,16 @@
 """The model that each heliostat of a running plant is fitted with."""
 
 import asyncio
-from typing import cast
+from collections.abc import Generator
+from typing import TypeVar, cast
 
 from heliotrope.calibration.learn.own_model import OwnModel, choosing
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.visits.settings import SIMPLE, CycleSettings
+
+Result = TypeVar("Result")
 
 #: The model is chosen again when there are this many times as many sightings.
 MORE = 1.25
@@ -32,19 +35,18 @@ class ModelOfEach:
             return _given(self._model, nominal)
         count, model = self._kept.get(heliostat, (0, None))
         if model is None or len(sightings) >= MORE * count:
-            model = await _chosen(nominal, sightings)
+            model = await stepwise(choosing(nominal, sightings, SIMPLE))
             self._kept[heliostat] = len(sightings), model
         return model
 
 
-async def _chosen(nominal: Mechanism, sightings: Sightings) -> OwnModel:
-    """Choose a model, and let the plant work between the steps."""
-    steps = choosing(nominal, sightings, SIMPLE)
+async def stepwise(steps: Generator[None, None, Result]) -> Result:
+    """Return the result of work in steps, and let the plant work between them."""
     while True:
         try:
             next(steps)
         except StopIteration as end:
-            return cast("OwnModel", end.value)
+            return cast("Result", end.value)
         await asyncio.sleep(0.0)
 
 

@@ -1,0 +1,114 @@
+"""One mirror's parameters now: the drift is followed through its photographs."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome, fit
+from heliotrope.calibration.learn import drift, present
+from heliotrope.calibration.sightings import Sightings, sightings
+from heliotrope.field.layouts import malan_plant
+from heliotrope.geometry import MRAD, FloatArray, reflect
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.tracking import track
+from heliotrope.sun import vector
+
+PLANT = malan_plant(4)
+NOMINAL = next(iter(PLANT.groups.values())).mechanism[:1]
+ZEROS = drift.zeros(NOMINAL)
+AIM = PLANT.targets[0].center
+BEGIN = datetime(2026, 6, 1, tzinfo=UTC).timestamp()
+DAY, SIGMA = 86400.0, 2e-4
+#: Morning, noon and afternoon of 20 days, three days apart.
+TIMES = BEGIN + (3.0 * np.arange(20)[:, None] + np.array([7.0, 11.0, 15.0]) / 24.0).ravel() * DAY
+
+
+def photographs(zero: FloatArray, seed: int = 1) -> Sightings:
+    """Sightings at `TIMES` of a mirror whose first zero is off by ``zero`` (60,), rad."""
+    suns = vector(TIMES, PLANT.site)
+    counts = track(NOMINAL[np.zeros(len(TIMES), np.intp)], suns, AIM).best_counts
+    truth = NOMINAL[np.zeros(len(TIMES), np.intp)].with_parameters(
+        {ZEROS[0]: zero, "tilt_east": np.full(len(TIMES), 2 * MRAD)}
+    )
+    pose = truth.pose(counts)
+    away = np.linalg.norm(AIM - pose.vertex, axis=1)[:, None]
+    noise = SIGMA * np.random.default_rng(seed).standard_normal((len(TIMES), 3))
+    seen = pose.vertex + away * (reflect(suns, pose.normal) + noise)
+    return sightings(np.zeros(len(TIMES), np.intp), counts, suns, seen, time=TIMES, sigma=5e-4)
+
+
+def followed(seen: Sightings) -> tuple[FieldFit, FieldFit, int]:
+    """The fit of constants, the one that follows the drift, and the number of its steps."""
+    constants = fit(NOMINAL, seen, "malan8")
+    steps, count = present.fitting_present(NOMINAL, seen, constants), 0
+    while True:
+        try:
+            next(steps)
+            count += 1
+        except StopIteration as end:
+            return constants, end.value, count
+
+
+def miss(fitted: FieldFit, seen: Sightings) -> float:
+    """Beam error of the last three photographs by a fit, rad RMS."""
+    last = seen.take(np.arange(len(seen) - 3, len(seen)))
+    moved: Mechanism = NOMINAL.with_parameters(fitted.parameters)
+    return float(np.sqrt(np.mean(beam_errors(moved, last).beam ** 2)))
+
+
+def test_a_zero_that_drifts_is_followed() -> None:
+    exact = photographs(np.linspace(0.0, 2 * MRAD, len(TIMES)))
+    constants, now, _ = followed(exact)
+    assert miss(constants, exact) > 1.2 * MRAD
+    assert miss(now, exact) < 0.5 * MRAD
+
+
+def test_a_step_is_followed_at_once() -> None:
+    seen = photographs(np.where(np.arange(len(TIMES)) < 54, 0.0, 3 * MRAD))
+    constants, now, _ = followed(seen)
+    assert miss(constants, seen) > 3 * MRAD
+    assert miss(now, seen) < 1 * MRAD
+
+
+def test_where_nothing_moves_it_agrees_with_the_constants() -> None:
+    seen = photographs(np.zeros(len(TIMES)))
+    constants, now, _ = followed(seen)
+    assert abs(miss(now, seen) - miss(constants, seen)) < 0.1 * MRAD
+    # The zeros may drift, so they are known less well than constants would be.
+    place = now.names.index(ZEROS[0])
+    assert now.sigma[0, place] > constants.sigma[0, place]
+
+
+def test_one_photograph_of_another_light_moves_nothing() -> None:
+    seen = photographs(np.zeros(len(TIMES)))
+    wrong = seen.destination.copy()
+    wrong[-1, 0] += 3.0
+    _, good, _ = followed(seen)
+    _, now, _ = followed(replace(seen, destination=wrong))
+    assert abs(miss(now, seen) - miss(good, seen)) < 0.2 * MRAD
+
+
+def test_the_order_of_the_rows_does_not_matter() -> None:
+    seen = photographs(np.linspace(0.0, 2 * MRAD, len(TIMES)))
+    mixed = seen.take(np.random.default_rng(3).permutation(len(seen)))
+    _, now, _ = followed(seen)
+    _, same, _ = followed(mixed)
+    np.testing.assert_allclose(same.values, now.values, atol=1e-6 * MRAD)
+
+
+def test_many_sightings_are_taken_in_steps() -> None:
+    seen = photographs(np.zeros(len(TIMES)))
+    many = seen.take(np.tile(np.arange(len(seen)), 6))
+    assert followed(seen)[2] == 0
+    assert followed(many)[2] == (len(many) - 1) // present.AT_ONCE
+
+
+def test_a_fit_that_has_failed_is_returned_as_it_is() -> None:
+    seen = photographs(np.zeros(len(TIMES)))
+    failed = replace(fit(NOMINAL, seen, "malan8"), outcome=np.array([FitOutcome.FAILED], np.int8))
+    with pytest.raises(StopIteration) as end:
+        next(present.fitting_present(NOMINAL, seen, failed))
+    assert end.value.value is failed

@@ -1,0 +1,96 @@
+"""What a visit proposes: the drift followed, or constants where the belief sees mistakes."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+
+from heliotrope.calibration.learn import drift
+from heliotrope.calibration.learn.own_model import OwnModel
+from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
+from heliotrope.calibration.sightings import Sightings, sightings
+from heliotrope.field.layouts import malan_plant
+from heliotrope.geometry import MRAD, FloatArray, reflect
+from heliotrope.mechanism import parameters
+from heliotrope.mechanism.tracking import track
+from heliotrope.plant.beliefs import Beliefs
+from heliotrope.plant.visits.fitting import JudgedFit, fit_heliostat, surprise_of
+from heliotrope.plant.visits.settings import CycleSettings
+from heliotrope.sun import vector
+
+PLANT = malan_plant(4)
+NAME = PLANT.names[0]
+BEGIN = datetime(2026, 6, 1, 7, tzinfo=UTC).timestamp()
+HOUR, DAY = 3600.0, 86400.0
+
+
+def photographs(times: FloatArray, zero: FloatArray) -> Sightings:
+    """Sightings of a mirror whose first zero is off by ``zero`` (M,), rad."""
+    nominal, count = Beliefs(PLANT).nominal(NAME), len(times)
+    suns, aim = vector(times, PLANT.site), PLANT.targets[0].center
+    many = nominal[np.zeros(count, np.intp)]
+    counts = track(many, suns, aim).best_counts
+    pose = many.with_parameters({drift.zeros(nominal)[0]: zero}).pose(counts)
+    away = np.linalg.norm(aim - pose.vertex, axis=1)[:, None]
+    noise = 2e-4 * np.random.default_rng(5).standard_normal((count, 3))
+    seen = pose.vertex + away * (reflect(suns, pose.normal) + noise)
+    return sightings(np.zeros(count, np.intp), counts, suns, seen, time=times, sigma=5e-4)
+
+
+def fitted(beliefs: Beliefs, seen: Sightings) -> JudgedFit:
+    names = parameters.model("malan8", beliefs.nominal(NAME).parameters)
+    return fit_heliostat(beliefs, CycleSettings(), OwnModel("malan8", names), NAME, seen)
+
+
+def believed(beliefs: Beliefs, found: JudgedFit, at: float) -> HeliostatCalibration:
+    """Let the plant believe a fit, as a visit does."""
+    record = HeliostatCalibration(
+        NAME, at, found.fitted.names, found.fitted.values[0], found.fitted.covariance[0],
+        found.fitted.prior[0],
+    )  # fmt: skip
+    return beliefs.take(record)
+
+
+def test_a_mirror_that_has_stepped_is_calibrated_by_its_last_photographs() -> None:
+    """Constants are held back by the 30 photographs before the step."""
+    times = BEGIN + np.concatenate(
+        [DAY * day + HOUR * np.array([0.0, 3.0, 6.0]) for day in np.arange(0.0, 24.0, 2.0)]
+    )
+    seen = photographs(times, np.where(times < BEGIN + 21 * DAY, 0.0, 2 * MRAD))
+    beliefs = Beliefs(PLANT)
+    old = seen.take(np.arange(33))
+    record = believed(beliefs, fitted(beliefs, old), float(old.time[-1]))
+    found = fitted(beliefs, seen)
+    assert found.outcome is CalibrationOutcome.CALIBRATED
+    assert found.before > 3 * MRAD
+    assert found.after < 1 * MRAD
+    assert surprise_of(record, beliefs.nominal(NAME), seen.take(np.arange(33, 36))) > 4.0
+
+
+def test_what_came_within_the_hour_is_proposed_as_constants_explain_it() -> None:
+    """No step is believed within an hour; constants leave it to the verification."""
+    times = BEGIN + np.concatenate([60.0 * np.arange(5), 900.0 + 60.0 * np.arange(5)])
+    seen = photographs(times, np.where(np.arange(10) < 5, 0.0, 8 * MRAD))
+    beliefs = Beliefs(PLANT)
+    first = fitted(beliefs, seen.take(np.arange(5)))
+    believed(beliefs, first, float(times[4]))
+    names = parameters.model("malan8", beliefs.nominal(NAME).parameters)
+    model = OwnModel("malan8", names)
+    constants = model.fit(beliefs.nominal(NAME), seen)
+    found = fit_heliostat(beliefs, CycleSettings(left=1.0), model, NAME, seen)
+    np.testing.assert_array_equal(found.fitted.values, constants.values)
+
+
+def test_photographs_surprise_less_the_older_the_calibration() -> None:
+    times = BEGIN + HOUR * np.arange(6.0)
+    beliefs = Beliefs(PLANT)
+    record = believed(beliefs, fitted(beliefs, photographs(times, np.zeros(6))), times[-1])
+    nominal, surprise = beliefs.nominal(NAME), []
+    usual = photographs(times[-1] + np.array([600.0]), np.zeros(1))
+    assert surprise_of(record, nominal, usual) < 4.0
+    shifted = photographs(times[-1] + np.array([600.0]), np.full(1, 2 * MRAD))
+    for days in (0.0, 30.0, 300.0):
+        later = replace(shifted, time=shifted.time + days * DAY)
+        surprise.append(surprise_of(record, nominal, later))
+    assert surprise[0] > 4.0
+    assert (np.diff(surprise) < -0.3).all()
