@@ -27,6 +27,7 @@ from heliotrope.calibration.plan.percentiles import error_percentiles
 from heliotrope.calibration.plan.planning import aim_at
 from heliotrope.calibration.sightings import Sightings, camera_target, drone, join, sightings
 from heliotrope.calibration.uncertainty import suns_of_year
+from heliotrope.field.example import roughly_installed
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, reflect, tangent_axes
@@ -198,11 +199,17 @@ def come_true(
 
 @dataclass(frozen=True)
 class _Case:
-    """A way to commission a field; ``flown`` has a drone's flight before the first day."""
+    """A way to commission a field.
+
+    ``flown``: a drone flies before the first day. ``other``: the true errors are not drawn from the
+    priors, but those of `roughly_installed` of the same size, with a canting that no parameter of
+    the model describes.
+    """
 
     name: str
     terms: CommissionTerms
     flown: bool = False
+    other: bool = False
 
 
 def _cases(quick: bool) -> list[_Case]:
@@ -220,12 +227,16 @@ def _cases(quick: bool) -> list[_Case]:
         _Case("50 together, first visits too", replace(joint[50], first_alone=False, likely=0.2)),
         _Case("25 together after a drone", joint[25], flown=True),
         _Case("50 together after a drone", joint[50], flown=True),
+        _Case("the same, other errors than the priors", joint[50], flown=True, other=True),
+        _Case("the same, and 0.5 mrad not repeated", replace(joint[50], repeat=5e-4), flown=True),
     ]
     return cases[3:4] if quick else cases
 
 
 def _row(case: _Case, plant: Plant, fleet: Fleet, quick: bool) -> Row:
     mirrors = Commissioned.begin(plant, fleet, case.terms)
+    if case.other:
+        mirrors.truth = _other(mirrors)
     if case.flown:
         mirrors.fly()
         fleet = replace(fleet, information=np.linalg.inv(mirrors.covariance))
@@ -258,6 +269,14 @@ def _row(case: _Case, plant: Plant, fleet: Fleet, quick: bool) -> Row:
         "true_over_predicted_90": round(float(true[1] / predicted[1]), 3),
         "plan_s": round(planned, 1),
     }
+
+
+def _other(mirrors: Commissioned) -> Mechanism:
+    """Return true mechanisms with the errors of a quick installation, of the size of the priors."""
+    wanted = float(np.sqrt(np.mean(mirrors.true() ** 2)))
+    mirrors.truth = roughly_installed(mirrors.nominal, 1)
+    found = float(np.sqrt(np.mean(mirrors.true() ** 2)))
+    return roughly_installed(mirrors.nominal, 1, wanted / found)
 
 
 def _pair(values: FloatArray) -> str:

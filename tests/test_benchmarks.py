@@ -54,6 +54,11 @@ COLUMNS = {
         "split", "contender", "heliostats", "tested", "median_of_medians_mrad",
         "mean_of_medians_mrad", "processor_s_per_heliostat",
     },
+    "commission": {
+        "case", "visits", "sightings", "never_measured", "later_mirrors_an_hour_and_target",
+        "goal_after_h_of_sun", "predicted_50_90_mrad", "believed_50_90_mrad", "true_50_90_mrad",
+        "true_over_predicted_90",
+    },
     "learning": {
         "sightings_before", "stream_us", "batch_ms", "ratio", "difference_sigma", "hypotheses",
         "state_kB",

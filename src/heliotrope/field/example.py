@@ -78,11 +78,11 @@ def azimuth_elevation(position: FloatArray) -> Mechanism:
     )
 
 
-def roughly_installed(nominal: Mechanism, seed: int = 0) -> Mechanism:
+def roughly_installed(nominal: Mechanism, seed: int = 0, scale: float = 1.0) -> Mechanism:
     """Return mechanisms with the errors of a quick installation, for simulations.
 
     Standard deviations: tilts 10 mrad, encoder zeros 5 mrad, non-orthogonality and
-    canting 2 mrad, position 20 mm.
+    canting 2 mrad, position 20 mm; ``scale`` multiplies them.
     """
     rng = np.random.default_rng(seed)
     sizes = {
@@ -95,7 +95,7 @@ def roughly_installed(nominal: Mechanism, seed: int = 0) -> Mechanism:
     known = nominal.parameters
     return nominal.with_parameters(
         {
-            name: rng.normal(0.0, size, nominal.shape)
+            name: rng.normal(0.0, scale * size, nominal.shape)
             for role, size in sizes.items()
             for name in model(role, known)
         }
