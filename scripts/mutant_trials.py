@@ -39,6 +39,12 @@ RUNS: tuple[tuple[str, int, tuple[str, ...], float, float], ...] = (
     ("calm held 42", 42, ("calm", "held"), 30.0, 180.0),
     ("swarm 21", 21, ("swarm",), 12.0, 180.0),
     ("site 61", 61, ("site",), 12.0, 180.0),
+    ("visits 71", 71, ("visits",), 60.0, 180.0),
+    ("lights 72", 72, ("lights",), 60.0, 180.0),
+    ("day 73", 73, ("day", "visits"), 60.0, 180.0),
+    ("calibrations 74", 74, ("calm", "calibrations", "parameters"), 30.0, 180.0),
+    ("sensors 75", 75, ("calm", "sensors", "disk"), 30.0, 180.0),
+    ("place 76", 76, ("calm", "place", "held"), 30.0, 180.0),
 )
 HELIOSTATS = 3
 #: Tests of one mutant together, at most, s; those left over are not run.
@@ -93,7 +99,7 @@ class Reach:
     Attributes
     ----------
     seconds
-        Time of each test and run.
+        Time of the processor of each test and run.
     executed, felt
         Names of the tests and runs that execute the mutant of a key, and that feel it.
     """
@@ -331,17 +337,17 @@ class Bench:
         self._reach.begin(mutants)
         items = list(self._items.values())
         for item, after in zip(items, [*items[1:], None], strict=True):
-            begin = time.monotonic()
+            begin = time.process_time()
             self._config.hook.pytest_runtest_protocol(item=item, nextitem=after)
-            self._reach.note(mutants, item.nodeid, time.monotonic() - begin)
+            self._reach.note(mutants, item.nodeid, time.process_time() - begin)
             if self._failures.any:
                 print(f"fails unchanged, with probes: {item.nodeid}", file=sys.stderr, flush=True)
                 self._failures.any = False
         for name in self._kills:
-            begin = time.monotonic()
+            begin = time.process_time()
             if simulate(name):
                 raise SystemExit(f"the simulation finds something in unchanged code: {name}")
-            self._reach.note(mutants, name, time.monotonic() - begin)
+            self._reach.note(mutants, name, time.process_time() - begin)
         self._reach.keep(self._kept)
 
     # -- the parent ------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """Defects by which a field does less, or later, and nothing is unsafe: for `twin_defects`."""
 
+import asyncio
 from collections.abc import Callable
 from typing import Any
 
@@ -12,8 +13,14 @@ from heliotrope.lcu import messages, states
 from heliotrope.lcu.controller import Controller
 from heliotrope.lcu.lease import SunLease
 from heliotrope.lcu.search import Spiral
+from heliotrope.links.connection import CarriedLink
 from heliotrope.links.messages import Stage
+from heliotrope.plant import authority, refusals
+from heliotrope.plant.authority import Authority
+from heliotrope.plant.clusters import ClusterEnd
 from heliotrope.plant.emergency.order import EmergencyOrder
+from heliotrope.plant.identity import Identities
+from heliotrope.plant.parameters import ParameterSync
 
 Plant = Callable[[pytest.MonkeyPatch], None]
 
@@ -96,6 +103,69 @@ def _search_stands(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Spiral, "advance", standing)
 
 
+def _never_back(patch: pytest.MonkeyPatch) -> None:
+    """The plant's end of a line does not speak again after the connection was lost."""
+    converse = CarriedLink._converse
+
+    async def once(self: Any, keys: Any) -> None:
+        if self.statistics.opened and self.name != "plant":
+            await asyncio.Event().wait()
+        await converse(self, keys)
+
+    patch.setattr(CarriedLink, "_converse", once)
+
+
+def _seldom_leases(patch: pytest.MonkeyPatch) -> None:
+    """The plant renews its lease every fourth second: it lasts for five."""
+    keep = ClusterEnd.keep
+
+    async def seldom(self: Any, lease: Any, period: float, greet: Any) -> None:
+        await keep(self, lease, 4.0 * period, greet)
+
+    patch.setattr(ClusterEnd, "keep", seldom)
+
+
+def _wrong_holder(patch: pytest.MonkeyPatch) -> None:
+    """Who lacks the command authority is told that nobody has it."""
+    checked = Authority._checked
+
+    def vague(self: Any, person: Any, token: int) -> Any:
+        try:
+            return checked(self, person, token)
+        except refusals.RefusedError:
+            raise refusals.NO_AUTHORITY.error(person=person.name) from None
+
+    patch.setattr(Authority, "_checked", vague)
+
+
+def _role_too_high(patch: pytest.MonkeyPatch) -> None:
+    """TRACK is left to engineers."""
+    patch.setattr(authority, "OPERATOR_COMMANDS", authority.OPERATOR_COMMANDS - {"TRACK"})
+
+
+def _unheard(patch: pytest.MonkeyPatch) -> None:
+    """The statuses of a cluster that has come back are not judged."""
+    look = Identities.look
+
+    def first_only(self: Any, cluster: str) -> Any:
+        before = self._judged.get(cluster)
+        found = look(self, cluster)
+        if before is not None:
+            self._judged[cluster] = before
+        return found
+
+    patch.setattr(Identities, "look", first_only)
+
+
+def _uncompared(patch: pytest.MonkeyPatch) -> None:
+    """The parameters of a cluster that has connected are awaited, and not asked for."""
+
+    def waiting(self: Any, heliostats: Any) -> None:
+        self._strange.update(name for name in heliostats if name in self._wanted.items)
+
+    patch.setattr(ParameterSync, "greet", waiting)
+
+
 #: Defects where a state has the right name and the mirror does something else: name, defect, and
 #: whether the normal tests leave it to the slow ones.
 TOUR_ROWS: tuple[tuple[str, Plant, bool], ...] = (
@@ -112,4 +182,13 @@ ROWS: tuple[tuple[str, Plant, tuple[str, ...], bool], ...] = (
     ("a lease that ends by itself", _lease_too_short, ("calm",), False),
     ("nobody is told that a command is done", _never_told, ("calm",), True),
     ("no emergency is ever proven", _never_proven, (), True),
+    ("leases every fourth second", _seldom_leases, ("calm",), False),
+    ("a refusal names the wrong holder", _wrong_holder, (), False),
+    ("TRACK is left to engineers", _role_too_high, (), True),
+)
+#: The same for what comes back after a line was dropped.
+REJOIN_ROWS: tuple[tuple[str, Plant, tuple[str, ...], bool], ...] = (
+    ("a lost cluster never rejoins", _never_back, ("calm",), False),
+    ("a cluster that came back stays unheard", _unheard, ("calm",), True),
+    ("parameters are never compared again", _uncompared, ("calm", "calibrations"), True),
 )

@@ -400,6 +400,9 @@ DEFECTS = (
       for numbers, name, defect, only, pause, first in plant_defects.ROWS),
     *(Defect((16,), name, defect, faults=(), worlds=worlds, slow=slow)
       for name, defect, worlds, slow in quiet_defects.ROWS),
+    *(Defect((16,), name, defect, seconds=180.0, worlds=worlds, slow=slow,
+             faults=(Fault("line_cut", 40.0, 9.0, 0, 0.5),))
+      for name, defect, worlds, slow in quiet_defects.REJOIN_ROWS),
     *(Defect((11, 12), name, defect, faults=(), worlds=("tour",), slow=slow)
       for name, defect, slow in quiet_defects.TOUR_ROWS),
 )  # fmt: skip

@@ -31,6 +31,8 @@ RECORD_WITHIN = 2.0
 VOID_WITHIN = 4.2
 #: Leases that go to different clusters within this time are of one moment, s.
 _AT_ONCE = 0.5
+#: What a refusal says for one reason and for no other.
+ROLE_REASON, NOBODY_REASON, OTHER_REASON = "; it needs ", "nobody has it", "with this token"
 #: Longest time from posting a command to join to its execution, beyond its lifetime: in transit and
 #: late on the bus; and the interval between looks at the boards, s.
 LATE, LOOKS = 1.8, 0.5
@@ -212,6 +214,21 @@ class PlantObserver:
             self._awaited[ticket.identity] = now, person.name, what
         self._accepted[person.name, what] += 1
         self._count(now)
+
+    def refused(self, person: Person, token: int, what: str, reason: str, now: float) -> None:
+        """Judge the reason of a refusal, where it names the command authority or the role."""
+        holder = self._live(now)
+        # An authority that nobody has renewed for a while may be over a moment earlier or later.
+        sure = holder is not None and now - holder[2] < self._settings.authority - _AT_ONCE
+        saw = f"{what} was refused: {reason}; "
+        if ROLE_REASON in reason:
+            least = Role.OPERATOR if what in OPERATOR_COMMANDS else Role.ENGINEER
+            self.check(16, person.role < least, now, f"{saw}{least.title} is enough")
+        elif sure and holder is not None and NOBODY_REASON in reason:
+            self.check(16, False, now, f"{saw}{holder[0].name} has it")
+        elif sure and holder is not None and OTHER_REASON in reason:
+            right = holder[:2] != (person, token) and f"{holder[0].name} has it" in reason
+            self.check(16, right, now, f"{saw}{holder[0].name} has it")
 
     def _kept_record(self, identity: str, who: str, what: str, now: float) -> None:
         record = self._disk.records.get(identity)

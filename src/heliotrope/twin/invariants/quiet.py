@@ -46,6 +46,13 @@ NEAR, NEAR_M = 4e-3, 0.1
 #: An authority counts once the clusters have it, and orders given one after another cross, s.
 GRANTED, CROSSING = 4.0, 3.0
 
+#: What a refusal says of a heliostat, and for how long a quiet stretch may have lasted by then, s:
+#: statuses come every second, what is stored is asked for again after 30 s.
+UNHEARD_REASON, UNHEARD_FOR = "has not been heard since", 0.0
+UNCOMPARED_REASON, UNCOMPARED_FOR = "not been compared with the wanted", 45.0
+#: A refusal by step counts that are right.
+DOUBT_REASON = "step counts may be wrong"
+
 #: States from which each order must be carried out, and those that it asks for.
 ORDERS = {
     "APPROACH": ((states.STOWED,), (states.IDLE,), APPROACH_WITHIN),
@@ -112,6 +119,8 @@ class _Mirror:
     elsewhere: bool = False
     own: dict[str, bytes] = field(default_factory=dict)
     off_since: float | None = None
+    quiet_since: float = inf
+    sure_since: float = inf
 
     @property
     def name(self) -> str:
@@ -235,6 +244,22 @@ class QuietObserver:
         else:
             mirror.standby = point
 
+    def refused(self, heliostat: str, reason: str, now: float) -> None:
+        """Judge the reason of a refusal, where it names what this observer knows."""
+        mirror = self._mirrors[heliostat]
+        if heliostat not in self._quiet:
+            return
+        calm = now - mirror.quiet_since
+        saw = f"refused: {reason}; it has been quiet for {calm:.0f} s"
+        if UNHEARD_REASON in reason:
+            self._check(calm <= UNHEARD_FOR, now, mirror, saw)
+        elif UNCOMPARED_REASON in reason:
+            self._check(calm <= UNCOMPARED_FOR, now, mirror, saw)
+        elif DOUBT_REASON in reason:
+            sure = now - mirror.sure_since
+            saw = f"refused: {reason}; it has been sure of them for {sure:.0f} s"
+            self._check(sure <= STATUS_EVERY, now, mirror, saw)
+
     def progress(self, message: Progress) -> None:
         """Note that the plant is told that orders are done."""
         if message.stage is Stage.DONE:
@@ -287,7 +312,9 @@ class QuietObserver:
             calm = now - max(rest[mirror.name], mirror.booted_at, *named) > SETTLED
             if plant is None or mirror.cluster not in carried or mirror.state < 0 or not calm:
                 mirror.order = mirror.off_since = None
+                mirror.quiet_since = inf
                 continue
+            mirror.quiet_since = min(mirror.quiet_since, now)
             if mirror.name in self._quiet:
                 self._served(mirror, now)
                 self._carried_out(mirror, now)
@@ -305,6 +332,8 @@ class QuietObserver:
             mirror.state, mirror.since = board.state, now
         if mirror.state not in (states.IDLE, states.FAULT, states.LOCKED):
             mirror.elsewhere = False
+        sure = board.node is not None and board.node.journal.doubt == 0
+        mirror.sure_since = min(mirror.sure_since, now) if sure else inf
 
     def _is_own(self, mirror: _Mirror) -> bool:
         node = mirror.account.board.node

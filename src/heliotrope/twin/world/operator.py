@@ -29,6 +29,7 @@ from heliotrope.safety import FLUX_READING, Act, alarms
 from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STANDBY, Outfit
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.plant_observer import VOID_WITHIN, PlantObserver
+from heliotrope.twin.invariants.quiet import QuietObserver
 from heliotrope.twin.world.pod import PlantEar, Pod
 from heliotrope.twin.world.worlds import Habits, narrow_limits
 
@@ -86,6 +87,8 @@ class Operator:
         Number of actions of each kind.
     refusal
         Why the plant refused last.
+    quiet
+        Observer that judges whether the reason is true; None: it is not judged. Set by the owner.
     points
         Points last accepted, ENU, m, by command (AIM, STANDBY) and heliostat.
     """
@@ -107,6 +110,7 @@ class Operator:
         self.commands = True
         self.counts: Counter[str] = Counter()
         self.refusal = ""
+        self.quiet: QuietObserver | None = None
         self.points: dict[tuple[str, str], Point] = {}
         self._clock, self._observer, self._flux = clock, observer, flux
         self._beams, self._habits = beams, habits
@@ -239,13 +243,19 @@ class Operator:
                 numbers = self._values(what) if values is None else values
                 ticket = plant.command(who, mine, what, heliostats, numbers)
         except RefusedError as error:
-            self._refused(error)
+            self._refused(error, who, mine, what, heliostats)
             return None
         return self._accepted(who, mine, ticket, what)
 
-    def _refused(self, error: RefusedError) -> None:
+    def _refused(
+        self, error: RefusedError, who: Person, token: int, what: str, heliostats: Sequence[str]
+    ) -> None:
         self.counts["refused"] += 1
         self.refusal = str(error)
+        now = self._clock.monotonic()
+        self._observer.refused(who, token, what, self.refusal, now)
+        if self.quiet is not None and len(heliostats) == 1:
+            self.quiet.refused(heliostats[0], self.refusal, now)
 
     def _accepted(self, who: Person, token: int, ticket: Ticket, what: str) -> Ticket:
         self.counts["accepted"] += 1
@@ -352,7 +362,7 @@ class Operator:
         try:
             ticket = plant.parameters(who, token, name, items, confirmed)
         except RefusedError as error:
-            self._refused(error)
+            self._refused(error, who, token, "PARAMETERS", (name,))
             return None
         return self._accepted(who, token, ticket, "PARAMETERS")
 

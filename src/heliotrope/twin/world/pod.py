@@ -35,6 +35,7 @@ from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.invariants import Observer
 from heliotrope.twin.invariants.ledger import PlantCommand
+from heliotrope.twin.invariants.lines import LineObserver
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.quiet import QuietObserver
 from heliotrope.twin.world.intruder import Intruder
@@ -78,6 +79,8 @@ class Pod:
         The plant's end of the line and its listener; None while no plant runs.
     plant
         Observer of the plant; set by the owner.
+    lines
+        Observer of the line; None: a second plant takes it now and then.
     counts
         Messages to the plant, by kind.
     freezes
@@ -118,6 +121,7 @@ class Pod:
         self._names_of = {address: name for name, address in self.addresses.items()}
         observer.call(self._names_of)
         self._whole_since = clock.monotonic()
+        self.lines = None if errors.shared else LineObserver(name, clock.monotonic())
 
     def _new_bus(self) -> TwinBus:
         return TwinBus(self._true, list(self.boards), seed=self._chance.getrandbits(32), tap=self)
@@ -172,6 +176,14 @@ class Pod:
         if hindered or not whole:
             self._whole_since = now
             self.observer.disturbed(now)
+        if self.lines is not None:
+            there = tap is not None and link is not None
+            self.lines.look(now, clear=there and not hindered, connected=whole)
+
+    @property
+    def checks(self) -> Counter[int]:
+        """Number of checks of each invariant, of the cluster and of its line."""
+        return self.observer.checks + (Counter() if self.lines is None else self.lines.checks)
 
     def carried(self, now: float) -> bool:
         """Whether an order given now must be carried out."""
@@ -277,6 +289,8 @@ class PlantEar:
         message, observer = decode(data), self._pod.observer
         if isinstance(message, Lease):
             observer.leased(now)
+            if self._pod.lines is not None:
+                self._pod.lines.leased(now)
             if self._quiet is not None:
                 self._quiet.leased(message.token, now)
         elif isinstance(message, Emergency):

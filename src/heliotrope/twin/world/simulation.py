@@ -284,6 +284,7 @@ class Simulation:
             scene.keep_outs[0][0],
             None if self._measured else self._flux,
         )
+        self.operator.quiet = self.quiet
         self._exits = contextlib.ExitStack()
         self._work = self._new_work() if works(plan.worlds) else None
         self._tour: Tour | None = None
@@ -302,8 +303,7 @@ class Simulation:
         if not set(_WRONG).isdisjoint(self.plan.worlds):
             return None
         observers = {pod.name: pod.observer for pod in self.pods}
-        reaches = not drawn(self.plan.worlds)
-        return QuietObserver(self.begin, observers, self.sun, reaches=reaches)
+        return QuietObserver(self.begin, observers, self.sun, reaches=not drawn(self.plan.worlds))
 
     def _new_work(self) -> Working:
         """Return automatic control with its persons and its observer."""
@@ -582,7 +582,7 @@ def run(plan: RunPlan) -> RunResult:
     except RuntimeError as error:  # a task does not end, such as one of a program that is frozen
         outcome.problem = outcome.problem or f"the run does not end: {error}"
     outcome.checks = sum(
-        (pod.observer.checks for pod in simulation.pods),
+        (pod.checks for pod in simulation.pods),
         simulation.observer.checks + simulation.beams.checks + simulation.readings.checks,
     )
     for extra in (*simulation.working, simulation.quiet):

@@ -207,12 +207,14 @@ class PodErrors:
     ----------
     freezes
         Whether its program may be frozen.
+    shared
+        Whether a second plant takes its line now and then.
     """
 
     def __init__(self, worlds: Sequence[str], seed: int, index: int) -> None:
         self._worlds = worlds
         self._name = f"{seed} {index}"
-        self.freezes = "frozen" in worlds
+        self.freezes, self.shared = "frozen" in worlds, "twice" in worlds
 
     def _chance(self, world: str) -> random.Random | None:
         return random.Random(f"{world} {self._name}") if world in self._worlds else None
