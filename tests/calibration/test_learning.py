@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from heliotrope.calibration.evaluation import split
+from heliotrope.calibration.learn import _drift_kernels as kernels
 from heliotrope.calibration.learn import drift, learning
 from heliotrope.calibration.learn.assessment import assess
 from heliotrope.calibration.learn.learned import Learned
 from heliotrope.calibration.learn.learning import learn
-from heliotrope.calibration.learn.outliers import critical, generalised_esd
+from heliotrope.calibration.learn.outliers import critical, generalised_esd, left_out
 from heliotrope.calibration.learn.regimes import find_regimes, regime_at
 from heliotrope.calibration.sightings import Sightings, sightings
 from heliotrope.errors import InputError
@@ -270,8 +271,6 @@ def test_gradient_of_the_evidence() -> None:
     prepared = learning.prepare(
         nominal, seen, ("tilt_north", "azimuth_bias", "elevation_bias"), first.names, used
     )
-    from heliotrope.calibration.learn import _drift_kernels as kernels
-
     data = dataclasses.replace(prepared.field[0], steps=np.array([START / DAY + 80.0]))
 
     def value(vector: FloatArray) -> tuple[float, FloatArray]:
@@ -353,3 +352,35 @@ def test_guos_zeros_are_those_before_the_fit_and_his_scatter_that_after_it() -> 
         assert 0.05e-3 < figures.axes.sigma_alpha < 0.2e-3
         assert 0.05e-3 < figures.axes.sigma_gamma < 0.6e-3
         assert figures.document()["gamma_0_mrad"] == pytest.approx(8.0, abs=1.0)
+
+
+def test_left_out_and_gains_are_those_of_the_definition() -> None:
+    """Every sighting is predicted from the others, and every step weighed, without the lemmas."""
+    rng = np.random.default_rng(5)
+    n, size = 7, 2
+    root = rng.normal(size=(2 * n, 2 * n))
+    covariance = root @ root.T + np.eye(2 * n)
+    rest, slope = rng.normal(size=(n, 2)), rng.normal(size=(n, 2, size))
+    inverse, variance = np.linalg.inv(covariance), np.array([0.5, 2.0])
+    square, error, spread = left_out(inverse, inverse @ rest.ravel())
+    for i in range(n):
+        mine = np.array([2 * i, 2 * i + 1])
+        others = np.setdiff1d(np.arange(2 * n), mine)
+        share = covariance[np.ix_(mine, others)] @ np.linalg.inv(covariance[np.ix_(others, others)])
+        gap = rest[i] - share @ rest.ravel()[others]
+        left = covariance[np.ix_(mine, mine)] - share @ covariance[np.ix_(others, mine)]
+        np.testing.assert_allclose(error[i], gap, rtol=1e-9)
+        np.testing.assert_allclose(spread[i], left, rtol=1e-9)
+        assert square[i] == pytest.approx(gap @ np.linalg.solve(left, gap))
+    gains = kernels.step_gains(inverse, inverse @ rest.ravel(), slope, variance)
+    assert gains[0] == 0.0
+    for k in range(1, n):
+        moved = slope.copy()
+        moved[:k] = 0.0
+        moved = moved.reshape(2 * n, size)
+        with_step = covariance + moved @ np.diag(variance) @ moved.T
+        fits = [
+            rest.ravel() @ np.linalg.solve(c, rest.ravel()) + np.linalg.slogdet(c)[1]
+            for c in (covariance, with_step)
+        ]
+        assert gains[k] == pytest.approx(0.5 * (fits[0] - fits[1]), rel=1e-9)

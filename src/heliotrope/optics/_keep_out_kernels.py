@@ -21,7 +21,7 @@ import math
 
 from numba import njit
 
-from heliotrope.jit import INLINED, OPTIONS
+from heliotrope.jit import INLINED, INNER, OPTIONS
 from heliotrope.mechanism.kernels.vectors import about, across, add, cross, dot, minus, norm, times
 
 SPHERE, BOX, CYLINDER, PRISM = range(4)
@@ -63,7 +63,7 @@ def _extruded(flat, along):
     return outside + min(max(flat, along), 0.0)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _polygon(corners, first, last, x, y):
     """Signed distance of (x, y) from a polygon; inside where a ray crosses it an odd time."""
     best, inside = math.inf, False
@@ -179,7 +179,7 @@ def _levers(a):
     return norm(across(elbow, axis_1)) + norm(arm), norm(cross(axis_2, arm))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _move(row, corners, a, path, sun, reach, radius, near, spread, resolution, found):
     """Where along the path (K, 2) of joint angles a beam first enters the volume.
 
@@ -237,7 +237,8 @@ def move(table, corners, armatures, path, sun, reach, radius, near, spread, reso
     for i in range(len(armatures)):
         s = (sun[i, 0], sun[i, 1], sun[i, 2])
         for v in range(len(table)):
-            found[i, v, :] = math.nan
+            for c in range(found.shape[2]):
+                found[i, v, c] = math.nan
             poses = _move(
                 table[v],
                 corners,

@@ -17,7 +17,8 @@ from heliotrope.calibration.fit._residual_kernels import (
     scratch_mechanism,
     sighting_residual,
 )
-from heliotrope.jit import OPTIONS
+from heliotrope.calibration.median import median
+from heliotrope.jit import INNER, OPTIONS
 
 CONVERGED = 0
 NOT_CONVERGED = 1
@@ -66,7 +67,7 @@ def loss_and_weights(square, loss):
     return square, 1.0, 0.0
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def cholesky_solve(matrix, right, factor, out):
     """Solve matrix · out = right; returns False if the matrix is not positive definite."""
     size = matrix.shape[0]
@@ -94,7 +95,7 @@ def cholesky_solve(matrix, right, factor, out):
     return True
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def inverse_from(factor, out):
     """Inverse of factor · factorᵀ."""
     size = factor.shape[0]
@@ -156,7 +157,7 @@ def _normal_equations(problem, y, loss, scale, curved, hessian, gradient):
     return cost
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _minimise(problem, y, loss, scale, near, arrays, limit):
     """Levenberg-Marquardt from y, in place; returns (cost, iterations, converged).
 
@@ -207,7 +208,7 @@ def _minimise(problem, y, loss, scale, near, arrays, limit):
     return cost, limit, False
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _median_scale(squares, keep, rows):
     """Robust scale of residual lengths: the median of Rayleigh noise is 1.1774 σ."""
     kept = 0
@@ -219,10 +220,10 @@ def _median_scale(squares, keep, rows):
         if keep[i]:
             lengths[kept] = math.sqrt(squares[i])
             kept += 1
-    return np.median(lengths) / 1.1774100225154747
+    return median(lengths) / 1.1774100225154747
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _covariance(hessian, sigma, gradient, factor, step, out):
     """Covariance of x = y σ, (P, P); ``out`` is unchanged if the matrix is singular."""
     if cholesky_solve(hessian, gradient, factor, step):
@@ -278,7 +279,8 @@ def fit_block(
         kept = 0
         for k in range(rows[0], rows[1]):
             kept += keep[k]
-        y[:] = 0.0
+        for p in range(size):
+            y[p] = 0.0
         scale, total, converged, cost = 1.0, 0, False, np.nan
         problem = (base, codes, sigma[i], rows, data, squares, scratch, wrenches, jacobian)
         kind = loss
@@ -301,9 +303,13 @@ def fit_block(
         status[i] = CONVERGED if converged else NOT_CONVERGED
         if kept == 0:
             status[i] = TOO_FEW
-            hessian[:] = np.eye(size)
+            for p in range(size):
+                for q in range(size):
+                    hessian[p, q] = 1.0 * (p == q)
         elif not math.isfinite(cost):
             status[i] = FAILED
-        covariance[i] = np.nan
+        for p in range(size):
+            for q in range(size):
+                covariance[i, p, q] = np.nan
         if status[i] != FAILED:
             _covariance(hessian, sigma[i], gradient, solver[3], solver[4], covariance[i])

@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import INLINED, OPTIONS
+from heliotrope.jit import INLINED, INNER, OPTIONS
 from heliotrope.mechanism.kernels.chain import chain_pose
 from heliotrope.mechanism.kernels.drives import angle_per_slot, drive_angle, load_drive
 from heliotrope.mechanism.kernels.slots import (
@@ -37,7 +37,7 @@ from heliotrope.mechanism.kernels.track import (
 from heliotrope.mechanism.kernels.vectors import about, across, add, cross, dot, minus, times
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def apply_parameters(codes, x, position, origins, angles, drives, vertex, normal):
     """Move the arrays of one mechanism by x (P,), in place."""
     for p in range(codes.shape[0]):
@@ -95,7 +95,7 @@ def _row(table, i):
     return table[i, 0], table[i, 1], table[i, 2]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def place_mechanism(base, codes, sigma, y, scratch):
     """Move a mechanism by y σ, fill drives and twists; return its armature."""
     orientation, axes, driven, normal = base[1], base[2], base[6], base[8]

@@ -16,7 +16,8 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import OPTIONS
+from heliotrope.geometry import FloatArray
+from heliotrope.jit import INNER, OPTIONS
 
 
 @njit(**OPTIONS)
@@ -71,7 +72,7 @@ def gram(
     return out
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _decaying_gram(
     jacobian, time, label, epoch, static, regime, step, part, group, amplitude, tau, decay
 ):
@@ -194,75 +195,26 @@ def pooled_block(
             noise,
         )
         costs[i] = cost
-        gradients[i] = gradient
+        for k in range(gradients.shape[1]):
+            gradients[i, k] = gradient[k]
 
 
 @njit(**OPTIONS)
-def left_out(inverse, alpha, n):
-    """Squared distance of each sighting from the prediction of all others, and its variance.
+def step_sums(inverse, alpha, slope):
+    """Sums over the rows from each sighting on, by the zeros: UᵀK⁻¹U (n, Z, Z) and UᵀK⁻¹r (n, Z).
 
-    ``inverse`` is K⁻¹ (2 n, 2 n), ``alpha`` K⁻¹ r. Returns (z² (n,), error (n, 2),
-    covariance (n, 2, 2)); z² is χ² with two degrees of freedom. (Rasmussen & Williams,
-    Gaussian Processes for Machine Learning, (5.12), in blocks of two.)
-    """
-    square, error, spread = np.empty(n), np.empty((n, 2)), np.empty((n, 2, 2))
-    for i in range(n):
-        a, b, c = inverse[2 * i, 2 * i], inverse[2 * i, 2 * i + 1], inverse[2 * i + 1, 2 * i + 1]
-        determinant = a * c - b * b
-        spread[i, 0, 0], spread[i, 1, 1] = c / determinant, a / determinant
-        spread[i, 0, 1] = spread[i, 1, 0] = -b / determinant
-        x, y = alpha[2 * i], alpha[2 * i + 1]
-        error[i, 0] = spread[i, 0, 0] * x + spread[i, 0, 1] * y
-        error[i, 1] = spread[i, 1, 0] * x + spread[i, 1, 1] * y
-        square[i] = x * error[i, 0] + y * error[i, 1]
-    return square, error, spread
-
-
-@njit(**OPTIONS)
-def remove_farthest(inverse, residual, most):
-    """Remove the sighting farthest from the others repeatedly.
-
-    Returns (which (most,), their z² (most,)) in the order of removal.
-    """
-    n = len(residual)
-    inverse = inverse.copy()
-    flat = residual.copy().reshape(2 * n)
-    which, squares = np.empty(most, dtype=np.int64), np.empty(most)
-    gone = np.zeros(n, dtype=np.bool_)
-    for step in range(most):
-        square, _, spread = left_out(inverse, inverse @ flat, n)
-        best = -1
-        for i in range(n):
-            if not gone[i] and (best < 0 or square[i] > square[best]):
-                best = i
-        which[step], squares[step] = best, square[best]
-        gone[best] = True
-        # Schur: the inverse without rows and columns of ``best``.
-        pair = inverse[:, 2 * best : 2 * best + 2].copy()
-        inverse -= pair @ spread[best] @ np.ascontiguousarray(pair.T)
-        for k in (2 * best, 2 * best + 1):
-            inverse[k, :] = 0.0
-            inverse[:, k] = 0.0
-            inverse[k, k] = 1.0
-            flat[k] = 0.0
-    return which, squares
-
-
-@njit(**OPTIONS)
-def step_gains(inverse, alpha, slope, variance):
-    """Gain in log evidence by a step of the zeros before each sighting, sorted by time, (n,).
-
-    ``slope`` (n, 2, Z) are the derivatives by the Z zeros, ``variance`` (Z,) of the step.
-    With U the derivatives of the rows from k on, the gain is
-    −½ log |1 + V UᵀK⁻¹U| + ½ bᵀ(V⁻¹ + UᵀK⁻¹U)⁻¹ b, b = UᵀK⁻¹r (matrix determinant lemma).
+    ``slope`` (n, 2, Z) are the derivatives by the Z zeros; U are those of the rows from k on.
     """
     n, size = slope.shape[0], slope.shape[2]
-    gains = np.zeros(n)
-    total, right = np.zeros((size, size)), np.zeros(size)
-    for k in range(n - 1, 0, -1):
+    totals, rights = np.zeros((n, size, size)), np.zeros((n, size))
+    for k in range(n - 1, -1, -1):
         for z in range(size):
+            if k + 1 < n:
+                rights[k, z] = rights[k + 1, z]
+                for y in range(size):
+                    totals[k, y, z] = totals[k + 1, y, z]
             for a in range(2):
-                right[z] += slope[k, a, z] * alpha[2 * k + a]
+                rights[k, z] += slope[k, a, z] * alpha[2 * k + a]
         for j in range(k, n):
             twice = 1.0 if j == k else 2.0
             for y in range(size):
@@ -275,10 +227,22 @@ def step_gains(inverse, alpha, slope, variance):
                                 slope[k, a, y] * w * slope[j, b, z]
                                 + slope[k, a, z] * w * slope[j, b, y]
                             )
-                    total[y, z] += 0.5 * twice * block
-        spread = total.copy()
-        for z in range(size):
-            spread[z, z] += 1.0 / variance[z]
-        log_size = np.log(np.linalg.det(spread)) + np.sum(np.log(variance))
-        gains[k] = 0.5 * np.dot(right, np.linalg.solve(spread, right)) - 0.5 * log_size
-    return gains
+                    totals[k, y, z] += 0.5 * twice * block
+    return totals, rights
+
+
+def step_gains(
+    inverse: FloatArray, alpha: FloatArray, slope: FloatArray, variance: FloatArray
+) -> FloatArray:
+    """Gain in log evidence by a step of the zeros before each sighting, sorted by time, (n,).
+
+    ``variance`` (Z,) is that of the step; the first sighting has no step before it. The gain is
+    −½ log |1 + V UᵀK⁻¹U| + ½ bᵀ(V⁻¹ + UᵀK⁻¹U)⁻¹ b, b = UᵀK⁻¹r (matrix determinant lemma).
+    """
+    totals, rights = step_sums(inverse, alpha, slope)
+    spread = totals + np.diag(1.0 / variance)
+    log_size = np.linalg.slogdet(spread)[1] + np.sum(np.log(variance))
+    solved = np.linalg.solve(spread, rights[..., None])[..., 0]
+    gains = 0.5 * np.sum(rights * solved, axis=-1) - 0.5 * log_size
+    gains[:1] = 0.0
+    return np.asarray(gains)

@@ -5,7 +5,8 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import OPTIONS
+from heliotrope.calibration.median import median
+from heliotrope.jit import INNER, OPTIONS
 
 #: Largest squared residual that counts, units of the noise: one bad sighting makes no regime.
 TRUNCATION = 16.0
@@ -15,7 +16,7 @@ PRICE, CUT = 16.0, 8.0
 FEWEST = 3
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _segment(residual, jacobian, start, stop, shift):
     """Cost of one segment with zeros of its own, by re-weighted least squares from its median."""
     n = stop - start
@@ -30,7 +31,7 @@ def _segment(residual, jacobian, start, stop, shift):
             determinant = np.inf
         values[0, i] = -(d * x - b * y) / determinant
         values[1, i] = -(a * y - c * x) / determinant
-    shift[0], shift[1] = np.median(values[0]), np.median(values[1])
+    shift[0], shift[1] = median(values[0]), median(values[1])
     cost = np.inf
     for turn in range(4):
         h00, h01, h11, g0, g1, total = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -91,7 +92,8 @@ def partition(residual, jacobian, places, smallest):
     while k > 0:
         if own[k]:
             number += 1
-            label[places[come[k]] : places[k]] = number
+            for i in range(places[come[k]], places[k]):
+                label[i] = number
         k = come[k]
     # Numbered from the first to the last.
     for i in range(n):

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import OPTIONS
+from heliotrope.jit import INNER, OPTIONS
 
 # What happened before a sighting; UNKNOWN weighs all of it.
 UNKNOWN, NOTHING, STEP, REGIME, RETURN, BLUNDER = -1, 0, 1, 2, 3, 4
@@ -19,7 +19,7 @@ MOST, LEAST = 8, 1e-4
 ALIKE = 0.3
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def propagate(mean, covariance, first, amplitude, tau, days):
     """Let the processes of one hypothesis pass ``days``, in place."""
     for c in range(amplitude.shape[0]):
@@ -49,7 +49,7 @@ def moments(weight, mean, covariance, first, amplitude, tau, days):
     return middle, spread
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def reset(mean, covariance, k, variance):
     """Forget component k of one hypothesis, in place."""
     mean[k] = 0.0
@@ -59,14 +59,14 @@ def reset(mean, covariance, k, variance):
     covariance[k, k] = variance
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _log_density(x, y, a, b, c):
     determinant = a * c - b * b
     square = (c * x * x - 2.0 * b * x * y + a * y * y) / determinant
     return -0.5 * square - 0.5 * math.log(determinant) - math.log(2.0 * math.pi)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _compare(mean, covariance, rows, value, noise, far):
     """Compare one hypothesis with a sighting.
 
@@ -90,7 +90,7 @@ def _compare(mean, covariance, rows, value, noise, far):
     return gain, x, y, a, b, c, _log_density(x, y, a, b, c), _log_density(x, y, a + far, b, c + far)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _condition(mean, covariance, found):
     """Update one hypothesis by the sighting that it was compared with, in place."""
     gain, x, y, a, b, c = found[0], found[1], found[2], found[3], found[4], found[5]
@@ -106,7 +106,7 @@ def _condition(mean, covariance, found):
             covariance[k, j] = covariance[j, k]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _same(mean, covariance, i, j):
     for k in range(mean.shape[1]):
         a, b = covariance[i, k, k], covariance[j, k, k]
@@ -121,7 +121,7 @@ def _same(mean, covariance, i, j):
     return True
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _merge(mean, covariance, weight, i, j):
     """Moments of hypotheses i and j together, into i."""
     total = weight[i] + weight[j]
@@ -138,7 +138,7 @@ def _merge(mean, covariance, weight, i, j):
     weight[i] = total
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _reduce(mean, covariance, weight, regime, count):
     """Order hypotheses by weight, merge those alike and drop the improbable; return their number.
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 
 from heliotrope.calibration.learn import _drift_kernels as kernels
-from heliotrope.calibration.learn.outliers import ALPHA, critical, generalised_esd
+from heliotrope.calibration.learn.outliers import ALPHA, critical, generalised_esd, left_out
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.optics.beam import CHI_SQUARE_90
@@ -487,10 +487,7 @@ class Posterior:
 
     def left_out(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return z² (n,), error (n, 2), covariance (n, 2, 2) of each as the others predict it."""
-        found: tuple[FloatArray, FloatArray, FloatArray] = kernels.left_out(
-            self.inverse, self.alpha, len(self.data)
-        )
-        return found
+        return left_out(self.inverse, self.alpha)
 
     def log_predictive(self) -> FloatArray:
         """Return the log probability density of each sighting given the others, (n,)."""

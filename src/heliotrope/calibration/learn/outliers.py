@@ -9,7 +9,6 @@ exceeds 2 ln(n / α) with probability α.
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.learn import _drift_kernels as kernels
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 
@@ -57,11 +56,48 @@ def generalised_esd(
         inverse = np.linalg.inv(np.asarray(covariance, dtype=np.float64))
     except np.linalg.LinAlgError:
         raise InputError("covariance of the residuals: singular; add the noise") from None
-    which, squares = kernels.remove_farthest(inverse, rest, most)
+    which, squares = _remove_farthest(inverse, rest, most)
     beyond = np.flatnonzero(squares > critical(n - np.arange(most), alpha))
     if len(beyond):
         mask[which[: beyond[-1] + 1]] = True
     return mask
+
+
+def left_out(inverse: FloatArray, alpha: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return each sighting's distance from the prediction of all others, and its variance.
+
+    ``inverse`` is K⁻¹ (2 n, 2 n), ``alpha`` K⁻¹ r (2 n,). Returns (z² (n,), error (n, 2),
+    covariance (n, 2, 2)); z² is χ² with two degrees of freedom. (Rasmussen & Williams,
+    Gaussian Processes for Machine Learning, (5.12), in blocks of two.)
+    """
+    a, b = np.diagonal(inverse)[::2], np.diagonal(inverse, 1)[::2]
+    c = np.diagonal(inverse)[1::2]
+    determinant = a * c - b * b
+    spread = np.stack([c, -b, -b, a], axis=-1) / determinant[:, None]
+    x, y = alpha[::2], alpha[1::2]
+    error = np.stack([spread[:, 0] * x + spread[:, 1] * y, spread[:, 2] * x + spread[:, 3] * y], -1)
+    return x * error[:, 0] + y * error[:, 1], error, spread.reshape(-1, 2, 2)
+
+
+def _remove_farthest(
+    inverse: FloatArray, residual: FloatArray, most: int
+) -> tuple[npt.NDArray[np.intp], FloatArray]:
+    """Remove the sighting farthest from the others ``most`` times: (which, their z²), in order."""
+    inverse, flat = inverse.copy(), residual.ravel().copy()
+    which, squares = np.empty(most, dtype=np.intp), np.empty(most)
+    gone = np.zeros(len(residual), dtype=np.bool_)
+    for step in range(most):
+        square, _, spread = left_out(inverse, inverse @ flat)
+        best = int(np.argmax(np.where(gone, -np.inf, square)))
+        which[step], squares[step] = best, square[best]
+        gone[best] = True
+        # Schur: the inverse without rows and columns of ``best``.
+        rows = slice(2 * best, 2 * best + 2)
+        pair = inverse[:, rows].copy()
+        inverse -= pair @ spread[best] @ pair.T
+        inverse[rows], inverse[:, rows], flat[rows] = 0.0, 0.0, 0.0
+        inverse[rows, rows] = np.eye(2)
+    return which, squares
 
 
 def critical(count: npt.ArrayLike, alpha: float = ALPHA) -> FloatArray:

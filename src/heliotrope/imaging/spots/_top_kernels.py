@@ -5,10 +5,10 @@
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import OPTIONS
+from heliotrope.jit import INNER, OPTIONS
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _root(parent, number):
     """Return the top into which a top was merged."""
     while parent[number] != number:

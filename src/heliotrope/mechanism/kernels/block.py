@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import INLINED, OPTIONS
+from heliotrope.jit import INLINED, INNER, OPTIONS
 from heliotrope.mechanism.kernels.drives import drive_angle, drive_counts, load_drive
 from heliotrope.mechanism.kernels.slots import (
     BIAS,
@@ -65,7 +65,7 @@ def _counts(d, theta):
     return drive_counts(d, theta)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _count_stops(d):
     low, high = d[MIN_ANGLE], d[MAX_ANGLE]
     lower, upper = d[MIN_COUNT], d[MAX_COUNT]
@@ -106,12 +106,12 @@ def into_stops(theta, stops, near):
     return low, False
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _turn(theta_1, theta_2):
     return math.sin(theta_1), math.cos(theta_1), math.sin(theta_2), math.cos(theta_2)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _free_angle(g, axis, held, u, v, stops, near):
     """Best angle of the other joint while joint ``axis`` is held, within its stops."""
     if axis == 0:
@@ -123,7 +123,7 @@ def _free_angle(g, axis, held, u, v, stops, near):
     return into_stops(math.atan2(sine, cosine), stops, near)[0]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _along_stop(g, s, p, u, v, local, axis, held, stops, near):
     """Nearest pose with joint ``axis`` held at a stop; returns (residual, θ₁, θ₂)."""
     other = 1 - axis
@@ -144,7 +144,7 @@ def _along_stop(g, s, p, u, v, local, axis, held, stops, near):
     return residual_angle(g, t, u, v_here), one, two
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _nearest_at_stops(g, s, p, u, v, local, stops, near):
     """Nearest pose on the border of the stops' rectangle: (residual, θ₁, θ₂)."""
     best, one, two = np.inf, 0.0, 0.0
@@ -195,7 +195,7 @@ def _home(stops):
     return 0.0
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _better(status, residual, seconds, radians):
     """Whether the second branch is to be preferred to the first."""
     if status[0] == OK and status[1] == OK:

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import OPTIONS
+from heliotrope.jit import INNER, OPTIONS
 from heliotrope.mechanism.kernels.drives import angle_per_count, angle_per_slot, drive_angle
 from heliotrope.mechanism.kernels.slots import (
     MOVES_ALONG_NORMAL,
@@ -24,7 +24,7 @@ from heliotrope.mechanism.kernels.slots import (
 )
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def turn(matrix, axis, angle, out):
     """out = matrix · Rot(axis, angle), with the axis in the frame of ``matrix``."""
     x, y, z = axis[0], axis[1], axis[2]
@@ -47,13 +47,13 @@ def turn(matrix, axis, angle, out):
         out[i, 2] = a * r02 + b * r12 + c * r22
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _place(matrix, vector, out):
     for i in range(3):
         out[i] = matrix[i, 0] * vector[0] + matrix[i, 1] * vector[1] + matrix[i, 2] * vector[2]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def chain_pose(
     position,
     orientation,
@@ -77,8 +77,10 @@ def chain_pose(
     vertex m (3,).
     """
     joints = axes.shape[0]
-    frames[0] = orientation
-    m[:] = position
+    for i in range(3):
+        m[i] = position[i]
+        for k in range(3):
+            frames[0, i, k] = orientation[i, k]
     for j in range(joints):
         frame = frames[j]
         for i in range(3):
@@ -87,7 +89,7 @@ def chain_pose(
                 + frame[i, 1] * origins[j, 1]
                 + frame[i, 2] * origins[j, 2]
             )
-        screw_points[j] = m
+            screw_points[j, i] = m[i]
         _place(frame, axes[j], screw_axes[j])
         angle = angles[j]
         for k in range(driven.shape[0]):
@@ -100,7 +102,7 @@ def chain_pose(
         m[i] += frame[i, 0] * vertex[0] + frame[i, 1] * vertex[1] + frame[i, 2] * vertex[2]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _screw(axis, point, n, m, factor, dn, dm):
     dn[0] = factor * (axis[1] * n[2] - axis[2] * n[1])
     dn[1] = factor * (axis[2] * n[0] - axis[0] * n[2])
@@ -111,7 +113,7 @@ def _screw(axis, point, n, m, factor, dn, dm):
     dm[2] = factor * (axis[0] * y - axis[1] * x)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def chain_derivative(
     what, index, sub, drives, driven, counts, frames, screw_axes, screw_points, n, m, dn, dm
 ):
@@ -123,16 +125,16 @@ def chain_derivative(
         factor = angle_per_slot(drives[index], counts[index], sub)
         _screw(screw_axes[j], screw_points[j], n, m, factor, dn, dm)
     else:
-        dn[:] = 0.0
-        if what == MOVES_POSITION:
-            dm[:] = 0.0
-            dm[sub] = 1.0
-        elif what == MOVES_ORIGIN:
-            dm[:] = frames[index][:, sub]
-        elif what == MOVES_VERTEX:
-            dm[:] = frames[frames.shape[0] - 1][:, sub]
-        elif what == MOVES_ALONG_NORMAL:
-            dm[:] = n
+        for i in range(3):
+            dn[i] = 0.0
+            if what == MOVES_POSITION:
+                dm[i] = 1.0 * (i == sub)
+            elif what == MOVES_ORIGIN:
+                dm[i] = frames[index, i, sub]
+            elif what == MOVES_VERTEX:
+                dm[i] = frames[frames.shape[0] - 1, i, sub]
+            elif what == MOVES_ALONG_NORMAL:
+                dm[i] = n[i]
 
 
 @njit(**OPTIONS)
@@ -278,8 +280,8 @@ def armature_block(
             n,
             m,
         )
-        for k in range(driven.shape[0]):
-            out[i, 6 * k : 6 * k + 3] = screw_axes[driven[k]]
-            out[i, 6 * k + 3 : 6 * k + 6] = screw_points[driven[k]]
-        out[i, 12:15] = m
-        out[i, 15:18] = n
+        for c in range(3):
+            for k in range(driven.shape[0]):
+                out[i, 6 * k + c] = screw_axes[driven[k], c]
+                out[i, 6 * k + 3 + c] = screw_points[driven[k], c]
+            out[i, 12 + c], out[i, 15 + c] = m[c], n[c]

@@ -4,7 +4,7 @@ import math
 
 from numba import njit
 
-from heliotrope.jit import INLINED, OPTIONS
+from heliotrope.jit import INLINED, INNER, OPTIONS
 from heliotrope.mechanism.kernels.slots import (
     BIAS,
     KIND,
@@ -33,20 +33,20 @@ def load_drive(table, i, k):
     return r + s + t + (table[i, k, 15], table[i, k, 16], table[i, k, 17], table[i, k, 18])
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def triangle_angle(length, offset, radius):
     """Angle at the joint of the triangle (offset, radius, length), clamped to [0, π]."""
     cosine = (offset * offset + radius * radius - length * length) / (2.0 * offset * radius)
     return math.acos(min(1.0, max(-1.0, cosine)))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _triangle_slope(length, offset, radius):
     """dΦ/dL of the triangle; infinite where it is stretched flat."""
     return length / (offset * radius * math.sin(triangle_angle(length, offset, radius)))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def ideal_angle(d, counts):
     """Angle φ of drive row ``d`` before bias, scale, worm and sag."""
     if d[KIND] == LINEAR:
@@ -58,14 +58,14 @@ def ideal_angle(d, counts):
     return d[ZERO] + d[RATE] * counts
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _worm_argument(d, counts, phi):
     if d[KIND] == LINEAR:
         return d[WORM_RATIO] * d[RATE] * counts
     return d[WORM_RATIO] * phi
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def drive_angle(d, counts):
     """Joint angle θ = bias + (1 + scale) φ + worm + sag of drive row ``d``."""
     phi = ideal_angle(d, counts)
@@ -78,7 +78,7 @@ def drive_angle(d, counts):
     return theta
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def angle_per_ideal(d, counts, phi):
     """Return (dθ/dφ with the worm's argument held, dθ/du of the worm)."""
     slope = 1.0 + d[SCALE] - d[SAG] * math.sin(phi + d[SAG_PHASE])
@@ -89,7 +89,7 @@ def angle_per_ideal(d, counts, phi):
     return slope, worm
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def angle_per_count(d, counts):
     """dθ/dcounts of drive row ``d``."""
     phi = ideal_angle(d, counts)
@@ -101,7 +101,7 @@ def angle_per_count(d, counts):
     return (slope + worm * d[WORM_RATIO]) * d[RATE]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def angle_per_slot(d, counts, slot):
     """dθ/d(slot) of drive row ``d`` at constant counts."""
     phi = ideal_angle(d, counts)
@@ -143,7 +143,7 @@ def angle_per_slot(d, counts, slot):
     return slope * d[SENSE] * (second - first)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _counts_of_ideal(d, phi):
     """Counts at which the ideal angle is ``phi``; a jack's reach is clamped to its triangle."""
     if d[KIND] == LINEAR:
@@ -157,7 +157,7 @@ def _counts_of_ideal(d, phi):
     return (phi - d[ZERO]) / d[RATE]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def drive_counts(d, theta):
     """Counts at which drive row ``d`` stands at joint angle ``theta``.
 

@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import INLINED, OPTIONS
+from heliotrope.jit import INLINED, INNER
 from heliotrope.mechanism.kernels.vectors import (
     about,
     across,
@@ -217,7 +217,7 @@ def residual_angle(g, t, u, v):
     return angle(x, v)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _columns(g, t, n, m, k):
     """(dn, dm) by joint angle k: the screw formula."""
     if k == 0:
@@ -229,7 +229,7 @@ def _columns(g, t, n, m, k):
     return cross(w, n), cross(w, minus(m, o))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _difference_column(g, t, n, m, v, way, distance, k):
     """d(n − v) by joint angle k; the bisector v moves with the vertex."""
     dn, dm = _columns(g, t, n, m, k)
@@ -240,7 +240,7 @@ def _difference_column(g, t, n, m, v, way, distance, k):
     return minus(dn, times(0.5 / dot(v, way), across(dway, v)))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _gradient(g, s, p, one, two):
     """Half the gradient of |n − v|² by the two joint angles."""
     t = (math.sin(one), math.cos(one), math.sin(two), math.cos(two))
@@ -255,7 +255,7 @@ def _gradient(g, s, p, one, two):
     return dot(first, gap), dot(second, gap)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _curvature(g, s, p, one, two):
     """Half the second derivatives of |n − v|², by differences of its gradient.
 
@@ -271,7 +271,7 @@ def _curvature(g, s, p, one, two):
     return 0.5 * (up_0 - down_0) / h, mixed, 0.5 * (right_1 - left_1) / h
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _newton(g, s, p, t, tolerance):
     """Levenberg-damped Newton on |n − v|² from turn t; returns (status, iterations, t)."""
     theta_1, theta_2 = math.atan2(t[0], t[1]), math.atan2(t[2], t[3])

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import INLINED, OPTIONS
+from heliotrope.jit import INLINED, INNER
 from heliotrope.mechanism.kernels.track import axis_1, axis_2, constants, load_armature
 from heliotrope.mechanism.kernels.vectors import across, add, cross, dot, minus, times
 
@@ -92,7 +92,7 @@ def _step(w, sign):
         w[_Y + 2, i] = cosine_1 * z + sine_1 * (a0 * y - a1 * x) + along * a2
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def warm_start(armatures, suns, aims, index, first, stop, sign, vertices):
     """Vertices (LANES, 3) to start rows ``first`` … from, after STEPS steps.
 

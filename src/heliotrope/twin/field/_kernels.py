@@ -2,13 +2,13 @@
 
 from numba import njit
 
-from heliotrope.jit import OPTIONS
+from heliotrope.jit import INNER, OPTIONS
 
 SCALE = 1024
 BOTH, PRIMARY_FIRST, SECONDARY_FIRST = 0, 1, 2
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _root(square):
     if square < 2:
         return square
@@ -23,13 +23,13 @@ def _root(square):
         guess = better
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _stopping(speed, change):
     m = speed // change
     return (m + 1) * speed - change * m * (m + 1) // 2
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _fastest(distance, change):
     m = (_root(8 * distance // change + 1) - 1) >> 1
     while change * m * (m + 1) // 2 > distance:
@@ -39,13 +39,13 @@ def _fastest(distance, change):
     return (distance + change * m * (m + 1) // 2) // (m + 1)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _still(axes, i, k):
     a = axes[i, k]
     return a["speed"] == 0 and (a["braking"] or (a["count"] == a["leg"] and a["leg"] == a["goal"]))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _aim(axes, i, k, goal):
     a = axes[i, k]
     cut = min(max(goal, a["low"]), a["high"])
@@ -60,7 +60,7 @@ def _aim(axes, i, k, goal):
         axes[i, k]["leg"] = max(a["low"], cut - a["backlash"])
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _slot(axes, i, k, held):
     a = axes[i, k]
     if a["speed"] == 0:
@@ -114,7 +114,7 @@ def still_rows(axes, queued, out):
         out[i] = queued[i] <= 0 and _still(axes, i, 0) and _still(axes, i, 1)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _carry(drives, i, k, steps):
     """Turn a motor by its emitted steps; the flank of the gear that pushes carries the joint."""
     turned, joint, play, lost, missed = drives
