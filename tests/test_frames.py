@@ -9,6 +9,7 @@ import pytest
 import xarray
 
 import heliotrope as ht
+from heliotrope.calibration import predict
 from heliotrope.errors import InputError
 
 PLANT = ht.example_plant()
@@ -97,6 +98,7 @@ def test_every_record_has_a_frame_and_a_dataset(learned: ht.Learned, tmp_path: P
         "learned": learned,
         "forecast": learned.forecast("P6A", TIMES[:5], "target"),
         "errors": ht.beam_errors(PLANT["P6A"], seen),
+        "predicted": predict(learned, seen),
     }
     for name, record in records.items():
         frame, data = record.to_frame(), record.to_xarray()

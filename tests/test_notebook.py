@@ -104,6 +104,20 @@ def test_an_own_mechanism(tmp_path: Path) -> None:
     assert (found.charts, found.scenes) == (3, 1)
 
 
+def test_an_own_centroid(tmp_path: Path) -> None:
+    found = Executed(EXAMPLES / "notebooks" / "own_centroid.ipynb", tmp_path)
+    for name in ("everything", "upper half", "program"):
+        error, ratio = found.numbers(rf"{name}: ([\d.]+) mm RMS, .* ([\d.]+)")
+        assert error < 30.0
+        assert 0.3 < ratio < 3.0
+    (nominal,) = found.numbers(r"nominal: ([\d.]+) mrad of beam")
+    (calibrated,) = found.numbers(r"calibrated: ([\d.]+) mrad of beam")
+    assert nominal > 4.0
+    # 10 mm at 80 m are 0.13 mrad.
+    assert calibrated < 0.5
+    assert found.charts == 3
+
+
 def test_a_campaign(tmp_path: Path) -> None:
     found = Executed(EXAMPLES / "notebooks" / "campaign.ipynb", tmp_path)
     (planned,) = found.numbers(r"planned, best first: ([\d.]+) mrad")

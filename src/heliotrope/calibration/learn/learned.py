@@ -22,7 +22,7 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.calibration.sightings import sightings as make_sightings
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.target import Receiver, Target, point_of
-from heliotrope.frames import Framed, Labelled, Variable
+from heliotrope.frames import ACROSS, Framed, Labelled, Variable
 from heliotrope.frames import times as as_times
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.chain import Mechanism
@@ -36,7 +36,7 @@ USUAL_SIGMA = 5e-4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Prediction(Value):
+class Prediction(Value, Framed):
     """Predicted against measured positions of M beams.
 
     Attributes
@@ -65,6 +65,24 @@ class Prediction(Value):
     beam: FloatArray
     values: FloatArray
     usable: npt.NDArray[np.bool_]
+
+    def _labelled(self) -> Labelled:
+        row = ("sighting",)
+        return Labelled(
+            row,
+            {
+                "sighting": np.arange(len(self.plane)),
+                "across": ACROSS,
+                "across_2": ACROSS,
+            },
+            {
+                "beam": Variable(row, self.errors.beam, "rad"),
+                "plane": Variable((*row, "across"), self.plane, "rad"),
+                "covariance": Variable((*row, "across", "across_2"), self.covariance, "rad2"),
+                "inside": Variable(row, self.inside),
+                "usable": Variable(row, self.usable),
+            },
+        )
 
     def _card(self) -> Card:
         good = self.usable
