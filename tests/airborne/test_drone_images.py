@@ -13,12 +13,18 @@ from typer.testing import CliRunner
 from heliotrope.airborne.evaluate import evaluation, reading, rtk
 from heliotrope.airborne.evaluate.bundle import Priors
 from heliotrope.airborne.evaluate.detection import decode, find_outlines, find_patches, find_spots
-from heliotrope.airborne.evaluate.identification import identify
+from heliotrope.airborne.evaluate.identification import identify, rotation_angle
 from heliotrope.airborne.evaluate.orientation import measure_field, rotation_between
 from heliotrope.airborne.evaluate.reading import PhotoReading, look, read_photo
 from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.mirror import ideal
-from heliotrope.airborne.photo import Photo, read_camera, read_photos, rotation_of_gimbal
+from heliotrope.airborne.photo import (
+    Photo,
+    gimbal_of_rotation,
+    read_camera,
+    read_photos,
+    rotation_of_gimbal,
+)
 from heliotrope.airborne.simulate import rendering
 from heliotrope.airborne.simulate.simulation import Errors, Flight, exact_reflections
 from heliotrope.airborne.standing import MirrorPoses, standing
@@ -200,6 +206,28 @@ def test_wrong_field_is_not_believed(case: Case) -> None:
     rng = np.random.default_rng(7)
     other = replace(case.stand, vertex=case.stand.vertex + rng.uniform(-4, 4, (20, 3)) * [1, 1, 0])
     assert read_photo(case.photos[0], case.flown.camera, other).problem
+
+
+@pytest.mark.parametrize(
+    ("degrees", "found"),
+    # A turn by 8.6° brings each mirror of a ring before the next one.
+    [((8.7, 0.0), True), ((-8.7, 0.0), True), ((0.0, -8.7), True), ((12.2, 0.0), False)],
+)
+def test_a_gimbal_far_off_is_found_or_refused(
+    case: Case, degrees: tuple[float, float], found: bool
+) -> None:
+    true = case.flown.taken[5].rotation
+    yaw, pitch, roll = gimbal_of_rotation(true)
+    wrong = rotation_of_gimbal(yaw + np.radians(degrees[0]), pitch + np.radians(degrees[1]), roll)
+    photo = replace(case.photos[5], rotation=wrong)
+    seen = read_photo(photo, case.flown.camera, case.stand)
+    if found:
+        assert seen.problem == ""
+        assert rotation_angle(seen.rotation, true) < 1.0 * MRAD
+        assert seen.mirror.tolist() == list(range(20))
+    else:
+        assert "the gimbal may be more than 4° off: check its angles" in seen.problem
+        assert "heliotrope drone match" in seen.why_unused()
 
 
 def test_regular_field_without_edges_is_ambiguous() -> None:

@@ -11,13 +11,14 @@ In a night without moon only the lamp can be seen. A mirror that stands as comma
 the foot of the perpendicular from the drone, so these feet are matched with the spots instead.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from heliotrope.airborne.evaluate.detection import Picture, Spots, find_spots
-from heliotrope.airborne.photo import LedCamera, Photo
+from heliotrope.airborne.photo import LedCamera, Photo, gimbal_of_rotation, rotation_of_gimbal
 from heliotrope.airborne.standing import MirrorPoses
 from heliotrope.field.camera import undistort
 from heliotrope.geometry import FloatArray, as_float, rotation
@@ -26,6 +27,14 @@ Rows = npt.NDArray[np.intp]
 
 #: Largest gimbal error that is searched, rad.
 GIMBAL = float(np.radians(4.0))
+#: Largest error of a gimbal that is searched where the mirrors fit badly, rad: rows are nearly
+#: periodic, so the field shifted by a row may fit half-way while the gimbal is further off.
+FAR_GIMBAL = float(np.radians(12.0))
+#: A solution fits badly beyond this RMS distance of patches from mirrors, in mirrors' sides, or
+#: with a smaller share of mirrors and patches matched. Beyond the second distance it is not
+#: trusted, nor with this share of both mirrors and patches left over, as a shifted field leaves.
+#: Rendered photographs have 0.01 to 0.05, shifted fields 0.03 to 0.17 with 60 to 85 % matched.
+_BAD_FIT, _WORST_FIT, _GOOD_SHARE, _LEFT = 0.06, 0.08, 0.92, 0.1
 #: Fewest mirrors that must match, and their least share of those expected in the frame.
 FEWEST, LEAST_SHARE = 4, 0.4
 #: The best solution must explain this many more mirrors and patches than any other.
@@ -53,21 +62,25 @@ class Identified:
         Pairs of a mirror's row and a patch, (K,).
     reason
         Why no solution is trusted; "" if one is.
+    shifted
+        Whether the field seems to fit only where it is shifted: laid over the photograph it would
+        fit there too.
     """
 
     rotation: FloatArray
     mirror: Rows
     patch: Rows
     reason: str = ""
+    shifted: bool = False
 
 
 def expected_size(
-    camera: LedCamera, photo: Photo, stand: MirrorPoses
+    camera: LedCamera, photo: Photo, stand: MirrorPoses, gimbal: float = GIMBAL
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """Return the sides of mirrors as a photograph shows them, px, and which may be in it, (M,).
 
-    The side is the root of the area. A mirror may be in the frame if a gimbal error of up to
-    `GIMBAL` can bring it there.
+    The side is the root of the area. A mirror may be in the frame if an error of the gimbal can
+    bring it there.
     """
     local = (stand.corners - photo.position) @ photo.rotation
     depth = local[..., 2]
@@ -76,7 +89,7 @@ def expected_size(
     area = quad_area(plane)
     front = np.sum((photo.position - stand.vertex) * stand.rotation[:, :, 2], axis=-1) > 0.0
     width, height = camera.size
-    limit = np.array([width, height]) / (2.0 * camera.focal) * 1.1 + np.tan(GIMBAL)
+    limit = np.array([width, height]) / (2.0 * camera.focal) * 1.1 + np.tan(gimbal)
     middle = plane.mean(axis=1)
     seen = front & np.isfinite(area) & (np.abs(middle) < limit).all(axis=-1)
     return np.sqrt(np.nan_to_num(area)) * camera.focal, seen
@@ -99,7 +112,12 @@ def nearest_rotation(ways: FloatArray, rays: FloatArray) -> FloatArray:
 
 
 def identify(
-    camera: LedCamera, photo: Photo, stand: MirrorPoses, patches: FloatArray
+    camera: LedCamera,
+    photo: Photo,
+    stand: MirrorPoses,
+    patches: FloatArray,
+    *,
+    far: bool = True,
 ) -> Identified:
     """Return which mirrors the patches show, and the attitude of the camera.
 
@@ -113,9 +131,12 @@ def identify(
         All mirrors in their expected poses.
     patches
         Centres of patches, px, (K, 2).
+    far
+        Whether an attitude up to `FAR_GIMBAL` away is looked for where the mirrors fit badly. If
+        it fits clearly better, it counts.
     """
     none = np.empty(0, dtype=np.intp)
-    side, seen = expected_size(camera, photo, stand)
+    _, seen = expected_size(camera, photo, stand)
     rows = np.flatnonzero(seen)
     if len(rows) < FEWEST:
         text = f"wrong_field: {len(rows)} mirrors of the field can be in it; is this the right one?"
@@ -123,24 +144,86 @@ def identify(
     if len(patches) < FEWEST:
         text = f"nothing: {len(patches)} patches look like mirrors, {FEWEST} are needed"
         return Identified(photo.rotation, none, none, text)
+    tried = _search(camera, photo, stand, rows, patches, (photo.rotation,))
+    near, fit = _choose(tried, photo, camera, stand, rows, len(patches))
+    if not far or (fit is not None and fit.good) or near.reason.startswith("ambiguous"):
+        return near
+    return _farther(camera, photo, stand, patches, near, fit)
+
+
+def _search(
+    camera: LedCamera,
+    photo: Photo,
+    stand: MirrorPoses,
+    rows: Rows,
+    patches: FloatArray,
+    about: Sequence[FloatArray],
+) -> "list[_Tried]":
+    """Return the solutions within `GIMBAL` of some attitudes; their mirrors count in ``rows``."""
+    side, _ = expected_size(camera, photo, stand)
     ways = stand.corners[rows].mean(axis=1) - photo.position
     ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
     plane = undistort(camera, patches)
     rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     size = float(np.median(side[rows])) / camera.focal
-    tried = [
+    return [
         _refine(start, ways, rays, side[rows] / camera.focal)
-        for start in _starts(photo.rotation, ways, plane, size)
+        for turned in about
+        for start in _starts(turned, ways, plane, size)
     ]
-    return _choose(tried, photo, camera, stand, rows, len(patches))
+
+
+def _farther(
+    camera: LedCamera,
+    photo: Photo,
+    stand: MirrorPoses,
+    patches: FloatArray,
+    near: Identified,
+    fit: "_Fit | None",
+) -> Identified:
+    """Return an attitude far from the gimbal's if it fits clearly better than the near one."""
+    none = np.empty(0, dtype=np.intp)
+    _, seen = expected_size(camera, photo, stand, FAR_GIMBAL)
+    rows = np.flatnonzero(seen)
+    yaw, pitch, roll = gimbal_of_rotation(photo.rotation)
+    step = 2.0 * GIMBAL
+    about = [
+        rotation_of_gimbal(yaw + i * step, pitch + j * step, roll)
+        for i in (-1, 0, 1)
+        for j in (-1, 0, 1)
+        if i or j
+    ]
+    tried = _search(camera, photo, stand, rows, patches, about)
+    ranked = _ranked(tried, photo, camera, stand, rows, len(patches), FAR_GIMBAL)
+    best = max(ranked, key=lambda r: r.evidence, default=None)
+    others = [r.evidence for r in ranked if best is not None and best.differs(r)]
+    rivals = [0.0 if fit is None else fit.evidence, *others]
+    if best is not None and best.good and best.evidence > max(rivals) + MARGIN:
+        one = best.one
+        return Identified(as_float(one.rotation), rows[one.mirror], one.patch)
+    if fit is None:
+        return near
+    better = best is not None and best.evidence > fit.evidence + MARGIN
+    if better or fit.apart > _WORST_FIT or fit.left > _LEFT:
+        text = (
+            f"ambiguous: {len(fit.one.mirror)} mirrors match badly, {100 * fit.apart:.0f} % of a "
+            f"side apart and {100 * fit.matched:.0f} % of all; the gimbal may be more than "
+            f"{np.degrees(GIMBAL):.0f}° off: check its angles"
+        )
+        return Identified(photo.rotation, none, none, text, shifted=True)
+    return near
 
 
 @dataclass(frozen=True)
 class _Tried:
-    """A solution: how closely it fits, its attitude, and pairs of a mirror and a patch."""
+    """A solution: how closely it fits, its attitude, and pairs of a mirror and a patch.
+
+    ``apart``: their RMS distance, in mirrors' sides.
+    """
 
     score: float
+    apart: float
     rotation: FloatArray
     mirror: Rows
     patch: Rows
@@ -187,7 +270,8 @@ def _refine(turned: FloatArray, ways: FloatArray, rays: FloatArray, size: FloatA
     from scipy.spatial import cKDTree
 
     tree = cKDTree(rays)
-    score, mirror, patch = 0.0, np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
+    score, apart = 0.0, np.inf
+    mirror, patch = np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
     for k in range(_ROUNDS):
         reach = size * max(0.25, 0.9 * 0.6**k)
         found = tree.query(ways @ turned)
@@ -198,11 +282,84 @@ def _refine(turned: FloatArray, ways: FloatArray, rays: FloatArray, size: FloatA
         _, first = np.unique(nearest[order], return_index=True)
         mirror = order[first]
         patch = nearest[mirror]
-        score = float(np.sum(np.exp(-0.5 * (distance[mirror] / (0.12 * size[mirror])) ** 2)))
+        away = distance[mirror] / size[mirror]
+        score = float(np.sum(np.exp(-0.5 * (away / 0.12) ** 2)))
         if len(mirror) < 3:
             break
+        apart = float(np.sqrt(np.mean(away**2)))
         turned = nearest_rotation(ways[mirror], rays[patch])
-    return _Tried(score, turned, mirror, patch)
+    return _Tried(score, apart, turned, mirror, patch)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A solution with how well it fits.
+
+    Attributes
+    ----------
+    one
+        The solution.
+    merit, evidence
+        Mirrors that match closely, less those and patches left over; with and without the
+        penalty of an unusual gimbal.
+    inside
+        Mirrors that should be in the frame.
+    matched
+        Share of those, and of the patches, that match: the smaller one.
+    left
+        Mirrors without a patch, or patches without a mirror, over the pairs: the fewer ones.
+    apart
+        RMS distance of patches from their mirrors, in mirrors' sides.
+    """
+
+    one: _Tried
+    merit: float
+    evidence: float
+    inside: int
+    matched: float
+    left: float
+    apart: float
+
+    @property
+    def good(self) -> bool:
+        """Whether there is no reason to look elsewhere."""
+        return self.apart < _BAD_FIT and self.matched > _GOOD_SHARE
+
+    def differs(self, other: "_Fit") -> bool:
+        """Return whether another solution names most mirrors otherwise."""
+        pairs = [
+            set(zip(f.one.patch.tolist(), f.one.mirror.tolist(), strict=True))
+            for f in (self, other)
+        ]
+        return len(pairs[0] & pairs[1]) < 0.5 * len(other.one.mirror)
+
+
+def _ranked(
+    tried: "list[_Tried]",
+    photo: Photo,
+    camera: LedCamera,
+    stand: MirrorPoses,
+    rows: Rows,
+    patches: int,
+    most: float,
+) -> list[_Fit]:
+    """Return the solutions at most an angle from the gimbal's, the best first."""
+    found = []
+    for one in tried:
+        angle = rotation_angle(one.rotation, photo.rotation)
+        matched = len(one.mirror)
+        if angle > most or matched < FEWEST:
+            continue
+        pixels = photo.moved(photo.position, one.rotation).pixels(camera, stand.vertex[rows])
+        inside = int(((pixels > 0) & (pixels < np.array(camera.size) - 1)).all(axis=-1).sum())
+        # Mirrors without a patch, and patches without a mirror.
+        absent, strange = max(inside - matched, 0), patches - matched
+        usual = 0.5 * (angle / USUAL_GIMBAL) ** 2
+        evidence = one.score - 0.5 * (absent + strange)
+        share = matched / max(inside, patches, 1)
+        left = min(absent, strange) / matched
+        found.append(_Fit(one, evidence - usual, evidence, inside, share, left, one.apart))
+    return sorted(found, key=lambda f: -f.merit)
 
 
 def _choose(
@@ -212,44 +369,31 @@ def _choose(
     stand: MirrorPoses,
     rows: Rows,
     patches: int,
-) -> Identified:
-    """Return the best solution, or why it is not trusted."""
+) -> tuple[Identified, _Fit | None]:
+    """Return the best solution and its fit, or why it is not trusted."""
     none = np.empty(0, dtype=np.intp)
-    ranked: list[tuple[float, int, _Tried]] = []
-    for one in tried:
-        angle = rotation_angle(one.rotation, photo.rotation)
-        matched = len(one.mirror)
-        if angle > 2.0 * GIMBAL or matched < FEWEST:
-            continue
-        pixels = photo.moved(photo.position, one.rotation).pixels(camera, stand.vertex[rows])
-        inside = int(((pixels > 0) & (pixels < np.array(camera.size) - 1)).all(axis=-1).sum())
-        # Mirrors without a patch, and patches without a mirror.
-        absent, strange = max(inside - matched, 0), patches - matched
-        usual = 0.5 * (angle / USUAL_GIMBAL) ** 2
-        ranked.append((one.score - 0.5 * (absent + strange) - usual, inside, one))
+    ranked = _ranked(tried, photo, camera, stand, rows, patches, 2.0 * GIMBAL)
     if not ranked:
         text = "nothing: no mirrors of the field match its patches"
-        return Identified(photo.rotation, none, none, text)
-    ranked.sort(key=lambda r: -r[0])
-    merit, inside, best = ranked[0]
-    if best.score < LEAST_SHARE * inside:
+        return Identified(photo.rotation, none, none, text), None
+    best = ranked[0].one
+    if best.score < LEAST_SHARE * ranked[0].inside:
         text = (
-            f"wrong_field: {len(best.mirror)} patches match the {inside} mirrors of the field that "
-            "should be in it; check the field and the commands that were given"
+            f"wrong_field: {len(best.mirror)} patches match the {ranked[0].inside} mirrors of the "
+            "field that should be in it; check the field, the commands that were given, and the "
+            f"angles of the gimbal ({np.degrees(GIMBAL):.0f}° off are found)"
         )
-        return Identified(photo.rotation, none, none, text)
-    named = set(zip(best.patch.tolist(), best.mirror.tolist(), strict=True))
-    for other_merit, _, other in ranked[1:]:
-        same = named & set(zip(other.patch.tolist(), other.mirror.tolist(), strict=True))
-        close = other_merit > merit - max(MARGIN, 0.03 * best.score)
-        if len(same) < 0.5 * len(other.mirror) and close:
+        return Identified(photo.rotation, none, none, text), None
+    for other in ranked[1:]:
+        close = other.merit > ranked[0].merit - max(MARGIN, 0.03 * best.score)
+        if ranked[0].differs(other) and close:
             text = (
-                f"ambiguous: {len(other.mirror)} mirrors match if the camera pointed elsewhere, "
-                f"{len(best.mirror)} as it is; record the gimbal more accurately or photograph "
-                "more of the field"
+                f"ambiguous: {len(other.one.mirror)} mirrors match if the camera pointed "
+                f"elsewhere, {len(best.mirror)} as it is; record the gimbal more accurately or "
+                "photograph more of the field"
             )
-            return Identified(photo.rotation, none, none, text)
-    return Identified(as_float(best.rotation), rows[best.mirror], best.patch)
+            return Identified(photo.rotation, none, none, text), None
+    return Identified(as_float(best.rotation), rows[best.mirror], best.patch), ranked[0]
 
 
 def rotation_angle(a: FloatArray, b: FloatArray) -> float:
@@ -293,7 +437,9 @@ def find_lights(
         text = f"nothing: it is dark and shows {len(spots)} lights, {FEWEST} are needed"
         return replace(found, reason=text), spots
     if not photo.by_hand:
-        found = identify(camera, photo, replace(stand.take(rows), vertex=feet), spots.pixel)
+        found = identify(
+            camera, photo, replace(stand.take(rows), vertex=feet), spots.pixel, far=False
+        )
     if found.reason:
         text = (
             f"ambiguous: it is dark, and its {len(spots)} lights cannot be assigned to mirrors; "

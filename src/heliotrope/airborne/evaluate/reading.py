@@ -229,6 +229,8 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) 
     if found.reason:
         if is_dark(picture):
             return _lights(picture, photo, camera, stand)
+        if found.shifted:
+            return PhotoReading(photo.name, found.reason)
         # Clouds in mirrors or a few that touch spoil patches, but not the field as a whole.
         laid = _look_overlapping(picture, photo, camera, stand)
         return PhotoReading(photo.name, found.reason) if laid.problem else laid
