@@ -47,8 +47,9 @@ RUNS: tuple[tuple[str, int, tuple[str, ...], float, float], ...] = (
     ("place 76", 76, ("calm", "place", "held"), 30.0, 180.0),
 )
 HELIOSTATS = 3
-#: Tests of one mutant together, at most, s; those left over are not run.
-MOST_TESTS = 10.0
+#: Tests of one mutant together, at most, s; those left over are not run. What an interpreter of
+#: its own may take before the first, s.
+MOST_TESTS, START = 10.0, 10.0
 #: Tests that run the code in another interpreter, where no mutant is.
 ELSEWHERE = ("--ignore-glob=*micropython*",)
 #: Time of the processor after which a test or a run hangs: this and so much more than it takes
@@ -524,7 +525,10 @@ class Bench:
     def _tests(self, trial: Trial) -> None:
         assert self._config is not None
         items = [self._items[name] for name in trial.names]
+        begin = time.process_time()
         for item, after in zip(items, [*items[1:], None], strict=True):
+            if time.process_time() - begin > MOST_TESTS:
+                return
             trial.begins(item.nodeid)
             limit(SPARE + FACTOR * self._reach.seconds.get(item.nodeid, 20.0))
             self._config.hook.pytest_runtest_protocol(item=item, nextitem=after)
@@ -566,6 +570,8 @@ class _Noting:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> None:
+        if time.process_time() > START + MOST_TESTS:
+            item.session.shouldstop = "time is up"
         self._trial.begins(item.nodeid)
         limit(SPARE + FACTOR * self._trial.spare)
 
