@@ -59,6 +59,10 @@ COLUMNS = {
         "goal_after_h_of_sun", "predicted_50_90_mrad", "believed_50_90_mrad", "true_50_90_mrad",
         "true_over_predicted_90",
     },
+    "coded": {
+        "surface", "mirrors", "photographs", "proven", "rms_mrad", "worst_mrad", "within_90",
+        "power_lost_share", "separation_cpu_s", "mirrors_an_hour",
+    },
     "learning": {
         "sightings_before", "stream_us", "batch_ms", "ratio", "difference_sigma", "hypotheses",
         "state_kB",

@@ -70,8 +70,8 @@ def separate(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) 
 
     Notes
     -----
-    The covariance holds noise of the pixels as it is seen over the photographs, and a quarter of
-    the correction for the beam's shape. The error of the rectified pictures themselves (camera,
+    The covariance holds all that changes between photographs, and what is not corrected of the
+    beam's shape. The error of the rectified pictures themselves (camera,
     survey) is to be added, as for ordinary spots.
     """
     count = len(expected)
