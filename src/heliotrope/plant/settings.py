@@ -42,7 +42,7 @@ class PlantSettings:
         Largest change of a heliostat's beam by pushed parameters that nobody has confirmed, rad.
     stow_rate
         Heliostats a second that an ordinary STOW of more than these sends on their way, so that
-        their drives do not start together; 0: all at once. At 200 a second 10,000 take 50 s, with
+        their drives do not start together; 0: all at once. By the default 10,000 take 50 s, with
         2 % of the field starting in a second. A person's LOCK takes one that waits out of its
         order. Emergencies and the safety table never wait.
     """
@@ -62,7 +62,7 @@ class PlantSettings:
     sensors: frozenset[str] = frozenset()
     repeat: float = 1.0
     largest_change: float = 5e-3
-    stow_rate: float = 0.0
+    stow_rate: float = 200.0
 
     def __post_init__(self) -> None:
         if not 0.0 < 2.0 * self.period <= self.lease < math.inf:

@@ -115,7 +115,7 @@ def run(
             "Emergencies always send all at once.",
             rich_help_panel=_WORK,
         ),
-    ] = 0.0,
+    ] = 200.0,
     host: Annotated[
         str,
         typer.Option(
