@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.evaluation import beam_errors
-from heliotrope.calibration.fit.estimator import fit
+from heliotrope.calibration.fit.estimator import FieldFit, fit
 from heliotrope.calibration.plan.planning import SightingLimits, aim_at
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.calibration.sightings import Sightings, camera_target, join, sightings
@@ -232,7 +232,7 @@ class Days:
         record = HeliostatCalibration.from_fit(
             name,
             told.until,
-            fit(nominal, self.known[name], settings.model),
+            self.learnt(nominal, self.known[name]),
             nominal,
             self.known[name],
             np.zeros(len(self.known[name]), np.int64),
@@ -241,6 +241,10 @@ class Days:
         self.records[name], self.values[name] = record, record.mechanism(nominal)
         self.scheduler.learn(record)
         return Visited(name, told.target, told.until, True, measured)
+
+    def learnt(self, nominal: Mechanism, seen: Sightings) -> FieldFit:
+        """Return what a visit learns of one heliostat (1,) from all of its sightings: constants."""
+        return fit(nominal, seen, self.scheduler.settings.model)
 
     def look(self, times: FloatArray, names: tuple[str, ...] | None = None) -> Truth:
         """Return the true errors of heliostats that aim at the receiver.

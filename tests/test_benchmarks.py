@@ -63,6 +63,9 @@ COLUMNS = {
         "surface", "mirrors", "photographs", "proven", "rms_mrad", "worst_mrad", "within_90",
         "power_lost_share", "separation_cpu_s", "mirrors_an_hour",
     },
+    "drifting": {
+        "learns", "heliostats", "days", "visits", "median_mrad", "p90_mrad", "within_90",
+    },
     "learning": {
         "sightings_before", "stream_us", "batch_ms", "ratio", "difference_sigma", "hypotheses",
         "state_kB",
