@@ -56,11 +56,6 @@ def picture(figure: "Figure", alt: str, dpi: int = 80) -> "Markup":
     from markupsafe import Markup
 
     data = io.BytesIO()
-    if (engine := figure.get_layout_engine()) is not None:
-        # Saving would lay the figure out, draw it unseen, and do both once more.
-        figure.set_dpi(dpi)
-        engine.execute(figure)
-        figure.set_layout_engine("none")
     figure.savefig(data, dpi=dpi, format="png")
     code = base64.b64encode(data.getvalue()).decode("ascii")
     image = Markup('<img loading="lazy" src="data:image/png;base64,{}" alt="{}">')
