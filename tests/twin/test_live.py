@@ -301,11 +301,12 @@ def test_anothers_beam_is_not_taken_for_its_own(count: int) -> None:
 
 @pytest.mark.slow
 def test_heliostats_of_the_default_plant_fall_below_half_a_milliradian() -> None:
-    # Sixty of the ten thousand, near and far ones alike.
+    # Twelve of the ten thousand, near and far ones alike: the schedule prefers first visits, and
+    # only second ones go to the other target.
     design = malan_plant()
     (group,) = design.groups.values()
-    some = group.take(np.linspace(0, len(group) - 1, 60).astype(np.intp))
-    some = replace(some, cluster=tuple(f"C{1 + i // 20}" for i in range(60)))
+    some = group.take(np.linspace(0, len(group) - 1, 12).astype(np.intp))
+    some = replace(some, cluster=tuple(f"C{1 + i // 6}" for i in range(12)))
 
     async def work(plant: LivePlant) -> None:
         before = plant.errors()

@@ -218,20 +218,12 @@ class ExactCamera:
         """Do nothing: there are no pictures."""
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return where a heliostat's beam is on a target.
-
-        Raises
-        ------
-        UnknownNameError
-            There is no such heliostat.
-        """
+        """Return where a heliostat's beam is on a target; NaN where it is far from it."""
         at = await self._sight.exposure()
         mirrors = {mirror.heliostat: mirror for mirror in self._sight.mirrors()}
-        if heliostat not in mirrors:
-            raise UnknownNameError("heliostat", heliostat, list(mirrors))
         sun = self._sight.sun()
         places = {name: mirror.on(target, sun) for name, mirror in mirrors.items()}
-        true = places[heliostat]
+        true = places.get(heliostat, np.full(3, np.nan))
         point = true + (self._root @ self._chance.standard_normal(2)) @ target.axes
         reasons = []
         if not _within(target, true):
