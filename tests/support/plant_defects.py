@@ -159,12 +159,12 @@ def surer_than_it_is(patch: pytest.MonkeyPatch) -> None:
 
 def counted_often(patch: pytest.MonkeyPatch) -> None:
     """Every sighting is counted ten times in the fit."""
-    fit = OwnModel.fit
+    fitting = OwnModel.fitting
 
     def repeated(self: Any, nominal: Any, sightings: Any) -> Any:
-        return fit(self, nominal, join([sightings] * 10))
+        return fitting(self, nominal, join([sightings] * 10))
 
-    patch.setattr(OwnModel, "fit", repeated)
+    patch.setattr(OwnModel, "fitting", repeated)
 
 
 def sun_of_later(patch: pytest.MonkeyPatch) -> None:
