@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from heliotrope.calibration.learn import Forecast as Forecast
     from heliotrope.calibration.learn import compare_models as compare
     from heliotrope.calibration.learn import learn
-    from heliotrope.calibration.report import write_paint
+    from heliotrope.calibration.report import write_artist, write_paint
     from heliotrope.calibration.sightings import sightings
     from heliotrope.field import (
         Heliostat,
@@ -117,6 +117,7 @@ _HOMES = {
     "track": "heliotrope.mechanism",
     "track_day": "heliotrope.field",
     "track_path": "heliotrope.mechanism",
+    "write_artist": "heliotrope.calibration.report",
     "write_paint": "heliotrope.calibration.report",
     "write_plant": "heliotrope.field.formats.plant_file",
     "write_report": "heliotrope.calibration",
@@ -183,6 +184,7 @@ __all__ = [
     "track",
     "track_day",
     "track_path",
+    "write_artist",
     "write_paint",
     "write_plant",
     "write_report",

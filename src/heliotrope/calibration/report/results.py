@@ -266,7 +266,9 @@ def write_parquet(path: Path, mechanism_units: dict[str, str], results: FieldPar
 def write_paint(
     folder: str | Path, plant: Plant, learned: Learned, time: float | None = None
 ) -> dict[str, tuple[str, ...]]:
-    """Write what was learnt as heliostat properties in PAINT's form, which ARTIST reads too.
+    """Write what was learnt as heliostat properties in PAINT's form.
+
+    ARTIST reads these, but takes joint tilts for 0: `write_artist` writes into its own form.
 
     Parameters
     ----------
@@ -291,11 +293,7 @@ def write_paint(
     """
     from heliotrope.field.formats import paint
 
-    if not learned.heliostats:
-        raise InputError(
-            "write_paint: it was learnt without names; learn from the plant, or plant[name]"
-        )
-    given = apply_to_plant(plant, at_moment(learned.heliostats, learned, time))
+    given = _given(plant, learned, time, "write_paint")
     place = Path(folder)
     try:
         (place / "properties").mkdir(parents=True, exist_ok=True)
@@ -338,3 +336,51 @@ def apply_to_plant(plant: Plant, results: FieldParameters) -> Plant:
     for name in mine:
         plant = calibrated_plant(plant, name, results)
     return plant
+
+
+def write_artist(
+    path: str | Path,
+    scenario: str | Path,
+    plant: Plant,
+    learned: Learned,
+    time: float | None = None,
+) -> dict[str, tuple[str, ...]]:
+    """Write a copy of a scenario of ARTIST with what was learnt of its heliostats.
+
+    Parameters
+    ----------
+    path, scenario
+        HDF5 files: the new scenario, and the one that ARTIST's generator has made.
+    plant
+        The plant that it was learnt from.
+    learned
+        Of heliostats with names, all of them in the scenario.
+    time
+        Unix seconds; default: the time of the last sighting used.
+
+    Returns
+    -------
+    By heliostat, the parameters that have no place in the form, with their values.
+
+    Raises
+    ------
+    FormatError
+        If the scenario cannot be read, or has another layout.
+    InputError
+        If nothing learnt has a name, a mechanism is not of kind ``two_jacks``, or a heliostat is
+        not in the scenario.
+    """
+    from heliotrope.field.formats import artist
+
+    given = _given(plant, learned, time, "write_artist")
+    groups = {name: given.find(name)[0] for name in learned.heliostats}
+    return artist.write_scenario(path, scenario, groups, plant.site.origin)
+
+
+def _given(plant: Plant, learned: Learned, time: float | None, what: str) -> Plant:
+    """Return the plant with what was learnt, for ``what`` to write."""
+    if not learned.heliostats:
+        raise InputError(
+            f"{what}: it was learnt without names; learn from the plant, or plant[name]"
+        )
+    return apply_to_plant(plant, at_moment(learned.heliostats, learned, time))

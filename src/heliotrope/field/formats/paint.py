@@ -416,7 +416,8 @@ def write_heliostat(
 ) -> tuple[str, ...]:
     """Write the properties of one heliostat, its calibrated parameters folded in.
 
-    ARTIST reads them too. The zero of the second jack is folded into its initial angle.
+    The zero of the second jack is folded into its initial angle. ARTIST reads the form, but takes
+    joint tilts for 0; `artist.write_scenario` gives it all of them.
 
     Returns
     -------
@@ -428,34 +429,15 @@ def write_heliostat(
     InputError
         If its mechanism is not of kind ``two_jacks``.
     """
-    if heliostats.mechanism.kind != "two_jacks":
-        raise InputError(
-            f"heliostat {name}: kind {heliostats.mechanism.kind}; PAINT holds only two_jacks"
-        )
+    one = written(heliostats, name)
     i = heliostats.index(name)
-    one = heliostats.calibrated[i]
-    joints = dict(zip(one.joints, one.angles, strict=True))
     latitude, longitude, height = (float(v) for v in enu_to_geodetic(one.position, origin))
-    chain: dict[str, object] = {"actuators": [_actuator(one.drives.table[k], k) for k in (0, 1)]}
-    for part, joint in (
-        ("joint_translation_{}_1", 2),
-        ("joint_translation_{}_2", 3),
-        ("concentrator_translation_{}", 5),
-    ):
-        row = one.origins[joint] + (one.origins[0] if joint == 2 else 0.0)
-        chain |= {part.format(axis): float(row[k]) for k, axis in enumerate("enu")}
-    chain |= {
-        "joint_tilt_n_1": float(joints["tilt_up"]),
-        "joint_tilt_u_1": float(joints["tilt_north"]),
-        "joint_tilt_n_2": float(-joints["non_orthogonality"]),
-        "joint_tilt_e_2": float(one.drives.table[0, 7]),
-    }
     document: dict[str, object] = {
         "heliostat_position": [latitude, longitude, height],
         "height": float(heliostats.height[i]),
         "width": float(heliostats.width[i]),
         "initial_orientation": [0.0, -1.0, 0.0],
-        "kinematics_properties": chain,
+        "kinematics_properties": kinematics_properties(one),
     }
     if heliostats.facets is not None:
         f = heliostats.facets
@@ -467,10 +449,44 @@ def write_heliostat(
             ],
         }
     write_text(path, json.dumps(document, indent=1) + "\n")
-    return _without_place(one)
+    return without_place(one)
 
 
-def _without_place(one: Mechanism) -> tuple[str, ...]:
+def written(heliostats: Heliostats, name: str) -> Mechanism:
+    """Return the calibrated mechanism of a heliostat, of kind ``two_jacks``, without batch axis.
+
+    Raises
+    ------
+    InputError
+        If it is of another kind.
+    """
+    if heliostats.mechanism.kind != "two_jacks":
+        raise InputError(
+            f"heliostat {name}: kind {heliostats.mechanism.kind}; PAINT holds only two_jacks"
+        )
+    return heliostats.calibrated[heliostats.index(name)]
+
+
+def kinematics_properties(one: Mechanism) -> dict[str, object]:
+    """Return what PAINT's file says of a mechanism: translations, tilts, and two actuators."""
+    joints = dict(zip(one.joints, one.angles, strict=True))
+    chain: dict[str, object] = {"actuators": [_actuator(one.drives.table[k], k) for k in (0, 1)]}
+    for part, joint in (
+        ("joint_translation_{}_1", 2),
+        ("joint_translation_{}_2", 3),
+        ("concentrator_translation_{}", 5),
+    ):
+        row = one.origins[joint] + (one.origins[0] if joint == 2 else 0.0)
+        chain |= {part.format(axis): float(row[k]) for k, axis in enumerate("enu")}
+    return chain | {
+        "joint_tilt_n_1": float(joints["tilt_up"]),
+        "joint_tilt_u_1": float(joints["tilt_north"]),
+        "joint_tilt_n_2": float(-joints["non_orthogonality"]),
+        "joint_tilt_e_2": float(one.drives.table[0, 7]),
+    }
+
+
+def without_place(one: Mechanism) -> tuple[str, ...]:
     """Return the parameters of a mechanism that PAINT has no place for, with their values."""
     joints = dict(zip(one.joints, one.angles, strict=True))
     lost = {name: float(joints[name]) for name in ("canting", "canting_secondary")}
