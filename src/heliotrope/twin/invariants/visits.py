@@ -6,7 +6,7 @@ sighting, which must show the mirror's own beam (16).
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -29,6 +29,8 @@ FOREIGN = 1.0
 #: miss; and what its covariance need not hold, rad of beam in each direction: single steps, and
 #: step counts that are interpolated to the moment of a photograph.
 DEVIATIONS, FLOOR = 4.0, 1e-4
+#: A sighting has the time of a photograph, to within this, s.
+SAME_TIME = 1.0
 
 
 class VisitObserver:
@@ -42,6 +44,8 @@ class VisitObserver:
         All heliostats.
     targets
         Calibration targets.
+    away
+        Returns how far a POSIX time, s, is from that of the nearest photograph, s.
     followed
         Whether visits follow the beam that they photograph, so that the light of another one is
         never kept; without that, only a later photograph contradicts it.
@@ -53,10 +57,16 @@ class VisitObserver:
     """
 
     def __init__(
-        self, start: float, boards: Sequence[Board], targets: Sequence[Target], *, followed: bool
+        self,
+        start: float,
+        boards: Sequence[Board],
+        targets: Sequence[Target],
+        away: Callable[[float], float],
+        *,
+        followed: bool,
     ) -> None:
         self.checks: Counter[int] = Counter()
-        self._start, self._followed = start, followed
+        self._start, self._away, self._followed = start, away, followed
         self._boards, self._targets = {b.outfit.name: b for b in boards}, tuple(targets)
         self._judged: set[tuple[str, int, float]] = set()
         self._kept: dict[str, int] = {}
@@ -87,10 +97,10 @@ class VisitObserver:
             known = self._kept.get(name, 0)
             if seen is not None and len(seen.sightings) > known:
                 self._kept[name] = len(seen.sightings)
+                new = seen.sightings.take(np.arange(known, len(seen.sightings)))
+                self._dated(name, new, now)
                 if self._followed and name not in self._slipped:
-                    self._own(
-                        board, seen.sightings.take(np.arange(known, len(seen.sightings))), now
-                    )
+                    self._own(board, new, now)
 
     def _believed(
         self,
@@ -124,6 +134,13 @@ class VisitObserver:
             deviations = float(np.sqrt(off @ np.linalg.solve(spread, off)))
             saw = f"its calibration misses by {deviations:.1f} of its own standard deviations"
             self._check(12, deviations <= DEVIATIONS, now, name, saw)
+
+    def _dated(self, name: str, sightings: Sightings, now: float) -> None:
+        """Check that sightings have the times of photographs, from which their suns follow."""
+        for at in sightings.time:
+            away = self._away(float(at))
+            saw = f"a sighting that the plant keeps is dated {away:.1f} s from any photograph"
+            self._check(16, away <= SAME_TIME, now, name, saw)
 
     def _own(self, board: Board, sightings: Sightings, now: float) -> None:
         """Check that sightings show the beam of the mirror itself."""

@@ -56,6 +56,8 @@ class LyingCamera:
     ----------
     lies
         Number of photographs of each kind that lied.
+    taken
+        Times of all photographs, s of the monotonic clock.
     """
 
     def __init__(
@@ -69,10 +71,12 @@ class LyingCamera:
         self._lie: dict[str, _Lie] = {}
         self._last: dict[str, Shot] = {}
         self.lies = dict.fromkeys(LIES, 0)
+        self.taken: list[float] = []
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
         """Return what a photograph shows: the heliostat's beam, or something else."""
         true = self._wavered(target, await self._true.photograph(target, heliostat), heliostat)
+        self.taken.append(true.at)
         lie = self._lie.get(target.name)
         if lie is None and self._chance.random() < self._share:
             lie = self._begun(target, true.at)

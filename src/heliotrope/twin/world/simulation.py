@@ -315,9 +315,8 @@ class Simulation:
         shift = Shift(
             work, self.operator, self.observer, self.beams, day, names, clock, plan.seed, 90.0
         )
-        observer = VisitObserver(
-            self.begin, self.boards, self._scene.targets, followed=work.centred
-        )
+        targets = self._scene.targets
+        observer = VisitObserver(self.begin, self.boards, targets, work.away, followed=work.centred)
         return Working(work, shift, observer, day)
 
     def _board(self, outfit: Outfit) -> Board:

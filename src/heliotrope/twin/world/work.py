@@ -6,6 +6,7 @@ does.
 """
 
 import contextlib
+import math
 import random
 import tempfile
 from collections.abc import Sequence
@@ -100,6 +101,11 @@ class Work:
         exits.callback(self._records.close)
         self.operations: Operations | None = None
         self.logbook: Logbook | None = None
+
+    def away(self, at: float) -> float:
+        """Return how far a POSIX time, s, is from that of the nearest photograph, s."""
+        zero = self._clock.utc().timestamp() - self._clock.monotonic()
+        return min((abs(at - zero - taken) for taken in self.camera.taken), default=math.inf)
 
     def opens(self) -> Logbook:
         """Return the logbook of a new program."""
