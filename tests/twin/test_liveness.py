@@ -96,7 +96,9 @@ def test_a_refusal_names_the_holder_of_the_authority_and_the_role_that_lacks() -
 def refused() -> Callable[..., None]:
     """Refuse a command to a heliostat that has been quiet, with sure counts, since given times."""
 
-    def refuse(kind: Refusal, quiet: float = inf, sure: float = inf) -> None:
+    def refuse(
+        kind: Refusal, quiet: float = inf, sure: float = inf, *, fails: bool = False
+    ) -> None:
         account = SimpleNamespace(
             name="A1", board=SimpleNamespace(outfit=SimpleNamespace(mechanism=None))
         )
@@ -104,7 +106,11 @@ def refused() -> Callable[..., None]:
         observer.__dict__.update(checks={16: 0}, _start=0.0)
         mirror = silent._Mirror(account, "C1", state=0, quiet_since=quiet, sure_since=sure)  # type: ignore[arg-type]
         observer.__dict__.update(_mirrors={"A1": mirror}, _quiet={"A1"} if quiet < inf else set())
+        observer._refusals = []
         observer.refused("A1", f"TRACK A1: {kind.text}", 100.0)
+        if fails:  # the fault that was the reason has just begun
+            observer._quiet = frozenset()
+        observer._reasoned(100.5)
 
     return refuse
 
@@ -113,6 +119,7 @@ def test_a_refusal_is_false_by_what_has_been_true_for_a_while(
     refused: Callable[..., None],
 ) -> None:
     refused(refusals.NOT_HEARD)  # something is wrong near it
+    refused(refusals.NOT_HEARD, quiet=98.0, fails=True)
     refused(refusals.NOT_COMPARED, quiet=60.0)
     refused(refusals.COUNTS_DOUBTFUL, quiet=60.0)
     refused(refusals.COUNTS_DOUBTFUL, quiet=60.0, sure=97.0)

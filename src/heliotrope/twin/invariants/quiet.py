@@ -168,6 +168,7 @@ class QuietObserver:
             items = items_of(mirror.account.board.outfit.mechanism, MACHINE)
             mirror.own = {name: items[name] for name in _OWN if name in items}
         self._quiet: frozenset[str] = frozenset()
+        self._refusals: list[tuple[_Mirror, bool, str]] = []
         self._alarms: dict[tuple[str, str], str] = {}
         self._named_at: dict[str, float] = {}
         self._token, self._token_at = 0, -inf
@@ -245,20 +246,25 @@ class QuietObserver:
             mirror.standby = point
 
     def refused(self, heliostat: str, reason: str, now: float) -> None:
-        """Judge the reason of a refusal, where it names what this observer knows."""
+        """Note the reason of a refusal, where it names what this observer knows.
+
+        It is judged at the next look, which knows of a fault that has just begun.
+        """
         mirror = self._mirrors[heliostat]
         if heliostat not in self._quiet:
             return
         calm = now - mirror.quiet_since
         saw = f"refused: {reason}; it has been quiet for {calm:.0f} s"
+        good = True
         if UNHEARD_REASON in reason:
-            self._check(calm <= UNHEARD_FOR, now, mirror, saw)
+            good = calm <= UNHEARD_FOR
         elif UNCOMPARED_REASON in reason:
-            self._check(calm <= UNCOMPARED_FOR, now, mirror, saw)
+            good = calm <= UNCOMPARED_FOR
         elif DOUBT_REASON in reason:
             sure = now - mirror.sure_since
             saw = f"refused: {reason}; it has been sure of them for {sure:.0f} s"
-            self._check(sure <= STATUS_EVERY, now, mirror, saw)
+            good = sure <= STATUS_EVERY
+        self._refusals.append((mirror, good, saw))
 
     def progress(self, message: Progress) -> None:
         """Note that the plant is told that orders are done."""
@@ -323,6 +329,14 @@ class QuietObserver:
                 self._proven(mirror, plant, sun, now)
             quiet.add(mirror.name)
         self._quiet = frozenset(quiet)
+        self._reasoned(now)
+
+    def _reasoned(self, now: float) -> None:
+        """Judge the reasons of refusals since the last look, where nothing has failed meanwhile."""
+        refusals, self._refusals = self._refusals, []
+        for mirror, good, saw in refusals:
+            if mirror.name in self._quiet:
+                self._check(good, now, mirror, saw)
 
     def _notes(self, mirror: _Mirror, now: float) -> None:
         board = mirror.account.board
