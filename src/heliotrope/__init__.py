@@ -41,7 +41,12 @@ if TYPE_CHECKING:
     from heliotrope.calibration.learn import Forecast as Forecast
     from heliotrope.calibration.learn import compare_models as compare
     from heliotrope.calibration.learn import learn
-    from heliotrope.calibration.report import write_artist, write_paint
+    from heliotrope.calibration.report import (
+        write_artist,
+        write_opencsp,
+        write_paint,
+        write_solarpilot,
+    )
     from heliotrope.calibration.sightings import sightings
     from heliotrope.field import (
         Heliostat,
@@ -118,7 +123,9 @@ _HOMES = {
     "track_day": "heliotrope.field",
     "track_path": "heliotrope.mechanism",
     "write_artist": "heliotrope.calibration.report",
+    "write_opencsp": "heliotrope.calibration.report",
     "write_paint": "heliotrope.calibration.report",
+    "write_solarpilot": "heliotrope.calibration.report",
     "write_plant": "heliotrope.field.formats.plant_file",
     "write_report": "heliotrope.calibration",
     "write_sightings": "heliotrope.calibration",
@@ -185,10 +192,12 @@ __all__ = [
     "track_day",
     "track_path",
     "write_artist",
+    "write_opencsp",
     "write_paint",
     "write_plant",
     "write_report",
     "write_sightings",
+    "write_solarpilot",
 ]
 
 # Hidden from type checkers, for which every misspelt name would otherwise be there.

@@ -15,8 +15,10 @@ from heliotrope.calibration.report.results import (
     read_json,
     write_artist,
     write_json,
+    write_opencsp,
     write_paint,
     write_parquet,
+    write_solarpilot,
 )
 
 __all__ = [
@@ -29,8 +31,10 @@ __all__ = [
     "read_json",
     "write_artist",
     "write_json",
+    "write_opencsp",
     "write_paint",
     "write_parameters",
     "write_parquet",
     "write_report",
+    "write_solarpilot",
 ]

@@ -6,6 +6,7 @@ heliostat. The plant is the given one with the calibrated parameters.
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -27,6 +28,7 @@ from heliotrope.geometry import FloatArray
 
 KIND = "heliotrope calibration"
 VERSION = 1
+_AXES = ("east", "north", "up")
 
 
 @dataclass(frozen=True)
@@ -375,6 +377,98 @@ def write_artist(
     given = _given(plant, learned, time, "write_artist")
     groups = {name: given.find(name)[0] for name in learned.heliostats}
     return artist.write_scenario(path, scenario, groups, plant.site.origin)
+
+
+def write_opencsp(
+    path: str | Path, table: str | Path, plant: Plant, learned: Learned, time: float | None = None
+) -> dict[str, tuple[str, ...]]:
+    """Write a copy of OpenCSP's table of heliostats with the positions that were learnt.
+
+    Parameters
+    ----------
+    path, table
+        The new table, and the one that the plant was read from.
+    plant
+        The plant that it was learnt from.
+    learned
+        Of heliostats with names, all of them in the table.
+    time
+        Unix seconds; default: the time of the last sighting used.
+
+    Returns
+    -------
+    By heliostat, the parameters that have no place in the table: all but the position.
+
+    Raises
+    ------
+    FormatError
+        If the table cannot be read.
+    InputError
+        If nothing learnt has a name, or a heliostat is not in the table.
+    """
+    from heliotrope.field.formats import opencsp
+
+    old = opencsp.read_field(table)
+    given = _given(plant, learned, time, "write_opencsp")
+    moved, lost = _moved(given, learned.heliostats, old.names, old.location, table)
+    opencsp.write_field(path, replace(old, location=moved))
+    return lost
+
+
+def write_solarpilot(
+    path: str | Path, layout: str | Path, plant: Plant, learned: Learned, time: float | None = None
+) -> dict[str, tuple[str, ...]]:
+    """Write a copy of SolarPILOT's layout with the positions that were learnt.
+
+    Its heliostats are H1, H2, … by their row. The parameters are those of `write_opencsp`.
+
+    Returns
+    -------
+    By heliostat, the parameters that have no place in the layout: all but the position.
+
+    Raises
+    ------
+    FormatError
+        If the layout cannot be read.
+    InputError
+        If nothing learnt has a name, or a heliostat is not in the layout.
+    """
+    from heliotrope.field.formats import solarpilot
+
+    old = solarpilot.read_layout(layout)
+    names = tuple(f"H{i + 1}" for i in range(len(old)))
+    given = _given(plant, learned, time, "write_solarpilot")
+    moved, lost = _moved(given, learned.heliostats, names, old.location, layout)
+    solarpilot.write_layout(path, replace(old, location=moved))
+    return lost
+
+
+def _moved(
+    given: Plant,
+    heliostats: Sequence[str],
+    names: Sequence[str],
+    location: FloatArray,
+    source: str | Path,
+) -> tuple[FloatArray, dict[str, tuple[str, ...]]]:
+    """Return locations (N, 3) moved as was learnt, and what has no place beside them, by name."""
+    rows, found = {name: i for i, name in enumerate(names)}, location.copy()
+    lost: dict[str, tuple[str, ...]] = {}
+    for name in heliostats:
+        if name not in rows:
+            raise InputError(
+                f"heliostat {name}: {source} has no heliostat of that name; give the file that "
+                "the plant was read from"
+            )
+        group, i = given.find(name)
+        values = {key: float(each[i]) for key, each in group.parameters.items()}
+        found[rows[name]] += [values.pop(f"position_{axis}", 0.0) for axis in _AXES]
+        mechanism = group.mechanism
+        lost[name] = tuple(
+            f"{key} {value:.4g} {mechanism.parameter(key).unit}"
+            for key, value in values.items()
+            if value
+        )
+    return found, lost
 
 
 def _given(plant: Plant, learned: Learned, time: float | None, what: str) -> Plant:

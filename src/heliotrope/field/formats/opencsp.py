@@ -32,7 +32,7 @@ import numpy.typing as npt
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.plant import Plant
-from heliotrope.files import check_table, read_text
+from heliotrope.files import check_table, read_text, write_text
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.kinds import UP, azimuth_elevation
 from heliotrope.sun import Site
@@ -137,6 +137,20 @@ def read_field(path: str | Path) -> FieldTable:
         facet_height=table.numbers("Facet Height", above_zero=True),
         extra={name: table.column(name) for name in table.header if name not in COLUMNS},
     )
+
+
+def write_field(path: str | Path, table: FieldTable) -> None:
+    """Write the table of heliostats, with its further columns; it is there whole or not at all."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*COLUMNS, *table.extra])
+    for i, name in enumerate(table.names):
+        counts = [int(each[i]) for each in (table.facets, table.rows, table.columns)]
+        sizes = (table.pivot_height, table.pivot_offset, table.facet_width, table.facet_height)
+        numbers = [float(each[i]) for each in sizes]
+        more = [column[i] for column in table.extra.values()]
+        writer.writerow([name, *table.location[i].tolist(), *counts, *numbers, *more])
+    write_text(path, text.getvalue())
 
 
 def read_centroids(path: str | Path) -> Centroids:

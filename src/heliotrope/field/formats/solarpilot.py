@@ -32,7 +32,7 @@ import numpy.typing as npt
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
-from heliotrope.files import check_table, read_text
+from heliotrope.files import check_table, read_text, write_text
 from heliotrope.files.limits import ROWS, check_count
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.kinds import UP, azimuth_elevation
@@ -156,6 +156,21 @@ def read_layout(path: str | Path) -> Layout:
         numbers[:, 5:8],
         numbers[:, 8:],
     )
+
+
+def write_layout(path: str | Path, layout: Layout) -> None:
+    """Write a layout in 14 columns, as SolarPILOT exports it; it is there whole or not at all."""
+    lines = [",".join(part) for part in zip(*COLUMNS, strict=True)]
+    groups = (layout.location, layout.focus, layout.cant, layout.aim)
+    for i in range(len(layout)):
+        flags = [int(layout.template[i]), int(layout.enabled[i]), int(layout.in_layout[i])]
+        numbers = [
+            "NULL" if np.isnan(value) else repr(float(value))
+            for group in groups
+            for value in group[i]
+        ]
+        lines.append(",".join([*(str(flag) for flag in flags), *numbers]))
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def _column_name(k: int) -> str:
