@@ -56,8 +56,8 @@ class Table(CalibrationDataParser):
         )
 
 
-def scenario_of(data, name, folder):
-    """Return a scenario with one heliostat of ideal surface."""
+def write_scenario(data, names, file):
+    """Write a scenario with heliostats of ideal surfaces, from a folder in PAINT's form."""
     tower = data / "tower-measurements.json"
     plant, planar, round_ = paint_scenario_parser.extract_paint_tower_measurements(
         tower, device=CPU
@@ -71,12 +71,11 @@ def scenario_of(data, name, folder):
         covariance=4.3681e-06,
     )
     mirrors, prototype = paint_scenario_parser.extract_paint_heliostats_ideal_surface(
-        paths=[(name, data / "properties" / f"{name}.json")],
+        paths=[(name, data / "properties" / f"{name}.json") for name in names],
         power_plant_position=plant.power_plant_position,
         number_of_nurbs_control_points=torch.tensor([6, 6]),
         device=CPU,
     )
-    file = Path(folder) / f"{name}.h5"
     H5ScenarioGenerator(
         file_path=file,
         power_plant_config=plant,
@@ -86,6 +85,12 @@ def scenario_of(data, name, folder):
         prototype_config=prototype,
         heliostat_list_config=mirrors,
     ).generate_scenario()
+
+
+def scenario_of(data, name, folder):
+    """Return a scenario with one heliostat of ideal surface."""
+    file = Path(folder) / f"{name}.h5"
+    write_scenario(data, [name], file)
     with h5py.File(file) as f:
         return Scenario.load_scenario_from_hdf5(scenario_file=f, device=CPU)
 
@@ -159,4 +164,5 @@ def main():
             Path(out).write_text(json.dumps(done, indent=1))
 
 
-main()
+if __name__ == "__main__":
+    main()
