@@ -16,7 +16,12 @@ function open(title, fill) {
   async function done(work) {
     told.classList.remove("bad");
     told.textContent = "";
-    try { told.replaceChildren(...[await work()].flat().filter(Boolean)); await show(); } catch (error) { fail(error); }
+    try {
+      const said = await work();
+      body.inert = true;  // a click into rows that are about to be replaced would be lost
+      told.replaceChildren(...[said].flat().filter(Boolean));
+      await show();
+    } catch (error) { fail(error); } finally { body.inert = false; }
   }
   lay(dialog);
   show().catch(fail);
