@@ -7,8 +7,8 @@ could be used, how many reflections were found on the right mirrors, and true er
 FLIGHT is a station of the default radial field (``heliotrope field layout radial --heliostats 300
 --width 3.2 --height 2.54``, then ``drone plan``), such as C1-4, or ``paper``, in HelioPoint's
 geometry: mirrors of four facets, 3.2 m by 2.5 m, at 13.5° of elevation and 214° of azimuth, 150 m
-away; ``paper:7`` has another seed. Without any, it is the paper's flight and those of the five
-lowest stations. The flights have all errors of ``drone simulate`` by its defaults.
+away. ``C1-4:7`` or ``paper:7`` has another seed. Without any, it is the paper's flight and those of
+the five lowest stations. The flights have all errors of ``drone simulate`` by its defaults.
 """
 
 import sys
@@ -39,7 +39,7 @@ def lens() -> LedCamera:
     return LedCamera(SIZE, matrix, np.array([-0.08, 0.06, 3e-4, -2e-4, -0.01]))
 
 
-def planned(plan: FlightPlan, name: str, most: int) -> tuple[Flight, Plant]:
+def planned(plan: FlightPlan, name: str, most: int, seed: int) -> tuple[Flight, Plant]:
     """Return the flight of a station over the field of a plan."""
     group = next(iter(plan.plant.groups.values()))
     k = [f"{plan.labels[s.cluster]}-{s.point + 1}" for s in plan.stations].index(name)
@@ -55,7 +55,8 @@ def planned(plan: FlightPlan, name: str, most: int) -> tuple[Flight, Plant]:
         thinned(station.pattern.camera, most),
         plan.clusters.center[station.cluster],
         errors=errors,
-        installed=install(group, rows, errors),
+        seed=seed,
+        installed=install(group, rows, errors, seed=seed),
         flight=k,
     )
     return flown, plan.plant
@@ -92,13 +93,13 @@ def main() -> None:
     )
     print(" σ_tot | in 90 % |\n|---|---|---|---|---|---|---|---|---|")
     for name in names:
-        seed = 0
-        if name.startswith("paper"):
-            seed = int(name.partition(":")[2] or 0)
+        where, _, number = name.partition(":")
+        seed = int(number or 0)
+        if where == "paper":
             flown, plant = paper_flight(lens(), SITE, REAL, seed=seed)
         else:
             assert plan is not None
-            flown, plant = planned(plan, name, most)
+            flown, plant = planned(plan, where, most, seed)
         with tempfile.TemporaryDirectory() as folder:
             print(
                 line(name, fly_rendered(flown, plant, Path(folder), conditions=LIGHT, seed=seed)),
