@@ -704,6 +704,25 @@ def test_a_defocus_that_leaves_the_axes_where_they_are_is_never_done() -> None:
     run(main, "IDLE")
 
 
+def test_a_stow_is_reported_as_done_although_the_next_order_asks_for_it_again() -> None:
+    """A mirror on its way to stow goes on, whether STOW comes once more or DEFOCUS comes."""
+
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        orders = ("all", "STOW"), ("again", "STOW", "A1"), ("off", "DEFOCUS", "A1")
+        for identity, *order in orders:
+            await field.emergency(identity, *order)
+            whole = [*ALL_STAGES[:3]]
+            await field.until(lambda i=identity, w=whole: field.plant.stages(i, "A1")[:3] == w)
+            assert "STOWING" in field.states()
+        for identity in ("all", "again"):
+            assert await final(field, identity, limit=200.0) is Stage.DONE
+            assert field.plant.stages(identity, "A1") == ALL_STAGES
+        assert field.states()[0] == "STOWED"
+
+    run(main, "IDLE")
+
+
 def test_heliostats_that_do_not_obey_leave_the_bus_to_the_others() -> None:
     """Twelve that are silent are asked again each second, for a third of it at most."""
 

@@ -106,6 +106,8 @@ GOALS = {
 }
 #: Commands that take a beam off, which only known step counts prove.
 _LEAVE = ("DEFOCUS", "STOW")
+#: Goals that an order leaves in force, besides those of its own name: a stow is not undone.
+_SPARED = {"DEFOCUS": ("STOW",)}
 assert STOWED in GOALS["STOW"].there
 assert STOWING in GOALS["STOW"].there
 
@@ -159,26 +161,29 @@ class Goals:
         sure: bool = True,
         shift: Shift | None = None,
     ) -> None:
-        """Begin the goal of a command that a node has acknowledged; its earlier goals are void.
+        """Begin the goal of a command that a node has acknowledged; others are void (see `end`).
 
         Not ``sure``: the answer was lost, and ``shift``, if known, shows whether it was taken.
         """
         if name not in GOALS:
             self._reports.add(identity, Stage.DONE, node.name)
             return
-        same = [watch for watch in self._watches.get(node.index, []) if watch.name == name]
-        if not same:
-            self.end(node, f"{name} came after it")
-        self._watches[node.index] = [*same, _Watch(identity, name, now, sure, shift)]
+        self.end(node, f"{name} came after it", name)
+        others = [w for w in self._watches.get(node.index, []) if w.identity != identity]
+        self._watches[node.index] = [*others, _Watch(identity, name, now, sure, shift)]
 
     def waits(self, node: ClusterNode) -> bool:
         """Whether a node has a goal."""
         return node.index in self._watches
 
-    def end(self, node: ClusterNode, why: str) -> None:
-        """Give up the goals of a node."""
-        for watch in self._watches.pop(node.index, []):
-            self._reports.add(watch.identity, Stage.FAILED, node.name, f"{watch.name}: {why}")
+    def end(self, node: ClusterNode, why: str, name: str) -> None:
+        """Give up the goals of a node.
+
+        Those of an order of the same ``name`` stay, since the mirror goes where they ask, and so
+        does a STOW when DEFOCUS comes.
+        """
+        spared = (name, *_SPARED.get(name, ()))
+        self._judge(node, lambda watch: None if watch.name in spared else why)
 
     def heard(self, node: ClusterNode, asked_at: float) -> None:
         """Judge a node's STATUS and STEPS; STATUS was requested at ``asked_at``."""

@@ -236,8 +236,8 @@ class Orders:
         self._ready.extend(self._later)
         self._later.clear()
 
-    def cancel(self, nodes: Iterable[ClusterNode], why: str) -> None:
-        """Give up unacknowledged jobs and unreached goals, for some heliostats."""
+    def cancel(self, nodes: Iterable[ClusterNode], name: str, why: str) -> None:
+        """Give up unacknowledged jobs, and goals that DEFOCUS or STOW ends, of some heliostats."""
         chosen = {node.index for node in nodes}
         for job in [*self._ready, *self._later]:
             if job.node.index in chosen:
@@ -247,7 +247,7 @@ class Orders:
         if self._at_work is not None and self._at_work.node.index in chosen:
             self._at_work.void = why
         for index in chosen:
-            self._goals.end(self._nodes[index], why)
+            self._goals.end(self._nodes[index], why, name)
 
     # -- sending ---------------------------------------------------------------------------
 

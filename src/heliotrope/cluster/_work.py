@@ -50,13 +50,13 @@ class Work:
         except OrderRefusedError as refusal:
             self._reports.add(identity, Stage.REFUSED, text=str(refusal))
             return
-        self._orders.cancel(nodes, f"{name} came before it")
+        self._orders.cancel(nodes, name, f"{name} came before it")
         self._emergencies.begin(identity, name, nodes)
         self._exchange.interrupt()
 
     def obey(self, name: str, why: str) -> None:
         """Obey the safety table: DEFOCUS or STOW for all; earlier orders are void."""
-        self._orders.cancel(self._nodes, f"overruled: {why}")
+        self._orders.cancel(self._nodes, name, f"overruled: {why}")
         self._emergencies.begin("", name, list(self._nodes))
 
     def ready(self, *, patient: bool = True) -> bool:
