@@ -14,6 +14,7 @@ from heliotrope.imaging.coded import (
     coded_movements,
     photographs_for,
     separate,
+    shared_codes,
 )
 
 #: Standard deviation of the beams, m, and of their expected places, m.
@@ -208,9 +209,77 @@ def test_wrong_inputs_are_refused() -> None:
         separate(stack, moves[:-1], expected)
     twice = moves.copy()
     twice[:, 1] = twice[:, 0]
+    with pytest.raises(InputError, match=r"AA0 and AA1 have the same code, \d\.\d standard"):
+        separate(stack, twice, expected)
+    twice[3, 1] = -twice[3, 1]
     with pytest.raises(InputError, match="depend on each other"):
         separate(stack, twice, expected)
     with pytest.raises(InputError, match="exposure must be above 0"):
         replace(stack, exposures=np.zeros(len(moves)))
     with pytest.raises(InputError, match="seen has shape"):
         replace(stack, seen=np.ones((3, 3), bool))
+
+
+def crowded(
+    stuck: tuple[int, ...] = (), traded: tuple[int, ...] = ()
+) -> tuple[Separation, np.ndarray, np.ndarray]:
+    """Sixteen mirrors with the seven codes of 16 photographs; some rest, two are exchanged."""
+    rng = np.random.default_rng(5)
+    line, width = np.linspace(-3.0, 3.0, 4), 0.6
+    expected = np.array([(a, b) for b in line for a in line])
+    spread = (width**2 + PLACED**2) * np.eye(2)
+    code = shared_codes(expected, np.repeat(spread[None], 16, axis=0), 7)
+    assert code is not None
+    sizes = MOVE * rng.uniform(0.8, 1.3, (16, 1))
+    moves = coded_movements(7)[:, code] * sizes
+    true = expected + PLACED * rng.standard_normal(expected.shape)
+    true[list(traded)] = true[list(traded)[::-1]]
+    made = moves.copy()
+    made[:, list(stuck)] = 0.0
+    x = np.arange(-4.97, 5.0, STEP)
+    first = np.array([x[0], -x[0]])
+    values = 0.1 + NOISE * rng.standard_normal((len(moves), len(x), len(x)))
+    for i in range(16):
+        for k, move in enumerate(made[:, i]):
+            values[k] += 0.3 * bell(x, -x, true[i] + move, np.full(2, width))
+    seen = np.ones(values.shape[1:], bool)
+    stack = Stack(values, STEP, first, seen, None, np.full(seen.shape, 0.1))
+    beams = [
+        ExpectedBeam(f"AA{i}", place, PLACED**2 * np.eye(2), width**2 * np.eye(2))
+        for i, place in enumerate(expected)
+    ]
+    return separate(stack, moves, beams), true, code
+
+
+def test_beams_far_apart_share_a_code_and_are_told_apart_by_place() -> None:
+    found, true, code = crowded()
+    assert len(set(code.tolist())) <= 7
+    assert verdicts(found) == {}
+    assert errors(found, true).max() < 0.04
+    distance = [
+        (b.centroid - at) @ np.linalg.solve(b.covariance, b.centroid - at)
+        for b, at in zip(found.beams, true, strict=True)
+    ]
+    assert np.mean(np.array(distance) < 2.0 * np.log(10.0)) > 0.6
+
+
+def test_shared_codes_name_one_that_stands_and_two_that_are_exchanged() -> None:
+    found, true, code = crowded(stuck=(5,), traded=(2, 3))
+    assert code[2] != code[3]
+    assert verdicts(found) == {
+        "AA5": Verdict.STUCK,
+        "AA2": Verdict.EXCHANGED,
+        "AA3": Verdict.EXCHANGED,
+    }
+    good = np.setdiff1d(np.arange(16), [2, 3, 5])
+    assert errors(found, true)[good].max() < 0.04
+
+
+def test_too_few_codes_are_not_shared_by_beams_that_overlap() -> None:
+    places = np.array([(0.3 * k, 0.0) for k in range(9)])
+    shapes = np.repeat(0.25 * np.eye(2)[None], 9, axis=0)
+    assert shared_codes(places, shapes, 7) is None
+    code = shared_codes(places, shapes, 8)
+    assert code is not None
+    for a, b in zip(*np.triu_indices(9, 1), strict=True):
+        assert code[a] != code[b] or np.linalg.norm(places[a] - places[b]) >= 4.5 * 0.5

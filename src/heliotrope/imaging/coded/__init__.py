@@ -7,7 +7,7 @@
 """
 
 from heliotrope.imaging.coded.beams import ExpectedBeam, SeparatedBeam, Verdict
-from heliotrope.imaging.coded.codes import coded_movements, photographs_for
+from heliotrope.imaging.coded.codes import coded_movements, photographs_for, shared_codes
 from heliotrope.imaging.coded.separation import Separation, separate
 from heliotrope.imaging.coded.stack import Stack
 
@@ -20,4 +20,5 @@ __all__ = [
     "coded_movements",
     "photographs_for",
     "separate",
+    "shared_codes",
 ]

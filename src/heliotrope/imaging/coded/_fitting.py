@@ -70,12 +70,26 @@ class Fitted:
     mean: FloatArray
 
 
+def code_of(moves: FloatArray) -> npt.NDArray[np.intp]:
+    """Return the first mirror with the same code as each mirror, (M,), for moves (K, M, 2).
+
+    Mirrors share a code if their movements are in proportion, by one positive factor each axis.
+    """
+    size = np.sqrt((moves**2).sum(axis=0))
+    unit = moves / np.where(size > 0.0, size, 1.0)
+    same = np.einsum("kia,kja->ija", unit, unit).min(axis=-1) > 1.0 - 1e-9
+    return np.asarray(np.argmax(same, axis=1))
+
+
 def regression(moves: FloatArray, weights: FloatArray) -> FloatArray | None:
     """Return the rows (2 M, K) that turn pixels' series into changes per metre of movement.
 
-    None if the codes depend on each other over the photographs that count.
+    The change of mirrors that share a code is the same but for the size of their movements. None
+    if other codes depend on each other over the photographs that count.
     """
-    codes = moves.reshape(len(moves), -1)
+    code = code_of(moves)
+    first, group = np.unique(code, return_inverse=True)
+    codes = moves[:, first].reshape(len(moves), -1)
     codes = codes - weights @ codes / weights.sum()
     normal = codes.T @ (weights[:, None] * codes)
     size = np.sqrt(np.diag(normal))
@@ -85,7 +99,10 @@ def regression(moves: FloatArray, weights: FloatArray) -> FloatArray | None:
         return None
     # Against the weighted mean, which the regression takes away from the series, too.
     rows = np.linalg.solve(normal, codes.T * weights)
-    return np.asarray(rows - rows.sum(axis=1, keepdims=True) * weights / weights.sum())
+    rows = rows - rows.sum(axis=1, keepdims=True) * weights / weights.sum()
+    lengths = np.sqrt((moves**2).sum(axis=0))
+    smaller = (lengths[code] / np.where(lengths > 0.0, lengths, np.inf))[..., None]
+    return np.asarray((rows.reshape(len(first), 2, -1)[group] * smaller).reshape(-1, len(moves)))
 
 
 def fitted(

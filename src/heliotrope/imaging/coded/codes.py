@@ -1,12 +1,16 @@
 """Codes: small movements of many mirrors that no sum of other mirrors' movements imitates."""
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 
 #: Fewest and most photographs of a stack.
 _FEWEST, _MOST = 8, 1024
+#: Beams of one code are at least this many standard deviations apart: a matched filter sees one at
+#: the place of the other with less than 1 % of its height.
+APART = 4.5
 
 
 def photographs_for(mirrors: int) -> int:
@@ -57,3 +61,43 @@ def coded_movements(mirrors: int, photographs: int | None = None) -> FloatArray:
     return np.ascontiguousarray(
         np.stack([rows[first], rows[first + count // 2]], axis=-1).transpose(1, 0, 2)
     )
+
+
+def shared_codes(
+    places: npt.ArrayLike, moments: npt.ArrayLike, groups: int, apart: float = APART
+) -> npt.NDArray[np.intp] | None:
+    """Return which of a few codes each beam takes, (M,): those of one code are far apart.
+
+    Parameters
+    ----------
+    places
+        Expected places, m, (M, 2).
+    moments
+        Second moments of the beams with the covariances of their places, m², (M, 2, 2).
+    groups
+        Number of codes.
+    apart
+        Least distance of two beams of one code, in standard deviations of a beam.
+
+    Returns
+    -------
+        None if some beam finds no code.
+    """
+    at, spread = np.asarray(places, dtype=np.float64), np.asarray(moments, dtype=np.float64)
+    away = distances(at, spread)
+    found = np.full(len(at), -1, dtype=np.intp)
+    for i in range(len(at)):
+        near = set(found[:i][away[i, :i] < apart].tolist())
+        free = [code for code in range(groups) if code not in near]
+        if not free:
+            return None
+        # The code that was used least: light and noise are spread over all of them.
+        found[i] = min(free, key=lambda code: int((found[:i] == code).sum()))
+    return found
+
+
+def distances(places: FloatArray, moments: FloatArray) -> FloatArray:
+    """Return distances between places (M, 2), in standard deviations of the wider beam, (M, M)."""
+    between = places[:, None] - places
+    own = np.einsum("ijk,ikl,ijl->ij", between, np.linalg.inv(moments), between)
+    return np.asarray(np.sqrt(np.minimum(own, own.T)))

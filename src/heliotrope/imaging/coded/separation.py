@@ -16,12 +16,15 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.coded._fitting import fitted, regression
+from heliotrope.imaging.coded._bells import slopes
+from heliotrope.imaging.coded._fitting import code_of, fitted, regression
 from heliotrope.imaging.coded._judging import judged, lost
 from heliotrope.imaging.coded._still import still_light
-from heliotrope.imaging.coded._tops import find_top
+from heliotrope.imaging.coded._tops import Top, find_top
 from heliotrope.imaging.coded.beams import ExpectedBeam, SeparatedBeam, Verdict
+from heliotrope.imaging.coded.codes import APART, distances
 from heliotrope.imaging.coded.stack import Stack, light_of
+from heliotrope.imaging.targets.rectify import Mask
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ def separate(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) 
     survey) is to be added, as for ordinary spots.
     """
     count = len(expected)
-    _check(stack, moves, count)
+    _check(stack, moves, expected)
     work = stack.prepared()
     values = work.values[:, work.seen]
     empty = None if work.empty is None else work.empty[work.seen]
@@ -89,10 +92,7 @@ def separate(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) 
             np.empty((0, 2)),
         )
     pictures = (rows @ light.pictures).reshape(count, 2, -1)
-    tops = [
-        find_top(work, picture, np.asarray(beam.second_moments, dtype=np.float64))
-        for picture, beam in zip(pictures, expected, strict=True)
-    ]
+    tops = _tops(work, pictures, moves, expected)
     result = fitted(work, values, empty, moves, expected, tops)
     still = None
     if empty is not None:
@@ -111,7 +111,42 @@ def separate(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) 
     )
 
 
-def _check(stack: Stack, moves: FloatArray, count: int) -> None:
+def _tops(
+    stack: Stack, pictures: FloatArray, moves: FloatArray, expected: Sequence[ExpectedBeam]
+) -> list[Top]:
+    """Return the strongest beam that moves by each mirror's code.
+
+    Of mirrors that share a code, each is looked for where its place is nearer than the others',
+    and once more without the light of the others, which would pass for noise and second beams.
+    """
+    code, size = code_of(moves), np.sqrt((moves**2).sum(axis=0))
+    points = np.stack(np.meshgrid(*stack.axes), axis=-1)
+    shapes = [np.asarray(beam.second_moments, dtype=np.float64) for beam in expected]
+    mates = [[int(j) for j in np.flatnonzero(code == code[i]) if j != i] for i in range(len(code))]
+    own: list[Mask | None] = []
+    for beam, others in zip(expected, mates, strict=True):
+        away = np.linalg.norm(points - beam.place, axis=-1)
+        nearer = [away <= np.linalg.norm(points - expected[j].place, axis=-1) for j in others]
+        own.append(np.logical_and.reduce(nearer) if nearer else None)
+    tops = [
+        find_top(stack, picture, shape, mine)
+        for picture, shape, mine in zip(pictures, shapes, own, strict=True)
+    ]
+    seen = points[stack.seen]
+    found = list(tops)
+    for i, others in enumerate(mates):
+        if not others:
+            continue
+        alone = pictures[i].copy()
+        for j in others:
+            light = tops[j].power * slopes(seen, tops[j].place, shapes[j])
+            alone -= light * (size[j] / size[i])[:, None]
+        found[i] = find_top(stack, alone, shapes[i], own[i])
+    return found
+
+
+def _check(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) -> None:
+    count = len(expected)
     if moves.shape != (len(stack.values), count, 2) or not np.isfinite(moves).all():
         raise InputError(
             f"separation: moves of shape {moves.shape} for {len(stack.values)} photographs of "
@@ -121,4 +156,13 @@ def _check(stack: Stack, moves: FloatArray, count: int) -> None:
         raise InputError(
             f"separation: the codes of {count} mirrors over {len(moves)} photographs depend on "
             "each other; take codes from coded_movements"
+        )
+    code, places = code_of(moves), np.array([beam.place for beam in expected])
+    away = distances(places, np.array([b.second_moments + b.covariance for b in expected]))
+    near = np.argwhere((code[:, None] == code) & (away < 0.99 * APART) & ~np.eye(count, dtype=bool))
+    if len(near):
+        one, other = (expected[int(i)].heliostat for i in near[0])
+        raise InputError(
+            f"separation: {one} and {other} have the same code, {away[tuple(near[0])]:.1f} "
+            f"standard deviations apart; give them places {APART:g} apart, or codes of their own"
         )
