@@ -10,14 +10,17 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.lcu.node import Node
 from heliotrope.links.messages import Command, Progress, Stage
+from heliotrope.mechanism.tracking import TrackingStatus, track
 from heliotrope.plant.controller import PlantController
 from heliotrope.safety import Act, Alarm, alarms
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.boards.outfit import RECEIVER, STANDBY, STOW, Ball
+from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, STANDBY, STOW, Ball
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Violation
 
 Point = tuple[float, ...]
@@ -27,7 +30,8 @@ Point = tuple[float, ...]
 ASTRAY = 1.5
 #: Time for a mirror to get where it was sent after an order or a change of state, s.
 SETTLE = 10.0
-#: An astray beam is named by an alarm, and is off, within these times, s.
+#: An astray beam is named by an alarm, and is off, within these times, s, beyond the time that the
+#: drives need to bring it to its point; see `slew`.
 NAMED_WITHIN, OFF_WITHIN = 10.0, 30.0
 #: A mirror that is done is off the receiver or at stow this long after the proof, s.
 DONE_WITHIN = 5.0
@@ -71,6 +75,8 @@ class _Mirror:
         its standby point by the way from stow since it last had power or was at stow.
     astray_since, lit_since, inside_since
         Since when its beam is beside its place, on the receiver unsent, inside a volume, s.
+    due_at
+        When the drives can have brought its astray beam to its place, s.
     named_at
         When an alarm last named it, s.
     ordered_at, off_at, resumed_at
@@ -92,6 +98,7 @@ class _Mirror:
     astray_since: float | None = None
     lit_since: float | None = None
     inside_since: float | None = None
+    due_at: float = float("-inf")
     named_at: float = float("-inf")
     ordered_at: float = float("-inf")
     off_at: float = float("-inf")
@@ -108,6 +115,23 @@ class _Mirror:
     def left(self) -> bool:
         """Whether it is IDLE and holds still, wherever that is."""
         return self.state == states.IDLE and (self.elsewhere or not self.approached)
+
+
+def slew(board: Board, sun: FloatArray, point: Point) -> float:
+    """Return how long the drives need at least to bring a beam to a point, s; 0 if none can.
+
+    Near the zenith, in the keyhole, a small way of the beam is half a turn of the azimuth, and more
+    where a stop forbids the short sense. Of the two poses that reach the point, the one counts that
+    the true mirror comes to soonest; at the least rate that the boards are given, with its ramp.
+    """
+    mechanism, (rate, acceleration, _) = board.outfit.mechanism, LIMITS
+    stops = mechanism.drives.angles(np.transpose(RANGES))
+    drives = mechanism.drives.replace(min_angle=stops.min(axis=0), max_angle=stops.max(axis=0))
+    here = np.array([axis.turned for axis in board.axes], dtype=np.float64)
+    found = track(mechanism, sun, point, drives=drives, current=here)
+    if found.chosen(found.status) != TrackingStatus.OK:
+        return 0.0
+    return float(np.abs(found.best_counts - here).max()) / rate + rate / acceleration
 
 
 def _since(holds: bool, before: float | None, now: float) -> float | None:
@@ -301,8 +325,11 @@ class BeamObserver:
             (mirror.board.miss(sun, (p[0], p[1], p[2])) for p in points), default=float("inf")
         )
         astray = mirror.uncalled or (miss > slack and now >= mirror.settled_at)
+        if astray and mirror.astray_since is None:
+            mirror.due_at = now + max((slew(mirror.board, sun, p) for p in points), default=0.0)
         mirror.astray_since = _since(astray, mirror.astray_since, now)
         state, since = states.STATES[mirror.state], mirror.astray_since
+        since = None if since is None else max(since, mirror.due_at)
         passed = 0.0 if since is None else now - since
         where = "where nobody sent it" if not points else f"{miss:.1f} m beside where it was sent"
         beside = f"{state}, its beam {where} for {passed:.1f} s"
