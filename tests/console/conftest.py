@@ -42,7 +42,9 @@ def tokens(console: LiveConsole) -> dict[str, str]:
 @pytest.fixture
 def ask(console: LiveConsole, tokens: dict[str, str]) -> Iterator[Callable[..., httpx.Response]]:
     """Send a request as somebody of a role ("" for nobody)."""
-    with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
+    with httpx.Client(
+        base_url=f"{console.address}api/v1/", trust_env=False, timeout=60.0
+    ) as client:
 
         def send(role: str, method: str, path: str, body: Any = None) -> httpx.Response:
             headers = {"Authorization": f"Bearer {tokens[role]}"} if role else {}
@@ -54,7 +56,9 @@ def ask(console: LiveConsole, tokens: dict[str, str]) -> Iterator[Callable[..., 
 @pytest.fixture
 def signed_in(console: LiveConsole) -> Iterator[httpx.Client]:
     """A browser without a page: an operator with a session."""
-    with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
+    with httpx.Client(
+        base_url=f"{console.address}api/v1/", trust_env=False, timeout=60.0
+    ) as client:
         answer = client.post("session", json={"name": "operator", "password": PASSWORD})
         assert answer.status_code == 200
         client.headers["X-CSRF-Token"] = answer.json()["csrf"]
@@ -69,7 +73,9 @@ def person(console: LiveConsole) -> Iterator[Callable[..., httpx.Response]]:
 
         def send(role: str, method: str, path: str, body: Any = None) -> httpx.Response:
             if role not in clients:
-                made = httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False)
+                made = httpx.Client(
+                    base_url=f"{console.address}api/v1/", trust_env=False, timeout=60.0
+                )
                 client = clients[role] = stack.enter_context(made)
                 answer = client.post("session", json={"name": role, "password": PASSWORD})
                 client.headers["X-CSRF-Token"] = answer.json()["csrf"]

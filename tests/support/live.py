@@ -15,6 +15,7 @@ from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAsse
 from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.audit import Audit
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.learning import Learner
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.settings import CycleSettings
@@ -70,6 +71,7 @@ class LivePlant:
         extra: Callable[[], Mapping[str, Any]] = dict,
         pictures: Pictures | None = None,
         marks: Path | None = None,
+        learner: Learner | None = None,
     ) -> None:
         chosen = options or LiveOptions()
         self.design, self.clock = design, clock
@@ -77,7 +79,7 @@ class LivePlant:
         ports = self.world.ports(
             audit=audit, disk=disk, records=records, assigned=assigned, facts=extra
         )
-        ports = replace(ports, pictures=pictures, marks=marks)
+        ports = replace(ports, pictures=pictures, marks=marks, learner=learner)
         self.assembly = PlantAssembly(design, ports, chosen.settings())
         self.plant, self.operations = self.assembly.plant, self.assembly.operations
         self.names, self.cameras, self.field = (

@@ -6,6 +6,7 @@ again. `CalibrationOutcome` is the outcome of an attempt, whether or not it made
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Self
@@ -276,6 +277,12 @@ class HeliostatCalibration(Value):
         """
         days = (np.asarray(time, dtype=np.float64) - self.at) / DAY
         return self.growth.grown(self.covariance, self.names, days)
+
+    def growing(self, growth: Growth) -> Self:
+        """Return the same calibration, whose covariance grows otherwise from its fit on."""
+        other = copy(self)
+        object.__setattr__(other, "growth", growth)
+        return other
 
     def mechanism(self, nominal: Mechanism) -> Mechanism:
         """Return the calibrated mechanism, in the batch shape of the nominal one."""

@@ -17,7 +17,7 @@ from heliotrope.local import EMERGENCY, ORDINARY, ask_once, socket_folder
 
 _VIEWS = (
     "alarms", "authority", "calibration", "clusters", "emergency", "events", "field", "flights",
-    "holds", "packets", "schedule", "summary", "sun",
+    "holds", "learning", "packets", "schedule", "summary", "sun",
 )  # fmt: skip
 #: Calls of the socket for emergencies.
 _URGENT = ("order_emergency", "stow", "defocus")
@@ -37,6 +37,7 @@ _CALLS = {
     ("PUT", "calibration"): "switch_calibration",
     ("POST", "calibration/next"): "calibrate",
     ("POST", "flights"): "take_flight",
+    ("POST", "learning"): "learn",
     ("POST", "holds"): "hold",
     ("POST", "holds/release"): "unhold",
     ("POST", "parameters"): "set_parameters",

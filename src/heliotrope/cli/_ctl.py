@@ -227,8 +227,8 @@ def show(
     what: Annotated[
         str,
         typer.Argument(
-            help="alarms, events, packets, clusters, calibration, flights, schedule, holds, "
-            "emergency, sun, accounts, tokens, or the name of a heliostat."
+            help="alarms, events, packets, clusters, calibration, flights, learning, schedule, "
+            "holds, emergency, sun, accounts, tokens, or the name of a heliostat."
         ),
     ],
 ) -> None:
@@ -242,6 +242,7 @@ def show(
         "clusters",
         "calibration",
         "flights",
+        "learning",
         "schedule",
         "holds",
         "emergency",
@@ -542,6 +543,21 @@ def flight(
     print_table(("shared error", "found", "σ"), rows)
     for line in found["problems"]:
         print(line)
+
+
+@app.command()
+def learn(
+    context: typer.Context,
+    group: Annotated[
+        str, typer.Option(help="Group of the plant file.", show_default="all groups")
+    ] = "",
+) -> None:
+    """Learn drift, noise and installation of the mirrors now, as at night; nothing moves."""
+    with _client(context) as client:
+        found = client.ask("POST", "learning", {"group": group})
+    for one in found:
+        print(f"group {one['group']}: {one['said']}")
+        print(f"  in force: {one['drift']}")
 
 
 @app.command("out-of-service")

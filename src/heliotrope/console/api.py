@@ -228,6 +228,13 @@ async def flights(console: Here, request: Request, who: Anyone) -> Response:
     return await shared(console, request, "flights")
 
 
+@router.get("/learning", response_model=models.many(models.LearningView), tags=["calibration"])
+async def learning(console: Here, request: Request, who: Anyone) -> Response:
+    """Return what was learnt of each group of mirrors, and is in force."""
+    del who
+    return await shared(console, request, "learning")
+
+
 @router.get("/holds", response_model=models.many(models.Lockout), tags=["calibration"])
 async def holds(console: Here, who: Anyone) -> JSONResponse:
     """Return the heliostats that are out of service."""

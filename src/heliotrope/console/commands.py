@@ -220,6 +220,12 @@ async def take_flight(console: Here, who: Engineer, document: FlightDocument) ->
     return answer(value)
 
 
+@router.post("/learning", response_model=models.many(models.LearningView), tags=["calibration"])
+async def learn(console: Here, who: Engineer, order: orders.OneGroup) -> JSONResponse:
+    """Learn drift, noise and installation of a group of mirrors now; nothing moves."""
+    return answer(await console.plant.ask("learn", who.person, **order.model_dump()))
+
+
 @router.post("/holds", response_model=models.many(models.Lockout), tags=["commands"])
 async def hold(console: Here, who: Operator, order: orders.HoldOrder) -> JSONResponse:
     """Take heliostats out of service: they go to stow, and nobody moves them."""

@@ -147,6 +147,7 @@ class PlantAssembly:
             extra=ports.facts,
             pictures=ports.pictures,
             marking=None if cameras is None else self._marking(cameras),
+            learner=ports.learner,
         )
         if chosen.machines is not MachineTables.UNKNOWN:
             self._rest_on_machines()

@@ -6,12 +6,13 @@ calibration recalled from the store comes the same way.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.growth import Growth, default_growth
+from heliotrope.calibration.learn.drift import Hyperparameters
 from heliotrope.calibration.record import HeliostatCalibration, Identities
 from heliotrope.calibration.sightings import Sightings, join
 from heliotrope.field.plant import Plant
@@ -71,6 +72,8 @@ class Beliefs:
         self._seen: dict[str, Seen] = {}
         self._subscribers: list[Subscriber] = []
         self._number: Numbering = _unkept
+        self._drifting: list[Subscriber] = []
+        self._hyper: dict[str, Hyperparameters] = {}
         self._growth: dict[str, Growth] = {}
         for group in design.groups.values():
             self._growth |= dict.fromkeys(group.names, default_growth(group.mechanism))
@@ -80,6 +83,10 @@ class Beliefs:
         self._subscribers.append(subscriber)
         for record in self._records.values() if held else ():
             subscriber(record)
+
+    def subscribe_drift(self, subscriber: Subscriber) -> None:
+        """Call a function with each calibration whose covariance grows otherwise from now on."""
+        self._drifting.append(subscriber)
 
     def number_with(self, numbering: Numbering) -> None:
         """Let a store keep and number new sightings."""
@@ -111,6 +118,10 @@ class Beliefs:
     def growth(self, heliostat: str) -> Growth:
         """Return how the covariance of a heliostat's calibration grows with time."""
         return self._growth[heliostat]
+
+    def hyper(self, heliostat: str) -> Hyperparameters | None:
+        """Return what was learnt of the heliostat's group; None while the defaults are in force."""
+        return self._hyper.get(heliostat)
 
     def seen(self, heliostat: str) -> Seen | None:
         """Return the known sightings; None if there are none."""
@@ -152,11 +163,27 @@ class Beliefs:
 
         Its covariance grows from now on as its group drifts.
         """
-        record = replace(record, growth=self.growth(record.heliostat))
+        record = record.growing(self.growth(record.heliostat))
         self._records[record.heliostat] = record
         for subscriber in self._subscribers:
             subscriber(record)
         return record
+
+    def adopt(self, group: str, hyper: Hyperparameters, source: str) -> None:
+        """Put the hyperparameters of a group of the design in force.
+
+        Later fits follow the drift by them, and the covariances of the present calibrations grow as
+        they say; the values of these stay as they are until the next visit.
+        """
+        growth, names = Growth.of(hyper, source), self.design.groups[group].names
+        self._hyper |= dict.fromkeys(names, hyper)
+        self._growth |= dict.fromkeys(names, growth)
+        for name in names:
+            record = self._records.get(name)
+            if record is not None:
+                self._records[name] = record = record.growing(growth)
+                for subscriber in self._drifting:
+                    subscriber(record)
 
     def recall(
         self,

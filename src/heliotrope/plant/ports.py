@@ -20,6 +20,7 @@ from heliotrope.links.clock import Clock
 from heliotrope.links.link import Link
 from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.audit import Audit
+from heliotrope.plant.operations.learning import Learner
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.sensors import Readings
@@ -137,6 +138,8 @@ class Ports:
     truth
         Returns the true tracking error of each heliostat, rad, (N,), in the order of the plant's
         field; None where it is unknown, as in every real plant.
+    learner
+        Learns groups of mirrors at night; None: nothing is learnt, as in virtual time.
     facts
         Returns further rows of the summary, by name.
     """
@@ -155,4 +158,5 @@ class Ports:
         default=nullcontext, kw_only=True
     )
     truth: Callable[[], FloatArray] | None = field(default=None, kw_only=True)
+    learner: Learner | None = field(default=None, kw_only=True)
     facts: Callable[[], Mapping[str, Any]] = field(default=dict, kw_only=True)

@@ -30,6 +30,7 @@ from heliotrope.store.records import (
     FlightEntry,
     Hold,
     KeptSightings,
+    LearningEntry,
     PlannedVisit,
     StoreError,
     VisitEntry,
@@ -282,6 +283,18 @@ class Keeper:
     def flights(self) -> list[FlightEntry]:
         """Return the flights, the first taken first."""
         return self._records(FlightEntry, select(tables.flight).order_by(tables.flight.c.at))
+
+    def record_learning(self, entry: LearningEntry) -> None:
+        """Record what was learnt of a group."""
+        row = rows.row_of(tables.learning, entry)
+        self.writer.put(lambda c: rows.insert(c, tables.learning, [row]))
+
+    def learnings(self) -> list[LearningEntry]:
+        """Return what was learnt last of each group."""
+        found = self._records(
+            LearningEntry, select(tables.learning).order_by(tables.learning.c.version)
+        )
+        return list({entry.group: entry for entry in found}.values())
 
     def visits(self, limit: int = 100, heliostat: str = "") -> list[VisitEntry]:
         """Return the measurements, the latest first."""

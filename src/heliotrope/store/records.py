@@ -263,6 +263,34 @@ class FlightEntry:
 
 
 @dataclass(frozen=True)
+class LearningEntry:
+    """What was learnt of a group of mirrors: its hyperparameters.
+
+    Attributes
+    ----------
+    group, version
+        Name of the group in the plant file, and 1, 2, ... for each.
+    at, person
+        When it was learnt, POSIX s, and who ordered it.
+    heliostats, sightings
+        Numbers of each that it was learnt from.
+    gain
+        Rise of a sighting's log probability density, foretold from those before it.
+    document
+        The model and the hyperparameters as JSON; see `calibration.learn.group`.
+    """
+
+    group: str
+    version: int
+    at: float
+    person: str
+    heliostats: int
+    sightings: int
+    gain: float
+    document: str
+
+
+@dataclass(frozen=True)
 class AuditEntry:
     """One accepted command, as `plant.audit.Record`; times are ISO 8601."""
 
@@ -337,6 +365,10 @@ class Records(Protocol):
 
     def record_flight(self, flight: FlightEntry) -> None:
         """Record a flight that was taken."""
+        ...
+
+    def record_learning(self, entry: LearningEntry) -> None:
+        """Record what was learnt of a group."""
         ...
 
     def record_event(self, event: Event) -> None:
@@ -427,6 +459,10 @@ class Records(Protocol):
 
     def flights(self) -> list[FlightEntry]:
         """Return the flights, the first taken first."""
+        ...
+
+    def learnings(self) -> list[LearningEntry]:
+        """Return what was learnt last of each group."""
         ...
 
     def events(

@@ -271,6 +271,20 @@ flight = Table(
     _text("document"),
 )
 
+#: What was learnt of each group of mirrors, version by version.
+learning = Table(
+    "learning",
+    metadata,
+    _text("group", key=True),
+    Column("version", Integer, primary_key=True, autoincrement=False),
+    _real("at", needed=True),
+    _text("person"),
+    Column("heliostats", Integer, nullable=False),
+    Column("sightings", Integer, nullable=False),
+    _real("gain", needed=True),
+    _text("document"),
+)
+
 visit = Table(
     "visit",
     metadata,

@@ -16,6 +16,7 @@ import numpy as np
 from heliotrope.calibration.fit.estimator import FieldFit, fit
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn import models, periodic
+from heliotrope.calibration.learn.drift import Hyperparameters
 from heliotrope.calibration.learn.present import fitting_present
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray
@@ -54,13 +55,16 @@ class OwnModel:
         return self.completed(fit(self.start(nominal), sightings, self.parameters))
 
     def fitting(
-        self, nominal: Mechanism, sightings: Sightings
+        self, nominal: Mechanism, sightings: Sightings, group: Hyperparameters | None = None
     ) -> Generator[None, None, tuple[FieldFit, FieldFit]]:
-        """Return the fit of constants and the one that follows the drift; see `present`."""
+        """Return the fit of constants and the one that follows the drift of its ``group``.
+
+        See `present`.
+        """
         start = self.start(nominal)
         constants = fit(start, sightings, self.parameters)
         yield
-        followed = yield from fitting_present(start, sightings, constants)
+        followed = yield from fitting_present(start, sightings, constants, group)
         return self.completed(constants), self.completed(followed)
 
     def start(self, nominal: Mechanism) -> Mechanism:

@@ -63,10 +63,47 @@ def replaying(
     return belief
 
 
-def hyper_of(mechanism: Mechanism, fitted: FieldFit) -> Hyperparameters:
-    """Return the hyperparameters of one mirror (1,) for the parameters of its fit (1,)."""
+def hyper_of(
+    mechanism: Mechanism, fitted: FieldFit, group: Hyperparameters | None = None
+) -> Hyperparameters:
+    """Return the hyperparameters of one mirror (1,) for the parameters of its fit (1,).
+
+    Parameters
+    ----------
+    mechanism, fitted
+        The mirror, and its fit.
+    group
+        What was learnt of its group; parameters and processes that it does not know, and all
+        without it, have the defaults.
+    """
     hyper = drift.start(mechanism, tuple(fitted.names), priors=fitted.prior[0])
-    return replace(hyper, rate=drift.step_rate(()))
+    hyper = replace(hyper, rate=drift.step_rate(()))
+    return hyper if group is None else _applied(group, hyper)
+
+
+def _applied(group: Hyperparameters, own: Hyperparameters) -> Hyperparameters:
+    """Return a mirror's hyperparameters with those of its group where both have them."""
+    mean, spread = own.mean.copy(), own.spread.copy()
+    for p, name in enumerate(own.names):
+        # A parameter that only drifts in one of the models has no population there.
+        if name in group.names and own.spread[p] > 0.0:
+            k = group.names.index(name)
+            if group.spread[k] > 0.0:
+                mean[p], spread[p] = group.mean[k], group.spread[k]
+    sizes = dict(zip(group.processes, group.amplitude, strict=True))
+    times = dict(zip(group.groups, group.tau, strict=True))
+    amplitude = [sizes.get(p, a) for p, a in zip(own.processes, own.amplitude, strict=True)]
+    tau = [times.get(g, t) for g, t in zip(own.groups, own.tau, strict=True)]
+    return replace(
+        own,
+        mean=mean,
+        spread=spread,
+        amplitude=np.array(amplitude),
+        tau=np.array(tau),
+        noise=group.noise,
+        rate=group.rate,
+        heavy=group.heavy,
+    )
 
 
 def at_present(fitted: FieldFit, belief: Belief, time: float) -> FieldFit:
@@ -77,7 +114,10 @@ def at_present(fitted: FieldFit, belief: Belief, time: float) -> FieldFit:
 
 
 def fitting_present(
-    mechanism: Mechanism, sightings: Sightings, fitted: FieldFit
+    mechanism: Mechanism,
+    sightings: Sightings,
+    fitted: FieldFit,
+    group: Hyperparameters | None = None,
 ) -> Generator[None, None, FieldFit]:
     """Return the fit of a mirror as it is after its latest sighting, in steps of some ten ms.
 
@@ -89,9 +129,11 @@ def fitting_present(
         M of heliostat 0.
     fitted
         A robust fit of them, (1,). One that has failed is returned as it is.
+    group
+        What was learnt of its group; default: nothing.
     """
     known = sightings.time[np.isfinite(sightings.time)]
     if int(fitted.outcome[0]) != FitOutcome.CONVERGED or not len(known):
         return fitted
-    belief = yield from replaying(mechanism, sightings, fitted, hyper_of(mechanism, fitted))
+    belief = yield from replaying(mechanism, sightings, fitted, hyper_of(mechanism, fitted, group))
     return at_present(fitted, belief, float(known.max()))

@@ -17,6 +17,7 @@ from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAsse
 from heliotrope.plant.audit import Forgetful
 from heliotrope.plant.cameras import RealCameras
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
+from heliotrope.plant.learner import LearnerProcess
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.ports import Ports
 from heliotrope.plant.settings import clusters_of
@@ -139,6 +140,7 @@ class _Outside:
             records=keeper,
             assigned=KeptPoints(keeper),
             beside=self.running,
+            learner=LearnerProcess(),
             facts=self.links.facts,
         )
 

@@ -10,6 +10,7 @@ from heliotrope.files.disk import DiskThread
 from heliotrope.links.clock import SystemClock, VirtualClock
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
+from heliotrope.plant.learner import LearnerProcess
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.twin.live import CYCLE, PacedLoop, World, WorldOptions
 
@@ -55,5 +56,6 @@ async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
         )
         # A record takes long in a time that runs faster, so there the loop waits for it.
         kept = pictures(shown, folder, waits=choice.speed > 1.0)
-        live = PlantAssembly(design, replace(ports, pictures=kept, marks=shown.marks), settings)
+        ports = replace(ports, pictures=kept, marks=shown.marks, learner=LearnerProcess())
+        live = PlantAssembly(design, ports, settings)
         await at_work(live, keeper, shown, folder, ending, choice.speed)

@@ -183,9 +183,24 @@ function flights(box) {
   return refreshed(shown, { every: 5 });
 }
 
+// What was learnt of each group of mirrors, and is in force.
+function learning(box) {
+  const body = h("div");
+  box.append(body);
+  const shown = async () => {
+    const rows = await api("GET", "learning");
+    const learn = (group) => act(async () => { await api("POST", "learning", { group }); await shown(); }, `learn ${group}`);
+    body.replaceChildren(h("h3", {}, "Learnt at night"),
+      table([["Group", (r) => r.group], ["Version", (r) => (r.version ? h("span", { title: `${count(r.sightings)} photographs of ${count(r.heliostats)} heliostats` }, `${r.version}, ${new Date(1e3 * r.at).toISOString().slice(0, 16).replace("T", " ")}`) : "defaults")],
+        ["In force", (r) => r.drift], ["", (r) => h("span", { className: "hx-hint" }, r.said)],
+        ["", (r) => (me.role === "engineer" ? h("button", { className: "hx-button", onclick: () => learn(r.group) }, "Learn now") : "")]], rows));
+  };
+  return refreshed(shown, { every: 5 });
+}
+
 export function calibration(box) {
-  const body = h("div"), lines = h("canvas", { className: "hx-chart" }), air = h("div");
-  box.append(body, air);
+  const body = h("div"), lines = h("canvas", { className: "hx-chart" }), air = h("div"), nights = h("div");
+  box.append(body, air, nights);
   let view = null;
   const draw = () => {
     if (!view) return;
@@ -210,8 +225,8 @@ export function calibration(box) {
   };
   const end = refreshed(async () => { view = await api("GET", "calibration"); draw(); },
     { key: () => JSON.stringify([store.head?.calibration, store.head?.measuring]) });
-  const off = store.on("theme", draw), landed = flights(air);
-  return () => { end(); off(); landed(); };
+  const off = store.on("theme", draw), landed = flights(air), learnt = learning(nights);
+  return () => { end(); off(); landed(); learnt(); };
 }
 
 export function clusters(box) {

@@ -130,6 +130,11 @@ def _calibrate(desk: Desk, who: Person, given: orders.OneCalibration, _: bytes) 
     return desk.operations.calibration()
 
 
+def _learn(desk: Desk, who: Person, given: orders.OneGroup, _: bytes) -> Any:
+    desk.operations.learn(who, given.group)
+    return desk.operations.learning()
+
+
 def _hold(desk: Desk, who: Person, given: orders.HoldOrder, _: bytes) -> Any:
     hours = math.nan if given.hours is None else given.hours
     desk.operations.hold(who, given.heliostats, given.reason, hours)
@@ -150,6 +155,7 @@ _VIEWS = {
     "alarms": _see(lambda desk: desk.operations.alarms()),
     "calibration": _see(lambda desk: desk.operations.calibration()),
     "flights": _see(lambda desk: desk.operations.flights()),
+    "learning": _see(lambda desk: desk.operations.learning()),
     "holds": _see(lambda desk: desk.operations.holds()),
     "emergency": _see(lambda desk: desk.operations.emergency_view()),
     "commands": _see(lambda desk: desk.tickets.last()),
@@ -243,6 +249,7 @@ _ORDERS = {
     "take_flight": Call(
         Role.ENGINEER, orders.Nothing, lambda _, __, ___, blob: blob, Desk.take_flight, blob=True
     ),
+    "learn": Call(Role.ENGINEER, orders.OneGroup, _learn),
     "hold": Call(Role.OPERATOR, orders.HoldOrder, _hold),
     "unhold": Call(Role.OPERATOR, orders.GivenBack, _unhold),
 }

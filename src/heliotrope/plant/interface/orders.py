@@ -94,6 +94,12 @@ class OneCalibration(Strict):
     search: bool = False
 
 
+class OneGroup(Strict):
+    """A group of mirrors to be learnt now ("": all)."""
+
+    group: Annotated[str, Field(max_length=64)] = ""
+
+
 class ParameterOrder(Strict):
     """New error parameters of a heliostat by name, rad, m or 1, or an earlier version, and why."""
 

@@ -25,6 +25,7 @@ from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, Tru
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.flights import FlightIntake
 from heliotrope.plant.operations.keeping import Keeping
+from heliotrope.plant.operations.learning import Learner, Learning
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.pictures import Pictures
@@ -112,6 +113,8 @@ class AutomaticControl:
         Heliostats out of service.
     flights
         Takes flights of a drone.
+    learning
+        What is learnt of each group of mirrors at night.
     installed
         Tracking error that the priors allow an uncalibrated heliostat, rad.
     """
@@ -127,6 +130,7 @@ class AutomaticControl:
         truth: Callable[[], FloatArray] | None,
         settings: AutomaticSettings,
         pictures: Pictures | None = None,
+        learner: Learner | None = None,
     ) -> None:
         self._plant, self._log, self._settings = plant, logbook, settings
         self._on, self._day, self._gave_way_at = settings.calibrate, True, -math.inf
@@ -148,8 +152,10 @@ class AutomaticControl:
             wanted=settings.wanted,
         )
         self._losses = Losses(plant, logbook, settings.losses, records, self.give_way)
-        self.flights = FlightIntake(
-            plant, logbook, self._keeping, CycleSettings() if cycle is None else cycle.settings
+        visits = CycleSettings() if cycle is None else cycle.settings
+        self.flights = FlightIntake(plant, logbook, self._keeping, visits)
+        self.learning = Learning(
+            plant, logbook, self._keeping, visits.first_model, learner, AUTOMATIC
         )
         self._calibrating: Calibrating | None = None
         if cycle is not None and scheduler is not None:
@@ -167,6 +173,7 @@ class AutomaticControl:
         self._stopped = False
         if cycle is not None:
             self._keeping.recall()
+            self.learning.recall()
             self.flights.recall()
 
     # -- people's requests -----------------------------------------------------------------
@@ -250,7 +257,7 @@ class AutomaticControl:
     async def run(self) -> None:
         """Work until cancelled."""
         async with asyncio.TaskGroup() as group:
-            for part in (self._govern, self._raise, self._look):
+            for part in (self._govern, self._raise, self._look, self._learn):
                 name = part.__name__.strip("_")
                 group.create_task(self._again(name, part, self._settings.beat))
             if self._calibrating is not None:
@@ -393,6 +400,10 @@ class AutomaticControl:
                 self._raising.release(name)
 
         return visit
+
+    async def _learn(self) -> None:
+        """Learn what is due of the groups, beside all else."""
+        await self.learning.step(night=not self._day)
 
     async def _look(self) -> None:
         """Update predicted errors and the field's quality; check the records."""

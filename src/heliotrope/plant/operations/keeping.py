@@ -17,6 +17,7 @@ from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.store.records import (
     FlightEntry,
     KeptSightings,
+    LearningEntry,
     Records,
     StoreError,
     VisitEntry,
@@ -113,6 +114,19 @@ class Keeping:
         return self._records.record_sightings(
             flight.heliostats, flight.sightings, kind="drone", campaign=flight.name
         )
+
+    def learnings(self) -> list[LearningEntry]:
+        """Return what was learnt last of each group."""
+        return [] if self._records is None else self._records.learnings()
+
+    def keep_learning(self, entry: LearningEntry) -> None:
+        """Keep what was learnt of a group."""
+        if self._records is None:
+            return
+        try:
+            self._records.record_learning(entry)
+        except StoreError as error:
+            self.lost = str(error)
 
     def _number(self, name: str, target: str, new: Sightings) -> Identities:
         """Keep sightings; return their numbers, 0 where they could not be kept."""

@@ -32,6 +32,7 @@ from heliotrope.plant.emergency import EmergencyOrder
 from heliotrope.plant.lockouts import Lockout
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
+from heliotrope.plant.operations.learning import Learner
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.pictures import Pictures
@@ -48,6 +49,7 @@ from heliotrope.plant.operations.views import (
     FieldFrame,
     FlightView,
     HeliostatView,
+    LearningView,
     PacketRow,
     Planned,
     Summary,
@@ -117,6 +119,8 @@ class Operations:
         Keeps photographs with their results; None: they are not kept.
     marking
         Takes views that persons mark; None: there is no camera.
+    learner
+        Learns groups of mirrors at night; None: nothing is learnt.
 
     Attributes
     ----------
@@ -138,6 +142,7 @@ class Operations:
         extra: Callable[[], Mapping[str, Any]] | None = None,
         pictures: Pictures | None = None,
         marking: Marking | None = None,
+        learner: Learner | None = None,
     ) -> None:
         self.plant, self.logbook, self.pictures, self.marking = plant, logbook, pictures, marking
         self._cameras, self._extra = dict(cameras or {}), extra
@@ -150,6 +155,7 @@ class Operations:
             truth=truth,
             settings=settings or AutomaticSettings(),
             pictures=pictures,
+            learner=learner,
         )
         self.security = SecurityLog(logbook, plant.clock)
         self._viewer = Viewer(plant, self.automatic)
@@ -375,6 +381,15 @@ class Operations:
         """Take a flight of a drone, the text of its file; see `FlightIntake.take`."""
         document = await asyncio.to_thread(parse_flight, text)
         return await self.automatic.flights.take(person, document, text.decode())
+
+    def learning(self) -> tuple[LearningView, ...]:
+        """Return what was learnt of each group of mirrors, and is in force."""
+        return self.automatic.learning.views()
+
+    def learn(self, person: Person, group: str = "") -> None:
+        """Learn a group of mirrors ("": all) now; see `Learning.order`."""
+        self.automatic.learning.order(person, group)
+        self._tell(person, f"asked to learn {group or 'all groups'}")
 
     def camera(self, target: str) -> CameraView:
         """Return the last photograph of a target.

@@ -509,6 +509,39 @@ class FlightView:
 
 
 @dataclass(frozen=True)
+class LearningView:
+    """What was learnt of a group of mirrors, and is in force.
+
+    Attributes
+    ----------
+    group
+        Name of the group in the plant file.
+    version
+        1, 2, ...; 0 while the defaults are in force.
+    at, person
+        When it was learnt (POSIX s, NaN by default), and who ordered it.
+    heliostats, sightings
+        Numbers of each that it was learnt from.
+    gain
+        Rise of a photograph's log probability density, foretold from those before it.
+    drift
+        Drift, steps and noise in force, in words.
+    said
+        How the last attempt ended, or that one is under way.
+    """
+
+    group: str
+    version: int
+    at: float
+    person: str
+    heliostats: int
+    sightings: int
+    gain: float
+    drift: str
+    said: str
+
+
+@dataclass(frozen=True)
 class CameraView:
     """The last photograph of a target.
 

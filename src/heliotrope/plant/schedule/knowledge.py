@@ -157,7 +157,7 @@ class Knowledge:
             found[mine] = growth.variances(self.names, days[mine])
         return found
 
-    def _grow_as(self, row: int, growth: Growth) -> None:
+    def grow_as(self, row: int, growth: Growth) -> None:
         """Let a heliostat drift as its record says; its group shares one object."""
         if growth not in self._growths:
             used = np.unique(np.delete(self._grows, row))
@@ -225,7 +225,7 @@ class Knowledge:
         covariance[mine, :] = covariance[:, mine] = 0.0
         covariance[np.ix_(mine, mine)] = record.covariance[np.ix_(theirs, theirs)]
         self.covariance[row] = covariance
-        self._grow_as(row, record.growth)
+        self.grow_as(row, record.growth)
         self._set(np.array([row], dtype=np.intp), record.at)
 
     def doubt(self, row: int, factor: float) -> None:
@@ -354,6 +354,10 @@ class FieldKnowledge:
     def learn(self, row: int, record: HeliostatCalibration) -> None:
         """Take a new calibration of a heliostat."""
         self._groups[self.group[row]].learn(int(self._place[row]), record)
+
+    def grow_as(self, row: int, growth: Growth) -> None:
+        """Let a heliostat drift otherwise since its last calibration."""
+        self._groups[self.group[row]].grow_as(int(self._place[row]), growth)
 
     def doubt(self, row: int, factor: float) -> None:
         """Multiply the variances of a heliostat by a factor."""

@@ -70,6 +70,7 @@ class PlantSchedule:
         self._coming: Iterator[Assignment | None] | None = None
         self._made = -np.inf
         plant.beliefs.subscribe(scheduler.learn)
+        plant.beliefs.subscribe_drift(scheduler.drift)
 
     def next(self, target: str, ready: npt.NDArray[np.bool_]) -> Planned | None:
         """Return the next of the ready heliostats (N,) for a free target, None if none is due."""

@@ -243,6 +243,16 @@ class Scheduler:
         self._known.learn(row, record)
         self._learnt[row] += 1
 
+    def drift(self, record: HeliostatCalibration) -> None:
+        """Let a heliostat drift as the record of its last calibration says now.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such heliostat.
+        """
+        self._known.grow_as(self._find(record.heliostat), record.growth)
+
     def observe(self, heliostat: str, error: float, now_utc: datetime) -> bool:
         """Take a beam error seen in operation, rad; return whether it is a surprise.
 

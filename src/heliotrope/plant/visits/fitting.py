@@ -146,7 +146,7 @@ def fitting(
         return _fit_group(
             beliefs, beliefs.flights, settings, model, (name,), nominal, (photographed,)
         )[0]
-    constants, followed = yield from model.fitting(nominal, photographed)
+    constants, followed = yield from model.fitting(nominal, photographed, beliefs.hyper(name))
     recent = photographed.take(np.flatnonzero(photographed.time >= photographed.time.max() - DAY))
     left = [
         root_mean_square(beam_errors(nominal.with_parameters(one.parameters), recent).beam)

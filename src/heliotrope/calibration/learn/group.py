@@ -1,0 +1,242 @@
+"""Hyperparameters of a group of mirrors, learnt at night from the photographs of a running plant.
+
+The learning itself is step 3 of `learning`, as in ``heliotrope evaluate``. Around it stands what a
+plant needs that nobody watches: few enough sightings for a night, and the question whether the
+photographs were foretold better so. What was learnt serves each mirror's model (`applied`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+from threadpoolctl import threadpool_limits
+
+from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome, fit
+from heliotrope.calibration.learn import drift, learning, present
+from heliotrope.calibration.learn.drift import DAY, Hyperparameters, Process
+from heliotrope.calibration.learn.stream import Belief
+from heliotrope.calibration.sightings import Sightings, join
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.values import amount
+
+#: Fewest mirrors to learn a group from: below, the tables of priors would say more than they do.
+TEACHERS = 4
+#: Most sightings of one mirror, whole visits spread over its history: the cost grows as their cube.
+MOST = 120
+#: Sightings further apart than this are of two visits, s.
+APART = 3600.0
+
+
+@dataclass(frozen=True)
+class GroupHistory:
+    """All that a group of mirrors has shown.
+
+    Attributes
+    ----------
+    mechanism
+        Nominal mechanisms of its N mirrors, (N,).
+    sightings
+        The photographs of each, of heliostat 0; None without any, N.
+    model
+        The constant parameters.
+    before
+        Hyperparameters in force.
+    """
+
+    mechanism: Mechanism
+    sightings: tuple[Sightings | None, ...]
+    model: tuple[str, ...]
+    before: Hyperparameters
+
+
+@dataclass(frozen=True)
+class GroupTask:
+    """What a group is learnt from: M sightings of K of its mirrors; see `GroupHistory`."""
+
+    mechanism: Mechanism
+    sightings: Sightings
+    model: tuple[str, ...]
+    before: Hyperparameters
+
+
+@dataclass(frozen=True)
+class LearntGroup:
+    """What was learnt of a group.
+
+    Attributes
+    ----------
+    hyper
+        Its hyperparameters.
+    heliostats, sightings
+        Numbers of each that they were learnt from.
+    gain
+        How much better they foretell a sighting from those before it than the hyperparameters
+        before: mean difference of the log probability density.
+    """
+
+    hyper: Hyperparameters
+    heliostats: int
+    sightings: int
+    gain: float
+
+
+def defaults(mechanism: Mechanism, model: tuple[str, ...]) -> Hyperparameters:
+    """Return the hyperparameters that hold before anything was learnt."""
+    return replace(drift.start(mechanism, model), rate=drift.step_rate(()))
+
+
+def able(histories: Sequence[Sightings | None]) -> npt.NDArray[np.intp]:
+    """Return which mirrors can teach: enough sightings, on two days or more."""
+    found = []
+    for row, seen in enumerate(histories):
+        known = np.zeros(0) if seen is None else seen.time[np.isfinite(seen.time)]
+        if len(known) >= learning.FEWEST and np.ptp(known) >= DAY:
+            found.append(row)
+    return np.array(found, dtype=np.intp)
+
+
+def gathered(group: GroupHistory) -> GroupTask:
+    """Return what a group is learnt from.
+
+    Raises
+    ------
+    InputError
+        If fewer than `TEACHERS` mirrors can teach.
+    """
+    rows = able(group.sightings)
+    if len(rows) < TEACHERS:
+        raise InputError(
+            f"{amount(len(rows), 'heliostat')} with {learning.FEWEST} photographs on different "
+            f"days; {TEACHERS} are needed"
+        )
+    if len(rows) > learning.SAMPLE:
+        rows = rows[np.linspace(0, len(rows) - 1, learning.SAMPLE).round().astype(np.intp)]
+    parts = []
+    for place, row in enumerate(rows):
+        seen = thinned(cast("Sightings", group.sightings[row]))
+        parts.append(seen.renumbered(np.full(len(seen), place)))
+    return GroupTask(group.mechanism[rows], join(parts), group.model, group.before)
+
+
+def thinned(seen: Sightings, most: int = MOST) -> Sightings:
+    """Return some of a mirror's sightings in order of time: whole visits, the last one among them.
+
+    Visits are kept whole, for what moves within hours, and spread over the years, for what moves
+    within months.
+    """
+    order = np.flatnonzero(np.isfinite(seen.time))
+    seen = seen.take(order[np.argsort(seen.time[order], kind="stable")])
+    if len(seen) <= most:
+        return seen
+    visit = np.concatenate([[0], np.cumsum(np.diff(seen.time) > APART)])
+    count = int(visit[-1]) + 1
+    share = max(1, int(most * count / len(seen)))
+    kept = np.linspace(count - 1, 0, share).round().astype(np.intp)
+    return seen.take(np.flatnonzero(np.isin(visit, kept))[-most:])
+
+
+def learn_group(task: GroupTask) -> LearntGroup:
+    """Return what a group's sightings teach, beside what was in force."""
+    every = np.ones(len(task.sightings), np.bool_)
+    with threadpool_limits(1, "blas"):
+        hyper = learning.field_of(
+            task.mechanism, task.sightings, every, learning.Task(task.model, {})
+        )
+        fitted = fit(task.mechanism, task.sightings, task.model)
+        told = [density(task, fitted, each) for each in (task.before, hyper)]
+    gain = (told[1] - told[0]) / len(task.sightings)
+    return LearntGroup(hyper, len(task.mechanism), len(task.sightings), gain)
+
+
+def density(task: GroupTask, fitted: FieldFit, hyper: Hyperparameters) -> float:
+    """Return the log probability density of all sightings, each foretold by those before it."""
+    total = 0.0
+    for row in range(len(task.mechanism)):
+        if int(fitted.outcome[row]) == FitOutcome.CONVERGED:
+            one, seen = of_row(fitted, task.sightings, row), task.sightings.of(row)
+            total += _replayed(task.mechanism[row : row + 1], seen, one, hyper).density
+    return total
+
+
+def of_row(fitted: FieldFit, sightings: Sightings, row: int) -> FieldFit:
+    """Return the fit of one mirror from that of many, (1,)."""
+    whole = ("names", "lengths")
+    one = {name: value[[row]] for name, value in vars(fitted).items() if name not in whole}
+    return replace(fitted, lengths=fitted.lengths[sightings.heliostat == row], **one)
+
+
+def _replayed(
+    mechanism: Mechanism, seen: Sightings, fitted: FieldFit, hyper: Hyperparameters
+) -> Belief:
+    steps = present.replaying(mechanism, seen, fitted, present.hyper_of(mechanism, fitted, hyper))
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return cast("Belief", end.value)
+
+
+def described(hyper: Hyperparameters) -> str:
+    """Return the drift and the noise in words."""
+    tau = dict(zip(hyper.groups, hyper.tau.tolist(), strict=True))
+    parts = []
+    for group in hyper.groups:
+        mine = [
+            size for p, size in zip(hyper.processes, hyper.amplitude, strict=True)
+            if p.group == group
+        ]  # fmt: skip
+        what = "zeros wander" if group != "hours" else "normals move"
+        sizes = " and ".join(f"{1e3 * size:.2g}" for size in mine)
+        time = f"{tau[group]:.0f} days" if tau[group] >= 2.0 else f"{24 * tau[group]:.1f} hours"
+        parts.append(f"{what} by {sizes} mrad over {time}")
+    parts.append(f"a step in {1.0 / hyper.rate:.0f} days" if hyper.rate > 0.0 else "no steps")
+    parts.append(f"noise {hyper.noise:.2f} of a photograph's sigma")
+    return ", ".join(parts)
+
+
+_ARRAYS = ("mean", "spread", "regime", "step", "wide", "amplitude", "tau")
+
+
+def document_of(hyper: Hyperparameters) -> dict[str, Any]:
+    """Return hyperparameters for JSON."""
+    return {
+        "names": list(hyper.names),
+        "processes": [[p.parameter, p.group] for p in hyper.processes],
+        **{name: cast("FloatArray", getattr(hyper, name)).tolist() for name in _ARRAYS},
+        "noise": hyper.noise,
+        "rate": hyper.rate,
+        "heavy": hyper.heavy,
+    }
+
+
+def read_hyperparameters(document: dict[str, Any]) -> Hyperparameters:
+    """Return the hyperparameters of a document made by `document_of`.
+
+    Raises
+    ------
+    InputError
+        If it is not such a document.
+    """
+    try:
+        arrays: dict[str, Any] = {n: np.array(document[n], dtype=np.float64) for n in _ARRAYS}
+        numbers: dict[str, Any] = {n: float(document[n]) for n in ("noise", "rate", "heavy")}
+        found = Hyperparameters(
+            names=tuple(document["names"]),
+            processes=tuple(Process(*pair) for pair in document["processes"]),
+            **arrays,
+            **numbers,
+        )
+        count = len(found.names)
+        sizes = [getattr(found, name).shape == (count,) for name in _ARRAYS[:5]]
+        sizes += [found.amplitude.shape == (len(found.processes),)]
+        sizes += [found.tau.shape == (len(found.groups),), len(found.part) == len(found.processes)]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"hyperparameters: {error!r}; learn the group again") from error
+    figures = np.concatenate([*arrays.values(), list(numbers.values())])
+    if not (all(sizes) and np.isfinite(figures).all() and found.noise > 0.0):
+        raise InputError("hyperparameters: shapes or figures do not fit; learn the group again")
+    return found

@@ -1,0 +1,74 @@
+"""Learns one group in a process of its own: ``python -m heliotrope.calibration.learn.worker``.
+
+A plant starts it at night and writes a `GroupTask` to its input, pickled; it answers with one JSON
+document and ends. It takes only what the other processes leave of the machine.
+"""
+
+import json
+import os
+import pickle
+import sys
+from typing import Any
+
+from heliotrope.calibration.learn.group import (
+    GroupTask,
+    LearntGroup,
+    document_of,
+    learn_group,
+    read_hyperparameters,
+)
+from heliotrope.errors import InputError
+
+#: Threads of the process: the plant beside it has its own work.
+ENVIRONMENT = {"HELIOTROPE_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+_LEAST_URGENT = 19
+
+
+def asked(task: GroupTask) -> bytes:
+    """Return a task for the input of the process."""
+    return pickle.dumps(task)
+
+
+def answered(text: bytes) -> LearntGroup:
+    """Return what the process has answered.
+
+    Raises
+    ------
+    InputError
+        If it is no such answer, or names an error.
+    """
+    try:
+        found: dict[str, Any] = dict(json.loads(text))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"the process that learns gave no result ({error})") from error
+    if told := found.get("error"):
+        raise InputError(str(told))
+    try:
+        counts = int(found["heliostats"]), int(found["sightings"])
+        return LearntGroup(read_hyperparameters(found["hyper"]), *counts, float(found["gain"]))
+    except (KeyError, TypeError) as error:
+        raise InputError(f"the process that learns gave half a result ({error!r})") from error
+
+
+def _answer(data: bytes) -> dict[str, Any]:
+    try:
+        task = pickle.loads(data)  # noqa: S301  # from the process that has started this one
+        found = learn_group(task)
+    except Exception as error:  # noqa: BLE001  # whatever it is, the plant says it in one line
+        return {"error": f"{type(error).__name__}: {error}"}
+    return {
+        "hyper": document_of(found.hyper),
+        "heliostats": found.heliostats,
+        "sightings": found.sightings,
+        "gain": found.gain,
+    }
+
+
+def main() -> None:
+    """Learn the group that the input has."""
+    os.nice(_LEAST_URGENT)
+    sys.stdout.write(json.dumps(_answer(sys.stdin.buffer.read())))
+
+
+if __name__ == "__main__":
+    main()

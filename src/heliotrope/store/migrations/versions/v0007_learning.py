@@ -1,0 +1,22 @@
+"""What was learnt of each group of mirrors."""
+
+from alembic import op
+from sqlalchemy import Column, Double, Integer, Text
+
+revision = "0007"
+down_revision = "0006"
+
+
+def upgrade() -> None:
+    """Make the table."""
+    op.create_table(
+        "learning",
+        Column("group", Text, primary_key=True),
+        Column("version", Integer, primary_key=True, autoincrement=False),
+        Column("at", Double, nullable=False),
+        Column("person", Text, nullable=False),
+        Column("heliostats", Integer, nullable=False),
+        Column("sightings", Integer, nullable=False),
+        Column("gain", Double, nullable=False),
+        Column("document", Text, nullable=False),
+    )
