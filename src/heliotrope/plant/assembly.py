@@ -23,6 +23,7 @@ from heliotrope.plant.assigned import rest_on
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
+from heliotrope.plant.operations.foresight import Prospect
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.operations import Operations
@@ -304,6 +305,10 @@ class _WhereAwake:
 
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[Planned]:
         return self._schedule.plan(ready, limit)
+
+    def foresee(self, able: npt.NDArray[np.bool_], targets: Sequence[str]) -> Prospect | None:
+        awake = [target for target in targets if self._cameras.awake(target)]
+        return self._schedule.foresee(able, awake)
 
     def done(self, entry: CalibrationEntry) -> None:
         self._schedule.done(entry)

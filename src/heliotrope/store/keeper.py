@@ -31,6 +31,7 @@ from heliotrope.store.records import (
     Hold,
     KeptSightings,
     LearningEntry,
+    OutlookEntry,
     PlannedVisit,
     StoreError,
     VisitEntry,
@@ -296,6 +297,18 @@ class Keeper:
         )
         return list({entry.group: entry for entry in found}.values())
 
+    def record_outlook(self, outlook: OutlookEntry) -> None:
+        """Record a prediction; it replaces one made at the same time."""
+        row = rows.row_of(tables.outlook, outlook)
+        self.writer.put(lambda c: rows.replace(c, tables.outlook, [row]))
+
+    def outlooks(self, since: float) -> list[OutlookEntry]:
+        """Return the predictions made since a time, oldest first."""
+        o = tables.outlook.c
+        return self._records(
+            OutlookEntry, select(tables.outlook).where(o.at >= since).order_by(o.at)
+        )
+
     def visits(self, limit: int = 100, heliostat: str = "") -> list[VisitEntry]:
         """Return the measurements, the latest first."""
         query = select(tables.visit).order_by(tables.visit.c.number.desc()).limit(limit)
@@ -393,13 +406,14 @@ class Keeper:
         return self._records(AlarmEntry, query)
 
     def forget_events(self, before: float) -> None:
-        """Remove the oldest events up to a time, and alarms over and acknowledged by then."""
+        """Remove events and predictions up to a time, and alarms over and acknowledged by then."""
         a = tables.alarm.c
         over = and_(a.cleared < before, a.acknowledged < before)
 
         def work(connection: Connection) -> None:
             chain.forget_events(connection, before)
             connection.execute(delete(tables.alarm).where(over))
+            connection.execute(delete(tables.outlook).where(tables.outlook.c.at < before))
 
         self.writer.put(work)
 

@@ -291,6 +291,22 @@ class LearningEntry:
 
 
 @dataclass(frozen=True)
+class OutlookEntry:
+    """A prediction of the field's errors that the plant has made.
+
+    Attributes
+    ----------
+    at
+        When it was made, POSIX s.
+    document
+        The prediction as JSON; see `plant.operations.outlook`.
+    """
+
+    at: float
+    document: str
+
+
+@dataclass(frozen=True)
 class AuditEntry:
     """One accepted command, as `plant.audit.Record`; times are ISO 8601."""
 
@@ -369,6 +385,10 @@ class Records(Protocol):
 
     def record_learning(self, entry: LearningEntry) -> None:
         """Record what was learnt of a group."""
+        ...
+
+    def record_outlook(self, outlook: OutlookEntry) -> None:
+        """Record a prediction; it replaces one made at the same time."""
         ...
 
     def record_event(self, event: Event) -> None:
@@ -463,6 +483,10 @@ class Records(Protocol):
 
     def learnings(self) -> list[LearningEntry]:
         """Return what was learnt last of each group."""
+        ...
+
+    def outlooks(self, since: float) -> list[OutlookEntry]:
+        """Return the predictions made since a time, oldest first."""
         ...
 
     def events(

@@ -285,6 +285,14 @@ learning = Table(
     _text("document"),
 )
 
+#: Predictions of the field's errors, as JSON.
+outlook = Table(
+    "outlook",
+    metadata,
+    Column("at", Double, primary_key=True),
+    _text("document"),
+)
+
 visit = Table(
     "visit",
     metadata,

@@ -239,6 +239,7 @@ def plan_commission(
     *,
     size: npt.ArrayLike = 3.0,
     measured: npt.ArrayLike = False,
+    held: npt.ArrayLike = False,
     terms: CommissionTerms | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> CommissionPlan:
@@ -256,6 +257,8 @@ def plan_commission(
         Larger side of the mirrors, m, () or (N,).
     measured
         Heliostats that were measured before, as by a drone, () or (N,).
+    held
+        Heliostats that cannot be visited, () or (N,); they count in the field's errors.
     terms
         Default: `CommissionTerms()`.
     progress
@@ -276,6 +279,7 @@ def plan_commission(
     given = terms or CommissionTerms()
     days, cells = _cells(site, start, stop, given)
     work = _Commissioning(fleets, targets, given, np.asarray(size, dtype=np.float64), measured)
+    work.visited = work.counted & ~np.asarray(held, dtype=np.bool_)
     work.note(cells[0][0])
     for done, (begin, end) in enumerate(cells):
         if progress:
@@ -373,6 +377,7 @@ class _Commissioning:
         self.sigma = np.concatenate([np.full(len(f), f.sigma) for f in fleets])
         self.position = np.concatenate([f.mechanism.position for f in fleets])
         self.counted = self.field.form.any(axis=(1, 2))
+        self.visited = self.counted
         self.visits: list[Visit] = []
         self.times: list[float] = []
         self.curve: list[tuple[float, ...]] = []
@@ -391,7 +396,7 @@ class _Commissioning:
         choices = [self._choices(sun, target) for target in self.targets]
         clock = np.full(len(choices), begin)
         stop = begin + self.terms.clear * (end - begin)
-        free: Mask = np.array(self.counted)
+        free: Mask = np.array(self.visited)
         opened: Mask = np.ones(len(choices), dtype=np.bool_)
         while opened.any():
             j = int(np.argmin(np.where(opened, clock, np.inf)))

@@ -40,6 +40,8 @@ _OF_CONSOLE = ("argon2", "nicegui", "uvicorn", "websockets")
 FIRST_FILE = "first-password"
 #: Default time between lines, and period of the archive, s.
 EVERY, _ARCHIVED = 10.0, 5.0
+#: Time between predictions of the field's errors, s.
+FORESEE = 1800.0
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from heliotrope.cli.run._shared import Shown, at_work, begin, one_error, pictures, store
+from heliotrope.cli.run._shared import (
+    FORESEE,
+    Shown,
+    at_work,
+    begin,
+    one_error,
+    pictures,
+    store,
+)
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.files.disk import DiskThread
@@ -82,7 +90,7 @@ def _settings(choice: RealChoice, shown: Shown) -> AssemblySettings:
     return AssemblySettings(
         plant=shown.plant,
         # A heliostat that a person gives to automatic control is calibrated too.
-        work=AutomaticSettings(wanted=not choice.idle),
+        work=AutomaticSettings(wanted=not choice.idle, foresee=FORESEE),
         machines=MachineTables.WRITTEN if choice.configure else MachineTables.UNKNOWN,
     )
 

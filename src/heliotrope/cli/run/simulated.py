@@ -4,7 +4,15 @@ import asyncio
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-from heliotrope.cli.run._shared import Shown, at_work, begin, one_error, pictures, store
+from heliotrope.cli.run._shared import (
+    FORESEE,
+    Shown,
+    at_work,
+    begin,
+    one_error,
+    pictures,
+    store,
+)
 from heliotrope.field.plant import Plant
 from heliotrope.files.disk import DiskThread
 from heliotrope.links.clock import SystemClock, VirtualClock
@@ -40,7 +48,7 @@ async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
     options = WorldOptions(choice.seed, rendered=not choice.exact, boards=choice.boards)
     settings = AssemblySettings(
         plant=shown.plant,
-        work=AutomaticSettings(wanted=not choice.idle, calibrate=not choice.idle),
+        work=AutomaticSettings(wanted=not choice.idle, calibrate=not choice.idle, foresee=FORESEE),
         cycle=CYCLE,
         machines=MachineTables.HELD,
     )

@@ -183,6 +183,22 @@ function flights(box) {
   return refreshed(shown, { every: 5 });
 }
 
+// What the plant predicted for this day, and what has come true since the first prediction.
+const OUTLOOKS = ["LOCKED", "SEARCHING"], TRUE = "APPROACHING";
+function outlookView(view, canvas, key) {
+  if (!view.outlooks.length) return h("p", { className: "hx-hint" }, "No prediction yet: it is made once calibration runs and half of the field is up.");
+  const keys = view.outlooks.map((o, i) => [`predicted at ${clock(o.made).slice(0, 5)}`, colourOf(OUTLOOKS[i])]);
+  return h("div", { className: "hx-outlook" }, canvas, h("p", { className: "hx-keys" },
+    [["came true", colourOf(TRUE)], ...keys].flatMap(([text, colour]) => [key(`${text}, median`, colour), key("90th percentile", colour, true)])),
+  h("p", { className: "hx-hint" }, `Predicted at ${clock(view.outlooks.at(-1).made).slice(0, 5)}: ${view.outlooks.at(-1).text}.`));
+}
+
+function outlookLines(view) {
+  const since = view.outlooks[0].made - 1, came = view.field.filter((p) => p.at >= since);
+  return [...view.outlooks.map((o, i) => [o.points, OUTLOOKS[i]]), [came, TRUE]].flatMap(([points, colour]) =>
+    [["median"], ["percentile_90", [5, 4]]].map(([field, dash]) => ({ points: points.map((p) => [p.at, 1e3 * p[field]]), colour: colourOf(colour), dash })));
+}
+
 // What was learnt of each group of mirrors, and is in force.
 function learning(box) {
   const body = h("div");
@@ -199,7 +215,7 @@ function learning(box) {
 }
 
 export function calibration(box) {
-  const body = h("div"), lines = h("canvas", { className: "hx-chart" }), air = h("div"), nights = h("div");
+  const body = h("div"), lines = h("canvas", { className: "hx-chart" }), ahead = h("canvas", { className: "hx-chart" }), air = h("div"), nights = h("div");
   box.append(body, air, nights);
   let view = null;
   const draw = () => {
@@ -215,6 +231,7 @@ export function calibration(box) {
       h("h3", {}, "Error of the calibrated heliostats (mrad)"), lines,
       h("p", { className: "hx-keys" }, key("predicted, median", colourOf("APPROACHING")), key("90th percentile", colourOf("APPROACHING"), true),
         truth ? [key("true (twin), median", colourOf("SEARCHING")), key("90th percentile", colourOf("SEARCHING"), true)] : ""),
+      h("h3", {}, "Error of all heliostats over the year (mrad), UTC"), outlookView(view, ahead, key),
       h("h3", {}, "Last measurements"),
       table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target],
         ["Before", (r) => mrad(r.before), "num"], ["After", (r) => mrad(r.after), "num"], ["Predicted", (r) => mrad(r.predicted), "num"],
@@ -222,6 +239,7 @@ export function calibration(box) {
         ["", (r) => h("span", { className: r.outcome === "calibrated" ? "good" : "warn", title: r.text }, r.outcome === "calibrated" ? "✓ calibrated" : r.text.split(";")[0])]], view.results.slice(0, 60), (r) => look(r.heliostat)));
     chart(lines, [["median", "APPROACHING"], ["percentile_90", "APPROACHING", [5, 4]], ["truth_median", "SEARCHING"], ["truth_percentile_90", "SEARCHING", [5, 4]]]
       .map(([field, colour, dash]) => ({ points: view.quality.map((p) => [p.at, 1e3 * p[field]]), colour: colourOf(colour), dash })), dark());
+    if (view.outlooks.length) chart(ahead, outlookLines(view), dark());
   };
   const end = refreshed(async () => { view = await api("GET", "calibration"); draw(); },
     { key: () => JSON.stringify([store.head?.calibration, store.head?.measuring]) });

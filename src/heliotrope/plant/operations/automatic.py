@@ -24,6 +24,7 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, TrueErrors
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.flights import FlightIntake
+from heliotrope.plant.operations.foresight import POINT_EVERY, Foresight
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.learning import Learner, Learning
 from heliotrope.plant.operations.logbook import Logbook
@@ -72,6 +73,8 @@ class AutomaticSettings:
         Standard deviations by which an uncalibrated beam must miss the targets.
     losses
         Heliostats that may be lost within 30 s; after more, it waits for a person's Resume.
+    foresee
+        Time between predictions of the field's errors for the rest of the day, s; 0: none is made.
     events
         Age at which events, and alarms that are over and acknowledged, are removed, days.
     """
@@ -84,6 +87,7 @@ class AutomaticSettings:
     patience: float = 60.0
     margin: float = 3.0
     losses: int = 3
+    foresee: float = 0.0
     events: float = 400.0
 
     def __post_init__(self) -> None:
@@ -94,6 +98,10 @@ class AutomaticSettings:
             )
         if self.losses < 0:
             raise InputError(f"automatic control: {self.losses} losses; give 0 or more")
+        if not 0.0 <= self.foresee < math.inf:
+            raise InputError(
+                f"automatic control: a prediction every {self.foresee} s; give 0 (none) or more"
+            )
         if not self.events > 0.0:
             raise InputError(
                 f"automatic control: events are kept for {self.events} days; give above 0"
@@ -158,6 +166,7 @@ class AutomaticControl:
             plant, logbook, self._keeping, visits.first_model, learner, AUTOMATIC
         )
         self._calibrating: Calibrating | None = None
+        self._foresight: Foresight | None = None
         if cycle is not None and scheduler is not None:
             self._calibrating = Calibrating(
                 plant,
@@ -170,11 +179,15 @@ class AutomaticControl:
                 self.flights.first,
                 pictures,
             )
+            if settings.foresee > 0.0:
+                self._foresight = Foresight(plant, self._keeping, scheduler, settings.foresee)
         self._stopped = False
         if cycle is not None:
             self._keeping.recall()
             self.learning.recall()
             self.flights.recall()
+        if self._foresight is not None:
+            self._foresight.recall()
 
     # -- people's requests -----------------------------------------------------------------
 
@@ -246,6 +259,8 @@ class AutomaticControl:
             tuple(list(self.book.results)[:-51:-1]),
             tuple(self.book.quality),
             () if self._calibrating is None else self._calibrating.asked,
+            () if self._foresight is None else tuple(self._foresight.points),
+            () if self._foresight is None else self._foresight.outlooks,
         )
 
     def plan(self, limit: int) -> tuple[Planned, ...]:
@@ -264,6 +279,9 @@ class AutomaticControl:
                 for target in self._plant.design.targets:
                     visits = self._visits(self._calibrating, target.name)
                     group.create_task(self._again(f"target {target.name}", visits, 1.0))
+            if self._foresight is not None:
+                look = self._foresee(self._foresight)
+                group.create_task(self._again("prediction", look, POINT_EVERY))
 
     async def _again(self, name: str, part: Callable[[], Awaitable[None]], pause: float) -> None:
         """Repeat a part of the work; a failure raises an alarm and ends nothing."""
@@ -404,6 +422,13 @@ class AutomaticControl:
     async def _learn(self) -> None:
         """Learn what is due of the groups, beside all else."""
         await self.learning.step(night=not self._day)
+
+    def _foresee(self, foresight: Foresight) -> Callable[[], Awaitable[None]]:
+        async def look() -> None:
+            able = self._raising.wanted & ~self.service.rows()
+            await foresight.look(able, self._ready(), running=not self._why_not())
+
+        return look
 
     async def _look(self) -> None:
         """Update predicted errors and the field's quality; check the records."""

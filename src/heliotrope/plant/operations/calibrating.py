@@ -14,6 +14,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.plant.operations.foresight import Foreseeing
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.pictures import Pictures
@@ -24,7 +25,7 @@ from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleRes
 _TRUTH_EVERY = 5.0
 
 
-class Scheduling(Protocol):
+class Scheduling(Foreseeing, Protocol):
     """The choice of the heliostat that is calibrated next."""
 
     def next(self, target: str, ready: npt.NDArray[np.bool_]) -> Planned | None:

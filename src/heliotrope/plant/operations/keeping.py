@@ -18,6 +18,7 @@ from heliotrope.store.records import (
     FlightEntry,
     KeptSightings,
     LearningEntry,
+    OutlookEntry,
     Records,
     StoreError,
     VisitEntry,
@@ -127,6 +128,19 @@ class Keeping:
             self._records.record_learning(entry)
         except StoreError as error:
             self.lost = str(error)
+
+    def keep_outlook(self, outlook: OutlookEntry) -> None:
+        """Keep a prediction of the field's errors."""
+        if self._records is None:
+            return
+        try:
+            self._records.record_outlook(outlook)
+        except StoreError as error:
+            self.lost = str(error)
+
+    def outlooks(self, since: float) -> list[OutlookEntry]:
+        """Return the predictions made since a time, oldest first."""
+        return [] if self._records is None else self._records.outlooks(since)
 
     def _number(self, name: str, target: str, new: Sightings) -> Identities:
         """Keep sightings; return their numbers, 0 where they could not be kept."""

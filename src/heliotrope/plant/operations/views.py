@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.geometry import FloatArray
+from heliotrope.plant.operations.outlook import FieldPoint, Outlook
 from heliotrope.safety import Severity
 
 #: State shown for a row older than its limit, whose other values do not count.
@@ -432,6 +433,10 @@ class CalibrationView:
         Quality over time, oldest first.
     asked
         Heliostats that persons want calibrated next.
+    field
+        Errors of all heliostats over time, oldest first.
+    outlooks
+        Predictions of these for this day: the first of the day, and the last.
     """
 
     on: bool
@@ -443,6 +448,8 @@ class CalibrationView:
     results: tuple[CalibrationEntry, ...]
     quality: tuple[QualityPoint, ...]
     asked: tuple[str, ...] = ()
+    field: tuple[FieldPoint, ...] = ()
+    outlooks: tuple[Outlook, ...] = ()
 
 
 @dataclass(frozen=True)

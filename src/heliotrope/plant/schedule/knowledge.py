@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from heliotrope.calibration.growth import Growth, default_growth
 from heliotrope.calibration.learn.drift import DAY
 from heliotrope.calibration.plan import gain as _gain
+from heliotrope.calibration.plan.fleets import Fleet
 from heliotrope.calibration.plan.planning import Aimed, SightingLimits, aim_at, sighting_jacobian
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.calibration.uncertainty import error_form, precision, suns_of_year
@@ -100,7 +101,7 @@ class Knowledge:
         model: str | tuple[str, ...],
         priors: Mapping[str, float],
     ) -> None:
-        self.mechanism = heliostats.calibrated
+        self.mechanism, self._aim = heliostats.calibrated, aim
         known = self.mechanism.parameters
         self.names = parameter_table.model(model, known) if isinstance(model, str) else model
         self._priors = {name: value for name, value in priors.items() if name in self.names}
@@ -209,6 +210,12 @@ class Knowledge:
         gain = _gain.variance_gain(covariance, slope, self._form[self._like[rows]])
         drive = _drive_time(some.drives.table, aimed, counts)
         return VisitYield(able, aimed.normal, drive, slope, gain, sigma**2 * (seen + 2.0))
+
+    def fleet(self, labels: Sequence[str], now: float, sigma: float) -> Fleet:
+        """Return all heliostats at a time for a plan, with covariances for the information."""
+        form = self._form[self._like]
+        known = self.faded(np.arange(len(self.since)), now)
+        return Fleet(self.mechanism, self.names, known, form, self._aim, sigma, tuple(labels))
 
     def assume(self, row: int, slope: FloatArray, now: float) -> None:
         """Assume that a visit with this slope (2, P) has been made."""
@@ -346,6 +353,16 @@ class FieldKnowledge:
             sigma=settings.sigma,
             counts=counts,
         )
+
+    def fleets(self, now: float) -> tuple[tuple[Fleet, ...], Rows]:
+        """Return the heliostats for a plan, see `Knowledge.fleet`, and their rows in its order."""
+        names = np.array(list(self.row))
+        sigma = self._settings.sigma
+        found = tuple(
+            known.fleet(names[rows].tolist(), now, sigma)
+            for known, rows in zip(self._groups, self._rows, strict=True)
+        )
+        return found, np.concatenate(self._rows)
 
     def assume(self, row: int, slope: FloatArray, now: float) -> None:
         """Assume that a visit with this slope (2, P) has been made."""

@@ -15,6 +15,7 @@ from heliotrope.lcu import states
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import CalibrationEntry, Planned
 from heliotrope.plant.schedule.choice import Assignment
+from heliotrope.plant.schedule.prospect import FieldProspect
 from heliotrope.plant.schedule.scheduler import Scheduler, Visited
 from heliotrope.plant.schedule.settings import Settings, Weather
 from heliotrope.plant.visits.settings import CycleSettings
@@ -103,6 +104,10 @@ class PlantSchedule:
         shown = self._plan or tuple(self._draft)
         away, since = self.scheduler.running, self._plant.clock.utc().timestamp() - _LATE
         return [p for p in shown if p.heliostat not in away and p.at >= since][:limit]
+
+    def foresee(self, able: npt.NDArray[np.bool_], targets: Sequence[str]) -> FieldProspect | None:
+        """Return what is known now, to predict the rest of the day from; None without targets."""
+        return self.scheduler.prospect(self._plant.clock.utc(), able, targets)
 
     def done(self, entry: CalibrationEntry) -> None:
         """Take the result of a visit."""

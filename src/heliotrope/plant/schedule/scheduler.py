@@ -28,12 +28,15 @@ from heliotrope.geometry import FloatArray, as_vectors
 from heliotrope.lcu import states as lcu_states
 from heliotrope.plant.schedule.choice import Assignment, Judge, Mask
 from heliotrope.plant.schedule.knowledge import FieldKnowledge
+from heliotrope.plant.schedule.prospect import FieldProspect, terms_of
 from heliotrope.plant.schedule.settings import Settings, Weather
 
 #: A beam this many times as far off as expected says that its heliostat has changed.
 SURPRISE = 3.0
 #: States from which a heliostat can be sent to a target.
 READY = (lcu_states.IDLE, lcu_states.TRACKING)
+#: Visits from which their true pace counts in a prediction.
+ENOUGH = 10
 #: Finished visits to remember.
 REMEMBERED = 20_000
 #: Step of a plan while there is nothing to do, s.
@@ -108,6 +111,16 @@ class Comparison:
     def ratio(self) -> float:
         """Measured over predicted error: near 1 if the prediction is right."""
         return self.measured / self.predicted
+
+    @property
+    def pace(self) -> float:
+        """Mean time for each new calibration, as a share of the expected time of a visit.
+
+        NaN before there are `ENOUGH` visits.
+        """
+        if self.visits < ENOUGH:
+            return float("nan")
+        return self.longer * self.visits / max(self.calibrated, 1)
 
     @property
     def text(self) -> str:
@@ -385,6 +398,36 @@ class Scheduler:
         return compare(f for f in self.finished if f.visited.ended >= begin)
 
     # -- plan ------------------------------------------------------------------------------
+
+    def prospect(
+        self, now_utc: datetime, able: Mask, targets: Sequence[str]
+    ) -> FieldProspect | None:
+        """Return what is known now, to predict the rest of the day from; None without targets.
+
+        Parameters
+        ----------
+        now_utc
+            Time.
+        able
+            Heliostats that may be measured on this day, (N,).
+        targets
+            Targets that may be used.
+        """
+        used = tuple(target for target in self.design.targets if target.name in targets)
+        if not used:
+            return None
+        now = _unix(now_utc)
+        fleets, rows = self._known.fleets(now)
+        return FieldProspect(
+            now,
+            self.design.site,
+            used,
+            fleets,
+            self._known.size[rows].max(axis=1),
+            self._learnt[rows] > 0,
+            ~np.asarray(able, dtype=np.bool_)[rows],
+            terms_of(self.settings, self.compared().pace),
+        )
 
     def plan(
         self,

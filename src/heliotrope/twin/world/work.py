@@ -61,6 +61,10 @@ class _Rounds:
         del ready, limit
         return ()
 
+    def foresee(self, able: npt.NDArray[np.bool_], targets: Sequence[str]) -> None:
+        """Return nothing: it predicts nothing."""
+        del able, targets
+
     def done(self, entry: CalibrationEntry) -> None:
         """Nothing to do: the next is next."""
 

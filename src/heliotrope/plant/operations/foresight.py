@@ -1,0 +1,130 @@
+"""Predictions of the field's errors for the rest of the day, and what comes true of them.
+
+A prediction takes seconds for a large field, so it is made in a thread, from a copy of what the
+schedule knows. The first of a day stays beside what comes true; the last one says what is to come.
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.keeping import Keeping
+from heliotrope.plant.operations.outlook import FieldPoint, Outlook, day_of
+from heliotrope.store.records import OutlookEntry
+
+#: Time between points of the curve that comes true, s, and number of points that are held.
+POINT_EVERY, _POINTS = 60.0, 1500
+#: Least share of the heliostats that may be measured which is ready when a prediction is made:
+#: before that the field is still being raised.
+_UP = 0.5
+_DAY = 86_400.0
+
+
+class Prospect(Protocol):
+    """What is known of the field at one moment; its methods may be called in any thread."""
+
+    def now(self) -> FieldPoint:
+        """Return the errors of the field."""
+        ...
+
+    def outlook(self) -> Outlook | None:
+        """Return the prediction, None if nothing can be measured any more on this day."""
+        ...
+
+
+class Foreseeing(Protocol):
+    """The schedule, as a prediction needs it."""
+
+    def foresee(self, able: npt.NDArray[np.bool_], targets: Sequence[str]) -> Prospect | None:
+        """Return what is known now; None if it cannot predict.
+
+        Parameters
+        ----------
+        able
+            Heliostats that may be measured on this day, (N,).
+        targets
+            Targets that may be used.
+        """
+        ...
+
+
+class Foresight:
+    """Makes predictions, keeps them, and follows what comes true.
+
+    Parameters
+    ----------
+    plant, keeping
+        The controller, and the memory.
+    schedule
+        What is predicted from.
+    every
+        Time between predictions, s; 0: none is made.
+
+    Attributes
+    ----------
+    points
+        What has come true, oldest first.
+    outlooks
+        The first prediction of the day, and the last if it is another one.
+    """
+
+    def __init__(
+        self, plant: PlantController, keeping: Keeping, schedule: Foreseeing, every: float
+    ) -> None:
+        self._plant, self._keeping, self._schedule = plant, keeping, schedule
+        self.every = every
+        self.points: deque[FieldPoint] = deque(maxlen=_POINTS)
+        self.outlooks: tuple[Outlook, ...] = ()
+        self._targets = tuple(target.name for target in plant.design.targets)
+
+    def recall(self) -> None:
+        """Take up the predictions of this day that the store has kept."""
+        now = self._utc()
+        kept = [Outlook.of(entry) for entry in self._keeping.outlooks(now - _DAY)]
+        mine = [one for one in kept if self._day(one.made) == self._day(now) and one.made <= now]
+        # The first point of each is what had come true by then.
+        self.points.extend(one.points[0] for one in mine)
+        self.outlooks = tuple(dict.fromkeys(mine[:1] + mine[-1:]))
+
+    async def look(
+        self, able: npt.NDArray[np.bool_], ready: npt.NDArray[np.bool_], *, running: bool
+    ) -> None:
+        """Add a point to what has come true, and predict if it is time.
+
+        Parameters
+        ----------
+        able, ready
+            Heliostats that may be measured on this day, and those ready now, (N,).
+        running
+            Whether calibration is running: there is no prediction without.
+        """
+        prospect = self._schedule.foresee(able, self._targets)
+        if prospect is None:
+            return
+        self.points.append(await asyncio.to_thread(prospect.now))
+        up = able.any() and ready.sum() >= _UP * able.sum()
+        if not (running and up and self._due()):
+            return
+        made = await asyncio.to_thread(prospect.outlook)
+        if made is not None:
+            today = [one for one in self.outlooks if self._day(one.made) == self._day(made.made)]
+            self.outlooks = (*today[:1], made)
+            self._keeping.keep_outlook(OutlookEntry(made.made, made.document()))
+
+    def _due(self) -> bool:
+        now = self._utc()
+        if not self.outlooks or self._day(self.outlooks[-1].made) != self._day(now):
+            return True
+        return now - self.outlooks[-1].made >= self.every
+
+    def _utc(self) -> float:
+        return self._plant.clock.utc().timestamp()
+
+    def _day(self, at: float) -> int:
+        """Number of the day of local mean solar time."""
+        return day_of(at, self._plant.design.site)

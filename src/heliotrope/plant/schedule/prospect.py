@@ -1,0 +1,136 @@
+"""Predicts the errors of the field for the rest of a day, from what the schedule knows.
+
+The prediction is a plan as of `calibration.plan.plan_commission`, with the visits of the schedule:
+their times, the accuracy of a photograph, the least gain, and the goal.
+"""
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration.plan import (
+    CommissionPlan,
+    CommissionTerms,
+    Fleet,
+    plan_commission,
+)
+from heliotrope.calibration.plan.commission import SHARES
+from heliotrope.calibration.plan.percentiles import error_percentiles
+from heliotrope.calibration.plan.scaled_field import ScaledField
+from heliotrope.errors import InputError
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.plant.operations.outlook import FieldPoint, Outlook, end_of_day
+from heliotrope.plant.schedule.settings import Settings
+from heliotrope.sun import Site
+
+#: Least and longest interval of the predicted curve, s.
+_SHORT, _LONG = 120.0, 600.0
+#: A visit takes at most this many times as long as the schedule expects, or the inverse.
+_MOST_PACE = 4.0
+
+
+def terms_of(settings: Settings, pace: float) -> CommissionTerms:
+    """Return the terms of a plan whose visits are those of a schedule.
+
+    Parameters
+    ----------
+    settings
+        Of the schedule.
+    pace
+        Time of a visit that gives parameters, as a share of the expected time of a visit.
+    """
+    share = float(np.clip(pace, 1.0 / _MOST_PACE, _MOST_PACE)) if np.isfinite(pace) else 1.0
+    # Without a search, a beam that misses costs a whole visit.
+    look = settings.visit if settings.look is None else settings.look
+    return CommissionTerms(
+        goal=settings.goal,
+        settle=share * settings.settle,
+        shots=settings.shots,
+        interval=share * settings.interval,
+        look=share * look,
+        sigma=settings.sigma,
+        worth=settings.worth,
+        limits=settings.limits,
+    )
+
+
+@dataclass(frozen=True)
+class FieldProspect:
+    """What is known of a field at one moment; nothing in it changes, so any thread may use it.
+
+    Attributes
+    ----------
+    at
+        POSIX s.
+    site, targets
+        Place and air, and the targets that may be used.
+    fleets
+        Heliostats with the *covariance* of their parameters in place of the information, which the
+        thread computes.
+    size
+        Larger side of the mirrors, m, (N,), in the order of the fleets as what follows.
+    measured, held
+        Heliostats that are calibrated, and those that cannot be measured on this day, (N,).
+    terms
+        Of the visits.
+    """
+
+    at: float
+    site: Site
+    targets: tuple[Target, ...]
+    fleets: tuple[Fleet, ...]
+    size: FloatArray
+    measured: npt.NDArray[np.bool_]
+    held: npt.NDArray[np.bool_]
+    terms: CommissionTerms
+
+    def now(self) -> FieldPoint:
+        """Return the errors of the field."""
+        field = ScaledField(self._informed(), self.terms.limits)
+        found = error_percentiles(field.form, field.covariance, SHARES)
+        return FieldPoint(self.at, *(0.5 * found).tolist())
+
+    def outlook(self) -> Outlook | None:
+        """Return the prediction, None if the sun is too low for the rest of the day."""
+        try:
+            plan = plan_commission(
+                self._informed(),
+                self.site,
+                self.targets,
+                self.at,
+                end_of_day(self.at, self.site),
+                size=self.size,
+                measured=self.measured,
+                held=self.held,
+                terms=replace(self.terms, every=self._interval()),
+            )
+        except InputError:
+            return None
+        # Pages show errors of the normal, half of those of the beam.
+        curve = zip(plan.time.tolist(), (0.5 * plan.percentiles).tolist(), strict=True)
+        points = tuple(FieldPoint(at, *shares) for at, shares in curve)
+        able, goal = int((~self.held).sum()), 0.5 * self.terms.goal
+        return Outlook(self.at, able, goal, plan.reached, points, _told(plan))
+
+    def _interval(self) -> float:
+        """Return the time in which all are visited: a plan visits each once in an interval."""
+        all_once = len(self.held) * self.terms.alone / len(self.targets)
+        return float(np.clip(all_once, _SHORT, _LONG))
+
+    def _informed(self) -> list[Fleet]:
+        return [replace(f, information=as_float(np.linalg.inv(f.information))) for f in self.fleets]
+
+
+def _told(plan: CommissionPlan) -> str:
+    """Return the outcome in one sentence."""
+    goal, high = 0.5e3 * plan.terms.goal, 0.5e3 * plan.percentiles[-1, 1]
+    if plan.reached is not None:
+        when = datetime.fromtimestamp(plan.reached, UTC)
+        return f"90 % of the heliostats are within {goal:.2f} mrad by {when:%H:%M} UTC"
+    return (
+        f"90 % of the heliostats are within {high:.2f} mrad at the end of the day, not within "
+        f"{goal:.2f} mrad; limited by {plan.limit}"
+    )

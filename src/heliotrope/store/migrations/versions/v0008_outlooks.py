@@ -1,0 +1,16 @@
+"""Predictions of the field's errors that the plant has made."""
+
+from alembic import op
+from sqlalchemy import Column, Double, Text
+
+revision = "0008"
+down_revision = "0007"
+
+
+def upgrade() -> None:
+    """Make the table."""
+    op.create_table(
+        "outlook",
+        Column("at", Double, primary_key=True),
+        Column("document", Text, nullable=False),
+    )

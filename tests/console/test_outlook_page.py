@@ -1,0 +1,91 @@
+"""The predicted errors of the field on the page, beside what comes true, in a plant at work."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from support.live_console import LiveConsole
+from support.pages import NEEDS_BROWSER, browsers, entering
+
+pytestmark = NEEDS_BROWSER
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
+    """A few heliostats that calibrate themselves, at twenty times the speed of real time."""
+    work = AutomaticSettings(wanted=True, foresee=60.0)
+    made = LiveConsole(tmp_path_factory.mktemp("outlook"), 6, speed=20.0, work=work)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A browser for this module alone."""
+    yield from browsers()
+
+
+@pytest.fixture
+def enter(field: LiveConsole, browser: Any) -> Iterator[Callable[..., Any]]:
+    """Sign in as somebody of a role."""
+    yield from entering(field.address, browser)
+
+
+#: Whether a colour, [red, green, blue], is somewhere in the picture of a canvas.
+_DRAWN = """colour => {
+  const canvas = document.querySelector('.hx-outlook canvas');
+  if (!canvas || !canvas.width) return false;
+  const seen = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+  for (let i = 0; i < seen.length; i += 4)
+    if (seen[i + 3] > 200 && colour.every((c, k) => Math.abs(seen[i + k] - c) < 12)) return true;
+  return false;
+}"""
+#: Colours of `palette.js`, on dark and on light: the first prediction, the last, what came true.
+_COLOURS = {
+    True: [[0xCC, 0x79, 0xA7], [0xE6, 0x9F, 0x00], [0x56, 0xB4, 0xE9]],
+    False: [[0xB0, 0x56, 0x8A], [0xC9, 0x85, 0x00], [0x1F, 0x8F, 0xD0]],
+}
+
+
+def test_the_page_draws_the_prediction_beside_what_comes_true(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    def two() -> bool:
+        return len(field.live.operations.calibration().outlooks) == 2
+
+    field.until(two, 240.0)
+    page = enter("viewer", viewport={"width": 800, "height": 900})
+    page.click(".hx-tabs >> text=Calibration")
+    page.wait_for_selector(".hx-outlook .hx-keys")
+    keys = page.inner_text(".hx-outlook .hx-keys")
+    assert keys.count("90th percentile") == 3
+    assert "came true, median" in keys
+    assert keys.count("predicted at ") == 2
+    assert "90 % of the heliostats are within" in page.inner_text(".hx-outlook .hx-hint")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 800
+    assert page.locator(".hx-outlook canvas").bounding_box()["width"] > 600
+    for dark in (True, False):
+        page.evaluate("dark => { Quasar.Dark.set(dark); heliotrope.store.emit('theme'); }", dark)
+        for colour in _COLOURS[dark]:
+            page.wait_for_function(_DRAWN, arg=colour)
+
+
+def test_the_curve_is_in_the_answer_of_the_api_and_in_the_store(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    field.until(lambda: field.live.operations.calibration().outlooks, 240.0)
+    page = enter("viewer")
+    told = page.evaluate("async () => (await fetch('/api/v1/calibration')).json()")
+    first = told["outlooks"][0]
+    assert set(first) == {"made", "heliostats", "goal", "reached", "points", "text"}
+    assert first["heliostats"] == 6
+    assert first["points"][0]["at"] == first["made"]
+    assert first["points"][0]["percentile_90"] > first["points"][-1]["percentile_90"] > 0.0
+    assert told["field"][0]["at"] <= first["made"]
+
+    def kept() -> bool:
+        return first["made"] in [entry.at for entry in field.keeper.outlooks(0.0)]
+
+    field.until(kept)
