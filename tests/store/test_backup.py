@@ -27,6 +27,7 @@ from heliotrope.store.records import (
     CampaignEntry,
     Event,
     FlightEntry,
+    LearningEntry,
     OutlookEntry,
     PlannedVisit,
     StoreError,
@@ -60,6 +61,7 @@ def fill(keeper: Keeper, seen: Sightings, key_file: Path) -> None:
     keeper.record_plan([PlannedVisit("B", "west", 3.0)])
     keeper.record_campaign(CampaignEntry("spring", 1.0))
     keeper.record_flight(FlightEntry("C1-1", 1.0, "anna", "{}"))
+    keeper.record_learning(LearningEntry("field", 1, 1.0, "anna", 3, 10, 0.5, "{}"))
     keeper.record_outlook(OutlookEntry(1.0, "{}"))
     keeper.record_event(Event(1.0, "test", "hello", values={"x": float("nan")}))
     keeper.record_alarm("wind", "", "alarm", "too much", 1.0, active=True)
