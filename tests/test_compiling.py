@@ -2,6 +2,8 @@
 
 import ast
 import io
+import os
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,8 +13,12 @@ from numba import njit
 from numba.core import event
 
 import heliotrope as ht
+from heliotrope import warm
+from heliotrope.calibration.fit import _fit_kernels, estimator
+from heliotrope.calibration.learn import _drift_kernels, _regime_kernels
+from heliotrope.calibration.learn.learning import learn
 from heliotrope.calibration.median import median
-from heliotrope.jit import FIRST, FirstCompilation, as_input
+from heliotrope.jit import FIRST, FirstCompilation, as_input, is_compiled
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.kernels.block import track_block
 from heliotrope.mechanism.kernels.chain import jacobian_block, pose_block
@@ -96,6 +102,69 @@ def test_kernels_avoid_what_is_slow_to_compile() -> None:
                 if isinstance(node, ast.Attribute) and ast.unparse(node).startswith("np."):
                     assert node.attr not in slow, f"{path.name} {kernel.name}: {ast.unparse(node)}"
     assert seen > 100
+
+
+def test_machine_code_is_kept_while_its_source_is_older(tmp_path: Path) -> None:
+    source = tmp_path / "kernel.py"
+    source.write_text("def twice(x):\n    return 2.0 * x\n", encoding="utf-8")
+    space: dict[str, object] = {}
+    exec(compile(source.read_text(encoding="utf-8"), str(source), "exec"), space)
+    kernel = njit(cache=True)(space["twice"])
+    os.utime(source, (1e9, 1e9))
+    assert not is_compiled(kernel)
+    assert kernel(2.0) == 4.0
+    assert is_compiled(kernel)
+    os.utime(source, (4e9, 4e9))
+    assert not is_compiled(kernel)
+
+
+@pytest.mark.parametrize(("cores", "compiled"), [(1, False), (2, True), (2, False)])
+def test_two_processes_share_the_compiling(
+    cores: int, compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+
+    class Second:
+        def __init__(self, command: list[str], **_: object) -> None:
+            done.append(command[-1])
+
+        def __enter__(self) -> None:
+            pass
+
+        def __exit__(self, *_: object) -> None:
+            done.append("waited")
+
+    monkeypatch.setenv("HELIOTROPE_THREADS", str(cores))
+    monkeypatch.setattr(estimator, "is_compiled", lambda: compiled)
+    monkeypatch.setattr(subprocess, "Popen", Second)
+    monkeypatch.setattr(warm, "tracking", lambda: done.append("tracking"))
+    monkeypatch.setattr(warm, "searching", lambda: done.append("searching"))
+    with warm.compiling():
+        done.append("work")
+    if cores == 2 and not compiled:
+        assert done == [warm.OTHER_HALF, "tracking", "searching", "work", "waited"]
+    else:
+        assert done == ["work"]
+
+
+def test_warming_leaves_nothing_for_learning_to_compile() -> None:
+    kernels = (
+        track_block, pose_block, jacobian_block, _fit_kernels.fit_block,
+        _drift_kernels.pooled_block, _drift_kernels.gram, _drift_kernels.step_sums,
+        _regime_kernels.partition,
+    )  # fmt: skip
+    for part in (warm.tracking, warm.searching, warm.fitting, warm.breaking):
+        part()
+    before = [set(kernel.signatures) for kernel in kernels]
+    assert all(before)
+    mechanism = kinds.azimuth_elevation(np.array([[0.0, 50.0, 0.0], [9.0, 50.0, 0.0]]))
+    angles = np.linspace(-1.0, 1.0, 16)
+    suns = np.c_[np.sin(angles), np.zeros(16), np.cos(angles)]
+    rows = np.arange(16) % 2
+    counts = ht.track(mechanism[rows], suns, AIM).best_counts
+    seen = ht.sightings(rows, counts, suns, AIM, time=1.7e9 + 86400.0 * np.arange(16))
+    learn(mechanism, seen, ("tilt_north", "azimuth_bias"))
+    assert [set(kernel.signatures) for kernel in kernels] == before
 
 
 def test_median_is_that_of_numpy() -> None:

@@ -12,6 +12,7 @@ instead. At a terminal one line says what is going on when the first kernel is c
 """
 
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,13 @@ def as_input(array: np.ndarray) -> np.ndarray:
     return view
 
 
+def is_compiled(kernel: Any) -> bool:
+    """Whether machine code of a kernel is kept that is newer than its source."""
+    source = Path(kernel.py_func.__code__.co_filename)
+    kept = Path(kernel.stats.cache_path).glob(f"*.{kernel.__name__}-*.nbi")
+    return any(file.stat().st_mtime > source.stat().st_mtime for file in kept)
+
+
 class FirstCompilation(event.Listener):
     """Says once, at a terminal, that kernels are being compiled."""
 
@@ -52,7 +60,7 @@ class FirstCompilation(event.Listener):
         if sys.stderr is not None and sys.stderr.isatty():
             print(  # noqa: T201
                 "heliotrope: compiling kernels, once after an installation; "
-                "this takes up to a minute",
+                "this takes up to half a minute",
                 file=sys.stderr,
                 flush=True,
             )

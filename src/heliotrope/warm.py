@@ -1,29 +1,137 @@
 """Compile the numeric kernels once, so that programs start at full speed.
 
-``python -m heliotrope.warm`` takes about half a minute after an installation and a
-second afterwards; the compiled code stays in the package's ``__pycache__``.
+``python -m heliotrope.warm`` takes some twenty seconds of two cores after an installation and a
+second afterwards; the compiled code stays in the package's ``__pycache__``. The compiler works on
+one thread, so the kernels are shared out between two processes. Commands that need most of them
+begin with `compiling`.
 """
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from heliotrope.parallel import threads
+
+if TYPE_CHECKING:
+    from heliotrope.calibration.learn.drift import Hyperparameters, Linear
+    from heliotrope.calibration.sightings import Sightings
+    from heliotrope.mechanism.chain import Mechanism
+
+#: What a second process is called with, to compile the other half.
+OTHER_HALF = "other-half"
 
 
 def main() -> None:
-    """Run every kernel once on a small case."""
-    import numpy as np
+    """Run the kernels of tracking and learning once, in two processes where there are two cores."""
+    if OTHER_HALF in sys.argv[1:]:
+        fitting()
+        breaking()
+        return
+    with compiling():
+        following()
+    for part in (tracking, searching, fitting, breaking):
+        part()
 
-    from heliotrope.calibration.fit.estimator import fit
-    from heliotrope.calibration.learn.present import fitting_present
-    from heliotrope.calibration.sightings import sightings
-    from heliotrope.mechanism import kinds
+
+@contextmanager
+def compiling() -> Iterator[None]:
+    """Compile what a calibration takes, in two processes, if it has not been compiled.
+
+    Tracking is compiled when the block begins, fitting when it ends. With one core, or where
+    machine code cannot be kept, kernels are compiled when they are needed.
+    """
+    from heliotrope.calibration.fit import estimator
+
+    if threads() == 1 or estimator.is_compiled():
+        yield
+        return
+    command = [sys.executable, "-m", "heliotrope.warm", OTHER_HALF]
+    # What goes wrong there goes wrong here too, where it is seen.
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL):  # noqa: S603
+        tracking()
+        searching()
+        yield
+
+
+def tracking() -> None:
+    """Track a mirror."""
     from heliotrope.mechanism.tracking import track
 
+    mechanism, seen = _case()
+    counts = track(mechanism, seen.source[:1], seen.destination[:1]).best_counts
+    mechanism.pose(counts)
+
+
+def fitting() -> None:
+    """Fit a mirror."""
+    from heliotrope.calibration.fit.estimator import fit
+
+    mechanism, seen = _case()
+    mechanism.jacobian(seen.counts, ("tilt_north", "position_up"))
+    fit(mechanism, seen, "malan8")
+
+
+def searching() -> None:
+    """Search for the hyperparameters of a mirror."""
+    from heliotrope.calibration.learn import drift
+
+    drift.refine(*_drifting(), iterations=1)
+
+
+def breaking() -> None:
+    """Search for steps and regimes of a mirror."""
+    from heliotrope.calibration.learn import drift
+    from heliotrope.calibration.learn.regimes import find_regimes
+
+    hyper, data = _drifting()
+    drift.find_steps(hyper, data)
+    find_regimes(data.time, data.value, data.jacobian[:, :, :2])
+
+
+def following() -> None:
+    """Learn on from a sighting, and ask for the resolution of drives."""
+    from heliotrope.calibration.learn import stream
+
+    mechanism, seen = _case()
+    mechanism.drives.radians_per_count(seen.counts)
+    hyper, data = _drifting()
+    stream.update(stream.begin(hyper), data.jacobian[0], data.value[0], 0.0)
+
+
+def _case() -> "tuple[Mechanism, Sightings]":
+    """Return a mechanism and a sighting of it."""
+    import numpy as np
+
+    from heliotrope.calibration.sightings import sightings
+    from heliotrope.mechanism import kinds
+
     mechanism = kinds.azimuth_elevation(np.array([[0.0, 50.0, 0.0]]), pivot_offset=0.2)
-    sun, aim = np.array([0.0, -0.6, 0.8]), np.array([0.0, 0.0, 30.0])
-    tracking = track(mechanism, sun, aim)
-    counts = tracking.best_counts
-    mechanism.jacobian(counts, ("tilt_north", "position_up"))
-    mechanism.drives.radians_per_count(counts)
-    seen = sightings([0], counts, sun, aim, time=0.0)
-    for _ in fitting_present(mechanism, seen, fit(mechanism, seen, "malan8")):
-        pass
+    counts = np.array([[0.0, 1e5]])
+    return mechanism, sightings([0], counts, (0.0, -0.6, 0.8), (0.0, 0.0, 30.0), time=0.0)
+
+
+def _drifting() -> "tuple[Hyperparameters, Linear]":
+    """Return sightings of a mirror on eight days, linear in its parameters."""
+    import numpy as np
+
+    from heliotrope.calibration.learn import drift
+
+    hyper = drift.start(_case()[0], ("tilt_north",))
+    count, size = 8, len(hyper.names)
+    numbers = np.random.default_rng(0)
+    data = drift.Linear(
+        jacobian=numbers.normal(size=(count, 2, size)),
+        value=numbers.normal(size=(count, 2)),
+        time=np.arange(float(count)),
+        regime=np.zeros(count, dtype=np.int64),
+        centre=np.zeros(size),
+        own=np.zeros(size, dtype=np.bool_),
+        steps=np.empty(0),
+        suspect=np.zeros(count, dtype=np.bool_),
+    )
+    return hyper, data
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numba import njit
 
 from heliotrope.calibration.fit import _fit_kernels as kernels
 from heliotrope.calibration.fit._residual_kernels import scratch_mechanism
@@ -12,6 +13,16 @@ from heliotrope.mechanism.chain import Mechanism
 from support.machines import every_kind, imperfect, random_counts
 
 ROWS = 12
+
+
+@njit
+def normal_equations(problem, y, loss, scale, curved, hessian, gradient):  # type: ignore[no-untyped-def]
+    return kernels._normal_equations(problem, y, loss, scale, curved, hessian, gradient)
+
+
+@njit
+def loss_and_weights(square, loss):  # type: ignore[no-untyped-def]
+    return kernels.loss_and_weights(square, loss)
 
 
 def _problem(mechanism: Mechanism) -> tuple[Any, ...]:
@@ -49,7 +60,7 @@ def test_gradient_is_that_of_the_cost(kind: str, loss: int) -> None:
 
     def cost(moved: np.ndarray, out: np.ndarray = unused) -> float:
         args = problem, moved, loss, scale, False, hessian, out
-        return float(kernels._normal_equations(*args))
+        return float(normal_equations(*args))
 
     cost(y, gradient)
     steps = 1e-5 * np.eye(size)
@@ -64,8 +75,8 @@ def test_gradient_is_that_of_the_cost(kind: str, loss: int) -> None:
 def test_curvature_of_the_loss_is_that_of_its_weight(loss: int) -> None:
     for square in (0.3, 2.0, 4.0):
         h = 1e-6
-        up, down = (kernels.loss_and_weights(square + d, loss) for d in (h, -h))
-        value, weight, bend = kernels.loss_and_weights(square, loss)
+        up, down = (loss_and_weights(square + d, loss) for d in (h, -h))
+        value, weight, bend = loss_and_weights(square, loss)
         assert value > 0.0
         assert weight == pytest.approx((up[0] - down[0]) / (2 * h), abs=1e-8)
         assert bend == pytest.approx((up[1] - down[1]) / h, abs=1e-8)
@@ -73,5 +84,5 @@ def test_curvature_of_the_loss_is_that_of_its_weight(loss: int) -> None:
 
 def test_a_far_outlier_does_not_turn_the_step_around() -> None:
     square = 100.0
-    _, weight, bend = kernels.loss_and_weights(square, kernels.CAUCHY)
+    _, weight, bend = loss_and_weights(square, kernels.CAUCHY)
     assert weight + bend * square == pytest.approx(0.0, abs=1e-15)

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numba import njit
 
 from heliotrope.calibration.evaluation import split
 from heliotrope.calibration.learn import _drift_kernels as kernels
@@ -22,6 +23,13 @@ from heliotrope.mechanism.drives import direct
 from heliotrope.mechanism.tracking import track
 
 AIM = np.array([0.0, 0.0, 40.0])
+
+
+@njit
+def cost_and_gradient(*data):  # type: ignore[no-untyped-def]
+    return kernels.cost_and_gradient(*data)
+
+
 DAY = 86400.0
 START = 1.7e9
 PRIORS = {
@@ -275,7 +283,7 @@ def test_gradient_of_the_evidence() -> None:
 
     def value(vector: FloatArray) -> tuple[float, FloatArray]:
         h = first.with_vector(vector)
-        return kernels.cost_and_gradient(
+        return cost_and_gradient(
             data.jacobian,
             data.time,
             data.regime,

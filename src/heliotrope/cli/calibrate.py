@@ -9,6 +9,7 @@ import typer
 
 from heliotrope.cli import _calibration as shared
 from heliotrope.cli._common import open_plant, print_json, print_table
+from heliotrope.warm import compiling
 
 if TYPE_CHECKING:
     from heliotrope.calibration.report.content import CalibrationReport
@@ -37,7 +38,9 @@ def calibrate(
     priors = shared.parse_priors(prior or [])
     if fraction != 1.0:
         evaluation.check_fraction(fraction)
-    field = workflow.read_field_sightings(open_plant(place), place, sightings, centroid=centroid)
+    plant = open_plant(place)
+    with compiling():
+        field = workflow.read_field_sightings(plant, place, sightings, centroid=centroid)
     with shared.workers(scheduler) as runner, shared.progress_of_steps(as_json) as steps:
         content = workflow.calibrate(
             field,

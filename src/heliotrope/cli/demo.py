@@ -8,9 +8,12 @@ import typer
 
 from heliotrope.cli import _calibration as shared
 from heliotrope.cli._common import print_json
+from heliotrope.warm import compiling
 
 #: The day of the demonstration; mirrors are measured during the week before it.
 DAY = date(2026, 9, 2)
+#: Heliostats with pictures of their own in the report, enough to see what a report shows.
+SECTIONS = 4
 #: The usual parameters of this kind of mechanism, and the survey.
 MODEL = (
     "tilt_north", "tilt_east", "azimuth_bias", "elevation_bias", "non_orthogonality",
@@ -40,7 +43,8 @@ def demo(
     into.mkdir(parents=True, exist_ok=True)
     say(f"plant: {len(plant)} heliostats, installed with errors of about 10 mrad")
     days = tuple(DAY - timedelta(days=back) for back in range(7, 0, -2))
-    seen = measure(group.mechanism, truth, target, plant.site, days, seed=seed)
+    with compiling():
+        seen = measure(group.mechanism, truth, target, plant.site, days, seed=seed)
     say(f"measured: {len(seen)} sightings on the target in the week before")
     report = calibrate(FieldSightings(plant, "azel", seen, (), ()), MODEL, seed=seed)
     calibrated = plant.with_groups({"azel": report.results.apply(group)})
@@ -49,7 +53,7 @@ def demo(
     figure = day_picture(day)
     write_file(into / "day.png", lambda stream: figure.savefig(stream, dpi=110, format="png"))
     with shared.progress("drawing", as_json) as advance:
-        page = write_report(report, into / "report", advance)
+        page = write_report(report, into / "report", advance, most=SECTIONS)
     figures: dict[str, Any] = {
         "heliostats": len(report.names),
         "sightings": len(seen),

@@ -8,6 +8,7 @@ import typer
 
 from heliotrope.cli import _calibration as shared
 from heliotrope.cli._common import open_plant, print_json, print_table
+from heliotrope.warm import compiling
 
 
 def evaluate(
@@ -36,7 +37,9 @@ def evaluate(
 
     evaluation.check_fraction(fraction)
     priors = shared.parse_priors(prior or [])
-    field = workflow.read_field_sightings(open_plant(place), place, sightings, centroid=centroid)
+    plant = open_plant(place)
+    with compiling():
+        field = workflow.read_field_sightings(plant, place, sightings, centroid=centroid)
     with shared.workers(scheduler) as runner, shared.progress_of_steps(as_json) as steps:
         found = workflow.evaluate(
             field.heliostats.names,

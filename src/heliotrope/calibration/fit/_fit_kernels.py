@@ -46,7 +46,7 @@ UNSEEN = 1e-9
 DAMPING, HARDER, REFUSALS = 1e-3, 8.0, 25
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def loss_and_weights(square, loss):
     """Loss ρ(s), its derivative ρ', and what the curvature 2 ρ'' adds along the residual.
 
@@ -116,7 +116,7 @@ def inverse_from(factor, out):
             out[j, i] = total
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _normal_equations(problem, y, loss, scale, curved, hessian, gradient):
     """Cost at y with gradient (P,) and hessian (P, P), lower half, by y.
 

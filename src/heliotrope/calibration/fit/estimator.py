@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope import jit
 from heliotrope.calibration.fit import _fit_kernels as kernels
 from heliotrope.calibration.fit.residuals import whitening
 from heliotrope.calibration.named import Field, members
@@ -152,6 +153,11 @@ def parameter_rows(
         ]
         rows.append((name, *(f"{x:.4g} {unit}".strip() for x in figures)))
     return rows  # type: ignore[return-value]
+
+
+def is_compiled() -> bool:
+    """Whether the kernels of a fit need not be compiled first."""
+    return jit.is_compiled(kernels.fit_block)
 
 
 def fit(

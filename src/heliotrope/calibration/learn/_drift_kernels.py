@@ -112,7 +112,7 @@ def _decaying_gram(
     return out
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def cost_and_gradient(
     jacobian, time, label, epoch, residual, static, regime, step, part, group, amplitude, tau, noise
 ):

@@ -15,7 +15,7 @@ from heliotrope.field.formats.plant_file import write_plant
 from heliotrope.files.html import STYLE, picture, render
 from heliotrope.files.text import write_text
 
-#: At most this many heliostats get a section with pictures: those with the largest errors.
+#: At most this many heliostats get a section with pictures.
 MOST_SECTIONS = 60
 
 
@@ -42,7 +42,11 @@ def write_parameters(report: CalibrationReport, path: Path) -> None:
 
 
 def write_report(
-    report: CalibrationReport, folder: Path, progress: Callable[[int, int], None] | None = None
+    report: CalibrationReport,
+    folder: Path,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    most: int = MOST_SECTIONS,
 ) -> Path:
     """Write the page and the files beside it; returns the path of the page.
 
@@ -57,6 +61,8 @@ def write_report(
         Created if it does not exist.
     progress
         Called with (done, all) after each picture.
+    most
+        Largest number of heliostats with pictures of their own: those with the largest errors.
     """
     folder.mkdir(parents=True, exist_ok=True)
     learned, r = report.learned, report.results
@@ -66,7 +72,7 @@ def write_report(
     units = {n: learned.mechanism.parameter(n).unit for n in r.names}
     write_parquet(folder / "calibration.parquet", units, r)
     write_plant(calibrated_plant(report.plant, report.group, r), folder / "plant.toml")
-    rows = sorted(report.rows, key=lambda row: -np.nan_to_num(row.after.median))[:MOST_SECTIONS]
+    rows = sorted(report.rows, key=lambda row: -np.nan_to_num(row.after.median))[:most]
     rows = sorted(rows, key=lambda row: row.name)
     sections = []
     for k, row in enumerate(rows):
