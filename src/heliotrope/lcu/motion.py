@@ -31,6 +31,9 @@ RENEW_MS, KNOT_MS, KNOT_LIMIT = 200, 4000, 1e-3
 #: A path is followed by poses that divide each straight line evenly. In the mean their beams are at
 #: most this far apart, rad; where the line passes nearest, further.
 PIECE = 0.1
+#: A way back on which an axis would have to turn by more than this (rad) to the next point is left:
+#: such a turn, in the keyhole or the long way about a stop, carries the beam far off the line.
+FAR = 1.6
 #: Time that the spiral rests on a point, ms.
 DWELL_MS = 2000
 #: Rough stepping waits for this many steps, where a full step is not known.
@@ -207,6 +210,10 @@ class Motion:
             if self.pose(point, 0) is None:
                 return False
         return True
+
+    def _is_far(self, angles: "list[float]") -> bool:
+        """Whether angles are far from those at which `pose` was last asked for."""
+        return max(abs(angles[0] - self._near[0]), abs(angles[1] - self._near[1])) > FAR
 
     def _go_angles(self, angles: "list[float]", order: int) -> None:
         """Go to joint angles, by ``follow`` where order is −1."""
@@ -488,7 +495,7 @@ class Motion:
         self._place += 1
         if self._place < len(self._path):
             pose = self.pose(self._path[self._place], 0)
-            if pose is None:
+            if pose is None or (self.kind == RETURN and self._is_far(pose.angles)):
                 return "UNREACHABLE"
             order = BOTH
             if self.kind == APPROACH and self._place == 0:

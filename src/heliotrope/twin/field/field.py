@@ -23,6 +23,7 @@ from heliotrope.lcu.lease import RATE_FACTOR, UNIT
 from heliotrope.lcu.motion import (
     APPROACH,
     DEFOCUS,
+    FAR,
     HOLD,
     KNOT_LIMIT,
     KNOT_MS,
@@ -626,6 +627,8 @@ class Field:
         ends = rows[self._place[rows] >= self._length[rows]]
         if len(goes):
             angles, good = self._pose(goes, self._path[goes, self._place[goes]], 0)
+            turns = angles - self._angles_at(self.axes["count"][goes], goes)
+            good &= (np.abs(turns).max(axis=1) <= FAR) | (self.kind[goes] != RETURN)
             first = (self.kind[goes] == APPROACH) & (self._place[goes] == 0)
             how = np.where(first, kernels.PRIMARY_FIRST, kernels.BOTH)
             self._go(goes[good], angles[good], how[good])

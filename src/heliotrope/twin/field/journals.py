@@ -57,6 +57,13 @@ class Journals:
         )
         self.standby = np.full((count, 3), np.nan)
         for one, rows in self.machines():
+            # The limits of the motors are stops: a pose beyond them is no pose.
+            for i, axis in enumerate(one.axes):
+                own = self._drives[rows, i]
+                self._drives[rows, i, slot.MIN_COUNT] = np.maximum(own[:, slot.MIN_COUNT], axis.low)
+                self._drives[rows, i, slot.MAX_COUNT] = np.minimum(
+                    own[:, slot.MAX_COUNT], axis.high
+                )
             if one.standby is not None:
                 self.standby[rows] = one.standby
 

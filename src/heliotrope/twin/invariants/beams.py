@@ -125,8 +125,8 @@ def slew(board: Board, sun: FloatArray, point: Point) -> float:
     the true mirror comes to soonest; at the least rate that the boards are given, with its ramp.
     """
     mechanism, (rate, acceleration, _) = board.outfit.mechanism, LIMITS
-    stops = mechanism.drives.angles(np.transpose(RANGES))
-    drives = mechanism.drives.replace(min_angle=stops.min(axis=0), max_angle=stops.max(axis=0))
+    low, high = np.transpose(RANGES)
+    drives = mechanism.drives.replace(min_count=low, max_count=high)
     here = np.array([axis.turned for axis in board.axes], dtype=np.float64)
     found = track(mechanism, sun, point, drives=drives, current=here)
     if found.chosen(found.status) != TrackingStatus.OK:
