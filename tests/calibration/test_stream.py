@@ -161,3 +161,33 @@ def test_the_state_does_not_grow(hyper: Hyperparameters) -> None:
     assert belief.weight.sum() == pytest.approx(1.0)
     for covariance in belief.covariance:
         assert np.linalg.eigvalsh(covariance).min() > -1e-12
+
+
+def test_errors_that_some_sightings_share_are_constants_for_as_long(hyper: Hyperparameters) -> None:
+    """Against the posterior of all at once, with the shared errors integrated out."""
+    rng, days, shared = np.random.default_rng(7), np.full(9, 3.0), ("one", "two")
+    jacobian, value = _drawn(hyper, 8, days)
+    of_shared, spread = rng.normal(0.0, 1.0, (9, 2, 2)), np.array([1.5, 0.5])
+    of_shared[[0, 1, 8]] = 0.0  # they belong to the sightings between
+    value = value + of_shared @ (spread * rng.standard_normal(2))
+    belief = start = stream.begin(hyper)
+    for k, day in enumerate(days):
+        if k == 2:
+            belief = stream.with_constants(belief, shared, spread)
+        inside = 2 <= k < 8
+        row = np.concatenate([jacobian[k], of_shared[k]], axis=1) if inside else jacobian[k]
+        belief = stream.update(belief, row, value[k], day, Event.NOTHING)
+        if k == 7:
+            belief = stream.without_constants(belief, shared)
+    assert belief.hyper.names == hyper.names
+    rows = (jacobian @ start.layout.view).reshape(18, -1)
+    common = (of_shared * spread).reshape(18, 2)
+    noise = hyper.noise**2 * np.eye(18) + common @ common.T
+    before = start.covariance[0]
+    gain = before @ rows.T @ np.linalg.inv(rows @ before @ rows.T + noise)
+    mean = start.mean[0] + gain @ (value.ravel() - rows @ start.mean[0])
+    covariance = before - gain @ rows @ before
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance), 1e-30))
+    assert np.abs((belief.mean[0] - mean) / sigma).max() < 1e-4
+    found = np.diagonal(belief.covariance[0])
+    np.testing.assert_allclose(found, np.diagonal(covariance), rtol=1e-4, atol=1e-20)

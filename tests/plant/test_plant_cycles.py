@@ -179,7 +179,8 @@ def test_a_visit_fits_the_rows_of_a_flight_with_its_photographs(tmp_path: Path) 
         counts = np.array([[20_000.0 + 4_000.0 * k, 6_000.0 + 3_000.0 * k] for k in range(4)])
         pose = group.mechanism[[row] * 4].with_parameters(error).pose(counts)
         place = pose.vertex + 100.0 * pose.normal
-        made = drone(np.zeros(4, int), counts, place, place, time=1.7e9, sigma=1e-4)
+        at = bench.clock.utc().timestamp() - 3600.0
+        made = drone(np.zeros(4, int), counts, place, place, time=at, sigma=1e-4)
         shift = np.tile(np.eye(3), (4, 1, 1))
         flight = Flight(
             "one", (NAME,), made, np.array([1e-4]), ("e", "n", "u"), 1e-4 * np.eye(3), shift

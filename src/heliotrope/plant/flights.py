@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from heliotrope.calibration.fit.common import CommonErrors
 from heliotrope.calibration.flights import Flight
+from heliotrope.calibration.learn.present import Flown
 from heliotrope.calibration.record import Identities
 from heliotrope.calibration.sightings import Sightings, join
 from heliotrope.geometry import FloatArray
@@ -194,6 +195,32 @@ class Flights:
             np.concatenate(shifts), mean, covariance, np.concatenate(turned), turn
         )
         return join(parts), errors
+
+    def flown(self, heliostat: str) -> tuple[Flown, ...]:
+        """Return a heliostat's rows, flight by flight, with the errors that they share.
+
+        Of these errors counts what all others say. That those of two flights are known together is
+        left out.
+        """
+        mean, covariance = self.shared({heliostat})
+        found = []
+        rows_of = self._rows.get(heliostat, ())
+        for k, (each, rows) in enumerate(zip(self._taken, rows_of, strict=bool(rows_of))):
+            if not len(rows):
+                continue
+            part, flight = slice(self._edges[k], self._edges[k + 1]), each.flight
+            seen = _as_row(flight.sightings.take(rows), 0)
+            away = flight.shift[rows] @ mean[part]
+            seen = replace(
+                seen,
+                source=np.where(seen.source_at_infinity[:, None], seen.source, seen.source - away),
+                destination=np.where(
+                    seen.destination_at_infinity[:, None], seen.destination, seen.destination - away
+                ),
+            )
+            turn = float(flight.turn_sigma[flight.heliostats.index(heliostat)])
+            found.append(Flown(seen, flight.shift[rows], covariance[part, part], turn))
+        return tuple(found)
 
 
 def _as_row(sightings: Sightings, row: int) -> Sightings:

@@ -176,7 +176,7 @@ class _Step:
         lines = linearise(here, seen, fitted.names)
         by_turn = np.where(common.turned[:, None, None], derivative_by_turn(here, seen), 0.0)
         own = np.concatenate([lines.jacobian, by_turn], axis=-1)
-        by_shared = _by_shared(here, seen, common.shift)
+        by_shared = derivative_by_shared(here, seen, common.shift)
         weight = fitted.scale[row] ** -2.0
         if robust:
             weight = weight / (1.0 + (fitted.lengths / CAUCHY_WIDTH) ** 2)
@@ -261,8 +261,16 @@ def _axes(mechanism: Mechanism, counts: FloatArray) -> FloatArray:
     return np.stack([right, up], axis=1)
 
 
-def _by_shared(mechanism: Mechanism, seen: Sightings, shift: FloatArray) -> FloatArray:
-    """Return derivatives of whitened residuals by the shared errors removed, (M, 2, K)."""
+def derivative_by_shared(mechanism: Mechanism, seen: Sightings, shift: FloatArray) -> FloatArray:
+    """Return derivatives of whitened residuals by the shared errors removed, (M, 2, K).
+
+    Parameters
+    ----------
+    mechanism
+        One for each sighting, batch shape (M,).
+    seen, shift
+        M sightings, and the displacement of their ends by one unit of each error, (M, 3, K).
+    """
     vertex = mechanism.pose(seen.counts).vertex
     axes, whiten = whitening(seen, vertex)
     ways = ray_directions(seen, vertex)

@@ -7,7 +7,7 @@ white noise (Rasmussen & Williams 2006, (5.10)-(5.12), for blocks of two). The s
 within one standard error of the best is chosen, as there.
 """
 
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -17,7 +17,7 @@ from heliotrope.calibration.fit.estimator import FieldFit, fit
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn import models, periodic
 from heliotrope.calibration.learn.drift import Hyperparameters
-from heliotrope.calibration.learn.present import fitting_present
+from heliotrope.calibration.learn.present import Flown, fitting_present
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism import parameters as parameter_table
@@ -61,11 +61,35 @@ class OwnModel:
 
         See `present`.
         """
-        start = self.start(nominal)
-        constants = fit(start, sightings, self.parameters)
+        constants = self.completed(fit(self.start(nominal), sightings, self.parameters))
         yield
-        followed = yield from fitting_present(start, sightings, constants, group)
-        return self.completed(constants), self.completed(followed)
+        return constants, (yield from self.following(nominal, sightings, constants, group))
+
+    def following(
+        self,
+        nominal: Mechanism,
+        sightings: Sightings,
+        constants: FieldFit,
+        group: Hyperparameters | None,
+        flown: Sequence[Flown] = (),
+    ) -> Generator[None, None, FieldFit]:
+        """Return the fit that follows the drift, beside a fit of constants; see `present`."""
+        found = yield from fitting_present(
+            self.start(nominal), sightings, self._searched(constants), group, flown
+        )
+        return self.completed(found)
+
+    def _searched(self, fitted: FieldFit) -> FieldFit:
+        """Return a fit without the ratios; the reverse of `completed`."""
+        count = len(self.parameters)
+        return replace(
+            fitted,
+            names=fitted.names[:count],
+            values=fitted.values[:, :count],
+            centre=fitted.centre[:, :count],
+            prior=fitted.prior[:, :count],
+            covariance=fitted.covariance[:, :count, :count],
+        )
 
     def start(self, nominal: Mechanism) -> Mechanism:
         """Return the mechanism from which the parameters are fitted."""

@@ -6,11 +6,12 @@ the drift (`stream`): it forgets what the drive has lost since, and weighs steps
 mistakes. The whole history is replayed, so nothing but the sightings has to be kept.
 """
 
-from collections.abc import Generator
-from dataclasses import replace
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from heliotrope.calibration.fit.common import derivative_by_shared, derivative_by_turn
 from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn import drift, stream
@@ -19,29 +20,64 @@ from heliotrope.calibration.learn.learning import MISTAKE
 from heliotrope.calibration.learn.stream import Belief
 from heliotrope.calibration.learn.unusable import is_usable
 from heliotrope.calibration.sightings import Sightings
+from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 
 #: Sightings that are taken in one step of `replaying`.
 AT_ONCE = 100
 #: The values hold for the days after a visit: motion within hours is at its mean by then, days.
 AHEAD = 1.0
+#: The turn by slope deviations about the mirror's two axes, as constants of the state, and the
+#: standard deviation of one that does not occur, rad.
+TURN, NO_TURN = ("turn about x", "turn about y"), 1e-9
+
+
+@dataclass(frozen=True)
+class Flown:
+    """R orientations of one mirror, seen from the air in one flight.
+
+    Attributes
+    ----------
+    sightings
+        Of heliostat 0, less the mean of the errors that the flight's rows share, (R,).
+    shift
+        Displacement of their ends by one unit of each of K shared errors, ENU, m, (R, 3, K).
+    covariance
+        Of these errors, by all that is known of them but from this mirror, (K, K).
+    turn_sigma
+        Standard deviation of the turn that all rows of this mirror show alike, rad.
+    """
+
+    sightings: Sightings
+    shift: FloatArray
+    covariance: FloatArray
+    turn_sigma: float
 
 
 def replaying(
-    mechanism: Mechanism, sightings: Sightings, fitted: FieldFit, hyper: Hyperparameters
+    mechanism: Mechanism,
+    sightings: Sightings,
+    fitted: FieldFit,
+    hyper: Hyperparameters,
+    flown: Sequence[Flown] = (),
 ) -> Generator[None, None, Belief]:
     """Return the belief of a mirror after its sightings, in steps of some ten ms.
+
+    Errors that rows of flights share are constants of the state too: each flight's from its first
+    row to its last, and the mirror's turn from the first of all.
 
     Parameters
     ----------
     mechanism
         That the fit starts from, batch shape (1,).
     sightings
-        M of heliostat 0.
+        M photographs of heliostat 0.
     fitted
-        A robust fit of them, (1,), whose names are the first of ``hyper``.
+        A robust fit of all, (1,), whose names are the first of ``hyper``.
     hyper
         Of the mirror's group, for the same parameters.
+    flown
+        Its rows of flights.
     """
     count = len(fitted.names)
     values, centre = np.zeros(len(hyper.names)), np.zeros(len(hyper.names))
@@ -49,17 +85,78 @@ def replaying(
     # A start near the nominal only helped the search; the prior stays centred on the nominal.
     if (np.abs(fitted.centre[0]) >= MISTAKE * fitted.prior[0]).any():
         centre[:count] = fitted.centre[0]
-    # Unknown times first: they say nothing about drift, and a belief does not go back.
-    order = np.argsort(np.nan_to_num(sightings.time, nan=-np.inf), kind="stable")
-    seen = sightings.take(order)
     moved = mechanism.with_parameters({n: values[p : p + 1] for p, n in enumerate(hyper.names)})
-    line = linearise(moved[seen.heliostat], seen, hyper.names)
-    value = line.jacobian @ (values - centre) - line.residual
+    rows = _Rows.of(moved, sightings, hyper.names, values - centre)
+    parts = [rows, *(_Rows.of_flight(moved, f, hyper, values - centre) for f in flown)]
+    time = np.concatenate([part.time for part in parts])
+    which = np.repeat(np.arange(len(parts)), [len(part.time) for part in parts])
+    place = np.concatenate([np.arange(len(part.time)) for part in parts])
     belief = stream.begin(hyper, centre, centre != 0.0)
-    for done, k in enumerate(np.flatnonzero(is_usable(line))):
+    if flown:
+        turn = np.full(2, max(*(each.turn_sigma for each in flown), NO_TURN))
+        belief = stream.with_constants(belief, TURN, turn)
+    # Unknown times first: they say nothing about drift, and a belief does not go back.
+    order = np.argsort(np.nan_to_num(time, nan=-np.inf), kind="stable")
+    for done, k in enumerate(order):
         if done and done % AT_ONCE == 0:
             yield
-        belief = stream.update(belief, line.jacobian[k], value[k], seen.time[k] / DAY)
+        belief = _updated(belief, which[k], parts[which[k]], int(place[k]))
+    return belief
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Sightings of one origin, linear in the parameters, and the constants that they share."""
+
+    jacobian: FloatArray
+    value: FloatArray
+    time: FloatArray
+    shared: int = 0
+
+    @classmethod
+    def of(
+        cls, moved: Mechanism, seen: Sightings, names: tuple[str, ...], off: FloatArray
+    ) -> "_Rows":
+        line = linearise(moved[seen.heliostat], seen, names)
+        good = is_usable(line)
+        value = line.jacobian @ off - line.residual
+        return cls(line.jacobian[good], value[good], seen.time[good] / DAY)
+
+    @classmethod
+    def of_flight(
+        cls, moved: Mechanism, flown: Flown, hyper: Hyperparameters, off: FloatArray
+    ) -> "_Rows":
+        """Return a flight's rows; their sigma is their noise, whatever photographs have."""
+        seen = flown.sightings
+        here = moved[seen.heliostat]
+        line = linearise(here, seen, hyper.names)
+        value = line.jacobian @ off - line.residual
+        unit = flown.shift @ np.linalg.cholesky(flown.covariance)
+        more = [derivative_by_turn(here, seen), derivative_by_shared(here, seen, unit)]
+        whole = np.concatenate([line.jacobian, *more], axis=-1)
+        order = np.argsort(seen.time, kind="stable")
+        good = order[is_usable(line)[order]]
+        scale = hyper.noise
+        return cls(scale * whole[good], scale * value[good], seen.time[good] / DAY, unit.shape[-1])
+
+    def names(self, number: int) -> tuple[str, ...]:
+        return tuple(f"flight {number}: {k}" for k in range(self.shared))
+
+
+def _updated(belief: Belief, number: int, rows: _Rows, k: int) -> Belief:
+    """Return the belief after row k of one origin: 0 the photographs, or the number of a flight."""
+    names = rows.names(number)
+    if names and k == 0:
+        belief = stream.with_constants(belief, names, np.ones(len(names)))
+    jacobian = np.zeros((2, len(belief.hyper.names)))
+    own = rows.jacobian.shape[-1] - rows.shared
+    jacobian[:, :own] = rows.jacobian[k, :, :own]
+    if names:
+        first = belief.hyper.names.index(names[0])
+        jacobian[:, first : first + len(names)] = rows.jacobian[k, :, own:]
+    belief = stream.update(belief, jacobian, rows.value[k], rows.time[k])
+    if names and k == len(rows.time) - 1:
+        belief = stream.without_constants(belief, names)
     return belief
 
 
@@ -118,6 +215,7 @@ def fitting_present(
     sightings: Sightings,
     fitted: FieldFit,
     group: Hyperparameters | None = None,
+    flown: Sequence[Flown] = (),
 ) -> Generator[None, None, FieldFit]:
     """Return the fit of a mirror as it is after its latest sighting, in steps of some ten ms.
 
@@ -131,9 +229,13 @@ def fitting_present(
         A robust fit of them, (1,). One that has failed is returned as it is.
     group
         What was learnt of its group; default: nothing.
+    flown
+        Its rows of flights.
     """
-    known = sightings.time[np.isfinite(sightings.time)]
+    times = np.concatenate([sightings.time, *(each.sightings.time for each in flown)])
+    known = times[np.isfinite(times)]
     if int(fitted.outcome[0]) != FitOutcome.CONVERGED or not len(known):
         return fitted
-    belief = yield from replaying(mechanism, sightings, fitted, hyper_of(mechanism, fitted, group))
+    hyper = hyper_of(mechanism, fitted, group)
+    belief = yield from replaying(mechanism, sightings, fitted, hyper, flown)
     return at_present(fitted, belief, float(known.max()))

@@ -229,6 +229,65 @@ def begin(
     )
 
 
+def with_constants(belief: Belief, names: tuple[str, ...], spread: FloatArray) -> Belief:
+    """Return the belief with more constants, of mean 0 and standard deviations ``spread`` (K,).
+
+    They may be errors that some sightings share, such as those of a flight, and be left out again
+    after these (`without_constants`).
+    """
+    h, place = belief.hyper, len(belief.hyper.names)
+    nothing, more = np.zeros(len(names)), np.asarray(spread, dtype=np.float64)
+    hyper = replace(
+        h,
+        names=h.names + names,
+        mean=np.concatenate([h.mean, nothing]),
+        spread=np.concatenate([h.spread, more]),
+        regime=np.concatenate([h.regime, nothing]),
+        step=np.concatenate([h.step, nothing]),
+        wide=np.concatenate([h.wide, more]),
+    )
+    old = np.delete(np.arange(belief.mean.shape[1] + len(names)), place + np.arange(len(names)))
+    new = place + np.arange(len(names))
+    mean = np.zeros((len(belief.mean), len(old) + len(new)))
+    mean[:, old] = belief.mean
+    covariance = np.zeros((*mean.shape, mean.shape[1]))
+    covariance[:, old[:, None], old] = belief.covariance
+    covariance[:, new, new] = more**2
+    centre = np.concatenate([belief.centre, nothing])
+    return replace(
+        belief,
+        hyper=hyper,
+        layout=layout_of(hyper),
+        centre=centre,
+        mean=mean,
+        covariance=covariance,
+    )
+
+
+def without_constants(belief: Belief, names: tuple[str, ...]) -> Belief:
+    """Return the belief without some of its constants, whatever their values."""
+    h = belief.hyper
+    gone = np.array([h.names.index(name) for name in names], dtype=np.intp)
+    left = np.delete(np.arange(belief.mean.shape[1]), gone)
+    hyper = replace(
+        h,
+        names=tuple(np.delete(np.array(h.names, dtype=object), gone)),
+        mean=np.delete(h.mean, gone),
+        spread=np.delete(h.spread, gone),
+        regime=np.delete(h.regime, gone),
+        step=np.delete(h.step, gone),
+        wide=np.delete(h.wide, gone),
+    )
+    return replace(
+        belief,
+        hyper=hyper,
+        layout=layout_of(hyper),
+        centre=np.delete(belief.centre, gone),
+        mean=np.ascontiguousarray(belief.mean[:, left]),
+        covariance=np.ascontiguousarray(belief.covariance[:, left[:, None], left]),
+    )
+
+
 def update(
     belief: Belief,
     jacobian: FloatArray,

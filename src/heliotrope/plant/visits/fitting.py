@@ -14,6 +14,7 @@ from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.fit.common import CommonFit, fit_common
 from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome
 from heliotrope.calibration.fit.residuals import linearise
+from heliotrope.calibration.learn import drift
 from heliotrope.calibration.learn.drift import DAY
 from heliotrope.calibration.learn.own_model import OwnModel
 from heliotrope.calibration.record import (
@@ -123,12 +124,7 @@ def fit_heliostat(
     beliefs: Beliefs, settings: CycleSettings, model: OwnModel, name: str, photographed: Sightings
 ) -> JudgedFit:
     """Return the fit of one heliostat, by a model, to its photographs and its rows of flights."""
-    steps = fitting(beliefs, settings, model, name, photographed)
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return cast("JudgedFit", end.value)
+    return _ended(fitting(beliefs, settings, model, name, photographed))
 
 
 def fitting(
@@ -136,26 +132,93 @@ def fitting(
 ) -> Generator[None, None, JudgedFit]:
     """Fit as `fit_heliostat`, in steps of some ten ms between which others may work.
 
-    Photographs alone are followed through the drift to the latest of them, and the last day's must
-    be explained: what the belief takes for mistakes may be a mirror that has moved an hour ago. If
-    constants explain them better, these are proposed. Rows of flights share errors with other
-    mirrors, so a mirror that has some gets constants, in one joint fit.
+    Photographs and rows of flights are followed through the drift to the latest of them, and the
+    last day's must be explained: what the belief takes for mistakes may be a mirror that has moved
+    an hour ago. If constants explain them better, these are proposed. Rows of flights share errors
+    with other mirrors, of which the joint fit of constants keeps account.
     """
     nominal, nothing = beliefs.nominal(name), np.zeros(0, np.int64)
     if name in beliefs.flights:
-        return _fit_group(
+        (constants,) = _fit_group(
             beliefs, beliefs.flights, settings, model, (name,), nominal, (photographed,)
-        )[0]
-    constants, followed = yield from model.fitting(nominal, photographed, beliefs.hyper(name))
-    recent = photographed.take(np.flatnonzero(photographed.time >= photographed.time.max() - DAY))
+        )
+        return (
+            yield from _following(
+                beliefs, beliefs.flights, settings, model, constants, photographed
+            )
+        )
+    still, moving = yield from model.fitting(nominal, photographed, beliefs.hyper(name))
+    constants = _judged(beliefs, settings, model, name, nominal, still, photographed, nothing)
+    return _better(beliefs, settings, model, constants, moving)
+
+
+def _following(
+    beliefs: Beliefs,
+    flights: Flights,
+    settings: CycleSettings,
+    model: OwnModel,
+    constants: JudgedFit,
+    photographed: Sightings | None,
+) -> Generator[None, None, JudgedFit]:
+    """Return the fit that follows the drift of a mirror with rows of flights, or its constants."""
+    name, seen = constants.name, constants.seen
+    photographs = seen.take(np.zeros(0, np.intp)) if photographed is None else photographed
+    moving = yield from model.following(
+        constants.nominal,
+        photographs,
+        constants.fitted,
+        beliefs.hyper(name),
+        flights.flown(name),
+    )
+    return _better(beliefs, settings, model, constants, moving)
+
+
+def _better(
+    beliefs: Beliefs,
+    settings: CycleSettings,
+    model: OwnModel,
+    constants: JudgedFit,
+    moving: FieldFit,
+) -> JudgedFit:
+    """Return the fit that follows the drift if it explains the last day, else the constants."""
+    seen, nominal = constants.seen, constants.nominal
+    recent = seen.take(np.flatnonzero(seen.time >= seen.time.max() - DAY))
     left = [
         root_mean_square(beam_errors(nominal.with_parameters(one.parameters), recent).beam)
-        for one in (constants, followed)
+        for one in (constants.fitted, moving)
     ]
-    if left[1] <= max(left[0], EXPLAINED * settings.sigma):
-        found = _judged(beliefs, settings, model, name, nominal, followed, recent, nothing)
-        return replace(found, seen=photographed)
-    return _judged(beliefs, settings, model, name, nominal, constants, photographed, nothing)
+    if not left[1] <= max(left[0], EXPLAINED * settings.sigma):
+        return constants
+    found = _judged(
+        beliefs, settings, model, constants.name, nominal, moving, recent, constants.flown
+    )
+    return replace(found, seen=seen, revealed=constants.revealed)
+
+
+def _room(beliefs: Beliefs, settings: CycleSettings, name: str, flown: Identities) -> float:
+    """Return the beam error that motion within hours leaves, which is not followed, rad RMS.
+
+    A photograph's own sigma says it well enough; a row of a flight is ten times as precise.
+    """
+    usual = ROOM * settings.sigma
+    if not len(flown):
+        return usual
+    hyper = beliefs.hyper(name)
+    if hyper is None:
+        motion = np.full(2, drift.START_RAD["hours"])
+    else:
+        hours = [process.group == "hours" for process in hyper.processes]
+        motion = hyper.amplitude[np.array(hours, dtype=np.bool_)]
+    # A beam turns by twice as much as its normal.
+    return float(np.hypot(usual, 2.0 * np.linalg.norm(motion)))
+
+
+def _ended(steps: Generator[None, None, JudgedFit]) -> JudgedFit:
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return cast("JudgedFit", end.value)
 
 
 def fit_flights(
@@ -200,7 +263,13 @@ def _fit_names(
     word = first if isinstance(first, str) else "+".join(first)
     known = group.mechanism.parameters
     model = OwnModel(word, parameter_table.model(first, known) if word == first else tuple(first))
-    return _fit_group(beliefs, flights, settings, model, names, group.mechanism[rows], photographed)
+    joint = _fit_group(
+        beliefs, flights, settings, model, names, group.mechanism[rows], photographed
+    )
+    return [
+        _ended(_following(beliefs, flights, settings, model, one, seen_of))
+        for one, seen_of in zip(joint, photographed, strict=True)
+    ]
 
 
 def _fit_group(
@@ -272,7 +341,8 @@ def _judged(
     before, after = (
         _weighted(beam_errors(m, seen).beam, seen) for m in (beliefs.present(name), new)
     )
-    outcome, problem = _judge(settings, fitted, before, after)
+    room = _room(beliefs, settings, name, flown)
+    outcome, problem = _judge(settings, fitted, before, after, room)
     return JudgedFit(
         model.name, fitted, nominal, seen, before, after, outcome, problem, name, flown
     )
@@ -286,7 +356,7 @@ def _weighted(errors: FloatArray, seen: Sightings) -> float:
 
 
 def _judge(
-    settings: CycleSettings, fitted: FieldFit, before: float, after: float
+    settings: CycleSettings, fitted: FieldFit, before: float, after: float, room: float
 ) -> tuple[CalibrationOutcome, str]:
     """Return the outcome of a fit, and why it is rejected, "" if it is not."""
     ending = FitOutcome(int(fitted.outcome[0]))
@@ -306,8 +376,7 @@ def _judge(
             f"the fit leaves {1e3 * after:.1f} mrad RMS, above {1e3 * settings.left:g} mrad; "
             "look at the photographs: is it this heliostat's beam?"
         )
-    # Motion within hours is not followed, so a photograph's own sigma leaves some room.
-    if not after <= settings.gain * np.hypot(before, ROOM * settings.sigma):
+    if not after <= settings.gain * np.hypot(before, room):
         return CalibrationOutcome.NO_BETTER, (
             f"the fit misses by {1e3 * after:.2f} mrad RMS, not below {settings.gain:g} times "
             f"the {1e3 * before:.2f} mrad before"
