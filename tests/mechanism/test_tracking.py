@@ -17,7 +17,7 @@ from heliotrope.geometry import (
 )
 from heliotrope.mechanism import guo, kinds
 from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.drives import direct
+from heliotrope.mechanism.drives import direct, linear_grigoriev
 from heliotrope.mechanism.tracking import TrackingStatus, track
 from support.machines import every_kind, imperfect
 
@@ -283,3 +283,25 @@ def test_guo_is_the_special_case() -> None:
         for branch in (0, 1):
             apart = np.abs(wrap_signed(found.angles - theirs[branch])).max(axis=-1).min()
             assert apart < 1e-9
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+@pytest.mark.parametrize("rate", [1e-5, -1e-5])
+def test_a_jack_is_not_tracked_beyond_its_triangle(rate: float, sense: int) -> None:
+    """Without stops in counts its reach ends where the triangle is folded or stretched."""
+    zero = 1.5 if sense > 0 else 1.7
+    jack = linear_grigoriev(0.5, 0.6, 0.75, rate, angle_zero=zero, sense=sense)
+    drives = (direct(min_angle=-3.2, max_angle=3.2), jack)
+    mechanism = kinds.azimuth_elevation((0.0, 50.0, 0.0), drives=drives)
+    elevation = np.radians(np.linspace(0.0, 89.0, 179))
+    suns = direction(0.0, elevation)
+    found = track(mechanism, suns, (0.0, 0.0, 30.0))
+    reached = found.status == TrackingStatus.OK
+    assert 0 < reached.sum() < reached.size
+    # What is called reached is reached by the counts, and a pose at the end says so.
+    angles = mechanism.drives.angles(found.counts)
+    np.testing.assert_allclose(angles, found.angles, atol=1e-7)
+    pose = mechanism.pose(found.counts)
+    off = angle_between(pose.normal, found.normal)
+    assert off.max() < 1e-7
+    assert (found.residual[~reached] > 1e-9).all()

@@ -6,10 +6,16 @@ import numpy as np
 from numba import njit
 
 from heliotrope.jit import INLINED, INNER, OPTIONS
-from heliotrope.mechanism.kernels.drives import drive_angle, drive_counts, load_drive
+from heliotrope.mechanism.kernels.drives import (
+    count_range,
+    drive_angle,
+    drive_counts,
+    load_drive,
+)
 from heliotrope.mechanism.kernels.slots import (
     BIAS,
     KIND,
+    LINEAR,
     MAX_ANGLE,
     MAX_COUNT,
     MIN_ANGLE,
@@ -52,7 +58,7 @@ STOP_SLACK = 1e-9
 @njit(**INLINED)
 def stop_angles(d):
     """Lowest and highest joint angle that both kinds of stops of drive ``d`` allow."""
-    if math.isfinite(d[MIN_COUNT]) or math.isfinite(d[MAX_COUNT]):
+    if d[KIND] == LINEAR or math.isfinite(d[MIN_COUNT]) or math.isfinite(d[MAX_COUNT]):
         return _count_stops(d)
     return d[MIN_ANGLE], d[MAX_ANGLE]
 
@@ -68,7 +74,7 @@ def _counts(d, theta):
 @njit(**INNER)
 def _count_stops(d):
     low, high = d[MIN_ANGLE], d[MAX_ANGLE]
-    lower, upper = d[MIN_COUNT], d[MAX_COUNT]
+    lower, upper = count_range(d)
     probe = lower if math.isfinite(lower) else upper - 1.0
     rising = drive_angle(d, probe + 1.0) > drive_angle(d, probe)
     if math.isfinite(lower):

@@ -9,6 +9,8 @@ from heliotrope.mechanism.kernels.slots import (
     BIAS,
     KIND,
     LINEAR,
+    MAX_COUNT,
+    MIN_COUNT,
     OFFSET,
     RADIUS,
     RATE,
@@ -31,6 +33,18 @@ def load_drive(table, i, k):
     s = (table[i, k, 5], table[i, k, 6], table[i, k, 7], table[i, k, 8], table[i, k, 9])
     t = (table[i, k, 10], table[i, k, 11], table[i, k, 12], table[i, k, 13], table[i, k, 14])
     return r + s + t + (table[i, k, 15], table[i, k, 16], table[i, k, 17], table[i, k, 18])
+
+
+@njit(**INNER)
+def count_range(d):
+    """Lowest and highest counts of drive row ``d``: its stops, and where a jack's triangle ends."""
+    low, high = d[MIN_COUNT], d[MAX_COUNT]
+    if d[KIND] == LINEAR:
+        folded = (abs(d[OFFSET] - d[RADIUS]) - d[STROKE]) / d[RATE]
+        stretched = (d[OFFSET] + d[RADIUS] - d[STROKE]) / d[RATE]
+        least, most = min(folded, stretched), max(folded, stretched)
+        low, high = min(max(low, least), most), max(min(high, most), least)
+    return low, high
 
 
 @njit(**INNER)
