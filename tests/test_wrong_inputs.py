@@ -18,6 +18,7 @@ from pvlib.location import Location
 import heliotrope as ht
 from heliotrope import geometry
 from heliotrope.calibration import join, predict, sun_sensor
+from heliotrope.calibration.fit import DriveTerm
 from heliotrope.errors import FormatError, InputError, TimeError, UnknownNameError
 from heliotrope.field import Box, Cylinder, Sphere
 from heliotrope.mechanism import (
@@ -36,6 +37,7 @@ AIM = (0.0, 0.0, 13.0)
 NOON = "2026-09-02T10:00Z"
 SITE = ht.Site(-33.93, 18.87, 120.0)
 NAN = float("nan")
+SINE = DriveTerm("k_sin", "azimuth", lambda angles: np.sin(angles[..., 0]), prior=5e-3)
 
 
 @cache
@@ -248,6 +250,7 @@ CALIBRATION = [
     Wrong(lambda: ht.fit(mechs(), seen(), "guo6", keep=[True]), "keep", "(1,)", "(12,)"),
     Wrong(lambda: ht.fit(mechs(), seen(), "guo6", max_iterations=0), "max_iterations", "0", "at least 1"),
     Wrong(lambda: ht.fit(mechs(), seen(), "azimuth_worm_ratio"), "fit", "azimuth_worm_ratio", "searched, not fitted"),
+    Wrong(lambda: ht.learn(mechs(), seen(), ("tilt_north", SINE)), "model", "a heliotrope DriveTerm", "fit_terms"),  # type: ignore[arg-type]
     Wrong(lambda: ht.learn(mechs(), seen(), "guo6", used=np.ones(3, bool)), "used", "(3,)", "(12,)"),
     Wrong(lambda: learned().parameters_at([1], 0.0), "heliostat", "row 1", "0 to 0"),
     Wrong(lambda: learned().parameters_at([0], "noon"), "times", "'noon'", "ISO 8601", TimeError),

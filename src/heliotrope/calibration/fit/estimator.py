@@ -308,6 +308,11 @@ def names_of(model: str | Sequence[str], mechanism: Mechanism) -> tuple[str, ...
     if not isinstance(model, list | tuple):
         raise InputError(f"model: {kind_of(model)}; give the name of a model or a list of names")
     for name in model:
+        if not isinstance(name, str):
+            raise InputError(
+                f"model: {kind_of(name)} is not the name of a parameter; give names (fit_terms "
+                "fits own terms of drives, and its result gives sightings without them)"
+            )
         mechanism.parameter(name)
     return tuple(model)
 
