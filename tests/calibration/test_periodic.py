@@ -92,7 +92,7 @@ def test_the_own_model_takes_the_worm_whether_its_ratio_is_known_or_searched(rat
     chosen = choose_own_model(nominal, learnt, SIMPLE)
     assert chosen.name.endswith("elevation_worm")
     assert len(chosen.errors) == (ratio == 0.0)
-    fitted = chosen.fit(nominal, learnt)
+    fitted = chosen.completed(fit(chosen.start(nominal), learnt, chosen.parameters))
     left = beam_errors(nominal.with_parameters(fitted.parameters), held).beam
     assert np.sqrt(np.mean(left**2)) < 0.5e-3
     assert ("elevation_worm_ratio" in fitted.names) == (ratio == 0.0)

@@ -5,6 +5,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.learn import drift
 from heliotrope.calibration.learn.own_model import OwnModel
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
@@ -76,7 +77,7 @@ def test_what_came_within_the_hour_is_proposed_as_constants_explain_it() -> None
     believed(beliefs, first, float(times[4]))
     names = parameters.model("malan8", beliefs.nominal(NAME).parameters)
     model = OwnModel("malan8", names)
-    constants = model.fit(beliefs.nominal(NAME), seen)
+    constants = fit(beliefs.nominal(NAME), seen, names)
     found = fit_heliostat(beliefs, CycleSettings(left=1.0), model, NAME, seen)
     np.testing.assert_array_equal(found.fitted.values, constants.values)
 

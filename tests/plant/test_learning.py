@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.growth import Growth
 from heliotrope.calibration.learn import group, present, worker
 from heliotrope.calibration.learn.group import GroupHistory, LearntGroup
@@ -164,7 +165,7 @@ def test_visits_follow_the_drift_as_it_was_learnt(tmp_path: Path) -> None:
     assert default is not None
     assert learnt is not None
     assert hyper is not None
-    constants = OwnModel("malan8", MODEL).fit(beliefs.nominal(NAMES[0]), seen)
+    constants = fit(beliefs.nominal(NAMES[0]), seen, MODEL)
     now = finished(present.fitting_present(beliefs.nominal(NAMES[0]), seen, constants, hyper))
     np.testing.assert_allclose(learnt.values, now.values[0])
     assert np.abs(learnt.values - default.values).max() > 1e-5

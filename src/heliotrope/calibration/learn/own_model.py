@@ -47,19 +47,13 @@ class OwnModel:
     parameters: tuple[str, ...]
     errors: tuple[periodic.PeriodicError, ...] = ()
 
-    def fit(self, nominal: Mechanism, sightings: Sightings) -> FieldFit:
-        """Return the fit of a heliostat (1,), its ratios among the values.
-
-        The values are deviations from ``nominal``, so that they alone make the mechanism.
-        """
-        return self.completed(fit(self.start(nominal), sightings, self.parameters))
-
     def fitting(
         self, nominal: Mechanism, sightings: Sightings, group: Hyperparameters | None = None
     ) -> Generator[None, None, tuple[FieldFit, FieldFit]]:
         """Return the fit of constants and the one that follows the drift of its ``group``.
 
-        See `present`.
+        See `present`. The values are deviations from ``nominal``, (1,), so that they alone make the
+        mechanism: ratios are among them.
         """
         constants = self.completed(fit(self.start(nominal), sightings, self.parameters))
         yield
