@@ -89,3 +89,44 @@ def test_the_curve_is_in_the_answer_of_the_api_and_in_the_store(
         return first["made"] in [entry.at for entry in field.keeper.outlooks(0.0)]
 
     field.until(kept)
+
+
+_RESULT = {
+    "at": 1.75e9,
+    "heliostat": "P0012F",
+    "target": "right",
+    "outcome": "calibrated",
+    "before": 0.0221,
+    "after": 0.00045,
+    "measured": 0.0221,
+    "predicted": 0.00123,
+    "truth_before": 0.01871,
+    "truth_after": 0.00123,
+    "sightings": 8,
+    "new": 4,
+    "text": "calibrated",
+    "version": 2,
+}
+
+
+def test_the_last_measurements_fit_into_every_window(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    field.until(lambda: field.live.operations.calibration().quality, 240.0)
+    page = enter("viewer")
+
+    def with_results(route: Any) -> None:
+        answer = route.fetch()
+        route.fulfill(response=answer, json={**answer.json(), "results": [_RESULT] * 3})
+
+    page.route("**/api/v1/calibration", with_results)
+    page.click(".hx-tabs >> text=Calibration")
+    page.wait_for_selector(".hx-calibration td:has-text('P0012F')")
+    for width in (800, 1100, 1400, 1900):
+        page.set_viewport_size({"width": width, "height": 900})
+        page.wait_for_function(
+            """() => { const table = document.querySelector('.hx-calibration .hx-scroll');
+            return table && table.scrollWidth <= table.clientWidth; }"""
+        )
+        assert page.locator(".hx-calibration td:last-child").first.inner_text() == "✓"
+    page.unroute_all(behavior="wait")

@@ -233,10 +233,10 @@ export function calibration(box) {
         truth ? [key("true (twin), median", colourOf("SEARCHING")), key("90th percentile", colourOf("SEARCHING"), true)] : ""),
       h("h3", {}, "Error of all heliostats over the year (mrad), UTC"), outlookView(view, ahead, key),
       h("h3", {}, "Last measurements"),
-      table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target],
+      table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target, "more"],
         ["Before", (r) => mrad(r.before), "num"], ["After", (r) => mrad(r.after), "num"], ["Predicted", (r) => mrad(r.predicted), "num"],
-        truth ? ["True before → after", (r) => `${mrad(r.truth_before)} → ${mrad(r.truth_after)}`, "num"] : ["", () => ""],
-        ["", (r) => h("span", { className: r.outcome === "calibrated" ? "good" : "warn", title: r.text }, r.outcome === "calibrated" ? "✓ calibrated" : r.text.split(";")[0])]], view.results.slice(0, 60), (r) => look(r.heliostat)));
+        ...(truth ? [["True before → after", (r) => `${mrad(r.truth_before)} → ${mrad(r.truth_after)}`, "num"]] : []),
+        ["", (r) => h("span", { className: r.outcome === "calibrated" ? "good" : "warn", title: r.text }, r.outcome === "calibrated" ? "✓" : r.text.split(";")[0])]], view.results.slice(0, 60), (r) => look(r.heliostat)));
     chart(lines, [["median", "APPROACHING"], ["percentile_90", "APPROACHING", [5, 4]], ["truth_median", "SEARCHING"], ["truth_percentile_90", "SEARCHING", [5, 4]]]
       .map(([field, colour, dash]) => ({ points: view.quality.map((p) => [p.at, 1e3 * p[field]]), colour: colourOf(colour), dash })), dark());
     if (view.outlooks.length) chart(ahead, outlookLines(view), dark());
