@@ -137,7 +137,12 @@ def test_the_goal_ends_the_plan(plant: Plant, fleet: Fleet, joint: CommissionPla
     plan = _plan(plant, fleet, replace(TOGETHER, goal=goal))
     assert plan.reached == plan.time[-1] < joint.time[-1]
     assert plan.percentiles[-1, 1] <= goal < plan.percentiles[-2, 1]
-    assert "goal of 1.50 mrad reached on day 1, 2026-09-02" in commission_report.sentence(plan)
+    told = commission_report.sentence(plan)
+    assert told.startswith("goal of 1.50 mrad reached on day 1, 2026-09-02")
+    # A goal that is reached is not limited; a later one is.
+    assert f"targets used for {100.0 * plan.busy:.0f} % of their time until then" in told
+    assert "limited" not in told
+    assert (plan.limit, bool(joint.limit)) == ("", joint.reached is None)
 
 
 def test_the_floor_and_the_clouds_are_told(plant: Plant, fleet: Fleet) -> None:

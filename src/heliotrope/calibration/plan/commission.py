@@ -204,8 +204,16 @@ class CommissionPlan:
         return float(self.time[good[0]]) if good.size else None
 
     @property
+    def busy(self) -> float:
+        """Share of the time of all targets that is used."""
+        total = sum(self.seconds.values())
+        return 1.0 - self.seconds["idle"] / total if total else 0.0
+
+    @property
     def limit(self) -> str:
-        """What limits the plan, in one clause."""
+        """What keeps the plan from its goal, in one clause; "" if it is reached."""
+        if self.reached is not None:
+            return ""
         total = sum(self.seconds.values())
         share = {name: value / total for name, value in self.seconds.items()} if total else {}
         if self.terms.floor > self.terms.goal:
@@ -225,8 +233,8 @@ class CommissionPlan:
             "travel": "slews",
         }[most]
         return (
-            f"the targets: used for {100.0 * (1.0 - share.get('idle', 0.0)):.0f} % of their "
-            f"time, {100.0 * share.get(most, 0.0):.0f} % for {words}"
+            f"the targets: used for {100.0 * self.busy:.0f} % of their time, "
+            f"{100.0 * share.get(most, 0.0):.0f} % for {words}"
         )
 
 
@@ -487,6 +495,7 @@ def chance_on_target(
     way = target.center - position
     distance = np.linalg.norm(way, axis=1)
     facing = np.abs(way @ target.normal) / distance
+    # The beam's own radius: half a mirror, and the sun's disc.
     radius = 0.5 * size + SUN_RADIUS * distance
     half = 0.5 * np.array([target.width, target.height])
     room = np.maximum(half - radius[:, None], 0.1 * half)

@@ -110,16 +110,18 @@ def document(
 
 
 def sentence(plan: CommissionPlan) -> str:
-    """Return when the goal is reached and what limits the plan, in one line."""
+    """Return when the goal is reached, or what keeps the plan from it, in one line."""
     high, goal = 1e3 * plan.percentiles[-1, 1], 1e3 * plan.terms.goal
     if plan.reached is not None:
         day = sum(begin < plan.reached for begin, _ in plan.days)
         when = datetime.fromtimestamp(plan.reached, UTC)
-        head = f"goal of {goal:.2f} mrad reached on day {day}, {when:%Y-%m-%d %H:%M} UTC"
-    else:
-        head = f"goal of {goal:.2f} mrad not reached: {high:.2f} mrad at the end"
-        if plan.unseen:
-            head += f", {plan.unseen:,} heliostats never measured"
+        return (
+            f"goal of {goal:.2f} mrad reached on day {day}, {when:%Y-%m-%d %H:%M} UTC; "
+            f"targets used for {100.0 * plan.busy:.0f} % of their time until then"
+        )
+    head = f"goal of {goal:.2f} mrad not reached: {high:.2f} mrad at the end"
+    if plan.unseen:
+        head += f", {plan.unseen:,} heliostats never measured"
     return f"{head}; limited by {plan.limit}"
 
 

@@ -10,15 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import erf
 
 from heliotrope.calibration.learn.drift import DAY
+from heliotrope.calibration.plan.commission import chance_on_target
 from heliotrope.calibration.plan.planning import SightingLimits
 from heliotrope.field.camera import Camera
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, angle_between, tangent_axes
-from heliotrope.optics.beam import SUN_RADIUS
 from heliotrope.plant.schedule.knowledge import FieldKnowledge, VisitYield
 from heliotrope.plant.schedule.settings import Settings, Weather
 
@@ -94,13 +93,9 @@ class Sight:
     ) -> None:
         self.target = target
         way = target.center - position
-        self.distance = np.linalg.norm(way, axis=1)
-        self.way = way / self.distance[:, None]
+        self.way = way / np.linalg.norm(way, axis=1)[:, None]
         self.obliquity = angle_between(-self.way, np.broadcast_to(target.normal, way.shape))
-        # The beam's own radius: half a mirror, and the sun's disc.
-        radius = 0.5 * size.max(axis=1) + SUN_RADIUS * self.distance
-        half = 0.5 * np.array([target.width, target.height])
-        self._room = np.maximum(half[None, :] - radius[:, None], 0.1 * half)
+        self._position, self._size = position, size.max(axis=1)
         self._eyes = [c.position for c in cameras if c.position is not None]
 
     def able(self, sun: FloatArray, limits: SightingLimits) -> Mask:
@@ -121,10 +116,7 @@ class Sight:
         rows
             Heliostats, (K,).
         """
-        sigma = np.sqrt(0.5 * square) * self.distance[rows]
-        across = sigma / np.maximum(np.cos(self.obliquity[rows]), 0.1)
-        room, root = self._room[rows], np.sqrt(2.0)
-        return np.asarray(erf(room[:, 0] / (root * across)) * erf(room[:, 1] / (root * sigma)))
+        return chance_on_target(self.target, self._position[rows], self._size[rows], square)
 
     def glare(self, sun: FloatArray) -> float:
         """Return the smallest angle between the sun and a camera's line to the target, rad."""
