@@ -6,6 +6,7 @@ import struct
 from binascii import crc32
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -746,6 +747,42 @@ def test_heliostats_that_do_not_obey_leave_the_bus_to_the_others() -> None:
         assert field.plant.status().cycle_s < 1.0
 
     run(main, count=13)
+
+
+class Standing(TwinBus):
+    """A bus whose cluster's program stands still for 4 s before it reads an answer of a name."""
+
+    before = ""
+
+    async def transact(self, *arguments: Any, **settings: Any) -> bytes:
+        answer = await super().transact(*arguments, **settings)
+        if answer and wire.Reader().feed(answer)[0].name == self.before:
+            self.before = ""
+            await asyncio.sleep(4.0)
+        return answer
+
+
+@pytest.mark.parametrize("name", ["STATUS", "STEPS"])
+def test_an_answer_that_was_read_late_is_as_old_as_its_question(name: str) -> None:
+    """Simulated run 950188: frozen for 45 s after a question, the cluster told a state as new."""
+
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        (node,), what, ages = field.cluster.nodes, name.lower(), list[float]()
+        take = getattr(node, f"take_{what}")
+
+        def taken(*values: Any) -> None:
+            take(*values)
+            ages.append(field.clock.monotonic() - getattr(node, f"{what}_at"))
+
+        setattr(node, f"take_{what}", taken)
+        field.bus.before = name
+        await field.until(lambda: not field.bus.before)
+        await asyncio.sleep(6.0)
+        assert 4.0 < max(ages) < 4.2
+        assert ages[-1] < 0.2
+
+    run(main, count=1, bus=lambda clock, boards: Standing(clock, [*boards]))
 
 
 def test_a_status_is_not_delivered_later_than_the_next_one_is_due() -> None:

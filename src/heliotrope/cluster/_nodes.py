@@ -127,7 +127,7 @@ class ClusterNode:
     status, steps
         Values of the last STATUS and STEPS.
     status_at, steps_at
-        When they came, monotonic s; -inf: never.
+        When they were asked for, monotonic s; -inf: never. The answer may have been read later.
     heard_at
         When it last answered anything, monotonic s; -inf: never.
     follow_until
@@ -172,13 +172,13 @@ class ClusterNode:
         """Fault as last heard, of `lcu.names.FAULTS`."""
         return int(self.status[2])
 
-    def take_status(self, status: tuple[Any, ...]) -> None:
+    def take_status(self, status: tuple[Any, ...], asked_at: float) -> None:
         """Store the values of a new STATUS."""
-        self.status, self.status_at = status, self.heard_at
+        self.status, self.status_at = status, asked_at
 
-    def take_steps(self, steps: tuple[Any, ...]) -> None:
+    def take_steps(self, steps: tuple[Any, ...], asked_at: float) -> None:
         """Store the values of a new STEPS."""
-        self.steps, self.steps_at = steps, self.heard_at
+        self.steps, self.steps_at = steps, asked_at
 
     def follow(self, until: float) -> None:
         """Have its step counts requested each second until a monotonic time."""

@@ -92,19 +92,20 @@ class Polling:
         """Ask a node for state and step counts at ``now``, and return the time afterwards."""
         exchange, sequence = self._exchange, node.next_sequence()
         status = await exchange.poll(node, STATUS, sequence, now)
-        if status is None or not self._believes(node, status):
+        if status is None or not self._believes(node, status, now):
             return exchange.now
         waits = self._goals.waits(node)
         due = (self._number + node.index) % self._config.steps_every == 0
         if waits or due or now < node.follow_until:
-            steps = await exchange.poll(node, STEPS, sequence, exchange.now)
+            begin = exchange.now
+            steps = await exchange.poll(node, STEPS, sequence, begin)
             if steps is not None:
-                node.take_steps(steps)
+                node.take_steps(steps, begin)
         if waits:
             self._goals.heard(node, now)
         return exchange.now
 
-    def _believes(self, node: ClusterNode, status: tuple[Any, ...]) -> bool:
+    def _believes(self, node: ClusterNode, status: tuple[Any, ...], asked_at: float) -> bool:
         """Take a STATUS; return False if its firmware has states unknown here."""
         if status[0] >= len(states.STATES):
             self._reports.alarm(alarms.NODE_UNINTELLIGIBLE.raised(node.name, state=status[0]))
@@ -114,7 +115,7 @@ class Polling:
             self._strange.remove(node.index)
             self._reports.clear(alarms.NODE_UNINTELLIGIBLE.ended(node.name))
         before = node.fault
-        node.take_status(status)
+        node.take_status(status, asked_at)
         if node.fault != before:
             self._report_fault(node)
         if bool(node.flags & _SUN_JUMPED) != (node.name in self._jumped):
