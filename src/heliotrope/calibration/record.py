@@ -51,6 +51,8 @@ class CalibrationOutcome(StrEnum):
     NO_BETTER = "no_better"
     #: A photograph did not confirm the new parameters; the old ones are back.
     NOT_VERIFIED = "not_verified"
+    #: In a joint visit no beam was proven to be its own.
+    NOT_PROVEN = "not_proven"
     REFUSED = "refused"
     ERROR = "error"
     #: Unchanged for a reason that was not kept.

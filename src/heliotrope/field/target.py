@@ -111,6 +111,18 @@ class Target(Value):
         """Return ENU points (..., 3) from metres right of and above the center (..., 2)."""
         return self.center + np.asarray(plane, dtype=np.float64) @ self.axes
 
+    def holds(self, points: npt.ArrayLike, off: float = 0.5) -> npt.NDArray[np.bool_]:
+        """Return which points (..., 3), ENU, lie on the target; one that is not finite does not.
+
+        They are within its border, and at most ``off`` m in front of or behind it.
+        """
+        given = np.asarray(points, dtype=np.float64)
+        away = given - self.center
+        place = away @ self.axes.T
+        corners = self.plane_coordinates(self.corners)
+        inside = (place >= corners.min(axis=0)) & (place <= corners.max(axis=0))
+        return np.asarray(inside.all(axis=-1) & (np.abs(away @ self.normal) <= off))
+
     def intersect(self, origin: npt.ArrayLike, direction: npt.ArrayLike) -> FloatArray:
         """Return where rays (..., 3) meet the target's plane, ENU; NaN where they miss it."""
         o, d = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)

@@ -1,17 +1,28 @@
 """The last photographs of a plant's targets, for people to look at."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.errors import InputError
+from heliotrope.field.camera import Camera
+from heliotrope.field.target import Target
 from heliotrope.imaging.annotate import annotate
-from heliotrope.imaging.photograph import Photograph
+from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.photograph import Photograph, PhotographSettings
+from heliotrope.imaging.targets.finding import FoundTarget, find_targets
+from heliotrope.imaging.targets.rectify import LEAST_RIM, rectify, rim_of
+from heliotrope.imaging.targets.view import FaceView
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.photographs import Shot
+from heliotrope.plant.visits.stacks import TargetLight
 
 #: JPEG quality (0 to 100) and gamma of the pictures for people.
 _JPEG, _GAMMA = 80, 0.45
+#: What people read under a photograph of a joint visit.
+SEVERAL = "joint visit: several beams, told apart by their movements over many photographs"
 
 
 class Views:
@@ -24,6 +35,11 @@ class Views:
         """Return the last photograph of a target."""
         return self._views.get(target, CameraView(target, 0, 0.0, b""))
 
+    def show(self, name: str, at: float, frame: Frame, line: str) -> None:
+        """Keep a frame that is not read by itself, at a time (POSIX s), with a line about it."""
+        jpeg = picture_of(Photograph(frame, ()))
+        self._views[name] = CameraView(name, self.view(name).version + 1, at, jpeg, (line,))
+
     def keep(self, name: str, at: float, seen: Photograph, jpeg: bytes) -> None:
         """Keep the reading of a target at a time (POSIX s), with its picture."""
         reading = seen.reading(name)
@@ -35,6 +51,38 @@ class Views:
             lines.insert(0, f"{len(reading.spots)} spot(s), {x:+.3f} m right, {y:+.3f} m up")
         version = self.view(name).version + 1
         self._views[name] = CameraView(name, version, at, jpeg, tuple(lines), centroid)
+
+
+def light_of(
+    frame: Frame,
+    target: Target,
+    targets: Sequence[Target],
+    camera: Camera,
+    settings: PhotographSettings,
+    view: FaceView | None,
+    at: float,
+) -> TargetLight:
+    """Return the light on a target in a frame taken at ``at``, monotonic s.
+
+    The target is searched for among those of the camera, unless its view is given.
+
+    Raises
+    ------
+    InputError
+        If it is not found.
+    """
+    linear = frame.linear(settings.gamma)
+    found: Sequence[FoundTarget] = ()
+    if view is None:
+        found = find_targets(linear, targets, camera, (), settings.pictures)
+        own = next(one for one in found if one.target.name == target.name)
+        if own.view is None:
+            raise InputError(f"target {target.name}: {own.reason}; look at the camera")
+        view = own.view
+        found = [one for one in found if one.view is view]
+    rim = max(LEAST_RIM, rim_of(found))
+    picture = rectify(linear, view, rim=rim)
+    return TargetLight.of(picture, target, frame.exposure * frame.gain, at)
 
 
 def shot_of(seen: Photograph, target: str, at: float) -> Shot:

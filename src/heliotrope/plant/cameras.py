@@ -17,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import TypeVar
 
 from heliotrope.errors import FetchError, HeliotropeError, InputError, UnknownNameError
 from heliotrope.field.camera import Camera
@@ -28,12 +29,15 @@ from heliotrope.imaging.memory import Memory
 from heliotrope.imaging.photograph import Photograph, PhotographSettings, read_photograph
 from heliotrope.imaging.sources import FolderSource, Source, VideoSource, open_source
 from heliotrope.imaging.targets.teaching import read_pictures
+from heliotrope.imaging.targets.view import FaceView
 from heliotrope.links.clock import Clock
-from heliotrope.plant.camera_views import Views, picture_of, shot_of
+from heliotrope.plant.camera_views import SEVERAL, Views, light_of, picture_of, shot_of
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.photographs import Shot
+from heliotrope.plant.visits.stacks import TargetLight
 from heliotrope.safety import Alarm, alarms
 
+T = TypeVar("T")
 #: Longest wait for a photograph, and the time between checks for its frame, s.
 PATIENCE, _LOOK = 15.0, 0.05
 #: Time until a source that failed is opened again, s.
@@ -279,6 +283,39 @@ class RealCameras:
             text = f"time: known within {known}; let the camera write its time with a zone"
             shot = replace(shot, reasons=(*shot.reasons, text))
         return shot
+
+    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
+        """Return the light on a target; see `plant.visits.stacks.StackCamera`.
+
+        Raises
+        ------
+        FetchError
+            No frame comes, or its time is not known well enough.
+        InputError
+            The target is not found in it.
+        """
+        eye = self._eye(target.name)
+        frame = await self._frame(eye, target.name)
+        if frame.time_deviation > _UNSURE:
+            known = f"{frame.time_deviation:.2g} s only, the limit is {_UNSURE:g} s"
+            raise FetchError(
+                f"camera {eye.camera.name}: the time of its frames is known within {known}; let "
+                "the camera write its time with a zone"
+            )
+        assert frame.time is not None
+        taken = frame.time.timestamp()
+        at = self._clock.monotonic() - (self._clock.utc().timestamp() - taken)
+        settings, loop = self._settings, asyncio.get_running_loop()
+
+        def work() -> TargetLight:
+            self._views.show(target.name, taken, frame, SEVERAL)
+            return light_of(frame, target, eye.targets, eye.camera, settings, view, at)
+
+        return await loop.run_in_executor(self._pool, work)
+
+    async def beside(self, work: Callable[[], T]) -> T:
+        """Return the result of a computation made in a thread."""
+        return await asyncio.to_thread(work)
 
     async def _frame(self, eye: _Eye, target: str) -> Frame:
         """Wait for a frame that is exposed from now on."""

@@ -829,11 +829,13 @@ class PlantController:
             if again:
                 self._refuse_now(name, names)
                 self._prove_points(name, names, rows, wanted)
+            here = self._stays(rows, wanted)
+            stays = frozenset(names[i] for i in np.flatnonzero(here))
             keep.assign(name, rows, wanted)
             if name == "STANDBY":
                 for each, place in zip(names, wanted, strict=True):
                     self.wanted.rest(each, tuple(place))
-            self._send_points(ticket, name, groups, token)
+            self._send_points(ticket, name, groups, token, stays)
 
         self._orders.when_recorded(ticket, send)
         return ticket
@@ -864,19 +866,31 @@ class PlantController:
         name: str,
         groups: Mapping[tuple[float, ...], Sequence[str]],
         token: int,
+        stays: frozenset[str],
     ) -> None:
-        """Send points that are stored; heliostats that track join their new aim."""
+        """Send points that are stored; heliostats that track join their new aim.
+
+        Those that stay on one target bring no light to a receiver and need no turn to join.
+        """
         names = [n for members in groups.values() for n in members]
         rows = np.array([self.field.place(n) for n in names], dtype=np.intp)
         tracking = self.field.among(_ON_AIM, self.now())[rows]
         self._joining.drop(f"superseded by another {name}", frozenset(names), name)
-        moving = {names[i] for i in np.flatnonzero(tracking)} if name == "AIM" else set()
+        joins = {names[i] for i in np.flatnonzero(tracking)} - stays
+        moving = joins if name == "AIM" else set()
         for point, members in groups.items():
             still = [n for n in members if n not in moving]
             if still:
                 self._orders.command(ticket, name, point, still, token)
             if len(still) < len(members):
                 self._join(ticket, name, point, [n for n in members if n in moving], token)
+
+    def _stays(self, rows: npt.NDArray[np.intp], wanted: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return which heliostats' aims and new points (K, 3) lie on the same target, (K,)."""
+        found = np.zeros(len(rows), dtype=np.bool_)
+        for target in self.design.targets:
+            found |= target.holds(self.aims[rows]) & target.holds(wanted)
+        return found
 
     def _join(
         self,

@@ -9,13 +9,14 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
 from heliotrope.files.disk import Disk
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.targets.view import FaceView
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Link
 from heliotrope.plant.assigned import Assigned
@@ -25,8 +26,11 @@ from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.sensors import Readings
 from heliotrope.plant.visits.photographs import Shot
+from heliotrope.plant.visits.stacks import TargetLight
 from heliotrope.safety import Alarm
 from heliotrope.store.records import Records
+
+T = TypeVar("T")
 
 
 class Cameras(Protocol):
@@ -60,6 +64,20 @@ class Cameras(Protocol):
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
         """Return what a new photograph shows of a heliostat's beam on the target."""
+        ...
+
+    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
+        """Return the light on the target, for a joint visit; see `StackCamera`.
+
+        Raises
+        ------
+        FetchError, InputError
+            No usable photograph.
+        """
+        ...
+
+    async def beside(self, work: Callable[[], T]) -> T:
+        """Return the result of a computation that must not hold up the loop."""
         ...
 
     def view(self, target: str) -> CameraView:

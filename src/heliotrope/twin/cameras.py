@@ -10,6 +10,8 @@ import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from datetime import datetime
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -22,11 +24,14 @@ from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.photograph import Photograph, PhotographSettings, read_photograph
 from heliotrope.imaging.synthetic.rendering import render
 from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
+from heliotrope.imaging.targets.view import FaceView
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.optics.mirror_image import reflected_beam
-from heliotrope.plant.camera_views import Views, picture_of, shot_of
+from heliotrope.plant.camera_views import SEVERAL, Views, light_of, picture_of, shot_of
 from heliotrope.plant.operations.views import CameraView
+from heliotrope.plant.visits.joint_layout import moments_on
 from heliotrope.plant.visits.photographs import Shot
+from heliotrope.plant.visits.stacks import TargetLight
 from heliotrope.safety import Alarm
 from heliotrope.twin.boards.board import Board
 
@@ -36,6 +41,12 @@ NEAR = 2.0
 GRAZING = 0.05
 #: Brightest reading after exposure, as a share of full scale.
 PEAK = 0.7
+#: Share of a mirror's size in its exact beam.
+_FLAT = 0.7
+#: Pictures of exact beams: pixels across, brightness of the paint and of a sun, and its noise.
+_ACROSS, _PAINT, _SUN, _GRAIN = 96, 0.05, 0.1, 0.0005
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -234,6 +245,37 @@ class ExactCamera:
         self._keep(target, point, (heliostat, *reasons))
         return Shot(point, at, target.axes.T @ self._plane @ target.axes, tuple(reasons))
 
+    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
+        """Return the light on a target: each beam a Gaussian at its true place, with noise."""
+        del view
+        at, sun = await self._sight.exposure(), self._sight.sun()
+        corners = target.plane_coordinates(target.corners)
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        step = float((high - low).min()) / _ACROSS
+        x = np.arange(low[0] + 0.5 * step, high[0], step)
+        y = np.arange(high[1] - 0.5 * step, low[1], -step)
+        values = _PAINT + _GRAIN * self._chance.standard_normal((len(y), len(x)))
+        points = np.stack(np.meshgrid(x, y), axis=-1)
+        for mirror in self._sight.mirrors():
+            place = mirror.on(target, sun)
+            if not _within(target, place, NEAR):
+                continue
+            size = mirror.width, mirror.height
+            shape = moments_on(target, mirror.vertex, mirror.normal, *size, flat=_FLAT)
+            power = mirror.width * mirror.height * float(mirror.normal @ sun)
+            away = points - target.plane_coordinates(place)
+            form = np.einsum("hwi,ij,hwj->hw", away, np.linalg.inv(shape), away)
+            peak = _SUN * power / (2.0 * np.pi * np.sqrt(np.linalg.det(shape)))
+            values += peak * np.exp(-0.5 * form)
+        self._keep(target, np.full(3, np.nan), (SEVERAL,))
+        seen = np.ones(values.shape, dtype=np.bool_)
+        first = np.array([x[0], y[0]])
+        return TargetLight(values.astype(np.float32), step, first, seen, 1.0, at)
+
+    async def beside(self, work: Callable[[], T]) -> T:
+        """Return the result of a computation."""
+        return work()
+
     def _keep(self, target: Target, point: FloatArray, lines: tuple[str, ...]) -> None:
         centroid = None
         if np.isfinite(point).all():
@@ -405,29 +447,75 @@ class RenderedCamera:
         seen, at = await self._take(target.name)
         return shot_of(seen, target.name, at)
 
+    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
+        """Return the light on a target; see `plant.visits.stacks.StackCamera`.
+
+        Raises
+        ------
+        InputError
+            The target is not found in the photograph.
+        UnknownNameError
+            There is no scene of the target.
+        """
+        name = target.name
+        camera, known = self._known_of(name)
+        draw, utc, at = await self._expose(name)
+        settings = self._settings
+
+        def work() -> tuple[TargetLight, Frame]:
+            frame = draw()
+            self._views.show(name, utc.timestamp(), frame, SEVERAL)
+            return light_of(frame, known, (known,), camera, settings, view, at), frame
+
+        seen, frame = await self._worked(work)
+        self.last = self._frames[name] = frame
+        return seen
+
+    async def beside(self, work: Callable[[], T]) -> T:
+        """Return the result of a computation, made in a thread if there are any."""
+        return await asyncio.to_thread(work) if self._pool is not None else work()
+
     def beams(self, target: Target) -> tuple[Thrown, ...]:
         """Return the beams on a target, and those beside it that a frame would show, now."""
         return _thrown(target, self._sight.mirrors(), self._sight.sun(), self._optics)
 
-    async def _take(self, name: str) -> tuple[Photograph, float]:
-        """Take a photograph; return it as read, and when it was exposed, monotonic s."""
+    def _known_of(self, name: str) -> tuple[Camera, Target]:
         if name not in self._scenes:
             raise UnknownNameError("target", name, list(self._scenes))
+        return self._known[name]
+
+    async def _expose(self, name: str) -> tuple[Callable[[], Frame], datetime, float]:
+        """Expose a frame: return what draws it, and when it was exposed, UTC and monotonic s."""
         at = await self._sight.exposure()
         scene, utc = self._scenes[name], self._sight.clock.utc()
-        (camera, target), settings = self._known[name], self._settings
         mirrors, sun = self._sight.mirrors(), self._sight.sun()
         seed = int(self._chance.integers(1 << 32))
         self.taken += 1
         title = f"{scene.camera.name} {self.taken}"
 
-        def work() -> tuple[Photograph, bytes]:
+        def draw() -> Frame:
             beams = _thrown(scene.targets[0], mirrors, sun, self._optics)
             # Automatic exposure: the brightest of paint and beams sets it.
             lit = exposed(replace(scene, beams=beams), PEAK)
-            frame = render(lit, seed, name=title, time=utc).frame
+            return render(lit, seed, name=title, time=utc).frame
+
+        return draw, utc, at
+
+    async def _worked(self, work: Callable[[], T]) -> T:
+        """Return the result of work on a photograph."""
+        if self._pool is None:
+            return work()
+        return await asyncio.get_running_loop().run_in_executor(self._pool, work)
+
+    async def _take(self, name: str) -> tuple[Photograph, float]:
+        """Take a photograph; return it as read, and when it was exposed, monotonic s."""
+        self._known_of(name)
+        draw, utc, at = await self._expose(name)
+        (camera, target), settings = self._known[name], self._settings
+
+        def work() -> tuple[Photograph, bytes]:
             seen = read_photograph(
-                frame,
+                draw(),
                 (target,),
                 camera,
                 settings=settings,
@@ -435,10 +523,7 @@ class RenderedCamera:
             )
             return seen, picture_of(seen)
 
-        if self._pool is None:
-            seen, jpeg = work()
-        else:
-            seen, jpeg = await asyncio.get_running_loop().run_in_executor(self._pool, work)
+        seen, jpeg = await self._worked(work)
         self.last = self._frames[name] = seen.frame
         self._views.keep(name, utc.timestamp(), seen, jpeg)
         return seen, at

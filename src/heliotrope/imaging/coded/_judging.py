@@ -18,6 +18,8 @@ _GATE = 2.0 * float(np.log(1000.0))
 _GAIN, _GAIN_SIGMAS = 0.3, 3.0
 #: A mirror that does not move has this share of the usual beam at its expected place.
 _STANDS = 0.4
+#: A top with less than this share of the usual power is what another beam of its code leaves.
+_WEAK = 0.25
 #: Error of powers by the shape of beams, relative.
 _SHAPE = 0.05
 
@@ -46,7 +48,9 @@ def judged(
     still
         Light at rest; None where other light hides it.
     """
-    return tuple(_one(i, expected, tops, fits, still) for i in range(len(expected)))
+    usual = float(np.percentile([fit.power for fit in fits if fit is not None] or [0.0], 75.0))
+    strong = [None if fit is None or fit.power < _WEAK * usual else fit for fit in fits]
+    return tuple(_one(i, expected, tops, strong, still) for i in range(len(expected)))
 
 
 def _one(
@@ -107,7 +111,8 @@ def _gain(
         there = float(still.powers[index])
         share = float(still.sigmas[index]) / max(there, 1e-300)
     if not there > 0.0:
-        return float("nan"), float("nan")
+        # Unknown without a picture of the empty surface; with one, nothing is there that moves.
+        return (np.nan, np.nan) if still is None else (np.inf, 0.0)
     gain = fit.power / there
     return gain, gain * float(np.sqrt(share**2 + (fit.power_sigma / fit.power) ** 2 + _SHAPE**2))
 

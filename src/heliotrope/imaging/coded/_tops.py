@@ -7,7 +7,6 @@ import numpy as np
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded._bells import slopes
 from heliotrope.imaging.coded.stack import Stack
-from heliotrope.imaging.targets.rectify import Mask
 
 #: Two tops of one code are at least this many standard deviations of a beam apart.
 _APART = 3.0
@@ -35,9 +34,7 @@ class Top:
     second: float
 
 
-def find_top(
-    stack: Stack, picture: FloatArray, moments: FloatArray, own: Mask | None = None
-) -> Top:
+def find_top(stack: Stack, picture: FloatArray, moments: FloatArray) -> Top:
     """Return the strongest beam in the two pictures (2, N) of a movement.
 
     Parameters
@@ -48,8 +45,6 @@ def find_top(
         Change per metre of movement along each axis.
     moments
         Expected second moments of the beam, m², (2, 2).
-    own
-        Pixels in which it is looked for, (H, W); None: all.
     """
     from scipy.signal import fftconvolve
 
@@ -65,18 +60,16 @@ def find_top(
     score = -sum(fftconvolve(full[a], template[a], mode="same") for a in range(2))
     norm = (template**2).sum()
     power = np.asarray(score / norm)
-    here = np.ones(power.shape, dtype=np.bool_) if own is None else own
-    best = np.unravel_index(int(np.argmax(np.where(here, power, -np.inf))), power.shape)
+    best = np.unravel_index(int(np.argmax(power)), power.shape)
     x, y = stack.axes
     place = np.array([x[best[1]], y[best[0]]])
     spread = float(np.sqrt(0.5 * np.trace(moments)))
     away = np.hypot(x[None, :] - place[0], y[:, None] - place[1]) > _APART * spread
     beside = power[away & stack.seen]
-    rivals = power[away & stack.seen & here]
     # The filter's own noise, where this beam is not: half of the pixels lie within 0.674 σ.
     noise = float(np.median(np.abs(beside))) / 0.674 if beside.size else np.inf
     top = float(power[best])
-    second = float(rivals.max(initial=0.0))
+    second = float(beside.max(initial=0.0))
     return Top(
         place,
         top,

@@ -9,7 +9,7 @@ codes that lost photographs; the moments of what it leaves correct its place.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,6 @@ from heliotrope.imaging.coded._tops import Top, find_top
 from heliotrope.imaging.coded.beams import ExpectedBeam, SeparatedBeam, Verdict
 from heliotrope.imaging.coded.codes import APART, distances
 from heliotrope.imaging.coded.stack import Stack, light_of
-from heliotrope.imaging.targets.rectify import Mask
 
 
 @dataclass(frozen=True)
@@ -116,33 +115,34 @@ def _tops(
 ) -> list[Top]:
     """Return the strongest beam that moves by each mirror's code.
 
-    Of mirrors that share a code, each is looked for where its place is nearer than the others',
-    and once more without the light of the others, which would pass for noise and second beams.
+    Of n mirrors that share a code the n strongest beams are found one after the other, each without
+    the light of those before it. Each mirror gets the one that is nearest to its place, such that
+    the sum of all distances is least.
     """
-    code, size = code_of(moves), np.sqrt((moves**2).sum(axis=0))
-    points = np.stack(np.meshgrid(*stack.axes), axis=-1)
-    shapes = [np.asarray(beam.second_moments, dtype=np.float64) for beam in expected]
-    mates = [[int(j) for j in np.flatnonzero(code == code[i]) if j != i] for i in range(len(code))]
-    own: list[Mask | None] = []
-    for beam, others in zip(expected, mates, strict=True):
-        away = np.linalg.norm(points - beam.place, axis=-1)
-        nearer = [away <= np.linalg.norm(points - expected[j].place, axis=-1) for j in others]
-        own.append(np.logical_and.reduce(nearer) if nearer else None)
-    tops = [
-        find_top(stack, picture, shape, mine)
-        for picture, shape, mine in zip(pictures, shapes, own, strict=True)
-    ]
-    seen = points[stack.seen]
-    found = list(tops)
-    for i, others in enumerate(mates):
-        if not others:
-            continue
-        alone = pictures[i].copy()
-        for j in others:
-            light = tops[j].power * slopes(seen, tops[j].place, shapes[j])
-            alone -= light * (size[j] / size[i])[:, None]
-        found[i] = find_top(stack, alone, shapes[i], own[i])
-    return found
+    from scipy.optimize import linear_sum_assignment
+
+    code, size = code_of(moves), np.sqrt((moves**2).sum(axis=0)).mean(axis=-1)
+    seen = np.stack(np.meshgrid(*stack.axes), axis=-1)[stack.seen]
+    found: dict[int, Top] = {}
+    for first in np.unique(code):
+        members = [int(i) for i in np.flatnonzero(code == first)]
+        shape = np.mean([expected[i].second_moments for i in members], axis=0)
+        usual = float(size[members].mean())
+        left = pictures[members[0]] * (size[members[0]] / usual)
+        tops: list[Top] = []
+        for _ in members:
+            tops.append(find_top(stack, left, shape))
+            left = left - tops[-1].power * slopes(seen, tops[-1].place, shape)
+        rest = find_top(stack, left, shape) if len(tops) > 1 else None
+        places = np.array([expected[i].place for i in members])
+        away = np.linalg.norm(places[:, None] - [top.place for top in tops], axis=-1)
+        for i, k in zip(*linear_sum_assignment(away**2), strict=True):
+            top = tops[k]
+            if rest is not None:
+                noise, share = rest.power / rest.significance, rest.power / max(top.power, 1e-300)
+                top = replace(top, significance=top.power / noise, second=share)
+            found[members[i]] = replace(top, power=top.power * usual / size[members[i]])
+    return [found[i] for i in range(len(expected))]
 
 
 def _check(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) -> None:

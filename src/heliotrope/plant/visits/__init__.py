@@ -2,12 +2,14 @@
 
 Begin with `CalibrationCycle`: it sends a heliostat to a target, takes photographs (plainly, or with
 a search for the beam: `Centring`), fits them, and lets the plant believe a better calibration.
+`JointCycle` calibrates several on one target at once, told apart by their movements.
 `Visit` is the way there and back; `TargetCamera` is the protocol of a camera.
 """
 
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
+from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.photographs import Photographs, Shot, TargetCamera
-from heliotrope.plant.visits.settings import Centring, CycleSettings
+from heliotrope.plant.visits.settings import Centring, CycleSettings, JointSettings
 from heliotrope.plant.visits.visit import Visit
 
 __all__ = [
@@ -15,6 +17,8 @@ __all__ = [
     "Centring",
     "CycleResult",
     "CycleSettings",
+    "JointCycle",
+    "JointSettings",
     "Photographs",
     "Shot",
     "TargetCamera",

@@ -11,6 +11,7 @@ expect are confirmed by one more photograph before they are taken; if it contrad
 parameters are pushed back.
 """
 
+import asyncio
 from dataclasses import dataclass, replace
 from datetime import timedelta
 
@@ -25,6 +26,7 @@ from heliotrope.calibration.record import (
 )
 from heliotrope.calibration.sightings import Sightings, camera_target, join
 from heliotrope.geometry import FloatArray
+from heliotrope.imaging.coded import Verdict
 from heliotrope.lcu import states
 from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
@@ -73,6 +75,8 @@ class CycleResult:
         without a fit.
     record
         The new calibration; None if nothing changed.
+    verdict
+        What a joint visit proves about the mirror; None for one that was alone.
     """
 
     heliostat: str
@@ -85,6 +89,7 @@ class CycleResult:
     before: float = float("nan")
     after: float = float("nan")
     record: HeliostatCalibration | None = None
+    verdict: Verdict | None = None
 
 
 class CalibrationCycle:
@@ -121,7 +126,7 @@ class CalibrationCycle:
             if centring is None
             else Centred(camera, self.settings, centring)
         )
-        self._models = ModelOfEach(self.settings)
+        self._models, self._fitting = ModelOfEach(self.settings), asyncio.Lock()
         self._verification = Verification(
             camera, self.settings, centring or Centring(), self._sighting
         )
@@ -158,9 +163,7 @@ class CalibrationCycle:
         async with visit:
             await visit.go(self.settings.arrival)
             taken = await self._photographing.take(visit, tell or _nobody)
-        result = await self._learn(visit, taken, tell or _nobody)
-        if taken.used and self._missed(heliostat, taken) <= PLACED:
-            plant.doubts.confirm(heliostat, boots)
+        result = await self.learn(visit, taken, boots, tell)
         if tracked and np.isfinite(aim).all():
             await visit.aim(aim)
             await visit.command("TRACK")
@@ -209,6 +212,25 @@ class CalibrationCycle:
             centroid_covariance=np.asarray(shot.covariance, dtype=np.float64),
         )
 
+    async def learn(
+        self, visit: Visit, taken: Photographs, boots: int, tell: Tell | None = None
+    ) -> CycleResult:
+        """Learn from the photographs of a heliostat that is at standby; see `run`.
+
+        Parameters
+        ----------
+        visit, taken
+            Its visit, and the photographs.
+        boots
+            Boots of its local controller before the photographs.
+        tell
+            Called with the name of each step.
+        """
+        result = await self._learn(visit, taken, tell or _nobody)
+        if taken.used and self._missed(visit.heliostat, taken) <= PLACED:
+            self._plant.doubts.confirm(visit.heliostat, boots)
+        return result
+
     async def _learn(self, visit: Visit, taken: Photographs, tell: Tell) -> CycleResult:
         """Fit all sightings once; push, verify and take a better fit."""
         name, beliefs = visit.heliostat, self._plant.beliefs
@@ -235,8 +257,10 @@ class CalibrationCycle:
                 len(here),
                 measured,
             )
-        model = await self._models.of(name, beliefs.nominal(name), every)
-        found = await stepwise(fitting(beliefs, self.settings, model, name, every))
+        # One fit at a time: the steps of many would hold up the loop together.
+        async with self._fitting:
+            model = await self._models.of(name, beliefs.nominal(name), every)
+            found = await stepwise(fitting(beliefs, self.settings, model, name, every))
         pushed: tuple[str, ...] = ()
         if not found.problem:
             with self._plant.doubts.unverified(name):

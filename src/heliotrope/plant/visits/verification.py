@@ -5,6 +5,7 @@ goes back to the target with its new parameters, to a place away from all earlie
 its beam must be where they predict it.
 """
 
+import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -99,6 +100,7 @@ class Verification:
     ) -> None:
         self._camera, self._settings, self._centring = camera, settings, centring
         self._sighting = sighting
+        self._alone: dict[str, asyncio.Lock] = {}
 
     async def problem(
         self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
@@ -123,6 +125,13 @@ class Verification:
         RefusedError
             If a command is refused, or the heliostat does not carry it out.
         """
+        # Of several that are verified after a joint visit, one goes to the target at a time.
+        async with self._alone.setdefault(visit.target.name, asyncio.Lock()):
+            return await self._photographed(visit, fitted, nominal, used, tell)
+
+    async def _photographed(
+        self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
+    ) -> str:
         point = apart(visit.target, [shot.point for shot in used], room_of(visit, self._centring))
         why = ""
         async with visit:

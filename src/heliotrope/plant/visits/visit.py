@@ -147,9 +147,10 @@ class Visit:
             counted = float(self.plant.field.counted_at[self.row])
             if counted > since:
                 since = counted
-                seen = seen + 1 if self._left() < ARRIVED else 0
+                seen = seen + 1 if self.left() < ARRIVED else 0
 
-    def _left(self) -> float:
+    def left(self) -> float:
+        """Return how far the axes are from their goals, rad, the further one."""
         node = self.plant.field.rows[self.row]
         here = np.array([node["primary"], node["secondary"]], dtype=np.float64)
         goal = np.array([node["primary_goal"], node["secondary_goal"]], dtype=np.float64)
@@ -158,6 +159,10 @@ class Visit:
     async def look(self) -> None:
         """Let a little time pass, and note the counts if they are new."""
         await sleep_until(self.plant.clock, self.plant.now() + _LOOK)
+        self.note()
+
+    def note(self) -> None:
+        """Note the step counts as last heard, if they are new."""
         # Counts may be polled less often than the state; their own age says when they were true.
         counted = float(self.plant.field.counted_at[self.row])
         node = self.plant.field.rows[self.row]
@@ -191,6 +196,11 @@ class Visit:
         return np.asarray(
             self._counts[after - 1] + share * (self._counts[after] - self._counts[after - 1])
         )
+
+    @property
+    def counted(self) -> tuple[FloatArray, FloatArray]:
+        """The times, monotonic s, (R,), and the step counts, (R, 2), that were noted."""
+        return np.array(self._times), np.array(self._counts).reshape(-1, 2)
 
     async def __aenter__(self) -> "Visit":
         """Begin the visit; at its end the heliostat is brought home."""

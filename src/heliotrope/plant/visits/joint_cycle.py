@@ -1,0 +1,336 @@
+"""The joint visit: many mirrors on one target at once, each told apart by its own movements.
+
+The heliostats go to their places together. Over a stack of photographs each beam moves by its code
+(`imaging.coded`); a photograph is taken only when all have settled. All go home before the stack is
+taken apart. Each proven beam is a sighting, which takes the way of an ordinary visit's: one fit,
+its safeguards, verification. What is not proven is named, and nothing is learnt from it.
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from heliotrope.calibration.record import CalibrationOutcome
+from heliotrope.errors import HeliotropeError
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.coded import SeparatedBeam, Separation, Verdict, separate
+from heliotrope.lcu import states
+from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
+from heliotrope.plant.visits.joint_layout import Layout, arranged
+from heliotrope.plant.visits.joint_visit import JointVisit
+from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
+from heliotrope.plant.visits.settings import JointSettings
+from heliotrope.plant.visits.stacks import StackCamera, TargetLight, stack_of
+from heliotrope.plant.visits.visit import Visit
+
+#: Step counts that differ from those of the ordered movements by this share of them do not follow.
+_FOLLOWS = 0.5
+#: Rows of step counts that a sighting needs.
+_LEAST_ROWS = 3
+
+
+@dataclass
+class _Taken:
+    """The photographs of a joint visit, and when the mirrors stood still for each.
+
+    Attributes
+    ----------
+    pictures
+        The last photographs, each with its number; those of one whole turn of the codes at the end.
+    still
+        From when to when all stood at the aims of a photograph, and its number.
+    count
+        Photographs in all.
+    """
+
+    pictures: deque[tuple[int, TargetLight]]
+    still: list[tuple[float, float, int]] = field(default_factory=list)
+    count: int = 0
+
+
+class JointCycle:
+    """Calibration of several heliostats on one target at once.
+
+    Parameters
+    ----------
+    plant
+        Running.
+    camera
+        Camera of its targets.
+    cycle
+        Learns from sightings as from those of its own visits.
+    settings
+        See `JointSettings`.
+
+    Attributes
+    ----------
+    settings
+        See `JointSettings`.
+    """
+
+    def __init__(
+        self,
+        plant: PlantController,
+        camera: StackCamera,
+        cycle: CalibrationCycle,
+        settings: JointSettings | None = None,
+    ) -> None:
+        self._plant, self._camera, self._cycle = plant, camera, cycle
+        self.settings = settings or JointSettings()
+
+    async def run(
+        self,
+        person: Person,
+        token: int,
+        heliostats: Sequence[str],
+        target: str,
+        tell: Tell = lambda _: None,
+    ) -> tuple[CycleResult, ...]:
+        """Calibrate heliostats together, and bring each back to where it was.
+
+        The command authority must be kept up meanwhile. If it is lost, the beams are taken off the
+        target, and nothing is changed.
+
+        Parameters
+        ----------
+        person, token
+            An engineer, with the token of the command authority.
+        heliostats, target
+            Names.
+        tell
+            Called with the name of each step.
+
+        Returns
+        -------
+            One for each heliostat, in the order given.
+
+        Raises
+        ------
+        RefusedError
+            If the plant refuses every motion, or too few heliostats are left.
+        FetchError, InputError
+            No usable photograph comes.
+        UnknownNameError
+            If there is no such heliostat or target.
+        """
+        plant = self._plant
+        plant.authority.check(person, token, "PARAMETERS")
+        place = plant.design.target(target)
+        layout, wrong = arranged(plant, place, tuple(dict.fromkeys(heliostats)), self.settings)
+        results = {name: _refused(name, text) for name, text in wrong.items()}
+        if layout.names:
+            joint = JointVisit(plant, person, token, layout.names, place)
+            visits = dict(joint.visits)
+            before = {name: _Before.of(visit) for name, visit in visits.items()}
+            tell("the empty target")
+            empty = await self._camera.light(place)
+            async with joint:
+                tell(f"{len(layout.names)} on the way")
+                await joint.go(layout.start(), self._cycle.settings.arrival)
+                taken = await self._photograph(joint, layout, empty, tell)
+                tell(f"{len(joint.names)} on the way back")
+            results |= {name: _refused(name, text) for name, text in joint.lost.items()}
+            results |= await self._learn(joint, layout, empty, taken, tell)
+            await self._back(visits, before)
+        return tuple(results[name] for name in dict.fromkeys(heliostats))
+
+    # -- photographs -----------------------------------------------------------------------
+
+    async def _photograph(
+        self, joint: JointVisit, layout: Layout, empty: TargetLight, tell: Tell
+    ) -> _Taken:
+        """Take the stack. When a heliostat drops out, a whole turn of the codes begins anew."""
+        needed = len(layout.moves)
+        taken = _Taken(deque(maxlen=needed))
+        while len(taken.pictures) < needed:
+            if await joint.leave():
+                taken.pictures.clear()
+            if not joint.visits:
+                why = next(iter(joint.lost.values()), "")
+                raise RefusedError(f"joint visit to {layout.target.name}: nobody is left; {why}")
+            if taken.count >= self.settings.again * needed:
+                raise RefusedError(
+                    f"joint visit to {layout.target.name}: {taken.count} photographs were taken, "
+                    f"and heliostats dropped out before {needed} of them in a row were"
+                )
+            number = taken.count % needed
+            tell(f"photograph {len(taken.pictures) + 1} of {needed}, {len(joint.names)} beams")
+            await joint.aim(layout.points(number))
+            begin = self._plant.now()
+            await self._settled(joint, begin + self.settings.settle)
+            picture = await self._light(joint, layout, empty)
+            joint.drop(joint.missing(states.TRACKING))
+            taken.count += 1
+            taken.still.append((begin + 0.5 * self.settings.settle, picture.at, number))
+            taken.pictures.append((number, picture))
+            if joint.astray:
+                taken.pictures.clear()
+        return taken
+
+    async def _settled(self, joint: JointVisit, until: float) -> None:
+        while self._plant.now() < until:
+            await joint.look()
+
+    async def _light(self, joint: JointVisit, layout: Layout, empty: TargetLight) -> TargetLight:
+        """Photograph the target, and go on noting step counts meanwhile."""
+        made: list[TargetLight | HeliotropeError] = []
+
+        async def look() -> None:
+            while True:
+                await joint.look()
+
+        async with asyncio.TaskGroup() as group:
+            looking = group.create_task(look())
+            try:
+                made.append(await self._camera.light(layout.target, empty.view))
+            except HeliotropeError as error:
+                made.append(error)  # a group would wrap it
+            looking.cancel()
+        if isinstance(made[0], HeliotropeError):
+            raise made[0]
+        return made[0]
+
+    # -- learning --------------------------------------------------------------------------
+
+    async def _learn(
+        self, joint: JointVisit, layout: Layout, empty: TargetLight, taken: _Taken, tell: Tell
+    ) -> dict[str, CycleResult]:
+        """Take the stack apart, and learn from each proven beam as from a visit of its own."""
+        chosen = [layout.names.index(name) for name in joint.names]
+        pictures = list(taken.pictures)
+        moves = layout.moves[[number for number, _ in pictures]][:, chosen]
+        beams = [layout.beams[i] for i in chosen]
+        tell("taking the beams apart")
+
+        def work() -> Separation:
+            return separate(stack_of([one for _, one in pictures], empty), moves, beams)
+
+        found = await self._camera.beside(work)
+        results: dict[str, CycleResult] = {}
+        proven: dict[str, Photographs] = {}
+        for i, beam in zip(chosen, found.beams, strict=True):
+            name = beam.heliostat
+            if beam.verdict is not Verdict.PROVEN:
+                results[name] = _not_proven(name, beam)
+                continue
+            counts = self._counts(joint.visits[name], layout.aims[i], layout, i, taken)
+            if isinstance(counts, str):
+                text = f"unchanged: {counts}"
+                results[name] = CycleResult(name, CalibrationOutcome.NOT_PROVEN, text)
+                continue
+            covariance = beam.covariance + empty.covariance_at(beam.centroid)
+            axes = layout.target.axes
+            point = np.asarray(layout.target.point(beam.centroid))
+            shot = Shot(point, _middle(pictures), axes.T @ covariance @ axes)
+            proven[name] = Photographs([(shot, counts)])
+        tell(f"learning from {len(proven)} proven beams")
+
+        async def one(name: str) -> None:
+            results[name] = await self._learnt(joint.visits[name], proven[name])
+
+        async with asyncio.TaskGroup() as group:
+            for name in proven:
+                group.create_task(one(name))
+        return results
+
+    async def _learnt(self, visit: Visit, taken: Photographs) -> CycleResult:
+        name, boots = visit.heliostat, int(self._plant.field.rows["boots"][visit.row])
+        try:
+            return await self._cycle.learn(visit, taken, boots)
+        except RefusedError as error:
+            return _refused(name, str(error))
+        except HeliotropeError as error:
+            text = f"{type(error).__name__}: {error}"
+            return CycleResult(name, CalibrationOutcome.ERROR, text)
+
+    def _counts(
+        self, visit: Visit, base: FloatArray, layout: Layout, i: int, taken: _Taken
+    ) -> FloatArray | str:
+        """Return the step counts of a heliostat at its aim without movement, (2,), or why not.
+
+        The local controller reports counts while it stands still for a photograph. They differ from
+        those that the aim of the photograph asks for by what its tracking lags; the median of
+        the differences belongs to all of them.
+        """
+        plant, axes = self._plant, layout.target.axes
+        times, counts = visit.counted
+        rows, aims = [], []
+        for begin, end, number in taken.still:
+            for r in np.flatnonzero((times >= begin) & (times <= end)):
+                rows.append(int(r))
+                aims.append(base + layout.moves[number, i] @ axes)
+        if len(rows) < _LEAST_ROWS:
+            return f"its step counts were heard {len(rows)} times at its aims; {_LEAST_ROWS} needed"
+        now = plant.now()
+        middle = _middle(list(taken.pictures))
+        when = [*times[rows], middle]
+        suns = np.stack([plant.sun_vector(float(at) - now) for at in when])
+        heard = np.concatenate([counts[rows], counts[rows[-1:]]])
+        which = np.full(len(when), visit.row, dtype=np.intp)
+        ordered = plant.beams.poses(which, np.array([*aims, base]), suns, heard).best_counts
+        still = plant.beams.poses(which, np.tile(base, (len(when), 1)), suns, heard).best_counts
+        off = counts[rows] - ordered[:-1]
+        # Medians: a drive with play overshoots for a moment when it turns back.
+        lag = np.median(off, axis=0)
+        loose = float(np.median(np.abs(off - lag).max(axis=-1)))
+        if not loose <= _FOLLOWS * float(np.median(np.abs((ordered - still)[:-1]).max(axis=-1))):
+            return "its step counts do not follow the movements of its aim"
+        return np.asarray(still[-1] + lag)
+
+    async def _back(self, visits: dict[str, Visit], before: "dict[str, _Before]") -> None:
+        """Send those that tracked back to their aims, as far as they are at standby."""
+        tracked = {
+            name: one.aim
+            for name, one in before.items()
+            if one.tracked and np.isfinite(one.aim).all() and _idle(visits[name])
+        }
+        if not tracked:
+            return
+        first = next(iter(visits.values()))
+        back = JointVisit(self._plant, first.person, first.token, tracked, first.target)
+        await back.aim(tracked)
+        await back.track()
+
+
+@dataclass(frozen=True)
+class _Before:
+    """Where a heliostat was before the visit: whether it tracked, and its aim."""
+
+    tracked: bool
+    aim: FloatArray
+
+    @classmethod
+    def of(cls, visit: Visit) -> "_Before":
+        """Return where it is now; one that is not heard is nowhere."""
+        try:
+            tracked = visit.state == states.TRACKING
+        except RefusedError:
+            tracked = False
+        return cls(tracked, visit.plant.aims[visit.row].copy())
+
+
+def _idle(visit: Visit) -> bool:
+    try:
+        return visit.state == states.IDLE
+    except RefusedError:
+        return False
+
+
+def _middle(pictures: Sequence[tuple[int, TargetLight]]) -> float:
+    """Return the middle of the exposures, monotonic s."""
+    return float(np.mean([picture.at for _, picture in pictures]))
+
+
+def _refused(name: str, text: str) -> CycleResult:
+    return CycleResult(name, CalibrationOutcome.REFUSED, text)
+
+
+def _not_proven(name: str, beam: SeparatedBeam) -> CycleResult:
+    other = f" ({beam.other})" if beam.other else ""
+    text = f"unchanged: {beam.verdict.value}{other}"
+    return CycleResult(name, CalibrationOutcome.NOT_PROVEN, text, verdict=beam.verdict)

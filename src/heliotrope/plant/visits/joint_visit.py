@@ -1,0 +1,221 @@
+"""Many heliostats on one target: their way there, their aims, and their way back.
+
+One that is refused, is lost or leaves its aim drops out: it is brought to standby, or its beam is
+taken off the target, and the others go on. The visit ends only with what ends it for all: an
+emergency, a lost command authority, a cancelled task. Then all beams leave the target.
+"""
+
+import asyncio
+from collections.abc import Callable, Iterable, Mapping
+
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+from heliotrope.links.clock import sleep_until
+from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.beam_watch import BeamError
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.visits.visit import ARRIVED, Visit
+
+#: Longest time of an order, and of the way to standby, s.
+_ORDER, _HOME = 60.0, 120.0
+#: Time between looks at the field, s.
+_LOOK = 0.25
+#: States in which a beam may be on the target, and those that an order of others has led to, which
+#: a visit does not undo.
+_ON = (states.IDLE, states.TRACKING, states.SEARCHING)
+_OFF = (states.DEFOCUSED, states.STOWING, states.STOWED, states.LOCKED, states.APPROACHING)
+
+
+class JointVisit:
+    """Several heliostats on their way to, at, and from one target.
+
+    Parameters
+    ----------
+    plant, person, token
+        As for `Visit`.
+    heliostats, target
+        Names, and the target.
+
+    Attributes
+    ----------
+    visits
+        Those that take part, by name.
+    lost
+        Why others do not, by name.
+    """
+
+    def __init__(
+        self,
+        plant: PlantController,
+        person: Person,
+        token: int,
+        heliostats: Iterable[str],
+        target: Target,
+    ) -> None:
+        self.plant, self.person, self.token, self.target = plant, person, token, target
+        self.visits = {
+            name: Visit(plant, person, token, name, target) for name in dict.fromkeys(heliostats)
+        }
+        self.lost: dict[str, str] = {}
+        self._away: set[str] = set()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Those that take part."""
+        return tuple(self.visits)
+
+    @property
+    def astray(self) -> bool:
+        """Whether one that takes part no longer has yet to be brought home; see `leave`."""
+        return not self._away <= set(self.visits)
+
+    def drop(self, why: Mapping[str, str]) -> None:
+        """Let heliostats take part no longer; `leave` brings them home."""
+        for name, text in why.items():
+            if self.visits.pop(name, None) is not None:
+                self.lost[name] = text
+
+    def missing(self, wanted: int) -> dict[str, str]:
+        """Return which of those that take part are not live or not in a state, and why."""
+        found = {}
+        for name, visit in self.visits.items():
+            try:
+                if visit.state != wanted:
+                    found[name] = f"{name} is {states.STATES[visit.state]}, no longer TRACKING"
+            except RefusedError as error:
+                found[name] = str(error)
+        return found
+
+    async def go(self, points: Mapping[str, FloatArray], limit: float) -> None:
+        """Send all to their points on the target, ENU, and wait until they are there.
+
+        Raises
+        ------
+        RefusedError
+            If the plant refuses every motion.
+        """
+        for name, visit in list(self.visits.items()):
+            try:
+                if visit.state not in (states.IDLE, states.TRACKING):
+                    state = states.STATES[visit.state]
+                    said = f"{name} is {state}; bring it to standby (APPROACH) first"
+                    self.drop({name: said})
+            except RefusedError as error:
+                self.drop({name: str(error)})
+        self._away |= set(self.visits)
+        await self.aim(points, limit)
+        await self.track(limit)
+        await self._arrived(limit)
+
+    async def track(self, limit: float = _ORDER) -> None:
+        """Let those at standby that take part track their aims."""
+        idle = self.missing(states.TRACKING)
+        await self._obeyed(lambda names: self._command("TRACK", names), idle, limit)
+
+    async def aim(self, points: Mapping[str, FloatArray], limit: float = _ORDER) -> None:
+        """Give those that take part their aims; who may not have its aim drops out."""
+
+        def ordered(names: tuple[str, ...]) -> Ticket:
+            return self.plant.aim(self.person, self.token, {name: points[name] for name in names})
+
+        await self._obeyed(ordered, self.names, limit)
+
+    def _command(self, name: str, heliostats: tuple[str, ...]) -> Ticket:
+        return self.plant.command(self.person, self.token, name, heliostats)
+
+    async def _obeyed(
+        self, order: Callable[[tuple[str, ...]], Ticket], heliostats: Iterable[str], limit: float
+    ) -> None:
+        """Give an order; drop those that it is refused for, or that do not carry it out."""
+        names = tuple(heliostats)
+        while names:
+            try:
+                ticket = order(names)
+                break
+            except BeamError as error:
+                if not set(error.refusals) & set(names):
+                    raise
+                self.drop({n: f"{n}: {text}" for n, text in error.refusals.items()})
+                names = tuple(name for name in names if name in self.visits)
+        else:
+            return
+        if not await ticket.end(limit):
+            late = dict.fromkeys(ticket.waiting(names), f"{ticket.name} not done in {limit:g} s")
+            self.drop({n: f"{n}: {text}" for n, text in (late | ticket.refusals).items()})
+
+    async def _arrived(self, limit: float) -> None:
+        """Wait until all stay at their aims, in two rows running; who does not arrive drops out."""
+        until, seen = self.plant.now() + limit, dict.fromkeys(self.visits, (self.plant.now(), 0))
+        while any(seen[name][1] < 2 for name in self.visits):
+            await self.look()
+            self.drop(self.missing(states.TRACKING))
+            for name, visit in self.visits.items():
+                counted = float(self.plant.field.counted_at[visit.row])
+                since, count = seen[name]
+                if counted > since:
+                    seen[name] = counted, count + 1 if visit.left() < ARRIVED else 0
+            if self.plant.now() >= until:
+                late = [name for name in self.visits if seen[name][1] < 2]
+                self.drop({name: f"{name}: not at its aim within {limit:g} s" for name in late})
+
+    async def look(self) -> None:
+        """Let a little time pass, and note the step counts that are new."""
+        await sleep_until(self.plant.clock, self.plant.now() + _LOOK)
+        for visit in self.visits.values():
+            visit.note()
+
+    async def leave(self) -> bool:
+        """Bring those home that take part no longer; return whether there were any."""
+        gone = tuple(name for name in self._away if name not in self.visits)
+        if gone:
+            await self._standby(gone)
+        return bool(gone)
+
+    async def home(self) -> None:
+        """Bring all to standby; those that do not go are taken off the target (DEFOCUS).
+
+        Raises
+        ------
+        RefusedError
+            If the plant refuses every motion; the beams are taken off the target then.
+        """
+        if self._away:
+            await self._standby(tuple(self._away))
+
+    async def _standby(self, names: tuple[str, ...]) -> None:
+        """Bring heliostats to standby; those that an order has taken off the target stay there."""
+        field, now = self.plant.field, self.plant.now()
+        heard = {name: int(field.rows["state"][field.place(name)]) for name in names}
+        live = field.live(now)
+        on = tuple(n for n in names if live[field.place(n)] and heard[n] in _ON)
+        left = {n for n in names if n not in on and not (live[field.place(n)] and heard[n] in _OFF)}
+        who = f"joint visit of {self.person.name}"
+        try:
+            able = tuple(name for name in on if not self.plant.waits_to_stow(name))
+            if able:
+                ticket = self._command("IDLE", able)
+                await ticket.end(_HOME)
+                left |= set(ticket.waiting(able)) | set(ticket.refusals)
+        except BeamError as error:
+            left |= set(error.refusals)
+        except (RefusedError, asyncio.CancelledError):
+            self.plant.defocus(who, names)
+            self._away -= set(names)
+            raise
+        if left:
+            self.plant.defocus(who, tuple(sorted(left)))
+        self._away -= set(names)
+
+    async def __aenter__(self) -> "JointVisit":
+        """Begin the visit; at its end all are brought home."""
+        return self
+
+    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Bring them home. A cancelled visit ends as cancelled, even if coming home is refused."""
+        try:
+            await self.home()
+        except RefusedError:
+            if kind is None or not issubclass(kind, asyncio.CancelledError):
+                raise

@@ -1,0 +1,98 @@
+"""Photographs of a target for a stack: its light, seen from the front, without a reading."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.coded import Stack
+from heliotrope.imaging.frame import Image
+from heliotrope.imaging.targets.rectify import Mask, Rectified
+from heliotrope.imaging.targets.view import FaceView
+from heliotrope.plant.visits.photographs import TargetCamera
+
+T = TypeVar("T")
+#: A pixel is left out that is at full scale by this share in any photograph.
+_FULL = 0.01
+
+
+@dataclass(frozen=True)
+class TargetLight:
+    """The light on a target in one photograph.
+
+    Attributes
+    ----------
+    values
+        Brightness over full scale, (H, W), row 0 at the top.
+    step
+        Size of a pixel, m.
+    first
+        Place of the first pixel's centre, m right of and above the target's centre, (2,).
+    seen
+        Pixels that show bare paint of the target, none at full scale, (H, W).
+    exposure
+        Exposure times gain.
+    at
+        Middle of the exposure, s of the plant's monotonic clock.
+    view
+        How the target's face lies in the frame; None where no frame was taken.
+    shift
+        The target's centre in the plane of the face, m, (2,).
+    """
+
+    values: Image
+    step: float
+    first: FloatArray
+    seen: Mask
+    exposure: float
+    at: float
+    view: FaceView | None = None
+    shift: FloatArray = field(default_factory=lambda: np.zeros(2))
+
+    @classmethod
+    def of(cls, picture: Rectified, target: Target, exposure: float, at: float) -> "TargetLight":
+        """Return the light on a target in a picture of its face."""
+        shift = picture.face.plane(target.center)
+        first = picture.first - shift
+        rows, columns = picture.shape
+        x = first[0] + picture.step * np.arange(columns)
+        y = first[1] - picture.step * np.arange(rows)
+        corners = target.plane_coordinates(target.corners)
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        own = ((y >= low[1]) & (y <= high[1]))[:, None] & (x >= low[0]) & (x <= high[0])
+        seen = picture.paint & own & (picture.clipped < _FULL)
+        return cls(picture.values, picture.step, first, seen, exposure, at, picture.view, shift)
+
+    def covariance_at(self, place: FloatArray) -> FloatArray:
+        """Return the covariance of a place (2,) on the target by the view's error, m², (2, 2)."""
+        if self.view is None:
+            return np.zeros((2, 2))
+        return self.view.covariance_at(np.asarray(place) + self.shift)
+
+
+def stack_of(pictures: Sequence[TargetLight], empty: TargetLight) -> Stack:
+    """Return photographs of one target, and of the empty target, as a stack."""
+    seen = np.logical_and.reduce([picture.seen for picture in (*pictures, empty)])
+    return Stack(
+        np.stack([picture.values for picture in pictures]).astype(np.float64),
+        pictures[0].step,
+        pictures[0].first,
+        seen,
+        np.array([picture.exposure for picture in pictures]),
+        np.asarray(empty.values, dtype=np.float64) / empty.exposure,
+    )
+
+
+class StackCamera(TargetCamera, Protocol):
+    """A camera that gives the light on targets, and a place for computations."""
+
+    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
+        """Photograph a target; with the view of an earlier photograph it is not searched for."""
+        ...
+
+    async def beside(self, work: Callable[[], T]) -> T:
+        """Return the result of a computation that must not hold up the loop."""
+        ...

@@ -1,0 +1,322 @@
+"""Joint visits: several mirrors of a simulated plant on one target, told apart by their movements.
+
+Mirrors drive, clusters poll and the plant commands as in operation; only the light is drawn by the
+test's cameras, from where the mirrors truly stand.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from functools import partial
+
+import numpy as np
+import pytest
+
+from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
+from heliotrope.errors import FetchError, InputError
+from heliotrope.field.example import roughly_installed
+from heliotrope.field.layouts import malan_plant
+from heliotrope.geometry import bisector, reflect
+from heliotrope.imaging.coded import Verdict
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.visits import (
+    CalibrationCycle,
+    Centring,
+    CycleResult,
+    CycleSettings,
+    JointCycle,
+    JointSettings,
+)
+from heliotrope.plant.visits.joint_layout import arranged
+from support.live import LiveOptions, LivePlant
+
+START = datetime(2026, 10, 21, 7, tzinfo=UTC)
+ENGINEER = Person("Egon", Role.ENGINEER)
+BIASES = ("azimuth_bias", "elevation_bias")
+#: One sighting is fitted, which the plant's own settings would not do.
+CYCLE = CycleSettings(least=1, model=BIASES, sigma=2e-4)
+_CALIBRATED = CalibrationOutcome.CALIBRATED
+
+
+@dataclass
+class Scene:
+    """A plant whose heliostats are up and calibrated to 0.3 mrad, and an engineer in command."""
+
+    live: LivePlant
+    cycle: JointCycle
+    token: int
+    stages: list[str] = field(default_factory=list)
+    during: Callable[[str], None] = lambda _: None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.live.plant.field.names
+
+    async def run(self, *names: str) -> dict[str, CycleResult]:
+        found = await self.cycle.run(ENGINEER, self.token, names or self.names, "left", self.tell)
+        return {result.heliostat: result for result in found}
+
+    def tell(self, stage: str) -> None:
+        self.stages.append(stage)
+        self.during(stage)
+
+    def photographs(self) -> int:
+        return sum(stage.startswith("photograph") for stage in self.stages)
+
+    def states(self) -> dict[str, str]:
+        rows = self.live.plant.field.rows["state"]
+        return {name: states.STATES[rows[i]] for i, name in enumerate(self.names)}
+
+    def lit(self) -> list[str]:
+        """Heliostats whose beams are on the target, in truth."""
+        target, light = self.live.design.targets[0], self.live.world.sun()
+        normals, vertices = self.live.field.stand()
+        points = target.intersect(vertices, reflect(light, normals))
+        on = target.holds(points)
+        return [name for name, here in zip(self.live.names, on, strict=True) if here]
+
+
+def joint(
+    scene: Callable[[Scene], Awaitable[None]], count: int = 6, *, rendered: bool = False
+) -> None:
+    """Play a scene in virtual time."""
+
+    async def main(clock: VirtualClock) -> None:
+        design = malan_plant(count)
+        installed = partial(roughly_installed, seed=3, scale=0.03)
+        work = AutomaticSettings(wanted=True, calibrate=False)
+        options = LiveOptions(rendered=rendered, threads=0, installed=installed, work=work)
+        live = LivePlant(design, clock, options)
+        plant = live.plant
+        async with live.running():
+            try:
+                until = clock.monotonic() + 600.0
+                while not plant.field.among((states.TRACKING,), plant.now()).all():
+                    assert clock.monotonic() < until
+                    await asyncio.sleep(1.0)
+                await live.operations.automatic.halt()
+                spread, prior = np.diag([9e-8, 9e-8]), np.full(2, 5e-3)
+                for name in plant.field.names:
+                    at = clock.utc().timestamp()
+                    record = HeliostatCalibration(name, at, BIASES, np.zeros(2), spread, prior)
+                    plant.beliefs.take(record)
+                whole = CalibrationCycle(plant, live.cameras, CYCLE, Centring())
+                cycle = JointCycle(plant, live.cameras, whole)
+                token = plant.take_authority(ENGINEER).token
+                await _in_command(Scene(live, cycle, token), scene)
+            finally:
+                await live.operations.automatic.halt()
+                await live.end()
+
+    run_virtual(main, start=START)
+
+
+async def _in_command(made: Scene, scene: Callable[[Scene], Awaitable[None]]) -> None:
+    async def stay() -> None:
+        plant = made.live.plant
+        while True:
+            if plant.authority.token == made.token:
+                plant.authority.keep(ENGINEER, made.token)
+            await asyncio.sleep(1.0)
+
+    async with asyncio.TaskGroup() as group:
+        staying = group.create_task(stay())
+        try:
+            await scene(made)
+        finally:
+            staying.cancel()
+
+
+def spoil(scene: Scene, stuck: str = "", traded: tuple[str, ...] = ()) -> None:
+    """From the first photograph on a mirror stands still, and two send their beams crosswise."""
+    live, target = scene.live, scene.live.design.targets[0]
+    true, held, aims = live.field.stand, {}, []
+
+    def during(stage: str) -> None:
+        if stage.startswith("photograph 1 ") and not aims:
+            aims.append(live.plant.aims.copy())  # before the first movement
+
+    scene.during = during
+
+    def stand() -> tuple[np.ndarray, np.ndarray]:
+        normals, vertices = (np.array(each) for each in true())
+        if scene.photographs():
+            light = live.world.sun()
+            if stuck:
+                row = live.names.index(stuck)
+                normals[row] = held.setdefault(stuck, normals[row].copy())
+            rows = [live.names.index(name) for name in traded]
+            points = target.intersect(vertices, reflect(light, normals))
+            places = [live.plant.field.place(name) for name in traded]
+            for row, mine, other in zip(rows, places, places[::-1], strict=True):
+                there = points[row] + aims[0][other] - aims[0][mine]
+                way = there - vertices[row]
+                normals[row] = bisector(light, way / np.linalg.norm(way))
+        return normals, vertices
+
+    live.field.stand = stand  # type: ignore[method-assign]
+
+
+def test_mirrors_on_one_target_are_calibrated_together() -> None:
+    async def scene(here: Scene) -> None:
+        plant = here.live.plant
+        before, aims = here.live.errors(), plant.aims.copy()
+        results = await here.run()
+        assert {r.outcome for r in results.values()} == {_CALIBRATED}, results
+        assert all(r.verdict is None and r.new == 1 for r in results.values())
+        await asyncio.sleep(30.0)
+        after = here.live.errors()
+        assert np.median(after) < 0.75 * np.median(before)
+        for name in here.names:
+            seen, row = plant.beliefs.seen(name), here.live.names.index(name)
+            assert seen is not None
+            true = here.live.truth[np.array([row])]
+            assert beam_errors(true, seen.sightings).beam[0] < 0.6e-3, "what it saw is true"
+        assert here.photographs() == 8, "three codes are enough for six beams on 12 m"
+        # They tracked the receiver before, and do so again.
+        assert set(here.states().values()) == {"TRACKING"}
+        np.testing.assert_array_equal(plant.aims, aims)
+        assert here.lit() == []
+
+    joint(scene)
+
+
+def test_drawn_photographs_name_a_stuck_mirror_and_an_exchanged_pair() -> None:
+    async def scene(here: Scene) -> None:
+        stuck, one, other = here.names[1], here.names[2], here.names[3]
+        spoil(here, stuck, (one, other))
+        version = {name: here.live.plant.beliefs.record(name) for name in here.names}
+        results = await here.run()
+        bad = {name: r.verdict for name, r in results.items() if r.verdict is not None}
+        assert bad == {
+            stuck: Verdict.STUCK,
+            one: Verdict.EXCHANGED,
+            other: Verdict.EXCHANGED,
+        }, results
+        assert f"({other})" in results[one].text
+        for name in bad:
+            assert results[name].outcome is CalibrationOutcome.NOT_PROVEN
+            assert here.live.plant.beliefs.record(name) is version[name]
+            assert here.live.plant.beliefs.seen(name) is None
+        good = [r for name, r in results.items() if name not in bad]
+        assert {r.outcome for r in good} == {_CALIBRATED}, results
+
+    joint(scene, rendered=True)
+
+
+def test_one_that_is_stowed_meanwhile_drops_out_and_the_others_go_on() -> None:
+    async def scene(here: Scene) -> None:
+        gone, plant = here.names[4], here.live.plant
+
+        def during(stage: str) -> None:
+            if stage.startswith("photograph 3 "):
+                here.during = lambda _: None
+                plant.stow("Vera", (gone,))
+
+        here.during = during
+        results = await here.run()
+        assert results[gone].outcome is CalibrationOutcome.REFUSED
+        assert "STOWING" in results[gone].text
+        good = [r for name, r in results.items() if name != gone]
+        assert {r.outcome for r in good} == {_CALIBRATED}, results
+        # The codes of the others begin anew: eight photographs in a row without the light of it.
+        assert 8 < here.photographs() < 20
+        await asyncio.sleep(120.0)
+        assert here.states()[gone] == "STOWED", "a person's order is not undone"
+
+    joint(scene)
+
+
+def test_an_emergency_a_lost_authority_or_a_blind_camera_ends_it_cleanly() -> None:
+    async def scene(here: Scene) -> None:
+        plant, camera = here.live.plant, here.live.cameras
+        real = camera.light
+
+        async def blind(*_: object) -> None:
+            if here.photographs() > 2:
+                raise FetchError("camera left: no frame for 15 s")
+            return await real(here.live.design.targets[0])
+
+        camera.light = blind  # type: ignore[method-assign, assignment]
+        with pytest.raises(FetchError, match="no frame"):
+            await here.run()
+        assert set(here.states().values()) == {"IDLE"}
+        camera.light = real  # type: ignore[method-assign]
+
+        here.stages.clear()
+        here.during = lambda stage: (
+            plant.release_authority(ENGINEER, here.token)
+            if stage.startswith("photograph 4 ")
+            else None
+        )
+        with pytest.raises(RefusedError, match="nobody has it"):
+            await here.run()
+        await asyncio.sleep(5.0)
+        assert set(here.states().values()) == {"DEFOCUSED"}
+        assert here.lit() == []
+
+        here.token = plant.take_authority(ENGINEER).token
+        await asyncio.sleep(5.0)
+        ticket = plant.command(ENGINEER, here.token, "IDLE")
+        assert await ticket.end(120.0), ticket.text
+        here.stages.clear()
+        here.during = lambda stage: (
+            plant.raise_emergency("anybody") and None if stage.startswith("photograph 4 ") else None
+        )
+        with pytest.raises(RefusedError, match="emergency"):
+            await here.run()
+        await asyncio.sleep(10.0)
+        assert not set(here.states().values()) & {"TRACKING", "IDLE"}
+        assert here.lit() == []
+        assert all(plant.beliefs.seen(name) is None for name in here.names)
+
+    joint(scene)
+
+
+def test_who_is_not_known_well_enough_or_would_be_too_bright_has_no_place() -> None:
+    async def scene(here: Scene) -> None:
+        plant, target = here.live.plant, here.live.design.targets[0]
+        name, at = here.names[0], here.live.clock.utc().timestamp()
+        wide = np.diag([1e-5, 1e-5])
+        plant.beliefs.take(
+            HeliostatCalibration(name, at, BIASES, np.zeros(2), wide, np.full(2, 5e-3))
+        )
+        layout, wrong = arranged(plant, target, here.names, JointSettings())
+        assert list(wrong) == [name]
+        assert "known to" in wrong[name]
+        assert layout.names == here.names[1:]
+        away = np.abs(target.plane_coordinates(layout.aims))
+        assert (away < 0.5 * target.width - 1.0).all(), "the beams keep off the border"
+        sizes = np.abs(layout.moves).max(axis=(0, 2))
+        slant = np.linalg.norm(plant.beams.armature.origin_1[1:] - target.center, axis=-1)
+        np.testing.assert_allclose(sizes, 5e-4 * slant)
+        alone, _ = arranged(plant, target, here.names[1:2], JointSettings(brightest=0.1))
+        assert len(alone.names) == 1
+        crowd = replace(target, corners=target.center + 0.3 * (target.corners - target.center))
+        dim = JointSettings(brightest=5.0)
+        fewer, wrong = arranged(plant, crowd, here.names[1:], dim)
+        assert 0 < len(fewer.names) < 5
+        assert all("would exceed 5 suns" in text for text in wrong.values())
+        most, wrong = arranged(plant, target, here.names[1:], JointSettings(most=3, least=2))
+        assert len(most.names) == 3
+        assert len(wrong) == 2
+
+    joint(scene)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"least": 9, "most": 8}, "9 to 8 heliostats"),
+        ({"movement": 0.0}, "movements of 0 mrad"),
+        ({"brightest": 0.0}, "up to 0 suns"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(wrong: dict[str, float], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        JointSettings(**wrong)  # type: ignore[arg-type]
