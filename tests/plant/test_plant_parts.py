@@ -401,13 +401,16 @@ class _Endless:
     def learn(self, *_: object) -> None:
         pass
 
+    def drift(self, *_: object) -> None:
+        pass
+
 
 def test_a_plan_is_made_when_it_is_as_long_as_it_is_shown() -> None:
     found = _Endless(50)
     plant = SimpleNamespace(
         now=lambda: 100.0,
         clock=VirtualClock(lambda: 0.0, AT),
-        beliefs=SimpleNamespace(subscribe=lambda learn: None),
+        beliefs=SimpleNamespace(subscribe=lambda learn: None, subscribe_drift=lambda learn: None),
     )
     schedule = PlantSchedule(plant, found)  # type: ignore[arg-type]
     schedule._states = lambda ready: None  # type: ignore[assignment,method-assign]
