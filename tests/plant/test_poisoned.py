@@ -9,6 +9,7 @@ from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.field.target import Target
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism.board_items import checksums
+from heliotrope.plant.beam_watch import BeamWatch
 from heliotrope.plant.visits import CalibrationCycle, CycleResult, CycleSettings
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.settings import Centring
@@ -70,6 +71,38 @@ def test_the_same_false_light_on_a_first_visit_changes_nothing(tmp_path: Path, l
     assert result.outcome is CalibrationOutcome.NOT_VERIFIED, result.text
     assert "the old parameters are back" in result.text
     assert result.record is None
+
+
+def test_new_parameters_go_back_where_no_way_to_their_photograph_is_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wrong(self: BeamWatch, *_: object) -> dict[str, str]:
+        return dict.fromkeys([NAME] if self._earlier else [], "the beam enters walkway")
+
+    monkeypatch.setattr(BeamWatch, "_by_earlier", wrong)
+    results: list[CycleResult] = []
+
+    async def main(clock: VirtualClock) -> None:
+        whole = WholePlant(clock, tmp_path, clusters=1)
+        async with whole.alive():
+            plant, token = whole.plant, whole.token
+            assert await plant.command(ENGINEER, token, "APPROACH", (NAME,)).end(400.0)
+            stored = await plant.stored(NAME)
+            cycle = CalibrationCycle(plant, Liar(whole, 0), CycleSettings(interval=5.0))
+            results.append(await cycle.run(ENGINEER, token, NAME, "white"))
+            again = await plant.stored(NAME)
+            assert {**again, "edition": 0} == {**stored, "edition": 0}
+            assert again["edition"] > stored["edition"]  # others were written in between
+            assert NAME not in plant.wanted.missing
+            assert whole.states()[NAME] == "IDLE"
+
+    run_virtual(main, 1)
+    (result,) = results
+    assert result.outcome is CalibrationOutcome.NOT_VERIFIED, result.text
+    assert (
+        "no free way to their photograph: the beam enters walkway; the old parameters are"
+        in result.text
+    )
 
 
 class Still:

@@ -635,6 +635,47 @@ def test_parameters_that_would_lead_the_present_beam_into_a_volume_are_not_writt
     play(tmp_path, scene)
 
 
+@pytest.mark.parametrize("name", ["TRACK", "IDLE"])
+def test_unverified_parameters_lead_no_beam_into_a_volume_if_the_earlier_are_right(
+    tmp_path: Path, name: str
+) -> None:
+    """To the verifying photograph, and back: the true beam may be where the earlier ones say."""
+    point = (-3.5, -12.0, 8.0)
+
+    async def scene(bench: Bench) -> None:
+        plant, ways = bench.plant, bench.plant._ways
+        place = plant.field.place("P5A")
+        (plant.aims if name == "TRACK" else plant.standbys)[place] = point
+        state = states.IDLE if name == "TRACK" else states.TRACKING
+        await stands(bench, "P5A", state, counts(plant, "P5A", WEST))
+
+        def why() -> dict[str, str]:
+            if name == "TRACK":
+                return ways.joining("TRACK", (), ("P5A",))
+            return ways._back_to_standby(np.array([place]))
+
+        group, row = DESIGN.find("P5A")
+        nominal, seen = group.mechanism[row], {True: 0, False: 0}
+        for lean in np.linspace(-0.1, 0.1, 21):
+            new = nominal.with_parameters({"canting": lean})
+            # The oracle: where the present mirror shines in the pose that the new one takes.
+            pose = nominal.pose(np.round(track(new, plant.sun_vector(), point).best_counts))
+            ray = reflect(plant.sun_vector(), pose.normal)
+            way = np.array(WALKWAY.center) - pose.vertex
+            inside = float(np.linalg.norm(way - ray * (way @ ray))) < WALKWAY.radius
+            seen[inside] += 1
+            with plant.unverified("P5A"):
+                plant.want("P5A", new)
+                assert not inside or "walkway" in why()["P5A"]
+                unproven = why()
+            plant.want("P5A", nominal)
+            assert lean or not unproven
+        assert min(seen.values()) > 0
+        assert not why()
+
+    play(tmp_path, scene)
+
+
 def test_an_approach_of_many_is_proven_and_sent_in_slices(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

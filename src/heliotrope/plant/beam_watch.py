@@ -3,7 +3,8 @@
 The watch over beams that light a receiver unsent is `unsent`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,7 @@ from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import Points
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.leaving import way_out
+from heliotrope.plant.parameters import Tables
 from heliotrope.plant.refusals import BEAM_REFUSED, RefusedError
 from heliotrope.plant.unsent import TURNS, UnsentBeams
 from heliotrope.plant.ways import Ways
@@ -104,6 +106,8 @@ class BeamWatch:
         self._machines = machines
         self._ways = Ways(check, machines)
         self.unsent = UnsentBeams(check, field, sun, machines)
+        #: Tables that unverified ones have replaced, by row.
+        self._earlier: dict[int, Tables] = {}
         self._seen: frozenset[str] = frozenset()
         self._turn = 0
         self._at = -np.inf
@@ -169,6 +173,7 @@ class BeamWatch:
         """Return which heliostats may not go straight to their standby points, and why."""
         rows, wrong = self._resting(rows)
         light = self._sun(0.0)
+        wrong |= self._by_earlier(rows, self.points.standbys[rows])
         rows, path = self._to_standby(rows, light)
         return wrong | self._check.moving(rows, path, light)
 
@@ -198,24 +203,68 @@ class BeamWatch:
         row = self._field.place(heliostat)
         if not self._check.volumes or not np.isfinite(self._field.posed_at[row]):
             return ""
-        rows, light = np.array([row]), self._sun(0.0)
-        present = self._check.armature.table[row].copy(), self._check.drives.table[row].copy()
-        try:
-            for tables in (present, (armature, drives)):
-                self._check.replace(row, *tables)
+        rows, new, present = np.array([row]), (armature, drives), self._tables(row)
+        for tables in (present, new):
+            with self._believing(row, tables):
                 if wrong := self._from_here(rows):
                     return wrong[heliostat].partition(";")[0]
-            counts, standbys = self._field.counts(rows), self.points.standbys[rows]
-            if not np.isfinite(standbys).all():
-                return ""
-            ends = self._check.poses(rows, standbys, light, counts).best_counts
-            self._check.replace(row, *present)
-            path = self._ways.motion(rows, counts, ends)
-            if wrong := self._check.moving(rows, path, light):
-                return wrong[heliostat].partition(";")[0]
+        standbys = self.points.standbys[rows]
+        with self._believing(row, new):
+            wrong = self._misled(rows, standbys, present)
+        return wrong[heliostat].partition(";")[0] if wrong else ""
+
+    @contextmanager
+    def unverified(self, heliostat: str) -> Iterator[None]:
+        """Prove ways with the present parameters too, while others that replace them are verified.
+
+        By those, the heliostat goes to a target and comes back; if they are wrong, its beam is
+        where the present ones say.
+        """
+        row = self._field.place(heliostat)
+        self._earlier[row] = self._tables(row)
+        try:
+            yield
+        finally:
+            self._earlier.pop(row, None)
+
+    def misled(self, heliostat: str, point: FloatArray) -> str:
+        """Return why unverified parameters may not lead a beam to a point (3,), "" if they may."""
+        rows = np.array([self._field.place(heliostat)])
+        wrong = self._by_earlier(rows, point[None])
+        return wrong[heliostat].partition(";")[0] if wrong else ""
+
+    def _tables(self, row: int) -> Tables:
+        return self._check.armature.table[row].copy(), self._check.drives.table[row].copy()
+
+    @contextmanager
+    def _believing(self, row: int, tables: Tables) -> Iterator[None]:
+        """Prove with other tables of a heliostat."""
+        present = self._tables(row)
+        self._check.replace(row, *tables)
+        try:
+            yield
         finally:
             self._check.replace(row, *present)
-        return ""
+
+    def _misled(self, rows: Rows, point: FloatArray, tables: Tables) -> dict[str, str]:
+        """Return why the way on which one heliostat is led to a point (1, 3) is not free.
+
+        The parameters of the check lead it, and the beam goes by ``tables``.
+        """
+        if not np.isfinite(point).all():
+            return {}
+        counts, light = self._field.counts(rows), self._sun(0.0)
+        ends = self._check.poses(rows, point, light, counts).best_counts
+        with self._believing(int(rows[0]), tables):
+            return self._check.moving(rows, self._ways.motion(rows, counts, ends), light)
+
+    def _by_earlier(self, rows: Rows, points: FloatArray) -> dict[str, str]:
+        """Return which ways to points (K, 3) are not free by parameters that were replaced."""
+        found: dict[str, str] = {}
+        for i, row in enumerate(rows.tolist()):
+            if row in self._earlier:
+                found |= self._misled(rows[i : i + 1], points[i : i + 1], self._earlier[row])
+        return found
 
     def _from_here(self, rows: Rows) -> dict[str, str]:
         """Return which heliostats may not go from where they stand to standby, and why."""
@@ -246,6 +295,7 @@ class BeamWatch:
         if not unknown.all():
             known = rows[~unknown]
             counts, light = self._field.counts(known), self._sun(0.0)
+            found |= self._by_earlier(known, aims[~unknown])
             found |= self._check.on_the_way(known, counts, aims[~unknown], light, self._ways.motion)
             if name == "SEARCH":
                 found |= self._check.around(known, aims[~unknown], values[1], light)

@@ -14,7 +14,8 @@ import asyncio
 import math
 import secrets
 from collections import deque
-from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -746,6 +747,19 @@ class PlantController:
         row = self.field.place(heliostat)
         before = self.beams.armature.table[row].copy(), self.beams.drives.table[row].copy()
         return before, tables_with(items, *before) if POSE_ITEMS.intersection(items) else before
+
+    @contextmanager
+    def unverified(self, heliostat: str) -> Iterator[None]:
+        """Trust new parameters of a heliostat as little as the present ones, until verified.
+
+        It may not join the receiver, and its ways are proven with both.
+        """
+        with self.doubts.unverified(heliostat), self._ways.unverified(heliostat):
+            yield
+
+    def misled(self, heliostat: str, point: FloatArray) -> str:
+        """Return why unverified parameters may not lead a beam to a point (3,), "" if they may."""
+        return self._ways.misled(heliostat, point)
 
     def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
         return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])

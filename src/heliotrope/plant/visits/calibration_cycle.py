@@ -263,7 +263,7 @@ class CalibrationCycle:
             found = await stepwise(fitting(beliefs, self.settings, model, name, every))
         pushed: tuple[str, ...] = ()
         if not found.problem:
-            with self._plant.doubts.unverified(name):
+            with self._plant.unverified(name):
                 found, pushed = await self._try(visit, found, here, taken, tell)
         if found.problem and (not old or found.outcome is CalibrationOutcome.NOT_VERIFIED):
             # No earlier sighting supports these, or a later photograph contradicts them: drop them.

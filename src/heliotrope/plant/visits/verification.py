@@ -133,7 +133,8 @@ class Verification:
         self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
     ) -> str:
         point = apart(visit.target, [shot.point for shot in used], room_of(visit, self._centring))
-        why = ""
+        if why := visit.plant.misled(visit.heliostat, point):
+            return f"the new parameters have no free way to their photograph: {why}"
         async with visit:
             tell("verification")
             await visit.go(self._settings.arrival, point)
