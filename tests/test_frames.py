@@ -99,6 +99,11 @@ def test_every_record_has_a_frame_and_a_dataset(learned: ht.Learned, tmp_path: P
         "forecast": learned.forecast("P6A", TIMES[:5], "target"),
         "errors": ht.beam_errors(PLANT["P6A"], seen),
         "predicted": predict(learned, seen),
+        "path": day.path,
+        "fit": ht.fit(PLANT["P6A"], seen, "guo6"),
+        "fits": learned.static,
+        "heliostats": PLANT.groups["azel"].with_parameters({"canting": 1e-3}),
+        "plant": PLANT,
     }
     for name, record in records.items():
         frame, data = record.to_frame(), record.to_xarray()
@@ -119,6 +124,13 @@ def test_every_record_has_a_frame_and_a_dataset(learned: ht.Learned, tmp_path: P
     np.testing.assert_array_equal(one["sun_up"], day.sun[:, 2])
     assert day.to_xarray()["angle"].attrs["units"] == "rad"
     assert set(seen.to_frame()["heliostat"]) == {"P6A"}
+    units = records["fit"].to_frame().attrs["units"]
+    assert units["value_tilt_north"] == units["sigma_canting"] == "rad"
+    assert learned.to_frame().attrs["units"]["value_tilt_north"] == "rad"
+    assert set(learned.to_xarray()["value"].attrs["units"].split(", ")) == {"rad"}
+    assert records["heliostats"].to_frame().loc["P6A", "canting"] == 1e-3
+    place = PLANT.to_frame().loc["P6A", ["position_east", "position_north", "position_up"]]
+    np.testing.assert_array_equal(place.to_numpy(float), PLANT["P6A"].nominal.position)
     value = learned.to_frame().loc["P6A", "value_tilt_north"]
     assert value == pytest.approx(learned.parameters_at([0], TIMES[UP][-1])[0][0, 0])
 

@@ -118,6 +118,7 @@ SUN = [
     Wrong(lambda: ht.sun.vector([0.0, NAN], SITE), "times[1]", "nan", "unix seconds", TimeError),
     Wrong(lambda: ht.sun.vector(np.datetime64("2026-09-02"), SITE), "times", "datetime64", "time zone", TimeError),
     Wrong(lambda: ht.sun.vector(1e13, SITE), "times", "year", "6000", TimeError),
+    Wrong(lambda: row(time=1.788e12), "times", "1788000000000 s", "unix seconds", TimeError),
     Wrong(lambda: ht.sun.vector(NOON, Location(-33.9, 18.9)), "site", "pvlib Location", "Site(latitude_deg"),
     Wrong(lambda: ht.sun.vector(NOON, (-33.9, 18.9, 120.0)), "site", "tuple", "Site(latitude_deg"),
     Wrong(lambda: ht.sun.position(NOON, SITE, algorithm="spa2"), "algorithm", "'spa2'", "spa", UnknownNameError),

@@ -28,11 +28,16 @@ ACROSS = ("right", "up")
 
 @dataclass(frozen=True)
 class Variable:
-    """An array with the names of its axes, and its unit ("" for none)."""
+    """An array with the names of its axes, and its unit ("" for none) or those along the last."""
 
     axes: tuple[str, ...]
     values: npt.ArrayLike
-    unit: str = ""
+    unit: str | tuple[str, ...] = ""
+
+    @property
+    def units(self) -> str:
+        """The unit, or those along the last axis in their order."""
+        return self.unit if isinstance(self.unit, str) else ", ".join(u or "1" for u in self.unit)
 
 
 @dataclass(frozen=True)
@@ -89,7 +94,7 @@ class Framed:
             for k, names in enumerate(labels):
                 column = "_".join((name, *names))
                 columns[column] = np.array(flat[:, k])
-                units[column] = one.unit
+                units[column] = one.unit if isinstance(one.unit, str) else one.unit[k]
         parts = [_index(given.labels[axis]) for axis in given.rows]
         index: Any = parts[0] if len(parts) == 1 else pd.MultiIndex.from_product(parts)
         index.names = list(given.rows)
@@ -110,7 +115,7 @@ class Framed:
         given = self._labelled()
         return xarray.Dataset(
             {
-                name: (one.axes, np.asarray(one.values), {"units": one.unit} if one.unit else {})
+                name: (one.axes, np.asarray(one.values), {"units": one.units} if one.units else {})
                 for name, one in given.variables.items()
             },
             coords={axis: _plain(labels) for axis, labels in given.labels.items()},

@@ -67,16 +67,7 @@ class TrackedDay(Value, Framed):
         return Labelled(
             row,
             labels,
-            {
-                "angle": Variable((*row, "joint"), path.angles, "rad"),
-                "count": Variable((*row, "joint"), path.counts),
-                "normal": Variable((*row, "axis"), path.normal),
-                "residual": Variable(row, path.residual, "rad"),
-                "reachable": Variable(row, path.reachable),
-                "branch": Variable(row, path.branch),
-                "over_the_top": Variable(row, path.over_the_top),
-                "sun": Variable(("time", "axis"), self.sun),
-            },
+            {**path.variables(row), "sun": Variable(("time", "axis"), self.sun)},
             notes={} if many else {"heliostat": "".join(self.names)},
         )
 

@@ -8,11 +8,13 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
+from heliotrope.mechanism.parameters import unit_of
 from heliotrope.values import Card, Value, amount, card_of_arrays, dots, span
 
 
@@ -43,7 +45,7 @@ class Facets(Value):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Heliostats(Value):
+class Heliostats(Value, Framed):
     """N heliostats of one kind.
 
     Attributes
@@ -128,6 +130,22 @@ class Heliostats(Value):
         ]
         header = ("heliostat", "east, m", "north, m", "up, m", "mirror, m")
         return Card(line, header, rows, dots(places[:, 0], places[:, 1], "map"))
+
+    def _labelled(self) -> Labelled:
+        row = ("heliostat",)
+        variables = {
+            "position": Variable((*row, "axis"), self.position, "m"),
+            "width": Variable(row, self.width, "m"),
+            "height": Variable(row, self.height, "m"),
+        }
+        if self.aim is not None:
+            variables["aim"] = Variable((*row, "axis"), self.aim, "m")
+        if self.cluster:
+            variables["cluster"] = Variable(row, np.array(self.cluster, dtype=str))
+        for name, values in self.parameters.items():
+            variables[name] = Variable(row, values, unit_of(name))
+        labels = {"heliostat": self.names, "axis": ENU}
+        return Labelled(row, labels, variables, notes={"kind": self.mechanism.kind})
 
     @property
     def mirror(self) -> str:

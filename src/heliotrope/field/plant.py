@@ -13,6 +13,7 @@ from heliotrope.field.heliostat import Heliostat
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Volume
+from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Mechanism, join_mechanisms
@@ -25,7 +26,7 @@ Surface = TypeVar("Surface", Target, Receiver, Camera)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Plant(Value):
+class Plant(Value, Framed):
     """A solar tower plant.
 
     Attributes
@@ -106,6 +107,26 @@ class Plant(Value):
         header = ("group", "heliostats", "kind", "mirrors", "calibrated")
         places = self.position
         return Card(line, header, rows, dots(places[:, 0], places[:, 1], "map"))
+
+    def _labelled(self) -> Labelled:
+        row, groups = ("heliostat",), self.groups.items()
+
+        def of_all(name: str) -> FloatArray:
+            return np.concatenate([getattr(group, name) for _, group in groups])
+
+        return Labelled(
+            row,
+            {"heliostat": self.names, "axis": ENU},
+            {
+                "position": Variable((*row, "axis"), self.position, "m"),
+                "width": Variable(row, of_all("width"), "m"),
+                "height": Variable(row, of_all("height"), "m"),
+                "group": Variable(
+                    row, np.repeat([n for n, _ in groups], [len(g) for _, g in groups])
+                ),
+            },
+            notes={"name": self.name},
+        )
 
     def __len__(self) -> int:
         return sum(len(group) for group in self.groups.values())

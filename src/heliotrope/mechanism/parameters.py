@@ -383,12 +383,17 @@ def _role(role: str, known: dict[str, Parameter]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def shown_in(name: str) -> tuple[float, str]:
-    """Return the factor and the unit in which people read a parameter: mrad, mm or none."""
+def unit_of(name: str) -> str:
+    """Return the unit of a parameter, "" where it has none."""
     rows = (*_PLACE, *_JOINTS.values(), _SAG)
     units = {row.name: row.unit for row in rows}
     units |= {suffix: row.unit for suffix, _, row in (*_ANY_DRIVE, *_LINEAR_DRIVE)}
     found = units.get(name) or next(
         (unit for end, unit in units.items() if name.endswith(f"_{end}")), "1"
     )
-    return {"rad": (1e3, "mrad"), "m": (1e3, "mm")}.get(found, (1.0, ""))
+    return "" if found == "1" else found
+
+
+def shown_in(name: str) -> tuple[float, str]:
+    """Return the factor and the unit in which people read a parameter: mrad, mm or none."""
+    return {"rad": (1e3, "mrad"), "m": (1e3, "mm")}.get(unit_of(name), (1.0, ""))

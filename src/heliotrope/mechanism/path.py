@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
+from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.geometry import TAU, FloatArray, angle_between, as_float, as_vectors, wrap_signed
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.kernels import slots as slot
@@ -54,7 +55,7 @@ class Slew(Value):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TrackedPath(Value):
+class TrackedPath(Value, Framed):
     """Poses at T times in their order; (...) are the batch axes of the heliostats.
 
     Attributes
@@ -97,6 +98,26 @@ class TrackedPath(Value):
         ]
         rows += [(f"slew before pose {s.step}", s.reason) for s in self.slews]
         return Card(line, ("part", "range"), rows)
+
+    def _labelled(self) -> Labelled:
+        shape, axes = self.status.shape, self.angles.shape[-1]
+        row = ("step", *(f"axis_{k}" for k in range(1, len(shape))))
+        labels: dict[str, npt.ArrayLike] = {"joint": np.arange(1, axes + 1), "axis": ENU}
+        labels |= {name: np.arange(n) for name, n in zip(row, shape, strict=True)}
+        return Labelled(row, labels, self.variables(row))
+
+    def variables(self, row: tuple[str, ...]) -> dict[str, Variable]:
+        """Return the arrays for a frame, by name; ``row`` names the axes (T, ...)."""
+        return {
+            "angle": Variable((*row, "joint"), self.angles, "rad"),
+            "count": Variable((*row, "joint"), self.counts),
+            "normal": Variable((*row, "axis"), self.normal),
+            "vertex": Variable((*row, "axis"), self.vertex, "m"),
+            "residual": Variable(row, self.residual, "rad"),
+            "reachable": Variable(row, self.reachable),
+            "branch": Variable(row, self.branch),
+            "over_the_top": Variable(row, self.over_the_top),
+        }
 
     @property
     def reachable(self) -> npt.NDArray[np.bool_]:

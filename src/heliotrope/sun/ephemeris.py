@@ -532,6 +532,10 @@ def unix_seconds(times: Times, *, unknown: bool = False) -> FloatArray:
     for index in np.argwhere(wrong)[:1]:
         value = np.asarray(times, dtype=object)[tuple(index)]
         raise _no_time(value, index)
+    # Milliseconds of our time are tens of thousands of years away.
+    _refuse_outside(
+        seconds, _FIRST_YEAR, _LAST_YEAR, "the validity of SPA; numbers are unix seconds"
+    )
     return seconds
 
 
@@ -598,10 +602,7 @@ def _label(index: Sequence[int]) -> str:
 
 
 def _check_years(seconds: FloatArray, site: Site) -> None:
-    """Refuse times outside the validity of SPA or of its ΔT."""
-    _refuse_outside(
-        seconds, _FIRST_YEAR, _LAST_YEAR, "the validity of SPA; numbers are unix seconds"
-    )
+    """Refuse times outside the validity of ΔT; those outside that of SPA are no times."""
     if site.delta_t is None:
         _refuse_outside(
             seconds, _FIRST_DELTA_T, _LAST_DELTA_T, "the known ΔT; give Site(delta_t=...) in s"

@@ -23,6 +23,7 @@ from heliotrope.calibration.fit.residuals import whitening
 from heliotrope.calibration.named import Field, members
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError, UnknownNameError, kind_of
+from heliotrope.frames import Framed, Labelled, Variable
 from heliotrope.geometry import (
     FloatArray,
     angle_between,
@@ -68,7 +69,7 @@ _TEXTS = {
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FieldFit(Value):
+class FieldFit(Value, Framed):
     """Fitted parameters of N heliostats, P each; without N where one mechanism was fitted.
 
     Attributes
@@ -115,6 +116,35 @@ class FieldFit(Value):
         header = ("parameter", "median size" if many else "value", "median σ" if many else "σ")
         sizes = np.abs(self.values) if many else np.atleast_2d(self.values)
         return Card(line, header, parameter_rows(self.names, sizes, np.atleast_2d(self.sigma)))
+
+    def _labelled(self) -> Labelled:
+        row, units = ("heliostat",), tuple(map(parameter_table.unit_of, self.names))
+        size = len(self.names)
+
+        def table(values: FloatArray) -> Variable:
+            return Variable((*row, "parameter"), values.reshape(-1, size), units)
+
+        return Labelled(
+            row,
+            {
+                "heliostat": np.arange(np.size(self.scale)),
+                "parameter": self.names,
+                "parameter_2": self.names,
+            },
+            {
+                "value": table(self.values),
+                "sigma": table(self.sigma),
+                "prior": table(self.prior),
+                "centre": table(self.centre),
+                "covariance": Variable(
+                    (*row, "parameter", "parameter_2"), self.covariance.reshape(-1, size, size)
+                ),
+                "scale": Variable(row, np.atleast_1d(self.scale)),
+                "sightings": Variable(row, np.atleast_1d(self.count)),
+                "outcome": Variable(row, np.atleast_1d(self.outcome)),
+            },
+            frozenset({"covariance"}),
+        )
 
     @property
     def parameters(self) -> dict[str, FloatArray]:

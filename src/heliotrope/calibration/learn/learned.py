@@ -26,6 +26,7 @@ from heliotrope.frames import ACROSS, Framed, Labelled, Variable
 from heliotrope.frames import times as as_times
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.parameters import unit_of
 from heliotrope.mechanism.tracking import track
 from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.sun import Site, Times, unix_seconds
@@ -192,7 +193,7 @@ class Learned(Value, Framed):
             amount(int(self.outlier.sum()), "outlier"),
             f"{self.unusable.sum()} unusable",
             amount(model, "constant parameter"),
-            f"{amount(all_names - model, 'parameter')} that only drift",
+            f"{amount(all_names - model, 'parameter')} that may only drift",
         ]
         static = self.static
         rows = parameter_rows(static.names, np.abs(static.values), static.sigma)
@@ -245,7 +246,7 @@ class Learned(Value, Framed):
         known = self.sightings.time[self.used & np.isfinite(self.sightings.time)]
         last = float(known.max()) if len(known) else np.nan
         values, spread = self.parameters_at(np.arange(count), last)
-        units = ", ".join(f"{n} {self.mechanism.parameter(n).unit}" for n in self.names)
+        units = tuple(map(unit_of, self.names))
         return Labelled(
             row,
             {
@@ -254,16 +255,16 @@ class Learned(Value, Framed):
                 "parameter_2": self.names,
             },
             {
-                "value": Variable((*row, "parameter"), values),
+                "value": Variable((*row, "parameter"), values, units),
                 "sigma": Variable(
-                    (*row, "parameter"), np.sqrt(np.diagonal(spread, axis1=-2, axis2=-1))
+                    (*row, "parameter"), np.sqrt(np.diagonal(spread, axis1=-2, axis2=-1)), units
                 ),
                 "covariance": Variable((*row, "parameter", "parameter_2"), spread),
                 "noise": Variable(row, np.array([m.hyper.noise for m in self.members])),
                 "sightings": Variable(row, np.array([len(m.data) for m in self.members])),
             },
             frozenset({"covariance"}),
-            {"units of the parameters": units, "time": str(as_times(last))},
+            {"time": str(as_times(last))},
         )
 
     @property
