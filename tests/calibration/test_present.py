@@ -11,7 +11,7 @@ from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome, fit
 from heliotrope.calibration.learn import drift, present
 from heliotrope.calibration.sightings import Sightings, sightings
 from heliotrope.field.layouts import malan_plant
-from heliotrope.geometry import MRAD, FloatArray, reflect
+from heliotrope.geometry import MRAD, FloatArray, angle_between, reflect
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
 from heliotrope.sun import vector
@@ -26,18 +26,16 @@ DAY, SIGMA = 86400.0, 2e-4
 TIMES = BEGIN + (3.0 * np.arange(20)[:, None] + np.array([7.0, 11.0, 15.0]) / 24.0).ravel() * DAY
 
 
-def photographs(zero: FloatArray, seed: int = 1) -> Sightings:
-    """Sightings at `TIMES` of a mirror whose first zero is off by ``zero`` (60,), rad."""
-    suns = vector(TIMES, PLANT.site)
-    counts = track(NOMINAL[np.zeros(len(TIMES), np.intp)], suns, AIM).best_counts
-    truth = NOMINAL[np.zeros(len(TIMES), np.intp)].with_parameters(
-        {ZEROS[0]: zero, "tilt_east": np.full(len(TIMES), 2 * MRAD)}
-    )
+def photographs(zero: FloatArray, seed: int = 1, times: FloatArray = TIMES) -> Sightings:
+    """Sightings at times of a mirror whose first zero is off by ``zero`` (M,), rad."""
+    many, suns = NOMINAL[np.zeros(len(times), np.intp)], vector(times, PLANT.site)
+    counts = track(many, suns, AIM).best_counts
+    truth = many.with_parameters({ZEROS[0]: zero, "tilt_east": np.full(len(times), 2 * MRAD)})
     pose = truth.pose(counts)
     away = np.linalg.norm(AIM - pose.vertex, axis=1)[:, None]
-    noise = SIGMA * np.random.default_rng(seed).standard_normal((len(TIMES), 3))
+    noise = SIGMA * np.random.default_rng(seed).standard_normal((len(times), 3))
     seen = pose.vertex + away * (reflect(suns, pose.normal) + noise)
-    return sightings(np.zeros(len(TIMES), np.intp), counts, suns, seen, time=TIMES, sigma=5e-4)
+    return sightings(np.zeros(len(times), np.intp), counts, suns, seen, time=times, sigma=5e-4)
 
 
 def followed(seen: Sightings) -> tuple[FieldFit, FieldFit, int]:
@@ -112,3 +110,25 @@ def test_a_fit_that_has_failed_is_returned_as_it_is() -> None:
     with pytest.raises(StopIteration) as end:
         next(present.fitting_present(NOMINAL, seen, failed))
     assert end.value.value is failed
+
+
+@pytest.mark.parametrize(("shots", "visits"), [(3, 1), (1, 2)])
+def test_a_step_overnight_is_taken_by_the_next_photographs(shots: int, visits: int) -> None:
+    """Two visits a day, and 2 mrad in one night, seen by nobody: no worse than without a step.
+
+    Three photographs of one visit settle it; of single ones the second does.
+    """
+    begin, count = BEGIN + 8 * DAY, 16 * shots + visits * shots
+    hours = np.arange(9)[:, None] * DAY + 3600.0 * np.array([8.0, 14.0])
+    times = (BEGIN + hours[:, :, None] + 20.0 * np.arange(shots)).ravel()[:count]
+    noon = vector(BEGIN + 8.5 * DAY, PLANT.site)
+    for seed in range(6):
+        missed = []
+        for jump in (0.0, 2 * MRAD * (-1) ** seed):
+            seen = photographs(np.where(times < begin, 0.0, jump), seed, times)
+            now = NOMINAL.with_parameters(followed(seen)[1].parameters)
+            truth = NOMINAL.with_parameters({ZEROS[0]: jump, "tilt_east": 2 * MRAD})
+            counts = track(now, noon, AIM).best_counts
+            normals = (m.pose(counts).normal for m in (now, truth))
+            missed.append(float(angle_between(*normals)[0]))
+        assert max(missed) < 0.5 * MRAD
