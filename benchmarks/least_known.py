@@ -89,4 +89,5 @@ class LeastKnown:
         never = np.all([np.isinf(seen) for seen in self._seen.values()], axis=0)[rows]
         rank = np.where(never, 1, np.where(np.isinf(here[rows]), 0, 2))
         worst = np.where(never, 0.0, -error[rows])
-        return list(map(int, rows[np.lexsort((sight.distance[rows], worst, rank))]))
+        far = np.linalg.norm(sight.target.center - self._plant.position[rows], axis=1)
+        return list(map(int, rows[np.lexsort((far, worst, rank))]))
