@@ -8,13 +8,15 @@ import pytest
 
 from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome, fit
-from heliotrope.calibration.learn import drift, present
+from heliotrope.calibration.learn import drift, own_model, present
 from heliotrope.calibration.sightings import Sightings, sightings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import MRAD, FloatArray, angle_between, reflect
+from heliotrope.mechanism import parameters
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
 from heliotrope.sun import vector
+from support.drifting import finished
 
 PLANT = malan_plant(4)
 NOMINAL = next(iter(PLANT.groups.values())).mechanism[:1]
@@ -36,6 +38,12 @@ def photographs(zero: FloatArray, seed: int = 1, times: FloatArray = TIMES) -> S
     noise = SIGMA * np.random.default_rng(seed).standard_normal((len(times), 3))
     seen = pose.vertex + away * (reflect(suns, pose.normal) + noise)
     return sightings(np.zeros(len(times), np.intp), counts, suns, seen, time=times, sigma=5e-4)
+
+
+def daylight(zero: FloatArray, times: FloatArray) -> Sightings:
+    """Photographs at the suns of one forenoon, whatever their times say."""
+    suns = TIMES[0] + 20.0 * np.arange(len(times))
+    return replace(photographs(zero, 2, suns), time=times)
 
 
 def followed(seen: Sightings) -> tuple[FieldFit, FieldFit, int]:
@@ -132,3 +140,30 @@ def test_a_step_overnight_is_taken_by_the_next_photographs(shots: int, visits: i
             normals = (m.pose(counts).normal for m in (now, truth))
             missed.append(float(angle_between(*normals)[0]))
         assert max(missed) < 0.5 * MRAD
+
+
+def test_constants_and_models_are_of_the_last_thousand_photographs() -> None:
+    """The work of a visit does not grow with the age of the plant."""
+    times = BEGIN + 3600.0 * np.arange(1200)
+    old = np.where(np.arange(1200) < 200, 50 * MRAD, 0.0)
+    mixed = daylight(old, times).take(np.random.default_rng(4).permutation(1200))
+    recent = own_model.latest(mixed)
+    np.testing.assert_array_equal(np.sort(recent.time), times[200:])
+    unknown = replace(mixed, time=np.where(mixed.time > times[1000], mixed.time, np.nan))
+    assert np.isfinite(own_model.latest(unknown).time).sum() == 199
+    assert own_model.latest(recent) is recent
+    model = own_model.OwnModel("malan8", parameters.model("malan8", NOMINAL.parameters))
+    still, moving = finished(model.fitting(NOMINAL, mixed))
+    same, other = finished(model.fitting(NOMINAL, recent))
+    np.testing.assert_allclose(still.values, same.values, atol=1e-9)
+    # The replay takes them all.
+    assert np.abs(moving.covariance - other.covariance).max() > 0.0
+
+
+def test_linearised_in_blocks_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = photographs(np.linspace(0.0, 2 * MRAD, len(TIMES)))
+    _, whole, _ = followed(seen)
+    monkeypatch.setattr(present, "BLOCK", 7)
+    _, blocks, steps = followed(seen)
+    assert steps == 8
+    np.testing.assert_allclose(blocks.values, whole.values, rtol=1e-9, atol=1e-12)

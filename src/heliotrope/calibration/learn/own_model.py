@@ -27,8 +27,19 @@ from heliotrope.mechanism.chain import Mechanism
 FEWEST = 8
 #: Only the last visits are compared: older ones cost time and tell of an older machine.
 MOST = 60
+#: Sightings that constants are fitted to and models are chosen by, the last ones: work for the
+#: plant's loop that does not grow with its age.
+RECENT = 1000
 #: Trial sizes of the noise of a visit, in units of the scale of the fit.
 NOISES = np.geomspace(0.2, 2.0, 9)
+
+
+def latest(sightings: Sightings) -> Sightings:
+    """Return the last `RECENT` sightings; those of unknown time are the first to go."""
+    if len(sightings) <= RECENT:
+        return sightings
+    order = np.argsort(np.nan_to_num(sightings.time, nan=-np.inf), kind="stable")
+    return sightings.take(np.sort(order[-RECENT:]))
 
 
 @dataclass(frozen=True)
@@ -52,10 +63,11 @@ class OwnModel:
     ) -> Generator[None, None, tuple[FieldFit, FieldFit]]:
         """Return the fit of constants and the one that follows the drift of its ``group``.
 
-        See `present`. The values are deviations from ``nominal``, (1,), so that they alone make the
-        mechanism: ratios are among them.
+        The constants are those of the `latest` sightings; see `present`. The values are deviations
+        from ``nominal``, (1,), so that they alone make the mechanism: ratios are among them.
         """
-        constants = self.completed(fit(self.start(nominal), sightings, self.parameters))
+        some = latest(sightings)
+        constants = self.completed(fit(self.start(nominal), some, self.parameters))
         yield
         return constants, (yield from self.following(nominal, sightings, constants, group))
 
@@ -140,7 +152,7 @@ def choosing(
     nominal: Mechanism, sightings: Sightings, simple: str
 ) -> Generator[None, None, OwnModel]:
     """Choose as `choose_own_model`, in steps of some ten ms between which others may work."""
-    base = parameter_table.model(simple, nominal.parameters)
+    base, sightings = parameter_table.model(simple, nominal.parameters), latest(sightings)
     mean = periodic.visit_means(nominal, sightings)
     if len(mean) < FEWEST:
         return OwnModel(simple, base)

@@ -25,6 +25,8 @@ from heliotrope.mechanism.chain import Mechanism
 
 #: Sightings that are taken in one step of `replaying`.
 AT_ONCE = 100
+#: Sightings that are linearised in one step.
+BLOCK = 1000
 #: The values hold for the days after a visit: motion within hours is at its mean by then, days.
 AHEAD = 1.0
 #: The turn by slope deviations about the mirror's two axes, as constants of the state, and the
@@ -86,8 +88,16 @@ def replaying(
     if (np.abs(fitted.centre[0]) >= MISTAKE * fitted.prior[0]).any():
         centre[:count] = fitted.centre[0]
     moved = mechanism.with_parameters({n: values[p : p + 1] for p, n in enumerate(hyper.names)})
-    rows = _Rows.of(moved, sightings, hyper.names, values - centre)
-    parts = [rows, *(_Rows.of_flight(moved, f, hyper, values - centre) for f in flown)]
+    blocks = []
+    for first in range(0, len(sightings), BLOCK):
+        if first:
+            yield
+        some = sightings.take(np.arange(first, min(first + BLOCK, len(sightings))))
+        blocks.append(_Rows.of(moved, some, hyper.names, values - centre))
+    parts = [
+        _Rows.joined(blocks),
+        *(_Rows.of_flight(moved, f, hyper, values - centre) for f in flown),
+    ]
     time = np.concatenate([part.time for part in parts])
     which = np.repeat(np.arange(len(parts)), [len(part.time) for part in parts])
     place = np.concatenate([np.arange(len(part.time)) for part in parts])
@@ -121,6 +131,16 @@ class _Rows:
         good = is_usable(line)
         value = line.jacobian @ off - line.residual
         return cls(line.jacobian[good], value[good], seen.time[good] / DAY)
+
+    @classmethod
+    def joined(cls, parts: Sequence["_Rows"]) -> "_Rows":
+        if not parts:
+            return cls(np.zeros((0, 2, 0)), np.zeros((0, 2)), np.zeros(0))
+        return cls(
+            np.concatenate([part.jacobian for part in parts]),
+            np.concatenate([part.value for part in parts]),
+            np.concatenate([part.time for part in parts]),
+        )
 
     @classmethod
     def of_flight(

@@ -148,8 +148,7 @@ def fitting(
             )
         )
     still, moving = yield from model.fitting(nominal, photographed, beliefs.hyper(name))
-    constants = _judged(beliefs, settings, model, name, nominal, still, photographed, nothing)
-    return _better(beliefs, settings, model, constants, moving)
+    return _better(beliefs, settings, model, name, nominal, photographed, nothing, still, moving)
 
 
 def _following(
@@ -157,42 +156,50 @@ def _following(
     flights: Flights,
     settings: CycleSettings,
     model: OwnModel,
-    constants: JudgedFit,
+    joint: JudgedFit,
     photographed: Sightings | None,
 ) -> Generator[None, None, JudgedFit]:
     """Return the fit that follows the drift of a mirror with rows of flights, or its constants."""
-    name, seen = constants.name, constants.seen
+    name, nominal, seen = joint.name, joint.nominal, joint.seen
     photographs = seen.take(np.zeros(0, np.intp)) if photographed is None else photographed
     moving = yield from model.following(
-        constants.nominal,
-        photographs,
-        constants.fitted,
-        beliefs.hyper(name),
-        flights.flown(name),
+        nominal, photographs, joint.fitted, beliefs.hyper(name), flights.flown(name)
     )
-    return _better(beliefs, settings, model, constants, moving)
+    found = _better(
+        beliefs, settings, model, name, nominal, seen, joint.flown, joint.fitted, moving
+    )
+    return replace(found, revealed=joint.revealed)
 
 
 def _better(
     beliefs: Beliefs,
     settings: CycleSettings,
     model: OwnModel,
-    constants: JudgedFit,
+    name: str,
+    nominal: Mechanism,
+    seen: Sightings,
+    flown: Identities,
+    still: FieldFit,
     moving: FieldFit,
 ) -> JudgedFit:
     """Return the fit that follows the drift if it explains the last day, else the constants."""
-    seen, nominal = constants.seen, constants.nominal
     recent = seen.take(np.flatnonzero(seen.time >= seen.time.max() - DAY))
     left = [
         root_mean_square(beam_errors(nominal.with_parameters(one.parameters), recent).beam)
-        for one in (constants.fitted, moving)
+        for one in (still, moving)
     ]
     if not left[1] <= max(left[0], EXPLAINED * settings.sigma):
-        return constants
-    found = _judged(
-        beliefs, settings, model, constants.name, nominal, moving, recent, constants.flown
-    )
-    return replace(found, seen=seen, revealed=constants.revealed)
+        return _judged(beliefs, settings, model, name, nominal, still, seen, flown)
+    found = _judged(beliefs, settings, model, name, nominal, moving, recent, flown)
+    return replace(found, seen=seen)
+
+
+def _ended(steps: Generator[None, None, JudgedFit]) -> JudgedFit:
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return cast("JudgedFit", end.value)
 
 
 def _room(beliefs: Beliefs, settings: CycleSettings, name: str, flown: Identities) -> float:
@@ -211,14 +218,6 @@ def _room(beliefs: Beliefs, settings: CycleSettings, name: str, flown: Identitie
         motion = hyper.amplitude[np.array(hours, dtype=np.bool_)]
     # A beam turns by twice as much as its normal.
     return float(np.hypot(usual, 2.0 * np.linalg.norm(motion)))
-
-
-def _ended(steps: Generator[None, None, JudgedFit]) -> JudgedFit:
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return cast("JudgedFit", end.value)
 
 
 def fit_flights(
