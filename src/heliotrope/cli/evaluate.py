@@ -2,13 +2,17 @@
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from heliotrope.cli import _calibration as shared
 from heliotrope.cli._common import open_plant, print_json, print_table
 from heliotrope.warm import compiling
+
+if TYPE_CHECKING:
+    from heliotrope.calibration.obstruction import Unobstructed
+    from heliotrope.calibration.workflow import FieldSightings
 
 
 def evaluate(
@@ -25,6 +29,12 @@ def evaluate(
         Literal["stream", "batch"],
         typer.Option(help="How --split sequential learns on: one update each, or all afresh."),
     ] = "stream",
+    neighbours: Annotated[
+        bool,
+        typer.Option(
+            "--neighbours", help="Correct centroids for shading and blocking by neighbours."
+        ),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Learn from a part of each heliostat's sightings and print the errors of the rest.
@@ -40,11 +50,12 @@ def evaluate(
     plant = open_plant(place)
     with compiling():
         field = workflow.read_field_sightings(plant, place, sightings, centroid=centroid)
+        freed = _unobstructed(field) if neighbours else None
     with shared.workers(scheduler) as runner, shared.progress_of_steps(as_json) as steps:
         found = workflow.evaluate(
             field.heliostats.names,
             field.heliostats.mechanism,
-            field.seen,
+            field.seen if freed is None else freed.seen,
             shared.parse_model(model),
             split=split,
             fraction=fraction,
@@ -61,6 +72,8 @@ def evaluate(
         **found.document(),
         "left_out": list(field.left_out),
     }
+    if freed is not None:
+        document["neighbours"] = freed.summary()
     document["unexplained_mirrors"] = unexplained_mirrors(field.heliostats.names, found.learned)
     document["unusable_sightings"] = [field.ids[k] for k in found.assessment.unusable]
     document["unexplained_sightings"] = [field.ids[k] for k in found.assessment.unexplained]
@@ -69,8 +82,19 @@ def evaluate(
         return
     _print(document)
     _print_left_out(document)
+    if freed is not None:
+        print(freed)
     for line in found.choice.describe() if found.choice else ():
         print(line)
+
+
+def _unobstructed(field: "FieldSightings") -> "Unobstructed":
+    """Return the sightings corrected for neighbours, which look at the first receiver."""
+    from heliotrope.calibration.obstruction import unobstructed
+
+    plant = field.plant
+    aim = (plant.receivers or plant.targets)[0].center
+    return unobstructed(field.heliostats, plant.targets, field.seen, aim)
 
 
 def _print_axes(document: dict[str, Any], shown: Callable[[Any], str]) -> None:

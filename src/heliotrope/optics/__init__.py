@@ -5,6 +5,7 @@
 - `offsets`: where an imperfect heliostat throws its beam (Malan's error model as a forward model).
 - `intercept` and `flux`: the share of a beam, and the flux of a field, on a receiver.
 - `mirror_image`: the flux of one heliostat on a target, for photographs and their simulation.
+- `obstruction`: the elements that neighbours shade and block, and how far that moves a centroid.
 - `coverage`: the share of a grid's cells that polygons cover (a function of the same name, so it
   stays there).
 - `keep_out`: beams that enter forbidden volumes; `glare`: the hazard to eyes, for information only.
@@ -55,12 +56,13 @@ from heliotrope.optics.keep_out import (
 )
 from heliotrope.optics.mirror_image import (
     Beam,
-    equal_facets,
     flat_top_beam,
     gaussian_beam,
     reflected_beam,
     sun_profile,
 )
+from heliotrope.optics.mirror_surface import equal_facets
+from heliotrope.optics.obstruction import CentroidShift, Neighbours, centroid_shift
 from heliotrope.optics.offsets import ImageOffsets, image_offsets, target_offsets
 
 __all__ = [
@@ -73,6 +75,7 @@ __all__ = [
     "SUN_SIGMA",
     "Beam",
     "Beams",
+    "CentroidShift",
     "Crossing",
     "Entries",
     "ExpectedError",
@@ -83,11 +86,13 @@ __all__ = [
     "Hazard",
     "ImageOffsets",
     "MirrorOptics",
+    "Neighbours",
     "Sweep",
     "Way",
     "air_loss",
     "beam_sigma",
     "beams",
+    "centroid_shift",
     "clearance",
     "concentration",
     "crossing",

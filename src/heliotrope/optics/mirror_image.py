@@ -20,6 +20,8 @@ from heliotrope.geometry import (
 )
 from heliotrope.optics.beam import SUN_RADIUS
 from heliotrope.optics.coverage import coverage
+from heliotrope.optics.mirror_surface import elements_of, equal_facets, mirror_axes
+from heliotrope.optics.obstruction import Neighbours
 
 #: Outer radius of Buie's aureole, rad.
 AUREOLE_RADIUS = 43.6e-3
@@ -294,6 +296,7 @@ def reflected_beam(
     circumsolar: float = 0.05,
     reflectivity: float = 0.9,
     dni: float = 900.0,
+    neighbours: Neighbours | None = None,
     step: float = 0.02,
     elements: int = 24,
 ) -> Beam:
@@ -332,7 +335,9 @@ def reflected_beam(
         Parameter χ of Buie's shape, nearly the circumsolar ratio, 0.01 to 0.8.
     reflectivity, dni
         Share and W/m². Their product with the area and the cosine of incidence is the power;
-        shading, blocking and atmospheric extinction are not included.
+        atmospheric extinction is not included.
+    neighbours
+        Mirrors that shade and block elements of this one; None: none does.
     step
         Step of the grid, m.
     elements
@@ -342,7 +347,8 @@ def reflected_beam(
     ------
     InputError
         If a value is invalid, sun or target are behind the mirror, the mirror is behind the
-        target, or the grid would have more than 4096 samples along a side.
+        target, its neighbours hide all of it, or the grid would have more than 4096 samples along
+        a side.
 
     Notes
     -----
@@ -369,7 +375,7 @@ def reflected_beam(
         shape = facets
     else:
         shape = equal_facets(width, height, facets, cant)
-    points, normals, areas = _elements(shape, curve, elements)
+    points, normals, areas = elements_of(shape, curve, elements)
     points, normals = center + points @ R.T, normals @ R.T
     incidence = normals @ to_sun
     rays = reflect(to_sun, normals)
@@ -380,55 +386,15 @@ def reflected_beam(
             "mirror, and the mirror in front of the target"
         )
     power = reflectivity * dni * areas * incidence
+    if neighbours is not None:
+        power = power * ~(neighbours.hide(points, to_sun) | neighbours.hide(points, rays))
+        if not power.any():
+            raise InputError("reflected beam: neighbours hide the whole mirror")
     ray = normalize(power @ rays)
     distance = float(power @ np.linalg.norm(hits - points, axis=-1) / power.sum())
     plane = target.plane_coordinates(hits)
     spread = _spread(target, to_sun, R[:, 2], ray, distance)
     return _gather(plane, power, spread, slope_error, sun_shape, circumsolar, step)
-
-
-def equal_facets(width: float, height: float, count: tuple[int, int], focal: float) -> Facets:
-    """Return equal facets of one mirror, tilted towards a focus; (1, F, 3).
-
-    Parameters
-    ----------
-    width, height
-        Size of the whole mirror, m.
-    count
-        Columns and rows.
-    focal
-        Distance of the focus, m; infinity: all in one plane. Centres lie on the paraboloid
-        z = (x² + y²) / 4f, to which each facet is tangent at its centre.
-    """
-    _above_zero("mirror: width", width, "m")
-    _above_zero("mirror: height", height, "m")
-    columns, rows = count
-    if min(columns, rows) < 1:
-        raise InputError(f"mirror: {columns} × {rows} facets; give 1 or more each way")
-    x = ((np.arange(columns) + 0.5) / columns - 0.5) * width
-    y = ((np.arange(rows) + 0.5) / rows - 0.5) * height
-    x, y = (a.ravel() for a in np.meshgrid(x, y))
-    center = np.stack([x, y, (x**2 + y**2) / (4.0 * focal)], axis=-1)
-    normal = normalize(np.stack([-x / (2.0 * focal), -y / (2.0 * focal), np.ones(x.size)], axis=-1))
-    right = normalize(np.cross([0.0, 1.0, 0.0], normal))
-    up = np.cross(normal, right)
-    half_width, half_height = 0.5 * width / columns * right, 0.5 * height / rows * up
-    return Facets(center[None], half_width[None], half_height[None])
-
-
-def _elements(facets: Facets, focal: float, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return places and normals (E, 3) and areas (E,) of the elements, in the mirror's frame."""
-    center, a, b = facets.center[0], facets.half_width[0], facets.half_height[0]
-    grid = (np.arange(n) + 0.5) / n * 2.0 - 1.0
-    s, t = (g.ravel()[:, None, None] for g in np.meshgrid(grid, grid))
-    flat = s * a + t * b
-    cross = np.cross(a, b)
-    normal = normalize(cross, "facets: normal")
-    sag = np.sum(flat**2, axis=-1, keepdims=True) / (4.0 * focal)
-    points = center + flat + sag * normal
-    normals = normalize(normal - flat / (2.0 * focal))
-    areas = np.broadcast_to(4.0 * np.linalg.norm(cross, axis=-1) / n**2, points.shape[:2])
-    return points.reshape(-1, 3), normals.reshape(-1, 3), areas.reshape(-1)
 
 
 def _mirror_axes(
@@ -447,8 +413,7 @@ def _mirror_axes(
         n = bisector(sun, normalize(aim - center, "aim − mirror_center"))
     else:
         n = normalize(_vector(normal, "normal"), "normal")
-    left, up = tangent_axes(n)  # looking along the normal, the right is the mirror's left
-    return np.stack([-left, up, n], axis=-1)
+    return mirror_axes(n)
 
 
 def _spread(

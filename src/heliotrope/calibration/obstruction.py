@@ -1,0 +1,164 @@
+"""Corrects sightings on targets for the shading and blocking of their mirrors by neighbours.
+
+Where each mirror stands is known; where its neighbours looked at the time is assumed: at their own
+aims. As in the schedule, mirrors turn about their feet.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.field.heliostats import Facets, Heliostats
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray, bisector, normalize
+from heliotrope.optics.mirror_surface import equal_facets
+from heliotrope.optics.obstruction import Neighbours, centroid_shift
+
+#: Neighbours that can shade or block a mirror.
+NEAREST = 12
+#: The focal length of a mirror whose facets are not known is that of its distance to the target,
+#: within this share.
+_FOCAL = 0.25
+#: Part of a shift that stays unknown, as the neighbours need not look where they are assumed to.
+_UNKNOWN = 0.25
+#: A destination is on a target if it is this near to its plane, m.
+_ON_PLANE = 0.1
+
+
+@dataclass(frozen=True)
+class Unobstructed:
+    """Sightings as if no neighbour stood in the light.
+
+    Attributes
+    ----------
+    seen
+        The sightings with corrected destinations and the uncertainty of the correction.
+    shift
+        What was taken off, right and up on the target, m, (M, 2); 0 where nothing hides.
+    hidden
+        Share of the mirror that neighbours hid, (M,).
+    """
+
+    seen: Sightings
+    shift: FloatArray
+    hidden: FloatArray
+
+    def __str__(self) -> str:
+        """One line."""
+        told = self.summary()
+        if not told["corrected"]:
+            return "shading and blocking: no neighbour in the plant file hides any of the mirrors"
+        return (
+            f"shading and blocking: {told['corrected']:,} of {told['sightings']:,} centroids "
+            f"corrected by {told['median_shift_mm']:.0f} mm in the median, "
+            f"{told['largest_shift_mm']:.0f} mm at most"
+        )
+
+    def summary(self) -> dict[str, float]:
+        """Return the numbers of sightings and of corrected ones, and their shifts."""
+        moved = self.hidden > 0.0
+        size = 1e3 * np.linalg.norm(self.shift, axis=1)[moved]
+        return {
+            "sightings": len(self.hidden),
+            "corrected": int(moved.sum()),
+            "median_shift_mm": float(np.median(size)) if moved.any() else 0.0,
+            "largest_shift_mm": float(size.max()) if moved.any() else 0.0,
+        }
+
+
+def unobstructed(
+    heliostats: Heliostats, targets: tuple[Target, ...], seen: Sightings, aim: FloatArray
+) -> Unobstructed:
+    """Return sightings corrected for shading and blocking.
+
+    Parameters
+    ----------
+    heliostats
+        All mirrors that may hide one another; rows as those of the sightings.
+    targets
+        Sightings of the sun's beam on one of them are corrected; others stay as they are.
+    seen
+        The sightings.
+    aim
+        Where the neighbours look, ENU metres, (3,), unless they have aims of their own.
+
+    Notes
+    -----
+    The canting of mirrors whose facets are not known is assumed to be for the target. Their shift
+    is uncertain by what it changes with focal lengths a quarter longer and shorter, and every
+    shift by a quarter of itself.
+    """
+    place = heliostats.position
+    own = np.full_like(place, np.nan) if heliostats.aim is None else heliostats.aim
+    aims = np.where(np.isfinite(own), own, aim)
+    count = min(NEAREST + 1, len(place))
+    near = np.asarray(cKDTree(place).query(place, k=count)[1]).reshape(len(place), count)[:, 1:]
+    shift, hidden = np.zeros((len(seen), 2)), np.zeros(len(seen))
+    destination, covariance = seen.destination.copy(), seen.destination_covariance.copy()
+    for m in np.flatnonzero(seen.source_at_infinity & ~seen.destination_at_infinity):
+        target = _under(targets, seen.destination[m])
+        if target is None or not near.shape[1]:
+            continue
+        i, sun = int(seen.heliostat[m]), seen.source[m]
+        others = near[i]
+        ways = normalize(aims[others] - place[others])
+        beside = Neighbours(
+            place[others],
+            bisector(np.broadcast_to(sun, ways.shape), ways),
+            heliostats.width[others],
+            heliostats.height[others],
+        )
+        found, spread, hidden[m] = _shift(heliostats, i, target, seen.destination[m], sun, beside)
+        if not hidden[m] > 0.0 or not np.isfinite(found).all():
+            hidden[m] = 0.0
+            continue
+        shift[m] = found
+        destination[m] -= found @ target.axes
+        covariance[m] += target.axes.T @ spread @ target.axes
+    corrected = replace(seen, destination=destination, destination_covariance=covariance)
+    return Unobstructed(corrected, shift, hidden)
+
+
+def _under(targets: tuple[Target, ...], point: FloatArray) -> Target | None:
+    """Return the target that a point is on, None if it is on none."""
+    for target in targets:
+        across = np.abs(target.plane_coordinates(point) - target.plane_coordinates(target.center))
+        off = abs(float((point - target.center) @ target.normal))
+        if off <= _ON_PLANE and (across <= 0.5 * np.array([target.width, target.height])).all():
+            return target
+    return None
+
+
+def _shift(
+    heliostats: Heliostats,
+    i: int,
+    target: Target,
+    centroid: FloatArray,
+    sun: FloatArray,
+    beside: Neighbours,
+) -> tuple[FloatArray, npt.NDArray[np.float64], float]:
+    """Return the shift (2,), its covariance (2, 2), m and m², and the hidden share."""
+    center = heliostats.position[i]
+    slant = float(np.linalg.norm(centroid - center))
+    normal = bisector(sun, (centroid - center) / slant)
+    found = []
+    for focal in (slant, slant / (1.0 + _FOCAL), slant * (1.0 + _FOCAL)):
+        facets = _facets(heliostats, i, focal)
+        found.append(centroid_shift(target, center, sun, normal, facets, beside, facet_focal=focal))
+        if not found[0].hidden:
+            return np.zeros(2), np.zeros((2, 2)), 0.0
+    usual = found[0].shift
+    unknown = np.max([np.linalg.norm(one.shift - usual) for one in found[1:]])
+    covariance = unknown**2 * np.eye(2) + _UNKNOWN**2 * np.outer(usual, usual)
+    return usual, covariance, found[0].hidden
+
+
+def _facets(heliostats: Heliostats, i: int, focal: float) -> Facets:
+    known = heliostats.facets
+    if known is None:
+        return equal_facets(float(heliostats.width[i]), float(heliostats.height[i]), (2, 2), focal)
+    row = slice(i, i + 1)
+    return Facets(known.center[row], known.half_width[row], known.half_height[row])

@@ -1,0 +1,68 @@
+"""The surface of one mirror as small elements."""
+
+import numpy as np
+
+from heliotrope.errors import InputError
+from heliotrope.field.heliostats import Facets
+from heliotrope.geometry import FloatArray, normalize, tangent_axes
+
+
+def mirror_axes(normal: FloatArray) -> FloatArray:
+    """Return the columns x (right, horizontal), y (up) and z (normal) of a mirror, (3, 3)."""
+    left, up = tangent_axes(normal)  # looking along the normal, the right is the mirror's left
+    return np.stack([-left, up, normal], axis=-1)
+
+
+def equal_facets(width: float, height: float, count: tuple[int, int], focal: float) -> Facets:
+    """Return equal facets of one mirror, tilted towards a focus; (1, F, 3).
+
+    Parameters
+    ----------
+    width, height
+        Size of the whole mirror, m.
+    count
+        Columns and rows.
+    focal
+        Distance of the focus, m; infinity: all in one plane. Centres lie on the paraboloid
+        z = (x² + y²) / 4f, to which each facet is tangent at its centre.
+    """
+    for name, side in (("width", width), ("height", height)):
+        if not (np.isfinite(side) and side > 0.0):
+            raise InputError(f"mirror: {name} {side} m must be above 0 and finite")
+    columns, rows = count
+    if min(columns, rows) < 1:
+        raise InputError(f"mirror: {columns} × {rows} facets; give 1 or more each way")
+    x = ((np.arange(columns) + 0.5) / columns - 0.5) * width
+    y = ((np.arange(rows) + 0.5) / rows - 0.5) * height
+    x, y = (a.ravel() for a in np.meshgrid(x, y))
+    center = np.stack([x, y, (x**2 + y**2) / (4.0 * focal)], axis=-1)
+    normal = normalize(np.stack([-x / (2.0 * focal), -y / (2.0 * focal), np.ones(x.size)], axis=-1))
+    right = normalize(np.cross([0.0, 1.0, 0.0], normal))
+    up = np.cross(normal, right)
+    half_width, half_height = 0.5 * width / columns * right, 0.5 * height / rows * up
+    return Facets(center[None], half_width[None], half_height[None])
+
+
+def elements_of(facets: Facets, focal: float, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return places and normals (E, 3) and areas (E,) of the elements, in the mirror's frame.
+
+    Parameters
+    ----------
+    facets
+        Facets of one heliostat.
+    focal
+        Focal length of each facet's own curvature, m; infinity: flat.
+    n
+        Each facet is divided into the square of this number.
+    """
+    center, a, b = facets.center[0], facets.half_width[0], facets.half_height[0]
+    grid = (np.arange(n) + 0.5) / n * 2.0 - 1.0
+    s, t = (g.ravel()[:, None, None] for g in np.meshgrid(grid, grid))
+    flat = s * a + t * b
+    cross = np.cross(a, b)
+    normal = normalize(cross, "facets: normal")
+    sag = np.sum(flat**2, axis=-1, keepdims=True) / (4.0 * focal)
+    points = center + flat + sag * normal
+    normals = normalize(normal - flat / (2.0 * focal))
+    areas = np.broadcast_to(4.0 * np.linalg.norm(cross, axis=-1) / n**2, points.shape[:2])
+    return points.reshape(-1, 3), normals.reshape(-1, 3), areas.reshape(-1)

@@ -1,0 +1,128 @@
+"""Shading and blocking by neighbours, and how far they move the centroid of a beam.
+
+A neighbour shades an element of a mirror if it stands between the element and the sun, and blocks
+it if it stands in the way of the reflected ray. What is left of the mirror has another middle. A
+flat mirror's beam moves by as much; the beam of a mirror that is focused on the target hardly moves
+while light comes along the axis, and moves by a part of it at an angle, where it is astigmatic.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.field.heliostats import Facets
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray, reflect, tangent_axes
+from heliotrope.optics.mirror_surface import elements_of, mirror_axes
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """J flat mirrors beside another one; their upper edges are level.
+
+    Attributes
+    ----------
+    center, normal
+        ENU metres, and unit vectors, (J, 3).
+    width, height
+        m, (J,).
+    """
+
+    center: FloatArray
+    normal: FloatArray
+    width: FloatArray
+    height: FloatArray
+
+    def hide(self, points: FloatArray, way: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return which points cannot be seen along a way from them, (E,).
+
+        Parameters
+        ----------
+        points
+            ENU metres, (E, 3).
+        way
+            Unit vector, (3,) or (E, 3): to the sun for shading, along the ray for blocking.
+        """
+        if not len(self.center):
+            return np.zeros(len(points), dtype=np.bool_)
+        ray = np.broadcast_to(way, points.shape)
+        steep = ray @ self.normal.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = (np.sum(self.center * self.normal, axis=1) - points @ self.normal.T) / steep
+        met = points[:, None, :] + along[..., None] * ray[:, None, :] - self.center
+        across = np.abs(np.einsum("ejc,jac->eja", met, tangent_axes(self.normal)))
+        half = 0.5 * np.stack([self.width, self.height], axis=-1)
+        # Parallel rays give infinities or NaN, which are within nothing.
+        within = (across <= half).all(axis=-1) & (along > 0.0)
+        return np.asarray(within.any(axis=1))
+
+
+@dataclass(frozen=True)
+class CentroidShift:
+    """The effect of neighbours on one beam.
+
+    Attributes
+    ----------
+    shift
+        Centroid with neighbours less that without, right and up on the target's plane, m, (2,);
+        NaN if they hide the whole mirror.
+    shaded, blocked, hidden
+        Shares of the mirror's area: without sun, in whose way to the target something stands, and
+        either.
+    """
+
+    shift: FloatArray
+    shaded: float
+    blocked: float
+    hidden: float
+
+
+def centroid_shift(
+    target: Target,
+    center: FloatArray,
+    sun: FloatArray,
+    normal: FloatArray,
+    facets: Facets,
+    neighbours: Neighbours,
+    *,
+    facet_focal: float = np.inf,
+    elements: int = 12,
+) -> CentroidShift:
+    """Return how far neighbours move the centroid of a beam.
+
+    Parameters
+    ----------
+    target
+        The beam falls on its plane.
+    center, normal
+        Middle of the mirror, ENU metres, and its unit normal, (3,).
+    sun
+        Unit vector to the sun, (3,).
+    facets
+        Facets of one heliostat, tilted as they are.
+    neighbours
+        Mirrors that may shade or block it.
+    facet_focal
+        Focal length of each facet's own curvature, m.
+    elements
+        Each facet is divided into the square of this number.
+
+    Notes
+    -----
+    Of the central rays: sun shape and slope errors widen the beam and do not move it. The
+    centroid is that of all light, on the target or beside it.
+    """
+    R = mirror_axes(normal)
+    points, normals, areas = elements_of(facets, facet_focal, elements)
+    points, normals = center + points @ R.T, normals @ R.T
+    rays = reflect(sun, normals)
+    plane = target.plane_coordinates(target.intersect(points, rays))
+    power = areas * np.maximum(normals @ sun, 0.0)
+    shaded, blocked = neighbours.hide(points, sun), neighbours.hide(points, rays)
+    left = power * ~(shaded | blocked)
+    shift = np.full(2, np.nan)
+    if left.any():
+        shift = left @ plane / left.sum() - power @ plane / power.sum()
+    shares = [float(areas @ mask / areas.sum()) for mask in (shaded, blocked, shaded | blocked)]
+    return CentroidShift(shift, *shares)
