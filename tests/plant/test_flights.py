@@ -25,7 +25,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.operations.flights import FlightIntake
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
-from heliotrope.plant.visits.fitting import fit_flights, fit_heliostat
+from heliotrope.plant.visits.fitting import fit_flights, fit_heliostat, follow_flights
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.keeper import Keeper
 from support.plant_bench import ENGINEER, OPERATOR, Bench
@@ -253,7 +253,8 @@ def test_a_mirror_with_a_flight_is_followed_through_its_drift(play: Play) -> Non
         old = site.flight(OFFSET, whom=(*KNOWN[:4], name))
         rows = [row.model_copy(update={"time": row.time - 100 * 86400.0}) for row in old.rows]
         site.take(old.model_copy(update={"rows": rows}))
-        flown = fit_flights(beliefs, beliefs.flights, SETTINGS, (name,))[name]
+        joint = fit_flights(beliefs, beliefs.flights, SETTINGS, (name,))
+        flown = follow_flights(beliefs, beliefs.flights, SETTINGS, joint)[name]
         assert site.missed({name: flown.mechanism}).max() < 0.5 * MRAD
         draws = np.random.default_rng(50)
         moved = {k: v * draws.standard_normal(len(NAMES)) for k, v in SIZES.items()}

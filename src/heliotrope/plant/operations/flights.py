@@ -26,7 +26,13 @@ from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.views import FlightView
 from heliotrope.plant.parameters import TAKES_POSE
-from heliotrope.plant.visits.fitting import WRONG, JudgedFit, change_of, fit_flights
+from heliotrope.plant.visits.fitting import (
+    WRONG,
+    JudgedFit,
+    change_of,
+    fit_flights,
+    follow_flights,
+)
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import FlightEntry
 
@@ -150,7 +156,9 @@ class FlightIntake:
         return flight
 
     def _fitted(self, flights: Flights, flight: Flight) -> dict[str, JudgedFit]:
-        return fit_flights(self._plant.beliefs, flights, self._settings, flight.heliostats)
+        beliefs, settings = self._plant.beliefs, self._settings
+        joint = fit_flights(beliefs, flights, settings, flight.heliostats)
+        return follow_flights(beliefs, flights, settings, joint)
 
     def _conclude(
         self, taken: TakenFlight, flights: Flights, fits: Mapping[str, JudgedFit], text: str
@@ -204,16 +212,22 @@ class FlightIntake:
         known, beliefs.flights = tuple(beliefs.flights), Flights()
         for taken in known:
             flights = beliefs.flights.adding(taken)
-            found = self._fitted(flights, taken.flight)
+            found = fit_flights(beliefs, flights, self._settings, taken.flight.heliostats)
             flights.leave_out([n for n, fit in found.items() if fit.outcome in WRONG])
             beliefs.flights = flights
             fits.update(found)
-        for name, fit in fits.items():
+        done = set()
+        for name in fits:
             record = beliefs.record(name)
             last = max(f.at for f in known if name in f.flight.heliostats)
-            done = record is not None and record.at >= last
+            if record is not None and record.at >= last:
+                done.add(name)
+        # Only what still waits is followed: a field of many flights would take minutes to start.
+        left = {name: fit for name, fit in fits.items() if name not in done}
+        fits |= follow_flights(beliefs, beliefs.flights, self._settings, left)
+        for name, fit in fits.items():
             waiting = self._sorted(fit)
-            self._waiting[name] = replace(waiting, way=_Way.IN_USE) if done else waiting
+            self._waiting[name] = replace(waiting, way=_Way.IN_USE) if name in done else waiting
         self.look()
 
     def look(self) -> None:

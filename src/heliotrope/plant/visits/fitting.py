@@ -4,7 +4,7 @@ One heliostat is fitted after a visit, many after a flight. Both use all that is
 its photographs, and its rows of flights with the errors that they share with other mirrors.
 """
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -223,7 +223,7 @@ def _room(beliefs: Beliefs, settings: CycleSettings, name: str, flown: Identitie
 def fit_flights(
     beliefs: Beliefs, flights: Flights, settings: CycleSettings, names: Sequence[str]
 ) -> dict[str, JudgedFit]:
-    """Return the fits of many heliostats, which share the errors of flights, by name.
+    """Return the joint fits of many heliostats, which share the errors of flights, by name.
 
     All are fitted with the model of few sightings; a visit chooses for each one.
     A mirror whose fit is wrong says nothing of the shared errors: the others are fitted again
@@ -251,6 +251,29 @@ def fit_flights(
     return found
 
 
+def follow_flights(
+    beliefs: Beliefs, flights: Flights, settings: CycleSettings, fits: Mapping[str, JudgedFit]
+) -> dict[str, JudgedFit]:
+    """Return the fits of `fit_flights` followed through the drift, by name.
+
+    Each replays all sightings of its heliostat.
+    """
+    found = {}
+    for name, joint in fits.items():
+        known = beliefs.seen(name)
+        seen = None if known is None else known.sightings
+        model = _first_model(settings, joint.nominal)
+        found[name] = _ended(_following(beliefs, flights, settings, model, joint, seen))
+    return found
+
+
+def _first_model(settings: CycleSettings, mechanism: Mechanism) -> OwnModel:
+    first = settings.first_model
+    if isinstance(first, str):
+        return OwnModel(first, parameter_table.model(first, mechanism.parameters))
+    return OwnModel("+".join(first), tuple(first))
+
+
 def _fit_names(
     beliefs: Beliefs, flights: Flights, settings: CycleSettings, names: Sequence[str]
 ) -> list[JudgedFit]:
@@ -258,17 +281,8 @@ def _fit_names(
     rows = np.array([group.index(name) for name in names], dtype=np.intp)
     seen = [beliefs.seen(name) for name in names]
     photographed = [None if one is None else one.sightings for one in seen]
-    first = settings.first_model
-    word = first if isinstance(first, str) else "+".join(first)
-    known = group.mechanism.parameters
-    model = OwnModel(word, parameter_table.model(first, known) if word == first else tuple(first))
-    joint = _fit_group(
-        beliefs, flights, settings, model, names, group.mechanism[rows], photographed
-    )
-    return [
-        _ended(_following(beliefs, flights, settings, model, one, seen_of))
-        for one, seen_of in zip(joint, photographed, strict=True)
-    ]
+    model = _first_model(settings, group.mechanism)
+    return _fit_group(beliefs, flights, settings, model, names, group.mechanism[rows], photographed)
 
 
 def _fit_group(
