@@ -127,15 +127,46 @@ def _merge(mean, covariance, weight, i, j):
     total = weight[i] + weight[j]
     a, b = weight[i] / total, weight[j] / total
     size = mean.shape[1]
-    gap = mean[j] - mean[i]
     for p in range(size):
         for q in range(size):
             covariance[i, p, q] = (
-                a * covariance[i, p, q] + b * covariance[j, p, q] + a * b * gap[p] * gap[q]
+                a * covariance[i, p, q]
+                + b * covariance[j, p, q]
+                + a * b * (mean[j, p] - mean[i, p]) * (mean[j, q] - mean[i, q])
             )
     for p in range(size):
-        mean[i, p] += b * gap[p]
+        mean[i, p] += b * (mean[j, p] - mean[i, p])
     weight[i] = total
+
+
+@njit(**INNER)
+def _copy(mean, covariance, mean_to, covariance_to):
+    """Copy one hypothesis."""
+    for j in range(mean.shape[0]):
+        mean_to[j] = mean[j]
+        for k in range(mean.shape[0]):
+            covariance_to[j, k] = covariance[j, k]
+
+
+@njit(**INNER)
+def _total(values, count):
+    total = 0.0
+    for k in range(count):
+        total += values[k]
+    return total
+
+
+@njit(**INNER)
+def _heaviest_first(weight, count):
+    """Places of the weights, the largest first, equal ones in their order."""
+    order = np.empty(count, dtype=np.int64)
+    for k in range(count):
+        j = k
+        while j > 0 and weight[order[j - 1]] < weight[k]:
+            order[j] = order[j - 1]
+            j -= 1
+        order[j] = k
+    return order
 
 
 @njit(**INNER)
@@ -144,10 +175,10 @@ def _reduce(mean, covariance, weight, regime, count):
 
     The best are at the places in ``keep``.
     """
-    order = np.argsort(-weight[:count])
+    order = _heaviest_first(weight, count)
     keep = np.empty(MOST, dtype=np.int64)
     kept = 0
-    total = weight[:count].sum()
+    total = _total(weight, count)
     for n in range(count):
         i = order[n]
         if weight[i] < LEAST * total and kept > 0:
@@ -181,8 +212,8 @@ def update(
     count, size = mean.shape
     most = 5 * count
     new_mean, new_cov = np.empty((most, size)), np.empty((most, size, size))
-    log_weight, new_regime = np.full(most, -np.inf), np.zeros(most, dtype=np.bool_)
-    blunder = np.zeros(most, dtype=np.bool_)
+    log_weight, new_weight = np.empty(most), np.empty(most)
+    new_regime, blunder = np.zeros(most, dtype=np.bool_), np.zeros(most, dtype=np.bool_)
     used = 0
     for k in range(count):
         m, p = mean[k].copy(), covariance[k].copy()
@@ -197,7 +228,7 @@ def update(
             prior = 0.0 if event != UNKNOWN else math.log(max(chance[what], 1e-300))
             if event == UNKNOWN and chance[what] <= 0.0:
                 continue
-            new_mean[used], new_cov[used] = m, p
+            _copy(m, p, new_mean[used], new_cov[used])
             new_regime[used] = regime[k]
             for z in range(zeros.shape[0]):
                 if what == STEP:
@@ -213,15 +244,26 @@ def update(
             log_weight[used] = base + prior + found[6]
             used += 1
             if what == NOTHING and event == UNKNOWN and chance[BLUNDER] > 0.0:
-                new_mean[used], new_cov[used] = m, p
+                _copy(m, p, new_mean[used], new_cov[used])
                 new_regime[used], blunder[used] = regime[k], True
                 log_weight[used] = base + math.log(chance[BLUNDER]) + found[7]
                 used += 1
-    top = log_weight[:used].max()
-    new_weight = np.exp(log_weight[:used] - top)
-    density = top + math.log(new_weight.sum())
-    mistaken = new_weight[blunder[:used]].sum() / new_weight.sum()
+    top, mistaken = -np.inf, 0.0
+    for k in range(used):
+        top = max(top, log_weight[k])
+    for k in range(used):
+        new_weight[k] = math.exp(log_weight[k] - top)
+        if blunder[k]:
+            mistaken += new_weight[k]
+    total = _total(new_weight, used)
     keep = _reduce(new_mean, new_cov, new_weight, new_regime, used)
-    kept_weight = new_weight[keep]
-    kept_weight /= kept_weight.sum()
-    return kept_weight, new_mean[keep], new_cov[keep], new_regime[keep], density, mistaken
+    kept = len(keep)
+    kept_weight, kept_regime = np.empty(kept), np.empty(kept, dtype=np.bool_)
+    kept_mean, kept_cov = np.empty((kept, size)), np.empty((kept, size, size))
+    for k in range(kept):
+        kept_weight[k], kept_regime[k] = new_weight[keep[k]], new_regime[keep[k]]
+        _copy(new_mean[keep[k]], new_cov[keep[k]], kept_mean[k], kept_cov[k])
+    total_kept = _total(kept_weight, kept)
+    for k in range(kept):
+        kept_weight[k] /= total_kept
+    return kept_weight, kept_mean, kept_cov, kept_regime, top + math.log(total), mistaken / total
