@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +25,8 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.parties import Parties
+from heliotrope.plant.operations.views import Planned
 from heliotrope.plant.visits import (
     CalibrationCycle,
     Centring,
@@ -90,7 +93,9 @@ def joint(
         design = malan_plant(count)
         installed = partial(roughly_installed, seed=3, scale=0.03)
         work = AutomaticSettings(wanted=True, calibrate=False)
-        options = LiveOptions(rendered=rendered, threads=0, installed=installed, work=work)
+        options = LiveOptions(
+            rendered=rendered, threads=0, installed=installed, work=work, cycle=CYCLE
+        )
         live = LivePlant(design, clock, options)
         plant = live.plant
         async with live.running():
@@ -100,11 +105,7 @@ def joint(
                     assert clock.monotonic() < until
                     await asyncio.sleep(1.0)
                 await live.operations.automatic.halt()
-                spread, prior = np.diag([9e-8, 9e-8]), np.full(2, 5e-3)
-                for name in plant.field.names:
-                    at = clock.utc().timestamp()
-                    record = HeliostatCalibration(name, at, BIASES, np.zeros(2), spread, prior)
-                    plant.beliefs.take(record)
+                believe(live, 3e-4)
                 whole = CalibrationCycle(plant, live.cameras, CYCLE, Centring())
                 cycle = JointCycle(plant, live.cameras, whole)
                 token = plant.take_authority(ENGINEER).token
@@ -114,6 +115,14 @@ def joint(
                 await live.end()
 
     run_virtual(main, start=START)
+
+
+def believe(live: LivePlant, sigma: float) -> None:
+    """Take all mirrors for calibrated, their zeros within ``sigma``, rad."""
+    at, spread = live.clock.utc().timestamp(), np.diag([sigma**2, sigma**2])
+    for name in live.plant.field.names:
+        record = HeliostatCalibration(name, at, BIASES, np.zeros(2), spread, np.full(2, 5e-3))
+        live.plant.beliefs.take(record)
 
 
 async def _in_command(made: Scene, scene: Callable[[Scene], Awaitable[None]]) -> None:
@@ -320,3 +329,103 @@ def test_who_is_not_known_well_enough_or_would_be_too_bright_has_no_place() -> N
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, float], said: str) -> None:
     with pytest.raises(InputError, match=said):
         JointSettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_automatic_control_sends_those_that_are_known_together() -> None:
+    async def scene(here: Scene) -> None:
+        plant, operations = here.live.plant, here.live.operations
+        names = here.names
+        believe(here.live, 1e-3)
+        plant.release_authority(ENGINEER, here.token)
+        operations.automatic.want(names, wanted=True)
+        operations.automatic.switch(on=True)
+        until = here.live.clock.monotonic() + 400.0
+        while not operations.calibration().on:
+            assert here.live.clock.monotonic() < until
+            await asyncio.sleep(0.5)
+        operations.calibrate(ENGINEER, names[5], "right", together=names[3:5])
+        assert operations.calibration().asked == (names[5], *names[3:5])
+        seen: dict[str, set[str]] = {}
+        log = here.live.assembly.logbook
+        told: list[str] = []
+        while not (
+            any("3 of 3" in text for text in told) and max(map(len, seen.values()), default=0) > 3
+        ):
+            told = [e.text for e in log.events(50) if e.who == "right"]
+            assert here.live.clock.monotonic() < until
+            for one in operations.calibration().running:
+                if one.others:
+                    seen.setdefault(one.target, set()).update(one.heliostats)
+            await asyncio.sleep(1.0)
+        operations.automatic.switch(on=False)
+        assert seen["right"] >= set(names[3:]), "what a person asked for"
+        assert "joint visit: 3 of 3 heliostats proven together" in told
+        assert all(plant.beliefs.count(name) for name in names)
+
+    joint(scene)
+
+
+class _Alarms(list):  # type: ignore[type-arg]
+    def active(self) -> list[tuple[str, bool]]:
+        return [(alarm.subject, alarm.active) for alarm in self]
+
+
+def parties(known: float, first: int) -> tuple[Parties, _Alarms, np.ndarray]:
+    """Six heliostats, ``first`` of them without a calibration."""
+    names = tuple("ABCDEF")
+    at = np.array([np.nan] * first + [1.0] * (6 - first))
+    plant = SimpleNamespace(field=SimpleNamespace(place=names.index, names=names))
+    book = SimpleNamespace(calibrated_at=at, error=np.full(6, known))
+    told = _Alarms()
+    cycle = SimpleNamespace(settings=JointSettings(most=5, least=2))
+    made = Parties(plant, book, cycle, told.append)  # type: ignore[arg-type]
+    return made, told, np.ones(6, dtype=np.bool_)
+
+
+def follow(target: str, ready: np.ndarray, beside: bool) -> Planned | None:
+    del beside
+    row = int(np.argmax(ready))
+    return Planned("ABCDEF"[row], target, 0.0, 1e-3, "") if ready[row] else None
+
+
+def test_parties_leave_every_second_visit_to_those_without_a_calibration() -> None:
+    made, _, ready = parties(1e-3, first=2)
+    # The first two are not known at all.
+    made._book.error[:2] = np.nan
+    assert asyncio.run(made.chosen("left", ready, follow)) == ("C", "D", "E", "F")
+    made.begun("left")
+    assert asyncio.run(made.chosen("left", ready, follow)) == ()
+    assert asyncio.run(made.chosen("left", ready, follow)) == ("C", "D", "E", "F")
+    made, _, ready = parties(1e-3, first=0)
+    made.begun("left")
+    assert asyncio.run(made.chosen("left", ready, follow)) == ("A", "B", "C", "D", "E")
+    vague, _, ready = parties(2.1e-3, first=0)
+    assert asyncio.run(vague.chosen("left", ready, follow)) == ()
+
+
+def test_who_was_disproved_goes_alone_and_has_an_alarm_until_it_is_seen() -> None:
+    made, told, ready = parties(1e-3, first=0)
+    bad = CycleResult("B", CalibrationOutcome.NOT_PROVEN, "unchanged: x", verdict=Verdict.STUCK)
+    made.concluded(bad, joint=True)
+    assert told.active() == [("B", True)]
+    assert "B: in a joint visit, x." in told[0].text
+    assert "B" not in asyncio.run(made.chosen("left", ready, follow))
+    made.concluded(CycleResult("B", _CALIBRATED, "calibrated", new=3), joint=False)
+    assert told.active() == [("B", True), ("B", False)]
+    assert "B" in asyncio.run(made.chosen("left", ready, follow))
+    faint = CycleResult("C", CalibrationOutcome.NOT_PROVEN, "unchanged", verdict=Verdict.FAINT)
+    made.concluded(faint, joint=True)
+    assert len(told) == 2, "light that is missing is no fault of the mirror"
+    assert "C" not in asyncio.run(made.chosen("left", ready, follow))
+
+
+def test_persons_wait_until_all_are_ready_and_can_withdraw() -> None:
+    made, _, ready = parties(1e-3, first=0)
+    made.ask(("A", "C", "E"), "left")
+    ready[2] = False
+    assert made.wanted("left", ready) == ()
+    ready[2] = True
+    assert made.wanted("right", ready) == ()
+    made.withdraw(("C",))
+    assert made.wanted("left", ready) == ("A", "E")
+    assert made.asked == ()

@@ -355,16 +355,25 @@ def calibration(
 @app.command()
 def calibrate(
     context: typer.Context,
-    heliostat: Annotated[str, typer.Argument(help="Heliostat.")],
+    heliostats: Annotated[list[str], typer.Argument(help="Heliostats.")],
     target: Annotated[str, typer.Option(help="Target; any if left out.")] = "",
     search: Annotated[
         bool, typer.Option("--search", help="Only search its beam with the camera.")
     ] = False,
+    together: Annotated[
+        bool, typer.Option("--together", help="All at once on one target, in a joint visit.")
+    ] = False,
 ) -> None:
-    """Have automatic control calibrate a heliostat next, as soon as a target is free."""
+    """Have automatic control calibrate heliostats next, as soon as a target is free."""
+    if search and together:
+        raise InputError("calibrate: --search looks for one beam; leave out --together")
     with _client(context) as client:
-        order = {"heliostat": heliostat, "target": target, "search": search}
-        found = client.ask("POST", "calibration/next", order)
+        first = heliostats[:1] if together else heliostats
+        for name in first:
+            order = {"heliostat": name, "target": target, "search": search}
+            if together:
+                order["together"] = heliostats[1:]
+            found = client.ask("POST", "calibration/next", order)
     print(f"asked for: {', '.join(found['asked'])}")
 
 

@@ -34,7 +34,8 @@ from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
 from heliotrope.plant.schedule.scheduler import Scheduler
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
-from heliotrope.plant.visits.settings import Centring, CycleSettings
+from heliotrope.plant.visits.joint_cycle import JointCycle
+from heliotrope.plant.visits.settings import Centring, CycleSettings, JointSettings
 from heliotrope.safety import alarms
 
 #: A calibration that removes the errors of a quick installation.
@@ -70,6 +71,8 @@ class AssemblySettings:
         Times and limits; the readings of the sensor port are added.
     cycle
         Calibration.
+    joint
+        Joint visits; None: each heliostat is calibrated alone.
     machines
         Whether the local controllers hold the plant file's machine tables.
     """
@@ -78,6 +81,7 @@ class AssemblySettings:
     plant: PlantSettings = field(default_factory=PlantSettings)
     cycle: CycleSettings = CYCLE
     machines: MachineTables = MachineTables.UNKNOWN
+    joint: JointSettings | None = field(default_factory=JointSettings, kw_only=True)
 
 
 class PlantAssembly:
@@ -125,16 +129,12 @@ class PlantAssembly:
             disk=ports.disk,
         )
         cameras = ports.cameras if design.targets else None
-        cycle = (
-            None
-            if cameras is None
-            else CalibrationCycle(
-                self.plant,
-                cameras if ports.pictures is None else KeptCamera(cameras, ports.pictures),
-                chosen.cycle,
-                Centring(),
-            )
-        )
+        cycle = joint = None
+        if cameras is not None:
+            eye = cameras if ports.pictures is None else KeptCamera(cameras, ports.pictures)
+            cycle = CalibrationCycle(self.plant, eye, chosen.cycle, Centring())
+            if chosen.joint is not None:
+                joint = JointCycle(self.plant, cameras, cycle, chosen.joint)
         self.schedule = None if cycle is None else self._schedule(cycle)
         self.operations = Operations(
             self.plant,
@@ -149,6 +149,7 @@ class PlantAssembly:
             pictures=ports.pictures,
             marking=None if cameras is None else self._marking(cameras),
             learner=ports.learner,
+            joint=joint,
         )
         if chosen.machines is not MachineTables.UNKNOWN:
             self._rest_on_machines()
@@ -298,10 +299,12 @@ class _WhereAwake:
     def __init__(self, schedule: Scheduling, cameras: Cameras) -> None:
         self._schedule, self._cameras = schedule, cameras
 
-    def next(self, target: str, ready: npt.NDArray[np.bool_]) -> Planned | None:
+    def next(
+        self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False
+    ) -> Planned | None:
         if not self._cameras.awake(target):
             return None
-        return self._schedule.next(target, ready)
+        return self._schedule.next(target, ready, beside)
 
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[Planned]:
         return self._schedule.plan(ready, limit)

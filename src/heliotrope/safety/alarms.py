@@ -294,6 +294,18 @@ CAMERA = AlarmKind(
     "Check the camera, its network and its clock.",
     over="target {subject}: frames arrive again",
 )
+BEAM_DISPROVED = AlarmKind(
+    "beam_disproved",
+    _PLANT,
+    Severity.WARNING,
+    "In a joint visit the light of a heliostat did not move with its aim, moved at the place of "
+    "another one, or was far from where it was expected.",
+    "{subject}: in a joint visit, {problem}",
+    "Nothing is learnt from that visit; it goes alone to its next one.",
+    "Look at its drives and couplings if it does not move; at addresses and the wiring of its bus "
+    "if it is exchanged with another one.",
+    over="{subject}: a photograph has shown its own beam at its place",
+)
 SENSOR = AlarmKind(
     "sensor",
     _PLANT,

@@ -221,7 +221,7 @@ export function calibration(box) {
   const draw = () => {
     if (!view) return;
     const truth = view.quality.some((p) => p.truth_median !== null);
-    const running = view.running.map((r) => h("li", {}, h("b", {}, r.heliostat), ` on ${r.target}: ${r.stage}`, h("em", {}, ` since ${clock(r.since)}`)));
+    const running = view.running.map((r) => h("li", {}, h("b", {}, r.heliostat), r.others.length ? ` and ${r.others.length} more (${r.others.join(", ")})` : "", ` on ${r.target}: ${r.stage}`, h("em", {}, ` since ${clock(r.since)}`)));
     const key = (text, colour, dashed) => h("span", {}, h("i", { className: dashed ? "dashed" : "", style: `color:${colour}` }), text);
     body.replaceChildren(
       h("div", { className: "hx-row" }, h("b", { className: view.on ? "good" : "warn" }, view.on ? "Running" : `Off: ${view.reason}`),

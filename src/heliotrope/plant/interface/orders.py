@@ -87,11 +87,15 @@ class Picture(Strict):
 
 
 class OneCalibration(Strict):
-    """A heliostat to be calibrated next, and the target ("": any); or only its beam searched."""
+    """A heliostat to be calibrated next, and the target ("": any).
+
+    Only its beam is searched; or others are calibrated together with it, in one joint visit.
+    """
 
     heliostat: Name
     target: Annotated[str, Field(max_length=64)] = ""
     search: bool = False
+    together: Annotated[list[Name], Field(max_length=127)] = []
 
 
 class OneGroup(Strict):

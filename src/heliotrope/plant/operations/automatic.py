@@ -29,11 +29,13 @@ from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.learning import Learner, Learning
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.losses import Losses
+from heliotrope.plant.operations.parties import Parties
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.operations.service import Service
 from heliotrope.plant.operations.views import CalibrationView, Planned
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
+from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.safety import alarms
 from heliotrope.store.records import Records
@@ -139,6 +141,7 @@ class AutomaticControl:
         settings: AutomaticSettings,
         pictures: Pictures | None = None,
         learner: Learner | None = None,
+        joint: JointCycle | None = None,
     ) -> None:
         self._plant, self._log, self._settings = plant, logbook, settings
         self._on, self._day, self._gave_way_at = settings.calibrate, True, -math.inf
@@ -178,6 +181,7 @@ class AutomaticControl:
                 self.truth,
                 self.flights.first,
                 pictures,
+                None if joint is None else Parties(plant, self.book, joint, logbook.take_alarm),
             )
             if settings.foresee > 0.0:
                 self._foresight = Foresight(plant, self._keeping, scheduler, settings.foresee)
@@ -201,11 +205,29 @@ class AutomaticControl:
         if not wanted and self._calibrating is not None:
             self._calibrating.withdraw(heliostats or self._plant.field.names)
 
-    def calibrate(self, heliostat: str, target: str = "", *, search: bool = False) -> None:
+    def calibrate(
+        self,
+        heliostat: str,
+        target: str = "",
+        *,
+        search: bool = False,
+        together: Sequence[str] = (),
+    ) -> None:
         """Calibrate a heliostat before all others; see `Operations.calibrate`."""
-        row = self._plant.field.place(heliostat)
         if target:
             self._plant.design.target(target)
+        names = tuple(dict.fromkeys((heliostat, *together)))
+        for name in names:
+            self._check_calibration(name)
+        if self._calibrating is None:
+            return
+        if len(names) > 1:
+            self._calibrating.ask_together(names, target)
+        else:
+            self._calibrating.ask(heliostat, target, search=search)
+
+    def _check_calibration(self, heliostat: str) -> None:
+        row = self._plant.field.place(heliostat)
         why = self._why_not()
         if not why and self.service.rows()[row]:
             why = "it is out of service"
@@ -213,7 +235,6 @@ class AutomaticControl:
             why = "automatic control does not have it"
         if why or self._calibrating is None:
             raise refusals.NO_CALIBRATION.error(heliostat=heliostat, why=why)
-        self._calibrating.ask(heliostat, target, search=search)
 
     @property
     def waits(self) -> str:
@@ -400,7 +421,8 @@ class AutomaticControl:
     def _visiting(self) -> frozenset[str]:
         if self._calibrating is None:
             return frozenset()
-        return frozenset(run.heliostat for run in self._calibrating.running.values())
+        running = self._calibrating.running.values()
+        return frozenset(name for run in running for name in run.heliostats)
 
     def _ready(self) -> npt.NDArray[np.bool_]:
         """Return which heliostats may be calibrated now, (N,)."""
@@ -413,8 +435,7 @@ class AutomaticControl:
         async def visit() -> None:
             if self._why_not():
                 return
-            name = await calibrating.visit(target, self._ready(), AUTOMATIC, self._token)
-            if name:
+            for name in await calibrating.visit(target, self._ready(), AUTOMATIC, self._token):
                 self._raising.release(name)
 
         return visit

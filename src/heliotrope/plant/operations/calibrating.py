@@ -17,6 +17,7 @@ from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.foresight import Foreseeing
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.parties import Parties
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import CalibrationEntry, Planned, Running
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
@@ -28,8 +29,13 @@ _TRUTH_EVERY = 5.0
 class Scheduling(Foreseeing, Protocol):
     """The choice of the heliostat that is calibrated next."""
 
-    def next(self, target: str, ready: npt.NDArray[np.bool_]) -> Planned | None:
-        """Return the next of the ready heliostats (N,) for a free target, None if none is due."""
+    def next(
+        self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False
+    ) -> Planned | None:
+        """Return the next of the ready heliostats (N,) for a free target, None if none is due.
+
+        With ``beside`` it goes there together with those returned before.
+        """
         ...
 
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[Planned]:
@@ -91,6 +97,8 @@ class Calibrating:
         Returns the heliostats to be visited first, after those in doubt.
     pictures
         Keeps the photographs with the results; None: they are not kept.
+    parties
+        Heliostats of joint visits; None: there are none.
     """
 
     def __init__(
@@ -104,8 +112,9 @@ class Calibrating:
         truth: TrueErrors,
         first: Callable[[], Collection[str]],
         pictures: Pictures | None = None,
+        parties: Parties | None = None,
     ) -> None:
-        self._first = first
+        self._first, self._parties = first, parties
         self._plant, self._log, self._cycle, self._scheduler = plant, log, cycle, scheduler
         self._book, self._keeping, self._truth = book, keeping, truth
         self._pictures = pictures
@@ -115,7 +124,8 @@ class Calibrating:
     @property
     def asked(self) -> tuple[str, ...]:
         """Heliostats that persons want calibrated next, in the order in which they were asked."""
-        return tuple(self._asked)
+        together = () if self._parties is None else self._parties.asked
+        return (*self._asked, *together)
 
     def ask(self, heliostat: str, target: str, *, search: bool = False) -> None:
         """Calibrate a heliostat before all others, on a target or, for "", on the next free one.
@@ -124,8 +134,15 @@ class Calibrating:
         """
         self._asked[heliostat] = target, search
 
+    def ask_together(self, heliostats: Sequence[str], target: str) -> None:
+        """Calibrate heliostats in a joint visit before all others; see `ask`."""
+        if self._parties is not None:
+            self._parties.ask(heliostats, target)
+
     def withdraw(self, heliostats: Sequence[str]) -> None:
         """Forget that persons wanted these heliostats calibrated."""
+        if self._parties is not None:
+            self._parties.withdraw(heliostats)
         for name in heliostats:
             self._asked.pop(name, None)
 
@@ -140,16 +157,19 @@ class Calibrating:
 
     async def visit(
         self, target: str, ready: npt.NDArray[np.bool_], person: Person, token: int
-    ) -> str:
-        """Calibrate the next of the ready heliostats (N,); return its name, "" if none is due.
+    ) -> tuple[str, ...]:
+        """Calibrate the next of the ready heliostats (N,), or several together; return which.
 
         Those that persons asked for come first, then those whose step counts are in doubt: a
         photograph ends it. Then those for which a flight has brought a large change, which a
         photograph confirms.
         """
+        if names := await self._party(target, ready):
+            await self._together(names, target, person, token)
+            return names
         name, search = self._chosen(target, ready)
         if not name:
-            return ""
+            return ()
         begun = self._now()
 
         def tell(stage: str) -> None:
@@ -171,7 +191,61 @@ class Calibrating:
         finally:
             self._running.pop(target, None)
         self._conclude(target, result, truth, begun, sigma)
-        return name
+        return (name,)
+
+    async def _party(self, target: str, ready: npt.NDArray[np.bool_]) -> tuple[str, ...]:
+        """Return the heliostats of a joint visit; () if the next visit is of one alone."""
+        if self._parties is None:
+            return ()
+        if names := self._parties.wanted(target, ready):
+            return names
+        alone = any(
+            where in ("", target) and ready[self._plant.field.place(name)]
+            for name, (where, _) in self._asked.items()
+        )
+        if alone or (ready & self._pressing()).any():
+            return ()
+        names = await self._parties.chosen(target, ready, self._scheduler.next)
+        # Another target's visit may have begun meanwhile.
+        away = {name for run in self._running.values() for name in run.heliostats}
+        free = tuple(name for name in names if name not in away)
+        return free if len(free) > 1 else ()
+
+    async def _together(
+        self, names: tuple[str, ...], target: str, person: Person, token: int
+    ) -> None:
+        """Calibrate heliostats on one target at once."""
+        assert self._parties is not None
+        begun, field = self._now(), self._plant.field
+
+        def tell(stage: str) -> None:
+            self._running[target] = Running(names[0], target, stage, begun, names[1:])
+
+        tell("on the way")
+        self._parties.begun(target)
+        truth = [self._truth.now(field.place(name)) for name in names]
+        sigma = [float(self._book.error[field.place(name)]) for name in names]
+        outcome, said = CalibrationOutcome.REFUSED, ""
+        try:
+            results = await self._parties.cycle.run(person, token, names, target, tell)
+        except RefusedError as error:
+            said = str(error)
+        except HeliotropeError as error:
+            outcome, said = CalibrationOutcome.ERROR, f"{type(error).__name__}: {error}"
+        finally:
+            self._running.pop(target, None)
+        if said:
+            results = tuple(CycleResult(name, outcome, said) for name in names)
+        for result, true, expected in zip(results, truth, sigma, strict=True):
+            self._conclude(target, result, true, begun, expected, joint=True)
+        proven = sum(result.new > 0 for result in results)
+        text = f"{proven} of {len(names)} heliostats proven together"
+        self._log.event("calibration", target, f"joint visit: {text}{said and f'; {said}'}")
+
+    def _pressing(self) -> npt.NDArray[np.bool_]:
+        """Return which heliostats are in doubt or changed by a flight, (N,): they go alone."""
+        changed = np.isin(self._plant.field.names, list(self._first()))
+        return np.asarray(self._plant.doubts.standing | changed)
 
     def _chosen(self, target: str, ready: npt.NDArray[np.bool_]) -> tuple[str, bool]:
         """Return the heliostat, and whether its beam is only searched for."""
@@ -190,7 +264,14 @@ class Calibrating:
         return self._plant.clock.utc().timestamp()
 
     def _conclude(
-        self, target: str, result: CycleResult, truth: float, begun: float, sigma: float
+        self,
+        target: str,
+        result: CycleResult,
+        truth: float,
+        begun: float,
+        sigma: float,
+        *,
+        joint: bool = False,
     ) -> None:
         row, good = self._plant.field.place(result.heliostat), result.outcome.calibrated
         record = result.record
@@ -210,6 +291,8 @@ class Calibrating:
             "; ".join((result.text, *result.rejected[:2])),
             0 if record is None else record.version,
         )
+        if self._parties is not None:
+            self._parties.concluded(result, joint=joint)
         self._book.conclude(entry)
         self._scheduler.done(entry)
         self._log.event("calibration", entry.heliostat, f"at {target}: {entry.text}")

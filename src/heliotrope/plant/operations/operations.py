@@ -57,6 +57,7 @@ from heliotrope.plant.operations.views import (
 )
 from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
+from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.safety import Act
 from heliotrope.store.records import Records
@@ -121,6 +122,8 @@ class Operations:
         Takes views that persons mark; None: there is no camera.
     learner
         Learns groups of mirrors at night; None: nothing is learnt.
+    joint
+        Calibrates several heliostats on one target; None: each is calibrated alone.
 
     Attributes
     ----------
@@ -143,6 +146,7 @@ class Operations:
         pictures: Pictures | None = None,
         marking: Marking | None = None,
         learner: Learner | None = None,
+        joint: JointCycle | None = None,
     ) -> None:
         self.plant, self.logbook, self.pictures, self.marking = plant, logbook, pictures, marking
         self._cameras, self._extra = dict(cameras or {}), extra
@@ -156,6 +160,7 @@ class Operations:
             settings=settings or AutomaticSettings(),
             pictures=pictures,
             learner=learner,
+            joint=joint,
         )
         self.security = SecurityLog(logbook, plant.clock)
         self._viewer = Viewer(plant, self.automatic)
@@ -336,9 +341,17 @@ class Operations:
         self._tell(person, f"calibration switched {'on' if on else 'off'}")
 
     def calibrate(
-        self, person: Person, heliostat: str, target: str = "", *, search: bool = False
+        self,
+        person: Person,
+        heliostat: str,
+        target: str = "",
+        *,
+        search: bool = False,
+        together: Sequence[str] = (),
     ) -> None:
         """Calibrate a heliostat, or only search its beam, on the next free target, before others.
+
+        With others (``together``) it is calibrated in one joint visit, as soon as all are ready.
 
         Raises
         ------
@@ -348,9 +361,11 @@ class Operations:
             If there is no such heliostat or target.
         """
         _operator(person, "calibration")
-        self.automatic.calibrate(heliostat, target, search=search)
+        self.automatic.calibrate(heliostat, target, search=search, together=together)
         what = "search for the beam" if search else "calibration"
-        self._tell(person, f"asked for a {what} of {heliostat}{target and f' on {target}'}")
+        what = "joint calibration" if together else what
+        whose = ", ".join((heliostat, *together))
+        self._tell(person, f"asked for a {what} of {whose}{target and f' on {target}'}")
 
     async def photograph(self, person: Person, target: str) -> CameraView:
         """Photograph a target now, with whatever beam is on it; return what is seen.

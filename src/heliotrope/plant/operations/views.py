@@ -333,12 +333,22 @@ class BusFrame:
 
 @dataclass(frozen=True)
 class Running:
-    """A visit under way: heliostat, target, what is being done, and its beginning (POSIX s)."""
+    """A visit under way.
+
+    Heliostat, target, what is being done, its beginning (POSIX s), and in a joint visit the other
+    heliostats.
+    """
 
     heliostat: str
     target: str
     stage: str
     since: float
+    others: tuple[str, ...] = ()
+
+    @property
+    def heliostats(self) -> tuple[str, ...]:
+        """All heliostats of the visit."""
+        return (self.heliostat, *self.others)
 
 
 @dataclass(frozen=True)

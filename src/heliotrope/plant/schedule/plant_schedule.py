@@ -73,11 +73,16 @@ class PlantSchedule:
         plant.beliefs.subscribe(scheduler.learn)
         plant.beliefs.subscribe_drift(scheduler.drift)
 
-    def next(self, target: str, ready: npt.NDArray[np.bool_]) -> Planned | None:
-        """Return the next of the ready heliostats (N,) for a free target, None if none is due."""
+    def next(
+        self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False
+    ) -> Planned | None:
+        """Return the next of the ready heliostats (N,) for a free target, None if none is due.
+
+        With ``beside`` it goes there together with those returned before.
+        """
         for gone in list(self.scheduler.running.values()):
             # The target is free, so the visit there has ended without a result.
-            if gone.target == target:
+            if gone.target == target and not beside:
                 self.scheduler.cancel(gone.heliostat)
         assignment = self.scheduler.next(
             self._plant.clock.utc(),

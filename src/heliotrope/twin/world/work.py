@@ -48,7 +48,10 @@ class _Rounds:
         self._last = dict.fromkeys(names, -1)
         self._count = 0
 
-    def next(self, target: str, ready: npt.NDArray[np.bool_]) -> Planned | None:
+    def next(
+        self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False
+    ) -> Planned | None:
+        del beside
         able = [name for name, free in zip(self._names, ready, strict=True) if free]
         if not able:
             return None
