@@ -49,14 +49,12 @@ _COLOURS = {
 }
 
 
-def test_the_page_draws_the_prediction_beside_what_comes_true(
-    field: LiveConsole, enter: Callable[..., Any]
-) -> None:
+def test_the_page_tells_what_is_predicted(field: LiveConsole, enter: Callable[..., Any]) -> None:
     def two() -> bool:
         return len(field.live.operations.calibration().outlooks) == 2
 
     field.until(two, 240.0)
-    page = enter("viewer", viewport={"width": 800, "height": 900})
+    page = enter("viewer")
     page.click(".hx-tabs >> text=Calibration")
     page.wait_for_selector(".hx-outlook .hx-keys")
     keys = page.inner_text(".hx-outlook .hx-keys")
@@ -64,12 +62,54 @@ def test_the_page_draws_the_prediction_beside_what_comes_true(
     assert "came true, median" in keys
     assert keys.count("predicted at ") == 2
     assert "90 % of the heliostats are within" in page.inner_text(".hx-outlook .hx-hint")
+
+
+def _curve(begin: float, level: float) -> list[dict[str, float]]:
+    """Percentiles that fall to a quarter within an hour, rad."""
+    steps = [begin + 600.0 * k for k in range(7)]
+    fall = [level * 4.0 ** (-k / 6.0) for k in range(7)]
+    return [
+        {"at": at, "median": value, "percentile_90": 2.0 * value}
+        for at, value in zip(steps, fall, strict=True)
+    ]
+
+
+def _outlook(made: float, level: float) -> dict[str, Any]:
+    rest = {"heliostats": 6, "goal": 3.5e-4, "reached": None, "text": "not today"}
+    return {"made": made, "points": _curve(made, level), **rest}
+
+
+#: Answers of the API in which no curve lies on another one.
+_CURVES = {
+    "outlooks": [_outlook(1.75e9, 2e-3), _outlook(1.75e9 + 1800.0, 7e-4)],
+    "field": _curve(1.75e9, 8e-3),
+}
+
+
+def test_the_page_draws_the_prediction_beside_what_comes_true(
+    enter: Callable[..., Any],
+) -> None:
+    page = enter("viewer", viewport={"width": 800, "height": 900})
+    _answering(page, _CURVES)
+    page.click(".hx-tabs >> text=Calibration")
+    page.wait_for_selector(".hx-outlook .hx-keys")
     assert page.evaluate("document.documentElement.scrollWidth") <= 800
     assert page.locator(".hx-outlook canvas").bounding_box()["width"] > 600
     for dark in (True, False):
         page.evaluate("dark => { Quasar.Dark.set(dark); heliotrope.store.emit('theme'); }", dark)
         for colour in _COLOURS[dark]:
             page.wait_for_function(_DRAWN, arg=colour)
+    page.unroute_all(behavior="wait")
+
+
+def _answering(page: Any, fields: dict[str, Any]) -> None:
+    """Let the progress of calibration have these fields, whatever the plant says."""
+
+    def answer(route: Any) -> None:
+        told = route.fetch()
+        route.fulfill(response=told, json={**told.json(), **fields})
+
+    page.route("**/api/v1/calibration", answer)
 
 
 def test_the_curve_is_in_the_answer_of_the_api_and_in_the_store(
@@ -115,11 +155,7 @@ def test_the_last_measurements_fit_into_every_window(
     field.until(lambda: field.live.operations.calibration().quality, 240.0)
     page = enter("viewer")
 
-    def with_results(route: Any) -> None:
-        answer = route.fetch()
-        route.fulfill(response=answer, json={**answer.json(), "results": [_RESULT] * 3})
-
-    page.route("**/api/v1/calibration", with_results)
+    _answering(page, {"results": [_RESULT] * 3})
     page.click(".hx-tabs >> text=Calibration")
     page.wait_for_selector(".hx-calibration td:has-text('P0012F')")
     for width in (800, 1100, 1400, 1900):
