@@ -4,6 +4,8 @@ import ast
 import builtins
 import importlib
 import json
+import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any
 
 import pytest
 
+SCRIPTS = Path(__file__).parents[1] / "scripts"
 SOURCE = '''"""A module."""
 LIMIT: float = 6.0
 
@@ -28,7 +31,7 @@ def late(age: int, known: bool = True) -> bool:
 def scripts() -> Iterator[Any]:
     """The scripts, as they find each other when one of them runs."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[1] / "scripts"))
+        patch.syspath_prepend(str(SCRIPTS))
         names = ("mutant_operators", "mutant_probes", "mutant_trials", "mutants")
         yield SimpleNamespace(**{name: importlib.import_module(name) for name in names})
         for name in names:
@@ -195,6 +198,27 @@ def test_what_feels_a_mutant_is_kept_until_the_sources_change(
     assert trials.Reach.read(path) == kept
     monkeypatch.setattr(trials, "stamp", lambda: "changed")
     assert trials.Reach.read(path) == trials.Reach()
+
+
+@pytest.mark.parametrize("most", [-1e9, 1e9])
+def test_tests_that_are_left_out_when_the_time_is_up_find_nothing(
+    tmp_path: Path, most: float
+) -> None:
+    """In an interpreter of its own: its status would count a mutant as found."""
+    failing = tmp_path / "test_one.py"
+    failing.write_text("def test_one():\n    assert False\n")
+    begin = f"import sys, mutant_trials as m\nm.MOST_TESTS, m.OPTIONS = {most}, ()"
+    run = f"sys.exit(m._alone('unit outside', ['test_one.py::test_one'], {str(tmp_path)!r}, 60.0))"
+    path = os.pathsep.join([str(SCRIPTS), *sys.path])
+    ended = subprocess.run(
+        [sys.executable, "-c", f"{begin}\n{run}"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == (0 if most < 0 else 1), ended.stdout + ended.stderr
 
 
 def test_the_table_counts_and_names_survivors(scripts: Any) -> None:
