@@ -27,6 +27,7 @@ from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.parties import Parties
 from heliotrope.plant.operations.views import Planned
+from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits import (
     CalibrationCycle,
     Centring,
@@ -85,7 +86,11 @@ class Scene:
 
 
 def joint(
-    scene: Callable[[Scene], Awaitable[None]], count: int = 6, *, rendered: bool = False
+    scene: Callable[[Scene], Awaitable[None]],
+    count: int = 6,
+    *,
+    rendered: bool = False,
+    settings: PlantSettings | None = None,
 ) -> None:
     """Play a scene in virtual time."""
 
@@ -94,7 +99,12 @@ def joint(
         installed = partial(roughly_installed, seed=3, scale=0.03)
         work = AutomaticSettings(wanted=True, calibrate=False)
         options = LiveOptions(
-            rendered=rendered, threads=0, installed=installed, work=work, cycle=CYCLE
+            rendered=rendered,
+            threads=0,
+            installed=installed,
+            work=work,
+            cycle=CYCLE,
+            plant=settings or PlantSettings(),
         )
         live = LivePlant(design, clock, options)
         plant = live.plant
@@ -239,6 +249,19 @@ def test_one_that_is_stowed_meanwhile_drops_out_and_the_others_go_on() -> None:
         assert here.states()[gone] == "STOWED", "a person's order is not undone"
 
     joint(scene)
+
+
+def test_movements_on_a_target_wait_for_no_turn_to_join_the_receiver() -> None:
+    async def scene(here: Scene) -> None:
+        times: dict[str, float] = {}
+        here.during = lambda stage: times.setdefault(stage, here.live.clock.monotonic()) and None
+        results = await here.run()
+        assert {r.outcome for r in results.values()} == {_CALIBRATED}, results
+        begin, end = times["photograph 1 of 8, 6 beams"], times["6 on the way back"]
+        # At the receiver's rate four of six beams would wait two seconds each, for each photograph.
+        assert 8 * 2.0 <= end - begin + 1e-6 < 8 * 4.0
+
+    joint(scene, settings=PlantSettings(join_rate=0.5, join_burst=2))
 
 
 def test_an_emergency_a_lost_authority_or_a_blind_camera_ends_it_cleanly() -> None:
@@ -399,7 +422,7 @@ def test_parties_leave_every_second_visit_to_those_without_a_calibration() -> No
     made, _, ready = parties(1e-3, first=0)
     made.begun("left")
     assert asyncio.run(made.chosen("left", ready, follow)) == ("A", "B", "C", "D", "E")
-    vague, _, ready = parties(2.1e-3, first=0)
+    vague, _, ready = parties(1.6e-3, first=0)
     assert asyncio.run(vague.chosen("left", ready, follow)) == ()
 
 

@@ -253,3 +253,32 @@ def test_what_is_a_snapshot() -> None:
     assert not is_snapshot("http://10.0.0.5/video")
     assert not is_snapshot("frames/now.jpg")
     assert isinstance(open_source("http://10.0.0.5/now.jpg"), SnapshotSource)
+
+
+def test_the_light_on_a_target_is_seen_from_its_front(plant: Plant, frame: Frame) -> None:
+    target, script = plant.targets[0], Scripted(frame)
+    cameras = RealCameras(plant, Path(), SystemClock(), sources=script)
+    cameras.start(unheard)
+    try:
+        before = SystemClock().monotonic()
+        light = asyncio.run(cameras.light(target))
+        assert light.at >= before - 0.02
+        rows, columns = light.values.shape
+        assert columns * light.step == pytest.approx(target.width, abs=0.1)
+        # The brightest paint is where the beam is.
+        shown = np.where(light.seen, light.values, 0.0)
+        row, column = np.unravel_index(int(np.argmax(shown)), shown.shape)
+        place = light.first + light.step * np.array([column, -row])
+        assert place == pytest.approx([OFF, 0.0], abs=0.2)
+        assert not light.seen[[0, rows - 1]].any(), "the rim shows what is behind the target"
+        assert 0.0 < np.sqrt(np.trace(light.covariance_at(place))) < 0.05
+        again = asyncio.run(cameras.light(target, light.view))
+        assert again.view is light.view
+        np.testing.assert_array_equal(again.values, light.values)
+        assert "joint visit" in cameras.view(target.name).reading[0]
+        assert asyncio.run(cameras.beside(threading.get_ident)) != threading.get_ident()
+        script.deviation = 2.0
+        with pytest.raises(FetchError, match="is known within 2 s only"):
+            asyncio.run(cameras.light(target))
+    finally:
+        cameras.close()

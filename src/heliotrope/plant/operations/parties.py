@@ -18,6 +18,8 @@ Mask = npt.NDArray[np.bool_]
 #: Returns the next of the ready heliostats (N,) for a target; with True others go there with it.
 Next = Callable[[str, Mask, bool], Planned | None]
 
+#: Share of the largest expected error that a heliostat may have which automatic control sends.
+_SURE = 0.75
 #: Verdicts that say that something is wrong with a mirror or with what is believed of it.
 _WRONG = (Verdict.STUCK, Verdict.EXCHANGED, Verdict.ELSEWHERE)
 
@@ -90,8 +92,9 @@ class Parties:
         if first.any() and target in self._last:
             self._last.discard(target)
             return ()
-        # The book has errors of the normal; a beam is off by twice as much.
-        known = ready & (2.0 * self._book.error <= settings.known)
+        # The book has errors of the normal at the receiver; a beam is off by twice as much, and on
+        # the target a little more. One that has no place in the visit would count as failed.
+        known = ready & (2.0 * self._book.error <= _SURE * settings.known)
         known[[field.place(name) for name in self._alone]] = False
         if int(known.sum()) < settings.least:
             return ()

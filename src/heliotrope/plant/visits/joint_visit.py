@@ -20,6 +20,8 @@ from heliotrope.plant.visits.visit import ARRIVED, Visit
 
 #: Longest time of an order, and of the way to standby, s.
 _ORDER, _HOME = 60.0, 120.0
+#: Longest wait for a turn to leave the receiver, s.
+_WAIT = 2.0
 #: Time between looks at the field, s.
 _LOOK = 0.25
 #: States in which a beam may be on the target, and those that an order of others has led to, which
@@ -104,8 +106,13 @@ class JointVisit:
                     self.drop({name: said})
             except RefusedError as error:
                 self.drop({name: str(error)})
-        self._away |= set(self.visits)
-        await self.aim(points, limit)
+        # One that tracks the receiver while its new aim waits for its turn points beside its aim,
+        # and after some seconds is taken for one that disobeys. So few wait at a time.
+        few = max(1, round(_WAIT * self.plant.settings.join_rate))
+        for first in range(0, len(names := self.names), few):
+            part = [name for name in names[first : first + few] if name in self.visits]
+            self._away |= set(part)
+            await self.aim({name: points[name] for name in part}, limit)
         await self.track(limit)
         await self._arrived(limit)
 
@@ -115,12 +122,13 @@ class JointVisit:
         await self._obeyed(lambda names: self._command("TRACK", names), idle, limit)
 
     async def aim(self, points: Mapping[str, FloatArray], limit: float = _ORDER) -> None:
-        """Give those that take part their aims; who may not have its aim drops out."""
+        """Give aims to those that take part; who may not have its aim drops out."""
+        wanted = [name for name in self.names if name in points]
 
         def ordered(names: tuple[str, ...]) -> Ticket:
             return self.plant.aim(self.person, self.token, {name: points[name] for name in names})
 
-        await self._obeyed(ordered, self.names, limit)
+        await self._obeyed(ordered, wanted, limit)
 
     def _command(self, name: str, heliostats: tuple[str, ...]) -> Ticket:
         return self.plant.command(self.person, self.token, name, heliostats)
