@@ -63,6 +63,10 @@ COLUMNS = {
         "surface", "mirrors", "photographs", "proven", "rms_mrad", "worst_mrad", "within_90",
         "power_lost_share", "separation_cpu_s", "mirrors_an_hour",
     },
+    "obstruction": {
+        "distance_m", "hidden", "predicted_right_mrad", "predicted_up_mrad", "read_right_mrad",
+        "read_up_mrad", "left_mrad", "left_of_flux_mrad",
+    },
     "drifting": {
         "learns", "heliostats", "days", "visits", "median_mrad", "p90_mrad", "within_90",
     },
