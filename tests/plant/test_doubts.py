@@ -178,12 +178,13 @@ def test_heliostats_in_doubt_are_visited_before_others(
                 lambda: (),
             )
             ready = np.ones(len(plant.field), dtype=np.bool_)
-            assert await calibrating.visit("target", ready, ENGINEER, 1) == first
+            assert await calibrating.visit("target", ready, ENGINEER, 1) == (first,)
             assert [entry.heliostat for entry in chooser.entries] == [first]
             # Not if it is on its way elsewhere, or held.
             for name in doubted:
                 ready[plant.field.place(name)] = False
-            assert await calibrating.visit("target", ready, ENGINEER, 1) not in doubted
+            (last,) = await calibrating.visit("target", ready, ENGINEER, 1)
+            assert last not in doubted
 
     run_virtual(main)
 
