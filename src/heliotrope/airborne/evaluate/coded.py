@@ -60,7 +60,7 @@ def find_targets(picture: Picture) -> SeenTargets:
     number, corners = number[once & large], corners[once & large]
     sigma = np.ones(len(number))
     for reach in _REACHES:
-        lines = find_outlines(picture, corners, reach)
+        lines = find_outlines(picture, corners, reach, printed=True)
         good = lines.found
         number, corners, sigma = number[good], lines.corners[good], lines.sigma[good]
     if not len(number):

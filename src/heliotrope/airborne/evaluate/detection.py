@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.airborne._photo_metadata import read_metadata
+from heliotrope.airborne.evaluate.edges import cross_edges
 from heliotrope.airborne.visibility import MARGIN, Labels
 from heliotrope.errors import FormatError
 from heliotrope.files.text import read_bytes
@@ -252,12 +253,15 @@ def find_outlines(
     reach: float,
     profiles: int = _PROFILES,
     shown: Overlap | None = None,
+    *,
+    printed: bool = False,
 ) -> Outlines:
     """Return the outlines of mirrors near the expected ones.
 
     Profiles across each edge are projected on the colour in which both sides differ most and
-    averaged in eight groups; the edge of each group is the centroid of its slope. A straight line
-    through them is fitted with weights that reject what is off it, such as a neighbour or a shadow.
+    averaged in eight groups, each of which gives a place of the edge
+    (`heliotrope.airborne.evaluate.edges`). A straight line through them is fitted with weights that
+    reject what is off it, such as a neighbour or a shadow.
 
     Parameters
     ----------
@@ -271,6 +275,8 @@ def find_outlines(
         Across each edge, a multiple of eight; fewer are quicker.
     shown
         What each pixel shows, if mirrors overlap: only edges against the ground are measured.
+    printed
+        Whether these are squares on paper, which have no shadow beside them.
     """
     count = len(expected)
     if count == 0:
@@ -294,7 +300,7 @@ def find_outlines(
     )
     colour = sample(picture, places)
     clear = np.ones(colour.shape[:3], np.bool_) if shown is None else shown.clear(places, steps)
-    offset, contrast, known = _edges(colour, steps, reach, clear)
+    offset, contrast, known = cross_edges(colour, steps, reach, clear, _GROUPS, fitted=not printed)
     middles = part.reshape(_GROUPS, -1).mean(axis=1)
     points = start[:, :, None] + middles[:, None] * along[:, :, None]
     points = points + offset[..., None] * outward[:, :, None]
@@ -309,40 +315,6 @@ def find_outlines(
     both = enough & np.roll(enough, 1, axis=1) & np.isfinite(corners).all(axis=-1)
     of_corner: Mask = np.asarray(both if shown is None else both & start_seen & end_seen)
     return Outlines(np.where(of_corner[..., None], corners, np.nan), sigma, contrast, of_corner)
-
-
-def _edges(
-    colour: FloatArray, steps: FloatArray, reach: float, clear: Mask
-) -> tuple[FloatArray, FloatArray, Mask]:
-    """Return offsets (M, 4, groups) of the edges, the least contrast (M,), and which are valid."""
-    inner, outer = steps < -reach, steps > reach
-    share = clear / np.maximum(clear.sum(axis=-1, keepdims=True), 1)
-    levels = [
-        np.einsum("mepc,mep->mec", colour[..., side, :].mean(axis=3), share)
-        for side in (inner, outer)
-    ]
-    apart = levels[0] - levels[1]
-    contrast = np.linalg.norm(apart, axis=-1)
-    direction = apart / np.maximum(contrast, 1e-9)[..., None]
-    profile = np.einsum("mepsc,mec->meps", colour, direction)
-    grouped = profile.reshape(*profile.shape[:2], _GROUPS, -1, len(steps)).mean(axis=3)
-    slope = -np.diff(grouped, axis=-1)
-    at = 0.5 * (steps[1:] + steps[:-1])
-    usable = np.abs(at) <= reach + 1.0
-    smooth = slope[..., :-2] + 2.0 * slope[..., 1:-1] + slope[..., 2:]
-    smooth = np.where(usable[1:-1], smooth, -np.inf)
-    peak = at[1:-1][np.argmax(smooth, axis=-1)]
-    near = np.abs(at - peak[..., None]) <= 2.6
-    highest = np.max(np.where(near, slope, 0.0), axis=-1, keepdims=True)
-    weight = np.where(near, np.clip(slope - 0.1 * highest, 0.0, None), 0.0)
-    total = weight.sum(axis=-1)
-    offset = np.sum(weight * at, axis=-1) / np.maximum(total, 1e-12)
-    # A true edge has most of the contrast.
-    jump = np.sum(np.where(near, slope, 0.0), axis=-1)
-    known = (jump > 0.5 * contrast[..., None]) & (total > 0.0)
-    known &= clear.reshape(*clear.shape[:2], _GROUPS, -1).all(axis=-1)
-    hidden = ~clear.any(axis=-1)
-    return offset, np.where(hidden, np.inf, contrast).min(axis=1) / np.sqrt(3.0), known
 
 
 def _lines(
