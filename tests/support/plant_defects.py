@@ -161,8 +161,8 @@ def counted_often(patch: pytest.MonkeyPatch) -> None:
     """Every sighting is counted ten times in the fit."""
     fitting = OwnModel.fitting
 
-    def repeated(self: Any, nominal: Any, sightings: Any) -> Any:
-        return fitting(self, nominal, join([sightings] * 10))
+    def repeated(self: Any, nominal: Any, sightings: Any, *more: Any) -> Any:
+        return fitting(self, nominal, join([sightings] * 10), *more)
 
     patch.setattr(OwnModel, "fitting", repeated)
 
