@@ -277,8 +277,8 @@ def test_dark_and_light(enter: Callable[[str], Any]) -> None:
 def test_calibration_is_seen(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page = enter("viewer")
     page.click(".hx-tabs >> text=Calibration")
-    page.wait_for_selector(".hx-calibration td:has-text('✓ calibrated')", timeout=180_000)
-    row = page.inner_text(".hx-calibration tbody tr:has-text('✓ calibrated') >> nth=0")
+    page.wait_for_selector(".hx-calibration td span.good:has-text('✓')", timeout=180_000)
+    row = page.inner_text(".hx-calibration tbody tr:has(span.good:has-text('✓')) >> nth=0")
     assert any(target in row for target in field.live.operations.targets)
     page.select_option(".hx-tools select", "error")
     assert page.evaluate("heliotrope.store.error.some(e => e > 0 && e < 3e-3)")

@@ -211,10 +211,6 @@ class Motion:
                 return False
         return True
 
-    def _is_far(self, angles: "list[float]") -> bool:
-        """Whether angles are far from those at which `pose` was last asked for."""
-        return max(abs(angles[0] - self._near[0]), abs(angles[1] - self._near[1])) > FAR
-
     def _go_angles(self, angles: "list[float]", order: int) -> None:
         """Go to joint angles, by ``follow`` where order is −1."""
         stepper, steps = self.stepper, [0, 0]
@@ -495,8 +491,13 @@ class Motion:
         self._place += 1
         if self._place < len(self._path):
             pose = self.pose(self._path[self._place], 0)
-            if pose is None or (self.kind == RETURN and self._is_far(pose.angles)):
+            if pose is None:
                 return "UNREACHABLE"
+            # `pose` keeps the turn of each axis from where it was asked for last.
+            if self.kind == RETURN:
+                for i in (0, 1):
+                    if abs(pose.angles[i] - self._near[i]) > FAR:
+                        return "UNREACHABLE"
             order = BOTH
             if self.kind == APPROACH and self._place == 0:
                 order = PRIMARY_FIRST if self.config.azimuth_axis == 0 else SECONDARY_FIRST
