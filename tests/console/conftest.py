@@ -10,6 +10,7 @@ import pytest
 
 from heliotrope.console import _secrets
 from support.live_console import PASSWORD, ROLES, LiveConsole
+from support.pages import browsers, entering
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -83,3 +84,15 @@ def person(console: LiveConsole) -> Iterator[Callable[..., httpx.Response]]:
             return clients[role].request(method, path, json=body)
 
         yield send
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A browser for this module alone."""
+    yield from browsers()
+
+
+@pytest.fixture
+def enter(field: LiveConsole, browser: Any) -> Iterator[Callable[..., Any]]:
+    """Sign in to the plant of the module as somebody of a role."""
+    yield from entering(field.address, browser)

@@ -18,7 +18,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.imaging.targets.teaching import known_points, with_camera
 from heliotrope.plant.operations.marking import Marking
 from support.live_console import ROLES, LiveConsole
-from support.pages import NEEDS_BROWSER, browsers, entering, said
+from support.pages import NEEDS_BROWSER, entering, said
 
 Ask = Callable[..., httpx.Response]
 TARGET = "left"
@@ -161,12 +161,6 @@ def test_wrong_marks_are_refused_in_one_line(
     assert answer.status_code in (404, 422)
     assert text in answer.json()["detail"]
     assert "\n" not in answer.json()["detail"]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """A browser for this module alone."""
-    yield from browsers()
 
 
 @pytest.fixture

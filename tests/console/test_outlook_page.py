@@ -7,7 +7,7 @@ import pytest
 
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from support.live_console import LiveConsole
-from support.pages import NEEDS_BROWSER, browsers, entering
+from support.pages import NEEDS_BROWSER
 
 pytestmark = NEEDS_BROWSER
 
@@ -19,18 +19,6 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
     made = LiveConsole(tmp_path_factory.mktemp("outlook"), 6, speed=20.0, work=work)
     yield made
     made.close()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """A browser for this module alone."""
-    yield from browsers()
-
-
-@pytest.fixture
-def enter(field: LiveConsole, browser: Any) -> Iterator[Callable[..., Any]]:
-    """Sign in as somebody of a role."""
-    yield from entering(field.address, browser)
 
 
 #: Whether a colour, [red, green, blue], is somewhere in the picture of a canvas.

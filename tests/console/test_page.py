@@ -14,7 +14,7 @@ from heliotrope.console._secrets import verify_password
 from heliotrope.console.people import FIRST, first_start
 from heliotrope.store.keeper import Keeper
 from support.live_console import PASSWORD, LiveConsole
-from support.pages import NEEDS_BROWSER, browsers, entering, menu, said
+from support.pages import NEEDS_BROWSER, menu, said
 
 pytestmark = NEEDS_BROWSER
 
@@ -25,18 +25,6 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
     made = LiveConsole(tmp_path_factory.mktemp("page"), 640, speed=4.0)
     yield made
     made.close()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """A browser for this module alone."""
-    yield from browsers()
-
-
-@pytest.fixture
-def enter(field: LiveConsole, browser: Any) -> Iterator[Callable[..., Any]]:
-    """Sign in as somebody of a role."""
-    yield from entering(field.address, browser)
 
 
 def test_log_in_and_look(field: LiveConsole, enter: Callable[[str], Any]) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from support.live_console import LiveConsole
-from support.pages import NEEDS_BROWSER, browsers, entering, menu, said
+from support.pages import NEEDS_BROWSER, menu, said
 
 pytestmark = NEEDS_BROWSER
 
@@ -18,18 +18,6 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
     made = LiveConsole(tmp_path_factory.mktemp("safety"), 64, speed=4.0)
     yield made
     made.close()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """A browser for this module alone."""
-    yield from browsers()
-
-
-@pytest.fixture
-def enter(field: LiveConsole, browser: Any) -> Iterator[Callable[..., Any]]:
-    """Sign in as somebody of a role."""
-    yield from entering(field.address, browser)
 
 
 # -- EMERGENCY above everything ----------------------------------------------------------------

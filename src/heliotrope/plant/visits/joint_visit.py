@@ -16,7 +16,7 @@ from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.tickets import Ticket
-from heliotrope.plant.visits.visit import ARRIVED, Visit
+from heliotrope.plant.visits.visit import ARRIVED, BroughtHome, Visit
 
 #: Longest time of an order, and of the way to standby, s.
 _ORDER, _HOME = 60.0, 120.0
@@ -30,7 +30,7 @@ _ON = (states.IDLE, states.TRACKING, states.SEARCHING)
 _OFF = (states.DEFOCUSED, states.STOWING, states.STOWED, states.LOCKED, states.APPROACHING)
 
 
-class JointVisit:
+class JointVisit(BroughtHome):
     """Several heliostats on their way to, at, and from one target.
 
     Parameters
@@ -215,15 +215,3 @@ class JointVisit:
         if left:
             self.plant.defocus(who, tuple(sorted(left)))
         self._away -= set(names)
-
-    async def __aenter__(self) -> "JointVisit":
-        """Begin the visit; at its end all are brought home."""
-        return self
-
-    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Bring them home. A cancelled visit ends as cancelled, even if coming home is refused."""
-        try:
-            await self.home()
-        except RefusedError:
-            if kind is None or not issubclass(kind, asyncio.CancelledError):
-                raise

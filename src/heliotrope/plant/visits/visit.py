@@ -1,7 +1,9 @@
 """A heliostat's visit to a target: the way there, the observed stay, and the way back."""
 
 import asyncio
+from abc import ABC, abstractmethod
 from bisect import bisect_right
+from typing import Self
 
 import numpy as np
 
@@ -22,7 +24,27 @@ SILENT = 10.0
 _LOOK = 0.25
 
 
-class Visit:
+class BroughtHome(ABC):
+    """What is brought home when its ``async with`` ends."""
+
+    @abstractmethod
+    async def home(self) -> None:
+        """Bring it home, or off the target; raise RefusedError if the plant refuses."""
+
+    async def __aenter__(self) -> Self:
+        """Begin the visit; at its end the heliostats are brought home."""
+        return self
+
+    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Bring them home. A cancelled visit ends as cancelled, even if coming home is refused."""
+        try:
+            await self.home()
+        except RefusedError:
+            if kind is None or not issubclass(kind, asyncio.CancelledError):
+                raise
+
+
+class Visit(BroughtHome):
     """One heliostat on its way to, and at, a target.
 
     Parameters
@@ -201,18 +223,6 @@ class Visit:
     def counted(self) -> tuple[FloatArray, FloatArray]:
         """The times, monotonic s, (R,), and the step counts, (R, 2), that were noted."""
         return np.array(self._times), np.array(self._counts).reshape(-1, 2)
-
-    async def __aenter__(self) -> "Visit":
-        """Begin the visit; at its end the heliostat is brought home."""
-        return self
-
-    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Bring it home. A cancelled visit ends as cancelled, even if coming home is refused."""
-        try:
-            await self.home()
-        except RefusedError:
-            if kind is None or not issubclass(kind, asyncio.CancelledError):
-                raise
 
     async def home(self) -> None:
         """Bring it back to standby; where that is not possible, take its beam off the target."""
