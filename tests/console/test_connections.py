@@ -20,9 +20,16 @@ Ask = Callable[..., httpx.Response]
 
 @pytest.fixture
 def listener(console: LiveConsole) -> Iterator[Listener]:
-    """Return the console's listener; its limits are put back afterwards."""
+    """Return the console's listener without strangers; its limits are put back afterwards.
+
+    The server may see later than the next test that a test's connections are gone, and would take
+    their places away first.
+    """
     found = console.server.listener
     limits = found.limits
+    until = time.monotonic() + 60.0
+    while len(found) and time.monotonic() < until:
+        time.sleep(0.05)
     yield found
     found.limits = limits
 
