@@ -29,6 +29,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.targets.click_page import ask, click_points
 from heliotrope.imaging.targets.marks import polygons
+from heliotrope.imaging.targets.sights import sights
 from heliotrope.imaging.targets.teaching import (
     Taught,
     Wish,
@@ -36,7 +37,6 @@ from heliotrope.imaging.targets.teaching import (
     known_points,
     read_pictures,
     see_marks,
-    sights,
     teach,
     write_taught,
 )

@@ -376,7 +376,7 @@ def show(
     """Print the cameras of a plant and their views of its targets."""
     import numpy as np
 
-    from heliotrope.imaging.targets.teaching import sights
+    from heliotrope.imaging.targets.sights import sights
 
     loaded = open_plant(plant)
     if not loaded.cameras and not as_json:

@@ -17,7 +17,8 @@ from heliotrope.imaging.spots.centroid import Centroid, with_centroid
 from heliotrope.imaging.spots.placed import PlacedSpot, place
 from heliotrope.imaging.spots.quality import Expectation, Limits, Reason, judge
 from heliotrope.imaging.spots.spot import find_spots
-from heliotrope.imaging.targets.finding import FoundTarget, Pictures, find_targets
+from heliotrope.imaging.targets.attempt import Pictures
+from heliotrope.imaging.targets.finding import FoundTarget, find_targets
 from heliotrope.imaging.targets.rectify import LEAST_RIM, Rectified, from_crop, rectify, rim_of
 from heliotrope.imaging.targets.view import FaceView
 

@@ -2,9 +2,10 @@
 
 - `marks` and `detection`: drawings of marks, and candidates for them in a frame.
 - `constellation` and `refinement`: which candidate is which mark, and its exact place.
-- `finding`: targets in a frame, or why they were not found. `view` maps a target's plane to a
-  frame, `rectify` shows it from the front.
-- `teaching` and `click_page`: marks and camera from points that a person gives.
+- `finding`: targets in a frame, or why they were not found, by one `attempt` after another. `view`
+  maps a target's plane to a frame, `rectify` shows it from the front.
+- `teaching` and `click_page`: marks and camera from points that a person gives. `sights`: how well
+  a camera sees its targets.
 
 Begin with `find_targets`.
 """
@@ -12,14 +13,13 @@ Begin with `find_targets`.
 from heliotrope.imaging.targets.finding import FoundMark, FoundTarget, find_targets
 from heliotrope.imaging.targets.marks import polygons
 from heliotrope.imaging.targets.rectify import Rectified, from_crop, rectify
+from heliotrope.imaging.targets.sights import TargetView, sights
 from heliotrope.imaging.targets.teaching import (
-    TargetView,
     Taught,
     TaughtPoint,
     Wish,
     known_points,
     read_pictures,
-    sights,
     teach,
     write_taught,
 )

@@ -10,7 +10,8 @@ import numpy.typing as npt
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame, Image
-from heliotrope.imaging.targets.finding import FoundTarget, face_marks
+from heliotrope.imaging.targets.attempt import face_marks
+from heliotrope.imaging.targets.finding import FoundTarget
 from heliotrope.imaging.targets.marks import polygons
 from heliotrope.imaging.targets.view import Face, FaceView, faces
 

@@ -1,0 +1,557 @@
+"""One attempt to see a face in a frame: its marks, the view that they give, and why to doubt it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from heliotrope.field.camera import Camera
+from heliotrope.field.marks import Mark
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.frame import Frame, Image
+from heliotrope.imaging.targets import detection
+from heliotrope.imaging.targets.refinement import Refined, locate, refine
+from heliotrope.imaging.targets.view import Face, FaceView, fit_view, homography, unknown_lens
+
+Pictures = Mapping[str, FloatArray]
+
+#: Standard deviation of a mark's place on its target, by survey and paint, m.
+SURVEY = 0.005
+#: Standard deviation of a tag's corners relative to each other, m.
+PRINT = 0.001
+#: Least correlation of a mark; least share of the variance that its drawing explains (without and
+#: with a code that was read); greatest brightness over its surroundings.
+LIKE, EXPLAINED, EXPLAINED_READ, CONTRAST = 0.45, 0.65, 0.3, 0.93
+#: A mark this many standard deviations from the place given by the others is not used.
+STRAY = 5.0
+#: Greatest distortion of one mark against its drawing, of the size of all marks, and of the marks
+#: against each other. Measured: 0.03 in photographs, 0.2 in clutter.
+MISSHAPEN, WRONG_SIZE, ALIKE = 0.2, 0.12, 0.08
+#: Greatest common stretch or skew of all marks. Measured: 0.01.
+ASKEW = 0.04
+#: Limits for each mark where there are no more marks than unknowns of a view.
+ALIKE_EACH, EXPLAINED_EACH = 0.12, 0.75
+#: Greatest residual of a view: share of the face's extent, plus pixels.
+MISFIT, MISFIT_PIXELS = 0.005, 1.0
+#: Greatest standard deviation of a target's centre, as a share of its extent.
+VAGUE = 0.005
+#: Greatest distance of a target's centre from the middle of the marks seen, in their standard
+#: deviations; beyond, lens and perspective are guesses.
+FAR = 4.0
+#: Least share of the paint between marks that is lighter than the nearest mark.
+LIGHTER = 0.8
+#: Least ratio of the scales of a face, and greatest ratio of the scales of its near and far side.
+FLATTEST, NEAREST = 0.2, 3.0
+#: Fewest points of a view, with and without prior knowledge of their places; least share of the
+#: points in the frame, likewise.
+FEWEST, ALONE, SHARE, SHARE_ALONE = 3, 4, 0.5, 0.7
+
+
+def face_marks(face: Face) -> tuple[list[Mark], FloatArray]:
+    """Return each mark of a face once, and their places in its plane (M, 2), m."""
+    kept: list[Mark] = []
+    for target in face.targets:
+        for mark in target.marks:
+            # Adjacent targets share the marks of their common corners.
+            if not any(one_mark(mark, m) for m in kept):
+                kept.append(mark)
+    return kept, face.plane(np.array([m.point for m in kept]).reshape(-1, 3))
+
+
+def one_mark(a: Mark, b: Mark) -> bool:
+    """Return whether marks of two targets are one mark on their common edge."""
+    return a.kind == b.kind and float(np.linalg.norm(a.point - b.point)) < 0.05
+
+
+class FrameSearch:
+    """One frame, with intermediate results that all faces share."""
+
+    def __init__(self, frame: Frame, camera: Camera | None, pictures: Pictures) -> None:
+        self.grey = np.ascontiguousarray(frame.grey)
+        self.size = frame.size
+        self.pictures = pictures
+        self.camera = camera if camera is not None and camera.size == frame.size else None
+        self.lens = self.camera or unknown_lens(frame.size)
+        self._light: dict[int, detection.Lightened] = {}
+        self._outlines: dict[tuple[int, float], detection.DarkParts] = {}
+        self._tags: dict[int, dict[tuple[int, int], list[FloatArray]]] = {}
+
+    @cached_property
+    def eight(self) -> Image:
+        """The frame in 8 bits."""
+        if self.grey.dtype == np.uint8:
+            return self.grey
+        # Sensors leave bits empty, and a beam outshines everything else: let the brightest
+        # thousandth clip.
+        top = max(float(np.percentile(self.grey[::4, ::4], 99.9)), 1.0)
+        scaled = self.grey.astype(np.float32) * np.float32(255.0 / top)
+        return np.asarray(np.minimum(scaled, 255.0), dtype=np.uint8)
+
+    def outlines(self, reduction: int, ratio: float) -> detection.DarkParts:
+        """Return the dark parts of the frame, computed once for all faces."""
+        key = (reduction, ratio)
+        if reduction not in self._light:
+            self._light[reduction] = detection.lighten(self.grey, reduction)
+        if key not in self._outlines:
+            self._outlines[key] = detection.outlines(self._light[reduction], ratio)
+        return self._outlines[key]
+
+    def tags(self, marks: list[Mark]) -> dict[int, FloatArray]:
+        """Return the corners (4, 2) of tags that are seen exactly once, by the mark's index."""
+        found = {}
+        for k, mark in enumerate(marks):
+            if mark.kind != "tag":
+                continue
+            key = detection.tag_number(mark)
+            if key[0] not in self._tags:
+                self._tags[key[0]] = detection.find_tags(self.eight, [key[0]])
+            seen = self._tags[key[0]].get(key, [])
+            if len(seen) == 1:
+                found[k] = seen[0]
+        return found
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """The result of one attempt.
+
+    Attributes
+    ----------
+    view
+        None if no view can be trusted.
+    seen
+        Pixel and covariance of recognised marks, by index.
+    used
+        Marks that fit together.
+    reasons
+        Why other marks are not used.
+    text
+        Why there is no view.
+    looks
+        Measurements of each mark.
+    known
+        Whether the face's rough place was known before the search.
+    vague
+        Why the places of some targets remain unknown, by name.
+    """
+
+    view: FaceView | None
+    seen: dict[int, tuple[FloatArray, FloatArray]]
+    used: tuple[int, ...]
+    reasons: dict[int, str]
+    text: str
+    looks: dict[int, Refined]
+    known: bool
+    vague: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class _Seen:
+    """Marks found so far."""
+
+    places: dict[int, tuple[FloatArray, FloatArray]]
+    reasons: dict[int, str]
+    looks: dict[int, Refined]
+    #: Corners of tags, (4, 2).
+    corners: dict[int, FloatArray]
+
+
+class Search:
+    """The search for one face in one frame."""
+
+    def __init__(self, look: FrameSearch, face: Face, marks: list[Mark], plane: FloatArray) -> None:
+        self.look, self.face, self.marks, self.plane = look, face, marks, plane
+        self.tags = look.tags(marks)
+        self.extent = float(np.ptp(face.span, axis=0).max())
+
+    def attempt(
+        self, pixels: FloatArray, scales: FloatArray, search: float, known: bool = False
+    ) -> Attempt:
+        """Search for every mark near ``pixels`` (M, 2) with ``scales`` (M, 2, 2).
+
+        The first, rough search gives a view with its perspective and lens. The second uses
+        the scales of that view, on which the places of corners depend.
+        """
+        rough = self._locate(pixels, scales, search)
+        view, used = self._fit(rough, pixels if known else None)
+        if view is None:
+            return self._failed(rough, used, known)
+        # Refining may find a mark or two that the rough search missed, but not more.
+        if self._points_of(used) + 2 < self._needed(view, known) or self._impossible(view):
+            return self._failed(rough, used, known)
+        fine = self._refine(view, used)
+        view, used = self._fit(fine, pixels if known else None)
+        if view is None:
+            return self._failed(fine, used, known)
+        text, vague = self._problem(view, used, fine, known), self._vague(view, used)
+        if not text and len(vague) == len(self.face.targets):
+            text = next(iter(vague.values()))
+        return Attempt(
+            None if text else view,
+            fine.places,
+            tuple(used),
+            fine.reasons,
+            text,
+            fine.looks,
+            known,
+            vague,
+        )
+
+    def _locate(self, pixels: FloatArray, scales: FloatArray, search: float) -> _Seen:
+        seen = _Seen({}, {}, {}, {})
+        for k, mark in enumerate(self.marks):
+            if k in self.tags:
+                seen.corners[k] = self.tags[k]
+                seen.places[k] = _crossing(self.tags[k]), 0.3**2 * np.eye(2)
+                continue
+            picture = self._picture(mark)
+            if mark.kind == "picture" and picture is None:
+                seen.reasons[k] = f"its picture {mark.code} is missing"
+                continue
+            found = locate(self.look.grey, mark, pixels[k], scales[k], search, picture)
+            if found is None:
+                seen.reasons[k] = "outside the frame or too small"
+            elif found[2] < LIKE:
+                seen.reasons[k] = f"covered or absent: correlation {found[2]:.2f}"
+            else:
+                seen.places[k] = found[0], found[1] ** 2 * np.eye(2)
+                if mark.kind == "tag":
+                    seen.corners[k] = found[0] + _square(mark) @ scales[k].T
+        return seen
+
+    def _refine(self, view: FaceView, used: list[int]) -> _Seen:
+        seen = _Seen({}, {}, {}, {})
+        pixels, scales = view.to_pixels(self.plane), view.scale(self.plane)
+        for k, mark in enumerate(self.marks):
+            picture = self._picture(mark)
+            if mark.kind == "picture" and picture is None:
+                seen.reasons[k] = f"its picture {mark.code} is missing"
+                continue
+            search = 0.0 if k in used else 0.2
+            around = self.face.span - self.plane[k]
+            refined = refine(self.look.grey, mark, pixels[k], scales[k], search, picture, around)
+            problem = _problem(refined, mark, k in self.tags)
+            if refined is None or problem:
+                seen.reasons[k] = problem
+                continue
+            seen.places[k] = refined.pixel, refined.covariance
+            seen.looks[k] = refined
+            if mark.kind == "tag":
+                # The view holds perspective and lens; the rest is affine.
+                box = _square(mark) @ (np.eye(2) + refined.shape).T
+                seen.corners[k] = view.to_pixels(self.plane[k] + box) + refined.pixel - pixels[k]
+        return seen
+
+    def _picture(self, mark: Mark) -> FloatArray | None:
+        return self.look.pictures.get(mark.code) if mark.kind == "picture" else None
+
+    def tag_map(self) -> FloatArray:
+        """Return the map from plane to pixels (3, 3) of all tags; affine for a single tag."""
+        places = np.concatenate([self.plane[k] + _square(self.marks[k]) for k in self.tags])
+        pixels = np.concatenate(list(self.tags.values()))
+        if len(self.tags) > 1:
+            return homography(places, pixels)
+        # One tag is too small to tell perspective over the face.
+        rows = np.column_stack([places, np.ones(len(places))])
+        return np.vstack([np.linalg.lstsq(rows, pixels, rcond=None)[0].T, [0.0, 0.0, 1.0]])
+
+    # -- fitting -----------------------------------------------------------------------
+
+    def _fit(self, seen: _Seen, known: FloatArray | None) -> tuple[FaceView | None, list[int]]:
+        """Fit a view to the marks seen, leaving out strays, the worst first."""
+        used = list(seen.places)
+        while True:
+            points = self._points(used, seen, known)
+            if points is None:
+                return None, used
+            camera = self.look.camera
+            view = fit_view(self.face, *points, self.look.lens, camera is not None)
+            if not np.isfinite(view.H_norm_plane).all():
+                return None, used
+            miss = view.to_pixels(self.plane[used]) - np.array([seen.places[k][0] for k in used])
+            per_metre = np.abs(np.linalg.det(view.scale(self.plane[used])))
+            image = np.array([0.5 * np.trace(seen.places[k][1]) for k in used])
+            spread = np.sqrt(image + per_metre * SURVEY**2 + 0.3**2)
+            apart = np.linalg.norm(miss, axis=-1)
+            worst = int(np.argmax(apart / spread))
+            if apart[worst] < STRAY * spread[worst] or len(used) <= 4:
+                return view, used
+            seen.reasons[used[worst]] = f"{apart[worst]:.1f} px from the place given by the others"
+            del used[worst]
+
+    def _points(
+        self, used: list[int], seen: _Seen, known: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Return points, pixels, covariance: four corners of a tag, four points for three marks."""
+        plane, pixels, covariance = [], [], []
+        per_metre = self._per_metre(used, seen)
+        for k in used:
+            mark, (pixel, spread) = self.marks[k], seen.places[k]
+            common = spread + (per_metre * SURVEY) ** 2 * np.eye(2)
+            if mark.kind == "tag":
+                plane += list(self.plane[k] + _square(mark))
+                pixels += list(seen.corners[k])
+                # Its corners share the errors of survey and place.
+                own = (per_metre * PRINT) ** 2 + 2.0 * np.trace(spread)
+                covariance.append(np.kron(np.ones((4, 4)), common) + own * np.eye(8))
+            else:
+                plane.append(self.plane[k])
+                pixels.append(pixel)
+                covariance.append(common)
+        if len(plane) < FEWEST:
+            return None
+        points, places = np.array(plane), np.array(pixels)
+        if len(plane) == 3:
+            fourth = self._fourth(used, points, places, known)
+            if fourth is None:
+                return None
+            points = np.vstack([points, fourth[0]])
+            places = np.vstack([places, fourth[1]])
+            covariance.append(fourth[2] ** 2 * np.eye(2))
+        elif np.linalg.matrix_rank(points - points.mean(axis=0), tol=0.1) < 2:
+            return None
+        return points, places, np.asarray(block_diag(*covariance), dtype=np.float64)
+
+    def _fourth(
+        self, used: list[int], points: FloatArray, places: FloatArray, known: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray, float] | None:
+        """Return a fourth point for three, its pixel and its standard deviation, px.
+
+        Three marks give an affine map. If the rough places of the marks are known, the map
+        corrects them. Otherwise perspective is unknown, up to that of the lens (or of a lens
+        of fifty degrees) at this slant.
+        """
+        if np.linalg.matrix_rank(points - points[0], tol=0.1) < 2:
+            return None
+        rows = np.column_stack([points, np.ones(3)])
+        fourth = points[0] + points[2] - points[1]
+        if known is not None:
+            rest = [k for k in range(len(self.plane)) if k not in used]
+            if not rest:
+                return None
+            far = max(
+                rest, key=lambda k: float(np.linalg.norm(points - self.plane[k], axis=1).min())
+            )
+            shift = np.linalg.solve(rows, places - known[used])
+            place = known[far] + np.append(self.plane[far], 1.0) @ shift
+            return self.plane[far], place, 1.0 + 0.1 * float(np.linalg.norm(place - known[far]))
+        affine = np.linalg.solve(rows, places)
+        lengths = np.linalg.svd(affine[:2], compute_uv=False)
+        slant = np.sqrt(max(1.0 - (lengths[1] / lengths[0]) ** 2, 0.02))
+        extent = float(np.linalg.norm(np.ptp(places, axis=0)))
+        spread = 0.5 * slant * extent**2 / float(self.look.lens.matrix[0, 0])
+        return fourth, np.append(fourth, 1.0) @ affine, max(spread, 0.005 * extent)
+
+    def _per_metre(self, used: list[int], seen: _Seen) -> float:
+        if len(used) < 2:
+            return 0.0
+        plane = self.plane[used] - self.plane[used].mean(axis=0)
+        pixels = np.array([seen.places[k][0] for k in used])
+        pixels = pixels - pixels.mean(axis=0)
+        return float(np.sqrt(np.sum(pixels**2) / max(np.sum(plane**2), 1e-12)))
+
+    # -- judging -----------------------------------------------------------------------
+
+    def _failed(self, seen: _Seen, used: list[int], known: bool) -> Attempt:
+        text = self._too_few(used, FEWEST if known else min(ALONE, len(self.marks)))
+        return Attempt(None, seen.places, tuple(used), seen.reasons, text, seen.looks, known)
+
+    def _too_few(self, used: list[int], needed: int) -> str:
+        total = len(self.marks)
+        if not used:
+            return f"none of its {total} marks was seen"
+        names = ", ".join(self.marks[k].name for k in used)
+        return f"only {len(used)} of its {total} marks were seen: {names}; {needed} are needed"
+
+    def _problem(self, view: FaceView, used: list[int], seen: _Seen, known: bool) -> str:
+        """Return why a view cannot be trusted; empty if it can."""
+        needed = self._needed(view, known)
+        if self._points_of(used) < needed:
+            return self._too_few(used, needed)
+        scale = view.scale(self.plane[used])
+        per_metre = np.sqrt(np.abs(np.linalg.det(scale)))
+        limit = MISFIT * self.extent * float(per_metre.mean()) + MISFIT_PIXELS
+        if not view.residual <= limit:
+            return (
+                f"its marks do not fit together: {view.residual:.1f} px RMS, limit {limit:.1f} px"
+            )
+        if self._impossible(view):
+            return "no camera can see a plane with its marks in these places"
+        return self._misshapen(used, seen, known) or self._dark(view, used, seen)
+
+    def _points_of(self, used: list[int]) -> int:
+        return sum(4 if self.marks[k].kind == "tag" else 1 for k in used)
+
+    def _needed(self, view: FaceView, known: bool) -> int:
+        """Return the number of points that a view needs."""
+        least = FEWEST if known or len(self.marks) <= ALONE else ALONE
+        share = SHARE if known else SHARE_ALONE
+        return max(least, int(np.ceil(share * len(self.expected(view)))))
+
+    def expected(self, view: FaceView) -> list[int]:
+        """Return the marks that the frame should show."""
+        return self.within(view.to_pixels(self.plane))
+
+    def within(self, pixels: FloatArray) -> list[int]:
+        """Return the indices of places (N, 2) in the frame."""
+        inside = (pixels >= 0.0) & (pixels <= np.array(self.look.size) - 1.0)
+        return [int(k) for k in np.flatnonzero(inside.all(axis=-1))]
+
+    def _impossible(self, view: FaceView) -> bool:
+        corners = np.concatenate([self.face.plane(t.corners) for t in self.face.targets])
+        depth = np.column_stack([corners, np.ones(len(corners))]) @ view.H_norm_plane[2]
+        if (depth * depth[0] <= 0.0).any():
+            return True
+        lengths = np.linalg.svd(view.scale(corners), compute_uv=False)
+        if (lengths[:, 1] < FLATTEST * lengths[:, 0]).any():
+            return True
+        return bool(np.abs(depth).max() > NEAREST * np.abs(depth).min())
+
+    def _misshapen(self, used: list[int], seen: _Seen, known: bool) -> str:
+        """Return why the marks' sizes and shapes are wrong; empty if they are not."""
+        drawn = [k for k in used if k in seen.looks and self.marks[k].kind != "picture"]
+        if not drawn:
+            return ""
+        shapes = np.array([seen.looks[k].shape for k in drawn])
+        middle = np.median(shapes, axis=0)
+        size = 0.5 * float(np.trace(middle))
+        if abs(size) > WRONG_SIZE:
+            return (
+                f"its marks appear {1.0 + size:.2f} times as large as they should be: another "
+                "target, or wrong sizes of the marks"
+            )
+        common = float(np.abs(middle - size * np.eye(2)).max())
+        if len(drawn) >= FEWEST and common > ASKEW:
+            return (
+                f"its marks are all stretched or skewed by {common:.0%}: another target, or wrong "
+                "places of the marks"
+            )
+        unlike = np.abs(shapes - size * np.eye(2)).max(axis=(1, 2))
+        explained = min((seen.looks[k].explained for k in drawn if k not in self.tags), default=1.0)
+        few = len(used) <= ALONE and not known
+        if float(np.median(unlike)) > ALIKE or (few and float(unlike.max()) > ALIKE_EACH):
+            return f"shapes that lie like its marks differ from them by up to {unlike.max():.0%}"
+        if few and explained < EXPLAINED_EACH:
+            return f"other shapes lie where its marks should: one is explained to {explained:.0%}"
+        return ""
+
+    def _dark(self, view: FaceView, used: list[int], seen: _Seen) -> str:
+        """Return why the space between the marks is not paint, which is lighter; empty if it is."""
+        flat = ("corner", "tee", "square", "disc")
+        shown = [k for k in used if k in seen.looks and self.marks[k].kind in flat]
+        if not shown:
+            return ""
+        print_, bare = self._levels(view, shown, seen)
+        low, high = self.plane[used].min(axis=0), self.plane[used].max(axis=0)
+        part = (np.arange(14) + 0.5) / 14
+        places = low + np.stack(np.meshgrid(part, part), axis=-1).reshape(-1, 2) * (high - low)
+        apart = np.linalg.norm(places[:, None] - self.plane[None], axis=-1)
+        places = places[(apart > [1.2 * mark.size for mark in self.marks]).all(axis=1)]
+        values = self._at(view.to_pixels(places))
+        nearest = np.argmin(
+            np.linalg.norm(places[:, None] - self.plane[shown][None], axis=-1), axis=1
+        )
+        level = print_[nearest] + 0.1 * (bare - print_)[nearest]
+        valid = np.isfinite(values)
+        if not valid.any():
+            return ""
+        lighter = float((values[valid] > level[valid]).mean())
+        if lighter >= LIGHTER:
+            return ""
+        return f"only {lighter:.0%} of the area between its marks is lighter than the marks"
+
+    def _levels(
+        self, view: FaceView, shown: list[int], seen: _Seen
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the brightness of marks and of their surroundings, (K,) each."""
+        inner = []
+        for k in shown:
+            mark = self.marks[k]
+            # The middle of an arm of an L and of a T's bar; of a disc and a square the centre.
+            across = {"corner": 0.5 * mark.size, "tee": 0.25 * mark.size}.get(mark.kind, 0.0)
+            cos, sin = np.cos(mark.turn), np.sin(mark.turn)
+            turn = np.array([[cos, -sin], [sin, cos]])
+            inner.append(self.plane[k] + turn @ [across, -0.5 * mark.stroke])
+        dark = self._at(view.to_pixels(np.array(inner)))
+        contrast = np.array([seen.looks[k].contrast for k in shown])
+        dark = np.where(np.isfinite(dark), dark, 0.0)
+        return dark, dark / np.clip(contrast, 0.05, 1.0)
+
+    def _at(self, pixels: FloatArray) -> FloatArray:
+        """Return the frame's values at pixels (N, 2); NaN outside."""
+        height, width = self.look.grey.shape
+        column, row = np.round(np.nan_to_num(pixels, nan=-1.0)).astype(int).T
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        values = self.look.grey[np.where(inside, row, 0), np.where(inside, column, 0)]
+        return np.where(inside, values.astype(np.float64), np.nan)
+
+    def _vague(self, view: FaceView, used: list[int]) -> dict[str, str]:
+        """Return by name why the marks seen do not determine some targets."""
+        parts = [
+            self.plane[k] + (_square(self.marks[k]) if self.marks[k].kind == "tag" else 0.0)
+            for k in used
+        ]
+        places = np.concatenate([np.reshape(part, (-1, 2)) for part in parts])
+        middle = places.mean(axis=0)
+        moments = np.cov((places - middle).T, bias=True) + 1e-6 * np.eye(2)
+        found = {}
+        for target in self.face.targets:
+            center, limit = self.face.plane(target.center), VAGUE * max(target.width, target.height)
+            off = center - middle
+            deviation = float(np.sqrt(np.linalg.eigvalsh(view.covariance_at(center))[-1]))
+            if not self._shown(view, target):
+                found[target.name] = "it lies outside the frame"
+            elif float(off @ np.linalg.solve(moments, off)) > FAR**2:
+                names = ", ".join(self.marks[k].name for k in used)
+                found[target.name] = f"all marks seen lie on one side of it: {names}"
+            elif not deviation <= limit:
+                found[target.name] = (
+                    f"the marks seen determine its place only to {deviation:.3f} m; "
+                    f"{limit:.3f} m is needed"
+                )
+        return found
+
+    def _shown(self, view: FaceView, target: Target) -> bool:
+        """Return whether the frame shows any part of a target."""
+        part = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), -1).reshape(-1, 2)
+        corners = self.face.plane(target.corners)
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        return bool(self.within(view.to_pixels(low + part * (high - low))))
+
+
+def _problem(refined: Refined | None, mark: Mark, read: bool) -> str:
+    """Return why what was found near a mark's place is not the mark; empty if it is.
+
+    A tag whose code was ``read`` may be explained less well: its cells may be small.
+    """
+    if refined is None:
+        return "outside the frame or too small"
+    if refined.explained < (EXPLAINED_READ if read else EXPLAINED):
+        return f"covered or absent: its drawing explains {100 * refined.explained:.0f} %"
+    if mark.kind == "picture":
+        return ""
+    if refined.contrast > CONTRAST:
+        return f"too faint: {100 * refined.contrast:.0f} % of the brightness around it"
+    if np.abs(refined.shape).max() > MISSHAPEN:
+        return "its size or shape is wrong"
+    return ""
+
+
+def _square(mark: Mark) -> FloatArray:
+    """Corners of a tag from the upper left, metres from its centre, (4, 2)."""
+    cos, sin = np.cos(mark.turn), np.sin(mark.turn)
+    box = 0.5 * mark.size * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
+    return np.asarray(box @ np.array([[cos, sin], [-sin, cos]]))
+
+
+def _crossing(corners: FloatArray) -> FloatArray:
+    """Return where the diagonals of four corners cross: a square's centre, also in perspective."""
+    a, b = corners[2] - corners[0], corners[3] - corners[1]
+    across = a[0] * b[1] - a[1] * b[0]
+    if abs(across) < 1e-9:
+        return np.asarray(corners.mean(axis=0))
+    gap = corners[1] - corners[0]
+    return np.asarray(corners[0] + (gap[0] * b[1] - gap[1] * b[0]) / across * a)
