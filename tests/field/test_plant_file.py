@@ -1,7 +1,7 @@
 """The plant file: what is written is read again, digit for digit."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from heliotrope.errors import FormatError, InputError
 from heliotrope.field.example import example_plant
 from heliotrope.field.formats import paint, plant_file
 from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.plant import Plant
 from heliotrope.field.stellenbosch import prototype
 from heliotrope.field.target import Receiver, Target
@@ -390,6 +391,54 @@ def test_machine_that_cannot_be_is_one_line(
         plant_file.read_plant(path)
     assert text in str(caught.value)
     assert "groups.azel" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+JOINT = """
+[joint_visits]
+most = 25
+known_mrad = 3
+settle_s = 1.5
+brightest_suns = 6
+"""
+
+
+def test_joint_visits_are_read_and_survive(tmp_path: Path) -> None:
+    plant = plant_file.read_plant(with_machine(tmp_path, MACHINE + JOINT))
+    settings = JointSettings(most=25, known=0.003, settle=1.5, brightest=6.0)
+    assert plant.joint_visits == settings
+    plant_file.write_plant(plant, tmp_path / "again.toml")
+    assert plant_file.read_plant(tmp_path / "again.toml").joint_visits == settings
+    for one in fields(JointSettings):
+        # An odd value, which thousandths would round.
+        value = getattr(JointSettings(), one.name)
+        odd = JointSettings(**{one.name: value + (1 if isinstance(value, int) else value / 7)})
+        plant_file.write_plant(replace(plant, joint_visits=odd), tmp_path / "odd.toml")
+        assert plant_file.read_plant(tmp_path / "odd.toml").joint_visits == odd
+    plant_file.write_plant(replace(plant, joint_visits=None), tmp_path / "alone.toml")
+    assert plant_file.read_plant(tmp_path / "alone.toml").joint_visits is None
+    (tmp_path / "new").mkdir()
+    assert plant_file.read_plant(with_machine(tmp_path / "new")).joint_visits == JointSettings()
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "text"),
+    [
+        ("most = 25", "most = 200", "joint_visits: joint visits: 4 to 200 heliostats; give 2 to"),
+        ("most = 25", "most = 2.5", "joint_visits.most: "),
+        ("known_mrad = 3", "known_mrad = 0", "beams known to 0 mrad"),
+        ("known_mrad = 3", "known = 3", "joint_visits.known: "),
+        ("most = 25", "known_rad = 0.003", "known is given twice, the second time as known_rad"),
+    ],
+)
+def test_joint_visits_that_cannot_be_are_one_line(
+    before: str, after: str, text: str, tmp_path: Path
+) -> None:
+    assert before in JOINT
+    path = with_machine(tmp_path, MACHINE + JOINT.replace(before, after))
+    with pytest.raises(FormatError) as caught:
+        plant_file.read_plant(path)
+    assert text in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

@@ -18,6 +18,7 @@ from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.errors import FetchError, InputError
 from heliotrope.field.example import roughly_installed
+from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import bisector, reflect
 from heliotrope.imaging.coded import Verdict
@@ -34,7 +35,6 @@ from heliotrope.plant.visits import (
     CycleResult,
     CycleSettings,
     JointCycle,
-    JointSettings,
 )
 from heliotrope.plant.visits.joint_layout import arranged
 from support.live import LiveOptions, LivePlant
@@ -386,6 +386,31 @@ def test_automatic_control_sends_those_that_are_known_together() -> None:
         assert all(plant.beliefs.count(name) for name in names)
 
     joint(scene)
+
+
+def test_a_plant_file_without_joint_visits_refuses_them() -> None:
+    """Automatic control has a heliostat, but calibrates each alone; a person hears it."""
+
+    async def main(clock: VirtualClock) -> None:
+        design = replace(malan_plant(6), joint_visits=None)
+        live = LivePlant(design, clock, LiveOptions(rendered=False, threads=0))
+        async with live.running():
+            try:
+                until = clock.monotonic() + 600.0
+                while not live.operations.calibration().on:
+                    assert clock.monotonic() < until
+                    await asyncio.sleep(1.0)
+                first, second = live.names[:2]
+                with pytest.raises(RefusedError, match="allows no joint visits; ask for one"):
+                    live.operations.calibrate(ENGINEER, first, together=[second])
+                assert not live.operations.calibration().asked
+                live.operations.calibrate(ENGINEER, first)
+                assert live.operations.calibration().asked == (first,)
+            finally:
+                await live.operations.automatic.halt()
+                await live.end()
+
+    run_virtual(main, start=START)
 
 
 class _Alarms(list):  # type: ignore[type-arg]

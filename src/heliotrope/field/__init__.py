@@ -23,6 +23,9 @@ from heliotrope.field.heliostats import (
     Facets,
     Heliostats,
 )
+from heliotrope.field.joint_visits import (
+    JointSettings,
+)
 from heliotrope.field.marks import (
     Mark,
 )
@@ -52,6 +55,7 @@ __all__ = [
     "Facets",
     "Heliostat",
     "Heliostats",
+    "JointSettings",
     "Mark",
     "Plant",
     "Prism",

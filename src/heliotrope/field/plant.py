@@ -11,6 +11,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.camera import Camera
 from heliotrope.field.heliostat import Heliostat
 from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Volume
 from heliotrope.frames import ENU, Framed, Labelled, Variable
@@ -48,6 +49,9 @@ class Plant(Value, Framed):
         Volumes that no beam may enter.
     eyes
         Points from which people may look into standby beams, ENU, m, (3,), by name.
+    joint_visits
+        Settings of visits of several heliostats to one target at once; None: each is calibrated
+        alone.
     """
 
     name: str
@@ -59,6 +63,7 @@ class Plant(Value, Framed):
     cameras: tuple[Camera, ...] = ()
     keep_outs: tuple[Volume, ...] = ()
     eyes: Mapping[str, FloatArray] = field(default_factory=dict)
+    joint_visits: JointSettings | None = field(default_factory=JointSettings)
 
     def __post_init__(self) -> None:
         check_site(self.site)

@@ -35,7 +35,7 @@ from heliotrope.plant.schedule.scheduler import Scheduler
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.joint_cycle import JointCycle
-from heliotrope.plant.visits.settings import Centring, CycleSettings, JointSettings
+from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.safety import alarms
 
 #: A calibration that removes the errors of a quick installation.
@@ -71,8 +71,6 @@ class AssemblySettings:
         Times and limits; the readings of the sensor port are added.
     cycle
         Calibration.
-    joint
-        Joint visits; None: each heliostat is calibrated alone.
     machines
         Whether the local controllers hold the plant file's machine tables.
     """
@@ -81,7 +79,6 @@ class AssemblySettings:
     plant: PlantSettings = field(default_factory=PlantSettings)
     cycle: CycleSettings = CYCLE
     machines: MachineTables = MachineTables.UNKNOWN
-    joint: JointSettings | None = field(default_factory=JointSettings, kw_only=True)
 
 
 class PlantAssembly:
@@ -133,8 +130,8 @@ class PlantAssembly:
         if cameras is not None:
             eye = cameras if ports.pictures is None else KeptCamera(cameras, ports.pictures)
             cycle = CalibrationCycle(self.plant, eye, chosen.cycle, Centring())
-            if chosen.joint is not None:
-                joint = JointCycle(self.plant, cameras, cycle, chosen.joint)
+            if design.joint_visits is not None:
+                joint = JointCycle(self.plant, cameras, cycle, design.joint_visits)
         self.schedule = None if cycle is None else self._schedule(cycle)
         self.operations = Operations(
             self.plant,

@@ -321,6 +321,35 @@ class GroupTable(StrictTable):
     )
 
 
+class JointVisitsTable(StrictTable):
+    """``[joint_visits]``: several heliostats on one target at once, told apart by movements."""
+
+    allowed: bool = Field(True, description="False: each heliostat is calibrated alone.")
+    most: int | None = Field(None, description="Heliostats on one target at once; default: 49.")
+    least: int | None = Field(
+        None, description="Heliostats that a visit of automatic control needs; default: 4."
+    )
+    known_mrad: Number | None = Field(
+        None, description="Largest expected beam error of one that takes part, RMS; default: 4."
+    )
+    known_rad: Number | None = Field(None, description="Instead, as the program writes it.")
+    visit_mrad: Number | None = Field(
+        None, description="Part of it that is drawn anew at each visit, each axis; default: 0.5."
+    )
+    visit_rad: Number | None = Field(None, description="Instead, as the program writes it.")
+    movement_mrad: Number | None = Field(
+        None, description="Coded movement of a beam, either way along each axis; default: 0.5."
+    )
+    movement_rad: Number | None = Field(None, description="Instead, as the program writes it.")
+    settle_s: Number | None = Field(
+        None, description="From the moment that all stand at their aims; default: 1."
+    )
+    brightest_suns: Number | None = Field(None, description="Most light on a target; default: 10.")
+    again: Number | None = Field(
+        None, description="Photographs at most, over those that a visit needs; default: 2.5."
+    )
+
+
 class PlantDocument(StrictTable):
     """The whole file."""
 
@@ -338,4 +367,7 @@ class PlantDocument(StrictTable):
     )
     eyes_m: dict[str, Vector] = Field(
         default_factory=dict, description="Places from which people may look into beams at rest."
+    )
+    joint_visits: JointVisitsTable | None = Field(
+        None, description="Without: joint visits with the default settings."
     )

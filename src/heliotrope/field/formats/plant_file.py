@@ -20,6 +20,7 @@ from heliotrope.field.formats._plant_cameras import (
     mark_document,
 )
 from heliotrope.field.formats._plant_groups import build_group, group_document
+from heliotrope.field.formats._plant_joint import build_joint, joint_document
 from heliotrope.field.formats._plant_models import PlantDocument, ReceiverTable, TargetTable
 from heliotrope.field.formats._plant_table import HeliostatColumns, read_table, write_table
 from heliotrope.field.formats._plant_volumes import build_volume, volume_document
@@ -86,6 +87,7 @@ def _models() -> list[Any]:
         models.SphereTable,
         models.CylinderTable,
         models.PrismTable,
+        models.JointVisitsTable,
     ]
 
 
@@ -125,6 +127,11 @@ def _assemble(
     cameras = _each(path, "cameras", document.cameras, build_camera, problems)
     keep_outs = _each(path, "keep_out", document.keep_out, build_volume, problems)
     eyes = {name: np.array(point) for name, point in document.eyes_m.items()}
+    joint = None
+    try:
+        joint = build_joint(document.joint_visits)
+    except InputError as error:
+        problems.append(FormatError(path, str(error), "joint_visits"))
     if problems:
         return None
     try:
@@ -137,6 +144,7 @@ def _assemble(
             cameras=cameras,
             keep_outs=keep_outs,
             eyes=eyes,
+            joint_visits=joint,
         )
     except InputError as error:
         problems.append(FormatError(path, str(error)))
@@ -262,6 +270,7 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
         "cameras": [camera_document(camera) for camera in plant.cameras],
         "keep_out": [volume_document(volume) for volume in plant.keep_outs],
         "eyes_m": {name: np.asarray(point).tolist() for name, point in plant.eyes.items()},
+        **joint_document(plant.joint_visits),
         "groups": groups,
     }
     write_text(place, tomli_w.dumps(document))

@@ -222,6 +222,9 @@ class AutomaticControl:
         if self._calibrating is None:
             return
         if len(names) > 1:
+            if not self._calibrating.together:
+                why = "the plant file allows no joint visits; ask for one heliostat at a time"
+                raise refusals.NO_CALIBRATION.error(heliostat=heliostat, why=why)
             self._calibrating.ask_together(names, target)
         else:
             self._calibrating.ask(heliostat, target, search=search)

@@ -134,6 +134,11 @@ class Calibrating:
         """
         self._asked[heliostat] = target, search
 
+    @property
+    def together(self) -> bool:
+        """Whether there are joint visits."""
+        return self._parties is not None
+
     def ask_together(self, heliostats: Sequence[str], target: str) -> None:
         """Calibrate heliostats in a joint visit before all others; see `ask`."""
         if self._parties is not None:

@@ -9,7 +9,7 @@ a search for the beam: `Centring`), fits them, and lets the plant believe a bett
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
 from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.photographs import Photographs, Shot, TargetCamera
-from heliotrope.plant.visits.settings import Centring, CycleSettings, JointSettings
+from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.plant.visits.visit import Visit
 
 __all__ = [
@@ -18,7 +18,6 @@ __all__ = [
     "CycleResult",
     "CycleSettings",
     "JointCycle",
-    "JointSettings",
     "Photographs",
     "Shot",
     "TargetCamera",

@@ -15,6 +15,7 @@ import numpy as np
 
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.errors import HeliotropeError
+from heliotrope.field.joint_visits import JointSettings
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import SeparatedBeam, Separation, Verdict, separate
 from heliotrope.lcu import states
@@ -24,7 +25,6 @@ from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleRes
 from heliotrope.plant.visits.joint_layout import Layout, arranged
 from heliotrope.plant.visits.joint_visit import JointVisit
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
-from heliotrope.plant.visits.settings import JointSettings
 from heliotrope.plant.visits.stacks import StackCamera, TargetLight, stack_of
 from heliotrope.plant.visits.visit import Visit
 

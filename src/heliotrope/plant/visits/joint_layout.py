@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from heliotrope.calibration.uncertainty import expected_error
+from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, bisector
 from heliotrope.imaging.coded import (
@@ -21,7 +22,6 @@ from heliotrope.imaging.coded import (
 )
 from heliotrope.optics.beam import beam_sigma
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.visits.settings import JointSettings
 
 #: Slope error of a mirror's surface that is assumed for the width of its beam, rad.
 _SLOPE = 1e-3

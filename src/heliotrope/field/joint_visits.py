@@ -1,0 +1,55 @@
+"""Settings of joint visits, which belong to a plant: its targets, its mirrors, its drives."""
+
+from dataclasses import dataclass
+
+from heliotrope.errors import InputError
+
+
+@dataclass(frozen=True)
+class JointSettings:
+    """Settings of joint visits: several heliostats on one target, told apart by their movements.
+
+    Attributes
+    ----------
+    most, least
+        Heliostats on one target at once; and how many a visit needs that automatic control begins.
+    known
+        Largest expected beam error of a heliostat that takes part, rad RMS (2-D).
+    visit
+        Part of it that is drawn anew at each visit, rad per axis.
+    movement
+        Coded movement of a beam, either way along each axis, rad.
+    settle
+        Time from the moment that all have taken their aims until the photograph, s.
+    brightest
+        Most light on a target, in suns.
+    again
+        Photographs that are taken at most, as a multiple of those that a visit needs.
+    """
+
+    most: int = 49
+    least: int = 4
+    known: float = 4e-3
+    visit: float = 5e-4
+    movement: float = 5e-4
+    settle: float = 1.0
+    brightest: float = 10.0
+    again: float = 2.5
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.least <= self.most <= 127:
+            raise InputError(
+                f"joint visits: {self.least} to {self.most} heliostats; give 2 to 127, the smaller "
+                "number first"
+            )
+        if not 0.0 < self.movement <= 5e-3 or not 0.0 <= self.settle <= 60.0:
+            raise InputError(
+                f"joint visits: movements of {1e3 * self.movement:g} mrad that settle in "
+                f"{self.settle:g} s; give above 0 to 5 mrad, and 0 to 60 s"
+            )
+        if not (self.brightest > 0.0 and self.known > 0.0 and self.again >= 1.0):
+            raise InputError(
+                f"joint visits: up to {self.brightest:g} suns, beams known to "
+                f"{1e3 * self.known:g} mrad, {self.again:g} times the photographs; give above 0, "
+                "above 0, and 1 or more"
+            )
