@@ -147,8 +147,70 @@ def test_deviations_are_carried_by_one_and_by_many() -> None:
         }
         assert not nominal.deviations
     plant = ht.example_plant()
-    with pytest.raises(InputError, match=r"shape \(2,\)"):
+    with pytest.raises(InputError, match=r"calibration of 2 heliostats.*plant\[name\]"):
         plant.nominal.with_calibration(_Values({"tilt_north": np.zeros(2)}))
+
+
+def test_a_fit_of_many_moves_one_heliostat_by_name() -> None:
+    plant = ht.example_plant()
+    old = plant.groups["azel"].with_parameters({"canting": 1e-3, "tilt_north": 5e-3})
+    plant = plant.with_groups({"azel": old.take(range(9)), "others": old.take(range(9, 18))})
+    truth = ht.roughly_installed(plant.nominal, seed=5)
+    # In another order than the plant's, and without three of its heliostats.
+    order = list(reversed(plant.names[3:]))
+    seen = ht.join([_seen(truth, plant.names)[name] for name in order])
+    group = ht.Heliostats(
+        tuple(order), plant.nominal[np.arange(17, 2, -1)], np.full(15, 1.8), np.full(15, 1.2)
+    )
+    fitted = ht.fit(group, seen, "tilts+biases")
+    row, many = order.index("P6A"), fitted["P6A"]
+    assert (many.heliostats, many.parameters["tilt_north"]) == (
+        ("P6A",),
+        fitted.values[row, fitted.names.index("tilt_north")],
+    )
+    assert many == fitted[row]
+    assert len(many.lengths) == len(seen["P6A"])
+    one, moved = plant["P6A"].with_calibration(fitted), plant.with_calibration(fitted)
+    wanted = plant["P6A"].nominal.with_calibration(many)
+    for found in (
+        one.calibrated,
+        plant["P6A"].with_calibration(many).calibrated,
+        moved["P6A"].calibrated,
+        moved.calibrated[plant.names.index("P6A")],
+        moved.groups["others"].calibrated[moved.groups["others"].index("P6A")],
+    ):
+        np.testing.assert_array_equal(found.vertex, wanted.vertex)
+        np.testing.assert_array_equal(found.angles, wanted.angles)
+        np.testing.assert_array_equal(found.drives.table, wanted.drives.table)
+        # The deviation that the plant had before is none of the fit's.
+        assert {n: float(v) for n, v in found.deviations.items() if v} == {
+            n: float(v) for n, v in wanted.deviations.items()
+        }
+    assert float(one.deviations["tilt_north"]) == float(many.parameters["tilt_north"])
+    assert moved.deviations["canting"].tolist() == [1e-3] * 3 + [0.0] * 15
+    assert moved.deviations["tilt_north"][:3].tolist() == [5e-3] * 3
+    for owner in (plant, plant["P6A"], plant.nominal):
+        with pytest.raises(InputError, match="calibration: a dict; give what fit returns"):
+            owner.with_calibration({"canting": 1e-3})  # type: ignore[arg-type]
+    with pytest.raises(UnknownNameError, match=plant.names[0]):
+        plant[plant.names[0]].with_calibration(fitted)
+    with pytest.raises(UnknownNameError, match="fitted"):
+        fitted["P9Z"]
+    with pytest.raises(InputError, match="heliostat 15: 15 were fitted"):
+        fitted[15]
+    with pytest.raises(InputError, match=r"calibration of 15 heliostats.*fitted\[name\]"):
+        plant["P6A"].nominal.with_calibration(fitted)
+
+
+def test_a_fit_without_names_goes_by_rows() -> None:
+    plant = ht.example_plant()
+    found = _Values({"tilt_north": np.arange(18) * 1e-3, "canting": np.full(18, 1e-3)})
+    moved = plant.with_calibration(found)
+    assert moved["P6A"].deviations["tilt_north"] == 1e-3 * plant.names.index("P6A")
+    alike = plant.groups["azel"].with_calibration(_Values({"canting": np.array(2e-3)}))
+    assert alike.deviations["canting"].tolist() == [2e-3] * 18
+    with pytest.raises(InputError, match="18 heliostats without names: there are 1;"):
+        plant["P6A"].with_calibration(found)
 
 
 def test_deviations_of_a_joined_plant_keep_their_heliostats() -> None:
@@ -177,3 +239,4 @@ def test_the_flux_of_a_plant_on_its_receiver() -> None:
 class _Values:
     def __init__(self, parameters: dict[str, np.ndarray]) -> None:
         self.parameters = parameters
+        self.heliostats: tuple[str, ...] = ()

@@ -52,7 +52,7 @@ def test_json_reads_back(learnt: Learned, tmp_path: Path) -> None:
     plant = example_plant()
     group = plant.groups["azel"].take(range(6))
     renamed = dataclasses.replace(group, names=("H0", "H1", "X", "H3", "H4", "H5"))
-    applied = again.apply(renamed)
+    applied = renamed.with_calibration(again)
     assert applied.parameters["tilt_north"][1] == found.values[1, found.names.index("tilt_north")]
     assert applied.parameters["tilt_north"][2] == 0.0
 

@@ -263,6 +263,11 @@ class HeliostatCalibration(Value):
         return {name: float(v) for name, v in zip(self.names, self.values, strict=True)}
 
     @property
+    def heliostats(self) -> tuple[str, ...]:
+        """The name, as `Mechanism.with_calibration` and others take it."""
+        return (self.heliostat,)
+
+    @property
     def sigma(self) -> FloatArray:
         """Standard deviations of the values at the time of the fit, (P,)."""
         return np.asarray(np.sqrt(np.diagonal(self.covariance)))

@@ -47,7 +47,7 @@ def demo(
         seen = measure(group.mechanism, truth, target, plant.site, days, seed=seed)
     say(f"measured: {len(seen)} sightings on the target in the week before")
     report = calibrate(FieldSightings(plant, "azel", seen, (), ()), MODEL, seed=seed)
-    calibrated = plant.with_groups({"azel": report.results.apply(group)})
+    calibrated = plant.with_calibration(report.results)
     write_plant(calibrated, into / "plant.toml")
     day = track_day(calibrated.groups["azel"], truth, target.center, plant.site, DAY)
     figure = day_picture(day)

@@ -89,9 +89,9 @@ def track(
     place = site or ("0,0,0" if sun is not None else "")
     plant = open_plant(field, parse_site(place) if place else None)
     if calibration is not None:
-        from heliotrope.calibration.report.results import apply_to_plant, read_json
+        from heliotrope.calibration.report.results import read_json
 
-        plant = apply_to_plant(plant, read_json(calibration))
+        plant = plant.with_calibration(read_json(calibration))
     mechanism = plant[heliostat].calibrated
     goal = np.array(aim_of(plant, heliostat, aim, target))
     moment = parse_time(time or "now")

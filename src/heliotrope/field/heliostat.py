@@ -1,13 +1,14 @@
 """One heliostat of a plant: what `Plant` gives for a name."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.chain import Calibrated, Mechanism
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.sun import Site
@@ -57,6 +58,25 @@ class Heliostat(Value):
     def calibrated(self) -> Mechanism:
         """The mechanism with its calibrated deviations, batch shape ()."""
         return self.heliostats.calibrated[0]
+
+    @property
+    def deviations(self) -> Mapping[str, FloatArray]:
+        """Deviations of the calibrated mechanism, by name, rad, m or 1, each ()."""
+        return self.calibrated.deviations
+
+    def with_calibration(self, calibration: Calibrated) -> "Heliostat":
+        """Return the heliostat with a calibration in place of its own deviations.
+
+        Of a calibration of many heliostats it takes the row of its name.
+
+        Raises
+        ------
+        InputError
+            If it is no calibration, or one of many heliostats without names.
+        UnknownNameError
+            If it does not name this heliostat, or the mechanism lacks one of its parameters.
+        """
+        return replace(self, heliostats=self.heliostats.with_calibration(calibration))
 
     @property
     def armature(self) -> Armature:

@@ -11,7 +11,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.chain import Calibrated, Mechanism, check_calibration
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.mechanism.parameters import unit_of
@@ -166,6 +166,11 @@ class Heliostats(Value, Framed):
         return self.mechanism.with_parameters(self.parameters)
 
     @property
+    def deviations(self) -> Mapping[str, FloatArray]:
+        """Deviations of the calibrated mechanisms, by name, rad, m or 1, each (N,)."""
+        return self.calibrated.deviations
+
+    @property
     def armature(self) -> Armature:
         """Armatures of the calibrated mechanisms, (N,)."""
         return self.calibrated.armature
@@ -228,3 +233,58 @@ class Heliostats(Value, Framed):
     def with_parameters(self, parameters: Mapping[str, npt.ArrayLike]) -> "Heliostats":
         """Return the heliostats with the calibrated deviations replaced by ``parameters``."""
         return replace(self, parameters={n: as_float(v) for n, v in parameters.items()})
+
+    def with_calibration(self, calibration: Calibrated) -> "Heliostats":
+        """Return the heliostats with a calibration in place of their own deviations.
+
+        Heliostats that it does not name keep theirs. A calibration without names must be one for
+        all of them, or hold one row for each.
+
+        Raises
+        ------
+        InputError
+            If it is no calibration, or has neither names nor as many rows.
+        UnknownNameError
+            If it names none of these heliostats, or they lack one of its parameters.
+        """
+        return self.with_rows(calibration, rows_in(calibration, self.names))
+
+    def with_rows(self, calibration: Calibrated, rows: npt.NDArray[np.intp]) -> "Heliostats":
+        """Return the heliostats with given rows of a calibration, (N,); −1 keeps their own."""
+        given, merged = calibration.parameters, {}
+        for name in dict.fromkeys((*self.parameters, *given)):
+            own = self.parameters.get(name, np.zeros(len(self)))
+            new = np.broadcast_to(as_float(given.get(name, 0.0)), _size(calibration))
+            merged[name] = np.where(rows >= 0, new[rows], own)
+        return self.with_parameters(merged)
+
+
+def rows_in(calibration: Calibrated, names: tuple[str, ...]) -> npt.NDArray[np.intp]:
+    """Return the row of each of N heliostats in a calibration; −1 if it is not there.
+
+    Raises
+    ------
+    InputError
+        If it is no calibration, or has neither names nor as many rows.
+    UnknownNameError
+        If it names none of the heliostats.
+    """
+    check_calibration(calibration)
+    count, size = len(names), _size(calibration)
+    if calibration.heliostats:
+        place = {name: i for i, name in enumerate(calibration.heliostats)}
+        rows = np.array([place.get(name, -1) for name in names], dtype=np.intp)
+        if (rows < 0).all():
+            raise UnknownNameError("heliostat (of a calibration)", calibration.heliostats[0], names)
+        return rows
+    if size not in (1, count):
+        raise InputError(
+            f"calibration of {size} heliostats without names: there are {count}; fit the plant, "
+            "its group or plant[name], which have names"
+        )
+    return np.arange(count) if size > 1 else np.zeros(count, dtype=np.intp)
+
+
+def _size(calibration: Calibrated) -> int:
+    sizes = [np.size(values) for values in calibration.parameters.values()]
+    return len(calibration.heliostats) or max(sizes, default=1)

@@ -10,14 +10,14 @@ import numpy as np
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.camera import Camera
 from heliotrope.field.heliostat import Heliostat
-from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.heliostats import Heliostats, rows_in
 from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Volume
 from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.chain import Mechanism, join_mechanisms
+from heliotrope.mechanism.chain import Calibrated, Mechanism, join_mechanisms
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.sun import Site, check_site
@@ -196,6 +196,31 @@ class Plant(Value, Framed):
     def calibrated(self) -> Mechanism:
         """The mechanisms of all heliostats with their calibrated deviations; see `nominal`."""
         return join_mechanisms([g.calibrated for g in self.groups.values()])
+
+    @property
+    def deviations(self) -> Mapping[str, FloatArray]:
+        """Deviations of the calibrated mechanisms, by name, each (N,); see `nominal`."""
+        return self.calibrated.deviations
+
+    def with_calibration(self, calibration: Calibrated) -> "Plant":
+        """Return the plant with a calibration in place of its heliostats' own deviations.
+
+        Heliostats that it does not name keep theirs. A calibration without names must hold one
+        row for each heliostat, in the order of ``names``.
+
+        Raises
+        ------
+        InputError
+            If it is no calibration, or has neither names nor as many rows.
+        UnknownNameError
+            If it names none of the heliostats, or a kind lacks one of its parameters.
+        """
+        rows, groups, start = rows_in(calibration, self.names), {}, 0
+        for name, group in self.groups.items():
+            mine = rows[start : start + len(group)]
+            start += len(group)
+            groups[name] = group.with_rows(calibration, mine) if (mine >= 0).any() else group
+        return self.with_groups(groups)
 
     def machine(self, name: str) -> Machine:
         """Return motor limits and resting places of one heliostat.

@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import EllipsisType
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.errors import InputError, UnknownNameError, kind_of
 from heliotrope.geometry import TAU, FloatArray, as_angles, as_numbers
 from heliotrope.jit import as_input
 from heliotrope.mechanism import parameters as parameter_table
@@ -80,12 +80,32 @@ class Jacobian(Value):
         return card_of_arrays(self)
 
 
+@runtime_checkable
 class Calibrated(Protocol):
     """Deviations of parameters from a nominal mechanism: a fit, a record, a file's content."""
 
     @property
     def parameters(self) -> Mapping[str, npt.ArrayLike]:
-        """Deviations by name, rad, m or 1."""
+        """Deviations by name, rad, m or 1, each () or (N,)."""
+
+    @property
+    def heliostats(self) -> tuple[str, ...]:
+        """Names of the heliostats, (N,); () if unknown."""
+
+
+def check_calibration(given: object) -> None:
+    """Refuse what holds no deviations of parameters.
+
+    Raises
+    ------
+    InputError
+        If it is neither a fit nor a record.
+    """
+    if not isinstance(given, Calibrated):
+        raise InputError(
+            f"calibration: {kind_of(given)}; give what fit returns, a HeliostatCalibration, or "
+            "with_parameters the values by name"
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -259,18 +279,26 @@ class Mechanism(Value):
     def with_calibration(self, calibration: Calibrated) -> "Mechanism":
         """Return the mechanism moved by a calibration, for example the result of `fit`.
 
-        One calibration moves many mechanisms alike; a calibration of N heliostats moves N.
+        One calibration moves many mechanisms alike; a calibration of N heliostats moves N, row by
+        row. A heliostat or a group of a plant takes its rows by name.
 
         Raises
         ------
         InputError
-            If it is of another number of heliostats.
+            If it is no calibration, or one of another number of heliostats.
         UnknownNameError
             If this kind of mechanism lacks one of its parameters.
         """
+        check_calibration(calibration)
         moved = {}
         for name, given in calibration.parameters.items():
             value = np.asarray(given)
+            if value.size != 1 and value.shape != self.shape:
+                raise InputError(
+                    f"calibration of {value.size} heliostats: the mechanisms have shape "
+                    f"{self.shape}; take one of it (fitted[name]), or apply it by name "
+                    "(plant[name].with_calibration)"
+                )
             moved[name] = value.reshape(()) if value.size == 1 else value
         return self.with_parameters(moved)
 

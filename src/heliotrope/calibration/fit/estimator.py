@@ -84,14 +84,17 @@ class FieldFit(Value, Framed):
         Standard deviations of the priors, (N, P).
     scale
         Estimated noise in units of the sightings' sigma, (N,).
-    lengths
-        Length of each sighting's whitened residual in units of ``scale``, (M,).
+    lengths, rows
+        Length of each sighting's whitened residual in units of ``scale``, and the row of its
+        heliostat, (M,).
     count
         Number of sightings used, (N,).
     iterations, outcome
         (N,); `FitOutcome` as integers.
     centre
         Centre of the priors: zero, or a far start, (N, P).
+    heliostats
+        Names, (N,); () if unknown.
     """
 
     names: tuple[str, ...]
@@ -104,6 +107,8 @@ class FieldFit(Value, Framed):
     iterations: npt.NDArray[np.int64]
     outcome: npt.NDArray[np.int8]
     centre: FloatArray
+    rows: npt.NDArray[np.int64]
+    heliostats: tuple[str, ...] = ()
 
     def _card(self) -> Card:
         ends = [FitOutcome(int(o)) for o in np.atleast_1d(self.outcome)]
@@ -127,7 +132,7 @@ class FieldFit(Value, Framed):
         return Labelled(
             row,
             {
-                "heliostat": np.arange(np.size(self.scale)),
+                "heliostat": self.heliostats or np.arange(np.size(self.scale)),
                 "parameter": self.names,
                 "parameter_2": self.names,
             },
@@ -156,19 +161,50 @@ class FieldFit(Value, Framed):
         """Standard deviations of the values, (N, P)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
 
-    def of_one(self) -> "FieldFit":
-        """Return the fit of a single heliostat without the axis N."""
-        return replace(
-            self,
-            values=self.values[0],
-            covariance=self.covariance[0],
-            prior=self.prior[0],
-            scale=self.scale[0],
-            count=self.count[0],
-            iterations=self.iterations[0],
-            outcome=self.outcome[0],
-            centre=self.centre[0],
-        )
+    def __getitem__(self, heliostat: int | str) -> "FieldFit":
+        """Return the fit of one heliostat, by name or by row, without the axis N.
+
+        Raises
+        ------
+        InputError
+            If there is no such row.
+        UnknownNameError
+            If there is no such name.
+        """
+        if isinstance(heliostat, str):
+            if heliostat not in self.heliostats:
+                raise UnknownNameError("heliostat (fitted)", heliostat, self.heliostats)
+            heliostat = self.heliostats.index(heliostat)
+        count = np.size(self.scale)
+        if not 0 <= heliostat < count:
+            raise InputError(f"heliostat {heliostat}: {count} were fitted; give a row or a name")
+        return self.of_one(heliostat) if np.ndim(self.scale) else self
+
+    def only(self, row: int) -> "FieldFit":
+        """Return the fit of one heliostat with the axis N, (1,)."""
+        mine = self.rows == row
+        one = {name: getattr(self, name)[row : row + 1] for name in BY_HELIOSTAT}
+        rows = np.zeros(int(mine.sum()), dtype=np.int64)
+        names = self.heliostats[row : row + 1]
+        return replace(self, lengths=self.lengths[mine], rows=rows, heliostats=names, **one)
+
+    def of_one(self, row: int = 0) -> "FieldFit":
+        """Return the fit of one heliostat without the axis N."""
+        found = self.only(row)
+        return replace(found, **{name: getattr(found, name)[0] for name in BY_HELIOSTAT})
+
+
+#: The arrays of a fit that have the axis N.
+BY_HELIOSTAT = (
+    "values",
+    "covariance",
+    "prior",
+    "scale",
+    "count",
+    "iterations",
+    "outcome",
+    "centre",
+)
 
 
 def parameter_rows(
@@ -243,6 +279,7 @@ def fit(
         keep,
         max_iterations,
     )
+    fitted = replace(fitted, heliostats=given.names or sightings.names)
     return fitted.of_one() if given.single else fitted
 
 
@@ -276,6 +313,7 @@ def _fit(
         iterations=np.empty(count, dtype=np.int64),
         outcome=np.empty(count, dtype=np.int8),
         centre=begin,
+        rows=sightings.heliostat,
     )
     codes = mechanism.codes(names)
     started = mechanism.with_parameters({n: begin[:, p] for p, n in enumerate(names)})

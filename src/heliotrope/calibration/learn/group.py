@@ -157,16 +157,9 @@ def density(task: GroupTask, fitted: FieldFit, hyper: Hyperparameters) -> float:
     total = 0.0
     for row in range(len(task.mechanism)):
         if int(fitted.outcome[row]) == FitOutcome.CONVERGED:
-            one, seen = of_row(fitted, task.sightings, row), task.sightings.of(row)
+            one, seen = fitted.only(row), task.sightings.of(row)
             total += _replayed(task.mechanism[row : row + 1], seen, one, hyper).density
     return total
-
-
-def of_row(fitted: FieldFit, sightings: Sightings, row: int) -> FieldFit:
-    """Return the fit of one mirror from that of many, (1,)."""
-    whole = ("names", "lengths")
-    one = {name: value[[row]] for name, value in vars(fitted).items() if name not in whole}
-    return replace(fitted, lengths=fitted.lengths[sightings.heliostat == row], **one)
 
 
 def _replayed(

@@ -169,14 +169,12 @@ class Learned(Value, Framed):
         mine = np.flatnonzero(self.sightings.heliostat == i)
         place = np.full(len(self.sightings), -1)
         place[mine] = np.arange(len(mine))
-        whole = ("names", "lengths")
-        one = {k: v[[i]] for k, v in vars(self.static).items() if k not in whole}
         return replace(
             self,
             mechanism=self.mechanism[np.array([i])],
             sightings=self.sightings.of(i),
             used=self.used[mine],
-            static=replace(self.static, lengths=self.static.lengths[mine], **one),
+            static=self.static.only(i),
             members=self.members[i : i + 1],
             regime=self.regime[mine],
             outlier=self.outlier[mine],

@@ -11,13 +11,14 @@ Steps 1, 2 and 4 treat every heliostat by itself; only step 3 needs several.
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from heliotrope.calibration.fit.estimator import (
+    BY_HELIOSTAT,
     FieldFit,
     Loss,
     canonical_order,
@@ -421,12 +422,14 @@ def _join(
         lengths[mine] = part.prepared.static.lengths
         rows += [mine[r] for r in part.prepared.rows]
     fits = [part.prepared.static for part in parts]
-    whole = {
-        f.name: np.concatenate([getattr(fit, f.name) for fit in fits])
-        for f in fields(FieldFit)
-        if f.name not in ("names", "lengths")
-    }
-    static = FieldFit(names=model, lengths=lengths, **whole)
+    names = given.names or sightings.names
+    static = FieldFit(
+        names=model,
+        lengths=lengths,
+        rows=sightings.heliostat,
+        heliostats=names,
+        **{name: np.concatenate([getattr(fit, name) for fit in fits]) for name in BY_HELIOSTAT},
+    )
     members = tuple(m for part in parts for m in part.members)
     return Learned(
         given.mechanism,
@@ -440,7 +443,7 @@ def _join(
         outlier,
         unusable,
         tuple(rows),
-        given.names or sightings.names,
+        names,
         given.around,
     )
 

@@ -2,16 +2,14 @@
 
 A `CalibrationReport` holds the content, `write_report` writes the page and all files beside it.
 `FieldParameters` are the parameters at one moment as they stand in ``calibration.json``:
-`read_json` reads them, `apply_to_plant` puts them into a plant.
+`read_json` reads them, `Plant.with_calibration` puts them into a plant.
 """
 
 from heliotrope.calibration.report.content import CalibrationReport, HeliostatRow
 from heliotrope.calibration.report.page import write_parameters, write_report
 from heliotrope.calibration.report.results import (
     FieldParameters,
-    apply_to_plant,
     at_moment,
-    calibrated_plant,
     read_json,
     write_artist,
     write_json,
@@ -25,9 +23,7 @@ __all__ = [
     "CalibrationReport",
     "FieldParameters",
     "HeliostatRow",
-    "apply_to_plant",
     "at_moment",
-    "calibrated_plant",
     "read_json",
     "write_artist",
     "write_json",

@@ -10,7 +10,7 @@ from heliotrope.calibration.fit.estimator import FitOutcome
 from heliotrope.calibration.learn.drift import DAY
 from heliotrope.calibration.report import pictures
 from heliotrope.calibration.report.content import CalibrationReport, HeliostatRow
-from heliotrope.calibration.report.results import calibrated_plant, write_json, write_parquet
+from heliotrope.calibration.report.results import write_json, write_parquet
 from heliotrope.field.formats.plant_file import write_plant
 from heliotrope.files.html import STYLE, picture, render
 from heliotrope.files.text import write_text
@@ -71,7 +71,7 @@ def write_report(
     write_json(folder / "calibration.json", report.names, learned, r, ids)
     units = {n: learned.mechanism.parameter(n).unit for n in r.names}
     write_parquet(folder / "calibration.parquet", units, r)
-    write_plant(calibrated_plant(report.plant, report.group, r), folder / "plant.toml")
+    write_plant(report.plant.with_calibration(r), folder / "plant.toml")
     rows = sorted(report.rows, key=lambda row: -np.nan_to_num(row.after.median))[:most]
     rows = sorted(rows, key=lambda row: row.name)
     sections = []

@@ -20,7 +20,6 @@ from heliotrope.calibration.fit.estimator import FitOutcome
 from heliotrope.calibration.learn.drift import DAY
 from heliotrope.calibration.learn.learned import Learned
 from heliotrope.errors import InputError
-from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.files import json as _json
 from heliotrope.files.text import write_file, write_text
@@ -71,22 +70,6 @@ class FieldParameters:
     def sigma(self) -> FloatArray:
         """Standard deviations of the values, (N, P)."""
         return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
-
-    def apply(self, heliostats: Heliostats) -> Heliostats:
-        """Return heliostats with these parameters; heliostats without any keep their own.
-
-        Raises
-        ------
-        UnknownNameError
-            If the mechanisms lack a parameter.
-        """
-        place = {name: i for i, name in enumerate(self.heliostats)}
-        rows = np.array([place.get(name, -1) for name in heliostats.names])
-        merged = dict(heliostats.parameters)
-        for p, name in enumerate(self.names):
-            old = merged.get(name, np.zeros(len(heliostats)))
-            merged[name] = np.where(rows >= 0, self.values[rows, p], old)
-        return heliostats.with_parameters(merged)
 
 
 def at_moment(
@@ -311,35 +294,6 @@ def write_paint(
     return left
 
 
-def calibrated_plant(plant: Plant, group: str, results: FieldParameters) -> Plant:
-    """Return ``plant`` with the parameters in the heliostats of ``group``."""
-    groups = dict(plant.groups)
-    groups[group] = results.apply(groups[group])
-    return replace(plant, groups=groups)
-
-
-def apply_to_plant(plant: Plant, results: FieldParameters) -> Plant:
-    """Return ``plant`` with the parameters in every group that has heliostats of these names.
-
-    Raises
-    ------
-    InputError
-        If no heliostat of the plant is among them.
-    UnknownNameError
-        If a mechanism lacks a parameter.
-    """
-    known = set(results.heliostats)
-    mine = [name for name, group in plant.groups.items() if known & set(group.names)]
-    if not mine:
-        raise InputError(
-            f"calibration of {', '.join(results.heliostats[:3])}…: the plant has none of these "
-            "heliostats; give the calibration of this plant"
-        )
-    for name in mine:
-        plant = calibrated_plant(plant, name, results)
-    return plant
-
-
 def write_artist(
     path: str | Path,
     scenario: str | Path,
@@ -477,4 +431,4 @@ def _given(plant: Plant, learned: Learned, time: float | None, what: str) -> Pla
         raise InputError(
             f"{what}: it was learnt without names; learn from the plant, or plant[name]"
         )
-    return apply_to_plant(plant, at_moment(learned.heliostats, learned, time))
+    return plant.with_calibration(at_moment(learned.heliostats, learned, time))
