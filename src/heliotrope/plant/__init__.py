@@ -15,9 +15,10 @@ from heliotrope.plant.assigned import Assigned, AssignedError, AssignedFile, res
 from heliotrope.plant.audit import Audit, AuditError, JsonLines, Record
 from heliotrope.plant.authority import OPERATOR_COMMANDS, Authority, Grant, Person, Role
 from heliotrope.plant.beam_watch import BeamError
-from heliotrope.plant.controller import JOINING, PlantController
+from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
 from heliotrope.plant.field_state import FieldState, HeliostatState
+from heliotrope.plant.permission import JOINING
 from heliotrope.plant.refusals import Refusal, RefusedError
 from heliotrope.plant.settings import PlantSettings, clusters_of
 from heliotrope.plant.tickets import Ticket

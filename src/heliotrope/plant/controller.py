@@ -14,10 +14,9 @@ import asyncio
 import math
 import secrets
 from collections import deque
-from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,10 +26,8 @@ from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.plant import Plant
 from heliotrope.field.volumes import Volume
-from heliotrope.files.disk import AtOnce, Disk, Work
+from heliotrope.files.disk import AtOnce, Disk
 from heliotrope.geometry import FloatArray
-from heliotrope.lcu import messages as wire
-from heliotrope.lcu import states
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.link import Link
 from heliotrope.links.messages import (
@@ -46,36 +43,28 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant import refusals
 from heliotrope.plant.agreement import Agreement
 from heliotrope.plant.aims import BeamCheck, default_aims
-from heliotrope.plant.assigned import Assigned, Points, grouped, points_of
-from heliotrope.plant.audit import Audit, AuditError
+from heliotrope.plant.assigned import Assigned, Points
+from heliotrope.plant.audit import Audit
 from heliotrope.plant.authority import Authority, Grant, Person, Role
 from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
+from heliotrope.plant.commands import Commands
 from heliotrope.plant.doubts import Doubts
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.identity import Identities
-from heliotrope.plant.joining import JoinDispatcher, JoiningJob, JoinQueue, in_slices
-from heliotrope.plant.lockouts import Lockout, locked_out
-from heliotrope.plant.orders import PlantOrders, whole
+from heliotrope.plant.joining import JoinDispatcher, JoinQueue
+from heliotrope.plant.lockouts import Lockout
+from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.parameters import ParameterSync, Tables, change_of_beam
+from heliotrope.plant.permission import Permission
 from heliotrope.plant.rivals import Rivals
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act, Alarm, Condition, alarms, conditions
 from heliotrope.sun import fast_vector
 
-#: Commands that bring beams to the receiver or move them across it.
-JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
-#: Commands that move heliostats by their parameters.
-MOTIONS = JOINING | {"APPROACH", "IDLE", "JOG", "GOTO", "DIAGNOSE"}
-#: Commands that move nothing.
-SETTINGS = frozenset({"LOCK_AIM", "ROUGH"})
-#: Commands that assign points; `PlantController.aim` and `standby` prove their beams.
-POINTS = frozenset({"AIM", "STANDBY"})
-#: States in which a beam is at its aim.
-_ON_AIM = (states.TRACKING, states.SEARCHING)
 #: An equal safe order of the same person within this time joins the one before, s.
 _SAME = 0.25
 #: Pause between two passes over parameters and owed records, s.
@@ -169,7 +158,6 @@ class PlantController:
         self.beliefs = Beliefs(design)
         self.beliefs.subscribe(self._believe)
         self.out_of_service: dict[str, Lockout] = {}
-        place = disk or AtOnce()
         points = Points(self.field.names, assigned)
         self.aims, self.standbys = points.aims, points.standbys
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, self.beams.machines)
@@ -190,7 +178,7 @@ class PlantController:
         self._orders = PlantOrders(
             clock,
             audit,
-            place,
+            disk or AtOnce(),
             self._clusters,
             self.name,
             self.settings.lifetime,
@@ -198,10 +186,6 @@ class PlantController:
             self.settings.stow_rate,
         )
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
-        life, barred = self.settings.join_life, self.doubts.barred
-        self._joiner = JoinDispatcher(
-            self._joining, self._orders, self._ways, life, barred, self._examine
-        )
         self._sync = ParameterSync(
             self.field,
             self.wanted,
@@ -211,15 +195,21 @@ class PlantController:
             self._rewriting,
             self._identities.barred,
         )
-        rows = conditions(self.settings.autonomy) if table is None else table
-        self._sentinel = self._guarded(rows)
+        self._sentinel = self._guarded(table)
+        self._permission = self._permitting()
+        self._commands = self._directed()
+        life, barred, examine = self.settings.join_life, self.doubts.barred, self._commands.examine
+        self._joiner = JoinDispatcher(
+            self._joining, self._orders, self._ways, life, barred, examine
+        )
         self._named_at = dict.fromkeys(members, -math.inf)
         self._slow_at = -math.inf
         self._closing = asyncio.Event()
         self._last_safe: tuple[tuple[str, Act, tuple[str, ...]], Ticket] | None = None
 
-    def _guarded(self, rows: Iterable[Condition]) -> Sentinel:
+    def _guarded(self, table: Iterable[Condition] | None) -> Sentinel:
         """Return the sentinel, with the plant's own readings of the safety table."""
+        rows = conditions(self.settings.autonomy) if table is None else table
         readings = PlantReadings(
             self.field,
             self.authority,
@@ -238,6 +228,34 @@ class PlantController:
             self.beams.drives,
             self.settings.repeat,
             self._identities,
+        )
+
+    def _permitting(self) -> Permission:
+        """Return what decides who may command what."""
+        return Permission(
+            self.field,
+            self.authority,
+            self._orders,
+            self._sentinel,
+            self._rivals,
+            self._identities,
+            self._sync,
+            self.doubts,
+            self.out_of_service,
+        )
+
+    def _directed(self) -> Commands:
+        """Return what gives people's commands."""
+        return Commands(
+            self.now,
+            self.field,
+            self._orders,
+            self._joining,
+            self._permission,
+            self._ways,
+            self.design.targets,
+            self.wanted,
+            self.settings.join_wait,
         )
 
     # -- running ---------------------------------------------------------------------------
@@ -542,66 +560,7 @@ class PlantController:
         """
         if name in ("DEFOCUS", "STOW"):
             return self._safe(person.name, Act[name], heliostats)
-        row = wire.ROW_OF.get(wire.NUMBER_OF.get(name, -1))
-        if row is None or row[2] != wire.AUTHORITY or name in POINTS:
-            known = [r[1] for r in wire.MESSAGES if r[2] == wire.AUTHORITY and r[1] not in POINTS]
-            raise UnknownNameError("command (points are given by aim and standby)", name, known)
-        numbers = whole(values, row[3], name)
-        names = tuple(dict.fromkeys(heliostats)) or self.field.names
-        out = self._locked_out(name, names)
-        clear, wrong = self._examine(name, numbers, tuple(n for n in names if n not in out))
-        ticket = self._accept(person, token, name, numbers, names)
-        ticket.block({**wrong, **out})
-        if name not in SETTINGS:
-            # A heliostat that still waits to join must not undo a later command.
-            self._joining.drop(f"superseded by {name}", frozenset(names))
-        self._orders.when_recorded(ticket, partial(self._send, ticket, numbers, clear, token))
-        return ticket
-
-    def _send(
-        self,
-        ticket: Ticket,
-        numbers: tuple[float, ...],
-        heliostats: tuple[str, ...],
-        token: int,
-        again: bool,
-    ) -> None:
-        """Send a recorded command; one that waited for its record (``again``) is examined again.
-
-        Raises
-        ------
-        RefusedError
-            If it may no longer be sent.
-        """
-        name, left = ticket.name, ticket.waiting(heliostats)
-        if again and left:
-            self._refuse_now(name, left)
-            out = locked_out(self.out_of_service, name, left)
-            left, wrong = self._examine(name, numbers, tuple(n for n in left if n not in out))
-            ticket.block({**wrong, **out})
-            if name not in SETTINGS:
-                # One that was given before it may have joined the queue after its acceptance.
-                self._joining.drop(f"superseded by {name}", frozenset(left))
-        if left:
-            waits = name in JOINING or in_slices(name, left)
-            send = self._join if waits else self._orders.command
-            send(ticket, name, numbers, left, token)
-
-    def _examine(
-        self, name: str, numbers: tuple[float, ...], names: tuple[str, ...]
-    ) -> tuple[tuple[str, ...], dict[str, str]]:
-        """Return the heliostats that may be sent a command now, and why the others may not.
-
-        Raises
-        ------
-        BeamError
-            If none may.
-        """
-        able, wrong = self._able(name, names)
-        if in_slices(name, able):
-            return able, wrong  # each slice is examined when its turn comes
-        clear, blocked = self._ways.clear(name, numbers, able, self.now())
-        return clear, wrong | blocked
+        return self._commands.give(person, token, name, heliostats, values)
 
     def zero(self, person: Person, token: int, heliostat: str, counts: Sequence[float]) -> Ticket:
         """Declare the step counts of the axes of one heliostat that is locked or has a fault.
@@ -627,17 +586,7 @@ class PlantController:
         UnknownNameError
             If there is no such heliostat.
         """
-        numbers = whole(counts, wire.ROW_OF[wire.NUMBER_OF["ZERO"]][3], "ZERO")
-        if wrong := self._identities.barred((heliostat,)):
-            raise BeamError("ZERO", wrong)
-        ticket = self._accept(person, token, "ZERO", numbers, (heliostat,))
-        self._orders.when_recorded(
-            ticket,
-            lambda _: self._orders.command(
-                ticket, "ZERO", numbers, ticket.waiting((heliostat,)), token
-            ),
-        )
-        return ticket
+        return self._commands.zero(person, token, heliostat, counts)
 
     def default_aims(
         self, heliostats: Sequence[str] = (), points: npt.ArrayLike | None = None
@@ -665,11 +614,11 @@ class PlantController:
         RefusedError
             If it is not accepted, or one of the beams may not go there.
         """
-        return self._point(person, token, "AIM", points)
+        return self._commands.point(person, token, "AIM", points)
 
     def standby(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
         """Set standby points, beyond which beams go on; see `aim`."""
-        return self._point(person, token, "STANDBY", points)
+        return self._commands.point(person, token, "STANDBY", points)
 
     def parameters(
         self,
@@ -719,7 +668,7 @@ class PlantController:
                     heliostat=heliostat, change=1e3 * change, limit=1e3 * limit.largest_change
                 )
         note = ", ".join(items) + (f"; confirmed: {confirmed}" if confirmed else "")
-        ticket = self._accept(person, token, "PARAMETERS", (), (heliostat,), note)
+        ticket = self._permission.accept(person, token, "PARAMETERS", (), (heliostat,), note)
 
         def use() -> None:
             self.wanted.set(heliostat, items)
@@ -771,27 +720,6 @@ class PlantController:
         centers += [target.center for target in self.design.targets]
         return np.array([*own[np.isfinite(own).all(axis=-1)], *centers])
 
-    def _able(self, name: str, names: tuple[str, ...]) -> tuple[tuple[str, ...], dict[str, str]]:
-        """Return the heliostats that may be given a command, and why the others may not.
-
-        Everything but LOCK needs a board that is the heliostat's; a motion, the wanted parameters;
-        joining, that no alarm bars the heliostat.
-
-        Raises
-        ------
-        RefusedError
-            If none may; the reason of the whole plant or of a cluster comes before their own.
-        """
-        wrong = {} if name == "LOCK" else self._identities.barred(names)
-        if name in MOTIONS:
-            wrong = self._sync.differing(names) | self._orders.to_stow(names) | wrong
-        if name in JOINING:
-            wrong |= self._sentinel.barred(names) | self.doubts.barred(names)
-        if wrong and len(wrong) == len(names):
-            self._refuse_now(name, names)
-            raise BeamError(name, wrong)
-        return tuple(n for n in names if n not in wrong), wrong
-
     def _believe(self, record: HeliostatCalibration) -> None:
         """Use a new calibration in the beam checks and in the wanted parameters."""
         self.want(record.heliostat, self.beliefs.present(record.heliostat)[0])
@@ -822,139 +750,6 @@ class PlantController:
         """
         self.field.place(heliostat)
         return await self._sync.stored(heliostat, timeout)
-
-    def _point(
-        self, person: Person, token: int, name: str, points: Mapping[str, npt.ArrayLike]
-    ) -> Ticket:
-        out = self._locked_out(name, points)
-        points = {n: point for n, point in points.items() if n not in out}
-        names = tuple(points)
-        rows = np.array([self.field.place(n) for n in names], dtype=np.intp)
-        wanted = points_of(name, points)
-        self._prove_points(name, names, rows, wanted)
-        groups, keep = grouped(names, wanted), self._ways.points
-        values = next(iter(groups)) if len(groups) == 1 else ()
-        all_names, note = (*names, *out), f"{len(groups)} points"
-        store = keep.storing(name, rows, wanted)
-        ticket = self._accept(person, token, name, values, all_names, note, store)
-        ticket.block(out)
-
-        def send(again: bool) -> None:
-            if again:
-                self._refuse_now(name, names)
-                self._prove_points(name, names, rows, wanted)
-            here = self._stays(rows, wanted)
-            stays = frozenset(names[i] for i in np.flatnonzero(here))
-            keep.assign(name, rows, wanted)
-            if name == "STANDBY":
-                for each, place in zip(names, wanted, strict=True):
-                    self.wanted.rest(each, tuple(place))
-            self._send_points(ticket, name, groups, token, stays)
-
-        self._orders.when_recorded(ticket, send)
-        return ticket
-
-    def _prove_points(
-        self, name: str, names: tuple[str, ...], rows: npt.NDArray[np.intp], wanted: FloatArray
-    ) -> None:
-        """Prove that heliostats (K,) may be given points (K, 3) now.
-
-        Raises
-        ------
-        BeamError
-            If one of them may not.
-        """
-        tracking = self.field.among(_ON_AIM, self.now())[rows]
-        moves = tracking if name == "AIM" else self.field.among((states.IDLE,), self.now())[rows]
-        moved = [names[i] for i in np.flatnonzero(moves)]
-        wrong = self._sync.differing(moved) | self._identities.barred(moved)
-        if name == "AIM":
-            wrong |= self.doubts.barred(moved, wanted[moves])
-        if wrong:
-            raise BeamError(name, wrong)
-        self._ways.check_points(name, rows, wanted, tracking)
-
-    def _send_points(
-        self,
-        ticket: Ticket,
-        name: str,
-        groups: Mapping[tuple[float, ...], Sequence[str]],
-        token: int,
-        stays: frozenset[str],
-    ) -> None:
-        """Send points that are stored; heliostats that track join their new aim.
-
-        Those that stay on one target bring no light to a receiver and need no turn to join.
-        """
-        names = [n for members in groups.values() for n in members]
-        rows = np.array([self.field.place(n) for n in names], dtype=np.intp)
-        tracking = self.field.among(_ON_AIM, self.now())[rows]
-        self._joining.drop(f"superseded by another {name}", frozenset(names), name)
-        joins = {names[i] for i in np.flatnonzero(tracking)} - stays
-        moving = joins if name == "AIM" else set()
-        for point, members in groups.items():
-            still = [n for n in members if n not in moving]
-            if still:
-                self._orders.command(ticket, name, point, still, token)
-            if len(still) < len(members):
-                self._join(ticket, name, point, [n for n in members if n in moving], token)
-
-    def _stays(self, rows: npt.NDArray[np.intp], wanted: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return which heliostats' aims and new points (K, 3) lie on the same target, (K,)."""
-        found = np.zeros(len(rows), dtype=np.bool_)
-        for target in self.design.targets:
-            found |= target.holds(self.aims[rows]) & target.holds(wanted)
-        return found
-
-    def _join(
-        self,
-        ticket: Ticket,
-        name: str,
-        values: tuple[float, ...],
-        heliostats: Sequence[str],
-        token: int,
-    ) -> None:
-        until = self.now() + self.settings.join_wait
-        self._joining.put(JoiningJob(ticket, name, values, token, deque(heliostats), until))
-
-    def _locked_out(self, name: str, heliostats: Collection[str]) -> dict[str, str]:
-        """Return which heliostats are out of service, and why; refuse if all of them are."""
-        out = locked_out(self.out_of_service, name, heliostats)
-        if out and len(out) == len(heliostats):
-            first, more = next(iter(out)), f" and {len(out) - 1} more" if len(out) > 1 else ""
-            raise refusals.OUT_OF_SERVICE.error(
-                what=name, heliostat=first, more=more, reason=out[first]
-            )
-        return out
-
-    def _accept(
-        self,
-        person: Person,
-        token: int,
-        name: str,
-        values: tuple[float, ...],
-        heliostats: Sequence[str],
-        note: str = "",
-        store: tuple[Work, Work] | None = None,
-    ) -> Ticket:
-        for each in heliostats:
-            self.field.place(each)
-        self.authority.check(person, token, name)
-        self._refuse_now(name, heliostats)
-        try:
-            return self._orders.accept(
-                (person.name, person.role.title, name), values, heliostats, note, store=store
-            )
-        except AuditError as error:
-            raise refusals.NOT_RECORDED.error(what=name, problem=error) from None
-
-    def _refuse_now(self, name: str, heliostats: Sequence[str]) -> None:
-        """Refuse a command where no new motion may begin now."""
-        rows = [self.field.place(n) for n in heliostats]
-        clusters = {self.field.clusters[self.field.cluster[row]] for row in rows}
-        reason = "" if name == "LOCK" else self._sentinel.refusal(clusters)
-        if reason := reason or self._rivals.refusal(clusters):
-            raise refusals.NOT_NOW.error(what=name, reason=reason)
 
 
 def _checked(

@@ -14,8 +14,9 @@ from itertools import islice
 from heliotrope.lcu import states
 from heliotrope.links.messages import Command, Emergency, Lease, Message, Parameters
 from heliotrope.plant.authority import OPERATOR_COMMANDS, Person, Role
-from heliotrope.plant.controller import JOINING, PlantController
+from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.automatic import AUTOMATIC
+from heliotrope.plant.permission import JOINING
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.tickets import Ticket
 from heliotrope.twin.invariants.invariants import InvariantError, Observer, Violation

@@ -1,0 +1,244 @@
+"""Commands of people: permitted, proven, recorded, and sent, at once or when their turn comes."""
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import UnknownNameError
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import messages as wire
+from heliotrope.lcu import states
+from heliotrope.mechanism.board_items import Wanted
+from heliotrope.plant.assigned import grouped, points_of
+from heliotrope.plant.authority import Person
+from heliotrope.plant.beam_watch import BeamError, BeamWatch
+from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.joining import JoiningJob, JoinQueue, in_slices
+from heliotrope.plant.orders import PlantOrders, whole
+from heliotrope.plant.permission import JOINING, Permission
+from heliotrope.plant.tickets import Ticket
+
+#: Commands that move nothing.
+SETTINGS = frozenset({"LOCK_AIM", "ROUGH"})
+#: Commands that assign points; `Commands.point` proves their beams.
+POINTS = frozenset({"AIM", "STANDBY"})
+#: States in which a beam is at its aim.
+_ON_AIM = (states.TRACKING, states.SEARCHING)
+
+
+class Commands:
+    """Gives the commands of the wire that need the command authority.
+
+    Parameters
+    ----------
+    now
+        Returns the monotonic time, s.
+    field, orders, joining
+        The plant's.
+    permission
+        Who may command what.
+    ways
+        Where beams may go.
+    targets
+        Of the plant: staying on one brings no light to a receiver.
+    wanted
+        Parameters that local controllers should store, their standby points among them.
+    patience
+        Time that a heliostat waits for its turn to join, s.
+    """
+
+    def __init__(
+        self,
+        now: Callable[[], float],
+        field: FieldState,
+        orders: PlantOrders,
+        joining: JoinQueue,
+        permission: Permission,
+        ways: BeamWatch,
+        targets: Sequence[Target],
+        wanted: Wanted,
+        patience: float,
+    ) -> None:
+        self._now, self._field, self._orders, self._joining = now, field, orders, joining
+        self._permission, self._ways = permission, ways
+        self._targets, self._wanted, self._patience = targets, wanted, patience
+
+    def give(
+        self,
+        person: Person,
+        token: int,
+        name: str,
+        heliostats: Sequence[str],
+        values: Sequence[float],
+    ) -> Ticket:
+        """Give a command without points; see `PlantController.command`."""
+        row = wire.ROW_OF.get(wire.NUMBER_OF.get(name, -1))
+        if row is None or row[2] != wire.AUTHORITY or name in POINTS:
+            known = [r[1] for r in wire.MESSAGES if r[2] == wire.AUTHORITY and r[1] not in POINTS]
+            raise UnknownNameError("command (points are given by aim and standby)", name, known)
+        numbers = whole(values, row[3], name)
+        names = tuple(dict.fromkeys(heliostats)) or self._field.names
+        out = self._permission.locked_out(name, names)
+        clear, wrong = self.examine(name, numbers, tuple(n for n in names if n not in out))
+        ticket = self._permission.accept(person, token, name, numbers, names)
+        ticket.block({**wrong, **out})
+        if name not in SETTINGS:
+            # A heliostat that still waits to join must not undo a later command.
+            self._joining.drop(f"superseded by {name}", frozenset(names))
+        self._orders.when_recorded(ticket, partial(self._send, ticket, numbers, clear, token))
+        return ticket
+
+    def _send(
+        self,
+        ticket: Ticket,
+        numbers: tuple[float, ...],
+        heliostats: tuple[str, ...],
+        token: int,
+        again: bool,
+    ) -> None:
+        """Send a recorded command; one that waited for its record (``again``) is examined again.
+
+        Raises
+        ------
+        RefusedError
+            If it may no longer be sent.
+        """
+        name, left = ticket.name, ticket.waiting(heliostats)
+        if again and left:
+            self._permission.refuse_now(name, left)
+            out = self._permission.still_locked_out(name, left)
+            left, wrong = self.examine(name, numbers, tuple(n for n in left if n not in out))
+            ticket.block({**wrong, **out})
+            if name not in SETTINGS:
+                # One that was given before it may have joined the queue after its acceptance.
+                self._joining.drop(f"superseded by {name}", frozenset(left))
+        if left:
+            waits = name in JOINING or in_slices(name, left)
+            send = self._join if waits else self._orders.command
+            send(ticket, name, numbers, left, token)
+
+    def examine(
+        self, name: str, numbers: tuple[float, ...], names: tuple[str, ...]
+    ) -> tuple[tuple[str, ...], dict[str, str]]:
+        """Return the heliostats that may be sent a command now, and why the others may not.
+
+        Raises
+        ------
+        BeamError
+            If none may.
+        """
+        able, wrong = self._permission.able(name, names)
+        if in_slices(name, able):
+            return able, wrong  # each slice is examined when its turn comes
+        clear, blocked = self._ways.clear(name, numbers, able, self._now())
+        return clear, wrong | blocked
+
+    def zero(self, person: Person, token: int, heliostat: str, counts: Sequence[float]) -> Ticket:
+        """Declare the step counts of one heliostat; see `PlantController.zero`."""
+        numbers = whole(counts, wire.ROW_OF[wire.NUMBER_OF["ZERO"]][3], "ZERO")
+        if wrong := self._permission.strange((heliostat,)):
+            raise BeamError("ZERO", wrong)
+        ticket = self._permission.accept(person, token, "ZERO", numbers, (heliostat,))
+        self._orders.when_recorded(
+            ticket,
+            lambda _: self._orders.command(
+                ticket, "ZERO", numbers, ticket.waiting((heliostat,)), token
+            ),
+        )
+        return ticket
+
+    def point(
+        self, person: Person, token: int, name: str, points: Mapping[str, npt.ArrayLike]
+    ) -> Ticket:
+        """Give AIM or STANDBY with a point (3,) for each heliostat; see `PlantController.aim`."""
+        out = self._permission.locked_out(name, points)
+        points = {n: point for n, point in points.items() if n not in out}
+        names = tuple(points)
+        rows = np.array([self._field.place(n) for n in names], dtype=np.intp)
+        wanted = points_of(name, points)
+        self._prove_points(name, names, rows, wanted)
+        groups, keep = grouped(names, wanted), self._ways.points
+        values = next(iter(groups)) if len(groups) == 1 else ()
+        all_names, note = (*names, *out), f"{len(groups)} points"
+        store = keep.storing(name, rows, wanted)
+        ticket = self._permission.accept(person, token, name, values, all_names, note, store)
+        ticket.block(out)
+
+        def send(again: bool) -> None:
+            if again:
+                self._permission.refuse_now(name, names)
+                self._prove_points(name, names, rows, wanted)
+            here = self._stays(rows, wanted)
+            stays = frozenset(names[i] for i in np.flatnonzero(here))
+            keep.assign(name, rows, wanted)
+            if name == "STANDBY":
+                for each, place in zip(names, wanted, strict=True):
+                    self._wanted.rest(each, tuple(place))
+            self._send_points(ticket, name, groups, token, stays)
+
+        self._orders.when_recorded(ticket, send)
+        return ticket
+
+    def _prove_points(
+        self, name: str, names: tuple[str, ...], rows: npt.NDArray[np.intp], wanted: FloatArray
+    ) -> None:
+        """Prove that heliostats (K,) may be given points (K, 3) now.
+
+        Raises
+        ------
+        BeamError
+            If one of them may not.
+        """
+        tracking = self._field.among(_ON_AIM, self._now())[rows]
+        moves = tracking if name == "AIM" else self._field.among((states.IDLE,), self._now())[rows]
+        moved = [names[i] for i in np.flatnonzero(moves)]
+        if wrong := self._permission.unready(name, moved, wanted[moves]):
+            raise BeamError(name, wrong)
+        self._ways.check_points(name, rows, wanted, tracking)
+
+    def _send_points(
+        self,
+        ticket: Ticket,
+        name: str,
+        groups: Mapping[tuple[float, ...], Sequence[str]],
+        token: int,
+        stays: frozenset[str],
+    ) -> None:
+        """Send points that are stored; heliostats that track join their new aim.
+
+        Those that stay on one target bring no light to a receiver and need no turn to join.
+        """
+        names = [n for members in groups.values() for n in members]
+        rows = np.array([self._field.place(n) for n in names], dtype=np.intp)
+        tracking = self._field.among(_ON_AIM, self._now())[rows]
+        self._joining.drop(f"superseded by another {name}", frozenset(names), name)
+        joins = {names[i] for i in np.flatnonzero(tracking)} - stays
+        moving = joins if name == "AIM" else set()
+        for point, members in groups.items():
+            still = [n for n in members if n not in moving]
+            if still:
+                self._orders.command(ticket, name, point, still, token)
+            if len(still) < len(members):
+                self._join(ticket, name, point, [n for n in members if n in moving], token)
+
+    def _stays(self, rows: npt.NDArray[np.intp], wanted: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return which heliostats' aims and new points (K, 3) lie on the same target, (K,)."""
+        found = np.zeros(len(rows), dtype=np.bool_)
+        for target in self._targets:
+            found |= target.holds(self._ways.points.aims[rows]) & target.holds(wanted)
+        return found
+
+    def _join(
+        self,
+        ticket: Ticket,
+        name: str,
+        values: tuple[float, ...],
+        heliostats: Sequence[str],
+        token: int,
+    ) -> None:
+        until = self._now() + self._patience
+        self._joining.put(JoiningJob(ticket, name, values, token, deque(heliostats), until))

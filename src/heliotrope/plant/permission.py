@@ -1,0 +1,137 @@
+"""Permission: which heliostats may be given a command now, by whom, and why others may not."""
+
+from collections.abc import Collection, Mapping, Sequence
+
+from heliotrope.files.disk import Work
+from heliotrope.geometry import FloatArray
+from heliotrope.plant import refusals
+from heliotrope.plant.audit import AuditError
+from heliotrope.plant.authority import Authority, Person
+from heliotrope.plant.beam_watch import BeamError
+from heliotrope.plant.doubts import Doubts
+from heliotrope.plant.emergency import Sentinel
+from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.identity import Identities
+from heliotrope.plant.lockouts import Lockout, locked_out
+from heliotrope.plant.orders import PlantOrders
+from heliotrope.plant.parameters import ParameterSync
+from heliotrope.plant.rivals import Rivals
+from heliotrope.plant.tickets import Ticket
+
+#: Commands that bring beams to the receiver or move them across it.
+JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
+#: Commands that move heliostats by their parameters.
+MOTIONS = JOINING | {"APPROACH", "IDLE", "JOG", "GOTO", "DIAGNOSE"}
+
+
+class Permission:
+    """Decides who may command what now; where beams may go is `BeamWatch`'s matter.
+
+    Parameters
+    ----------
+    field, authority, orders
+        The plant's.
+    sentinel, rivals
+        Whether new motion may begin now.
+    identities, sync, doubts
+        Whether a heliostat is what it seems to be.
+    out_of_service
+        Heliostats that nobody moves, by name.
+    """
+
+    def __init__(
+        self,
+        field: FieldState,
+        authority: Authority,
+        orders: PlantOrders,
+        sentinel: Sentinel,
+        rivals: Rivals,
+        identities: Identities,
+        sync: ParameterSync,
+        doubts: Doubts,
+        out_of_service: Mapping[str, Lockout],
+    ) -> None:
+        self._field, self._authority, self._orders = field, authority, orders
+        self._sentinel, self._rivals = sentinel, rivals
+        self._identities, self._sync, self._doubts = identities, sync, doubts
+        self._out = out_of_service
+
+    def able(self, name: str, names: tuple[str, ...]) -> tuple[tuple[str, ...], dict[str, str]]:
+        """Return the heliostats that may be given a command, and why the others may not.
+
+        Everything but LOCK needs a board that is the heliostat's; a motion, the wanted parameters;
+        joining, that no alarm bars the heliostat.
+
+        Raises
+        ------
+        RefusedError
+            If none may; the reason of the whole plant or of a cluster comes before their own.
+        """
+        wrong = {} if name == "LOCK" else self._identities.barred(names)
+        if name in MOTIONS:
+            wrong = self._sync.differing(names) | self._orders.to_stow(names) | wrong
+        if name in JOINING:
+            wrong |= self._sentinel.barred(names) | self._doubts.barred(names)
+        if wrong and len(wrong) == len(names):
+            self.refuse_now(name, names)
+            raise BeamError(name, wrong)
+        return tuple(n for n in names if n not in wrong), wrong
+
+    def strange(self, names: Sequence[str]) -> dict[str, str]:
+        """Return which heliostats' boards are not known to be theirs, and why."""
+        return self._identities.barred(names)
+
+    def unready(self, name: str, names: Sequence[str], points: FloatArray) -> dict[str, str]:
+        """Return which heliostats may not move to new points (K, 3) now, and why."""
+        wrong = self._sync.differing(names) | self._identities.barred(names)
+        return wrong | self._doubts.barred(names, points) if name == "AIM" else wrong
+
+    def still_locked_out(self, name: str, heliostats: Collection[str]) -> dict[str, str]:
+        """Return which heliostats are out of service, and why."""
+        return locked_out(self._out, name, heliostats)
+
+    def locked_out(self, name: str, heliostats: Collection[str]) -> dict[str, str]:
+        """Return which heliostats are out of service, and why; refuse if all of them are."""
+        out = self.still_locked_out(name, heliostats)
+        if out and len(out) == len(heliostats):
+            first, more = next(iter(out)), f" and {len(out) - 1} more" if len(out) > 1 else ""
+            raise refusals.OUT_OF_SERVICE.error(
+                what=name, heliostat=first, more=more, reason=out[first]
+            )
+        return out
+
+    def accept(
+        self,
+        person: Person,
+        token: int,
+        name: str,
+        values: tuple[float, ...],
+        heliostats: Sequence[str],
+        note: str = "",
+        store: tuple[Work, Work] | None = None,
+    ) -> Ticket:
+        """Return the ticket of a command that may be given, with its record on the way.
+
+        Raises
+        ------
+        RefusedError
+            If it may not.
+        """
+        for each in heliostats:
+            self._field.place(each)
+        self._authority.check(person, token, name)
+        self.refuse_now(name, heliostats)
+        try:
+            return self._orders.accept(
+                (person.name, person.role.title, name), values, heliostats, note, store=store
+            )
+        except AuditError as error:
+            raise refusals.NOT_RECORDED.error(what=name, problem=error) from None
+
+    def refuse_now(self, name: str, heliostats: Sequence[str]) -> None:
+        """Refuse a command where no new motion may begin now."""
+        rows = [self._field.place(n) for n in heliostats]
+        clusters = {self._field.clusters[self._field.cluster[row]] for row in rows}
+        reason = "" if name == "LOCK" else self._sentinel.refusal(clusters)
+        if reason := reason or self._rivals.refusal(clusters):
+            raise refusals.NOT_NOW.error(what=name, reason=reason)
