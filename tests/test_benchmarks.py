@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from heliotrope.geometry import normalize, reflect
+
 ROOT = Path(__file__).parents[1]
 TIMES = {"best_ms", "median_ms"}
 COLUMNS = {
@@ -62,6 +64,11 @@ COLUMNS = {
     "coded": {
         "surface", "mirrors", "photographs", "proven", "rms_mrad", "worst_mrad", "within_90",
         "power_lost_share", "separation_cpu_s", "mirrors_an_hour",
+    },
+    "floor": {
+        "split", "measured_mrad", "measured_within_90", "learner_on_drawn_mrad",
+        "learner_on_drawn_within_90", "oracle_mrad", "oracle_low_mrad", "oracle_high_mrad",
+        "visit_mrad", "photograph_mrad", "constants_mrad",
     },
     "obstruction": {
         "distance_m", "hidden", "predicted_right_mrad", "predicted_up_mrad", "read_right_mrad",
@@ -149,6 +156,64 @@ def test_the_chain_of_artist_is_ours(monkeypatch: pytest.MonkeyPatch) -> None:
         moved = beam_errors(nominal.with_parameters({name: 4e-3}), seen).beam
         found = artist.beam_errors(nominal, seen, tilts)
         np.testing.assert_allclose(found, moved, atol=1e-9)
+
+
+def test_the_oracle_predicts_as_well_as_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against the blocks of the inverse; in turn, each from those before it alone."""
+    floor = _module(monkeypatch, "floor")
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(10, 10))
+    k = root @ root.T + np.eye(10)
+    tested = np.array([False, True, False, True, False])
+    both = np.repeat(tested, 2)
+    expected = np.linalg.inv(np.linalg.inv(k)[np.ix_(both, both)])
+    np.testing.assert_allclose(floor._predicted(k, ~tested, tested), expected, atol=1e-9)
+    time = np.array([3.0, 1.0, 5.0, 4.0, 2.0])
+    turns = floor._in_turn(k, time, tested)
+    for place, i in enumerate(np.flatnonzero(tested)):
+        alone = np.arange(5) == i
+        expected = floor._predicted(k, time < time[i], alone)
+        np.testing.assert_allclose(turns[place], expected, atol=1e-9)
+    drawn = floor._drawn(k, rng).reshape(floor.DRAWS, 10)
+    np.testing.assert_allclose(np.cov(drawn.T), k, atol=0.35 * np.diag(k).max())
+
+
+def test_drawn_measurements_show_the_values_that_were_drawn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from tests.support.machines import jacks
+
+    from heliotrope.calibration.fit.residuals import linearise
+    from heliotrope.calibration.learn import learn
+    from heliotrope.calibration.learn.learned import moved_by
+    from heliotrope.calibration.sightings import sightings
+    from heliotrope.mechanism import kinds
+
+    floor = _module(monkeypatch, "floor")
+    artist = _module(monkeypatch, "_artist")
+    nominal = kinds.two_jacks(
+        np.array([[20.0, 90.0, 1.8]]), drives=jacks(), concentrator_translation=artist.CENTRE
+    )
+    rng = np.random.default_rng(5)
+    counts = rng.uniform(30_000, 45_000, (14, 2))
+    pose = nominal[np.zeros(14, np.intp)].pose(counts)
+    sun = np.array([0.1, -0.8, 0.6])
+    way = reflect(sun, pose.normal)
+    ends = pose.vertex + 100.0 * normalize(way + rng.normal(0.0, 5e-4, (14, 3)))
+    times = 86_400.0 * np.arange(14.0)
+    seen = sightings(np.zeros(14, np.intp), counts, sun, ends, time=times, sigma=5e-4)
+    found = learn(nominal, seen, ("tilt_north", "tilt_up", "canting"))
+    mirrors = floor._mirrors(found)
+    again = floor._measured_again(found, mirrors, rng)
+    at, _ = found.parameters_at(seen.heliostat, seen.time)
+    moved = moved_by(nominal, seen.heliostat, found.names, at)
+    rows = mirrors[0].rows
+    before, after = (linearise(moved, s, found.names).residual[rows] for s in (seen, again))
+    # The value is what the parameters have to explain: it grows by as much as the residual shrinks.
+    rest = mirrors[0].data.value + (before - after) - mirrors[0].constant
+    wander = np.linalg.cholesky(mirrors[0].wander)
+    z = np.linalg.solve(wander, rest.ravel())
+    assert 0.3 < np.mean(z**2) < 2.5
 
 
 def test_tracking_covers_what_is_claimed() -> None:
