@@ -127,6 +127,42 @@ def test_overlapping_beams_are_found_with_honest_ellipses() -> None:
     assert np.sqrt(np.mean(np.sum(np.square(deviations), axis=-1))) < 0.012
 
 
+@pytest.mark.parametrize("along", [0, 1])
+def test_movements_along_one_axis_need_half_as_many_photographs(along: int) -> None:
+    """Beams whose places nobody knows, all over the target, each with a code of its own."""
+    rng = np.random.default_rng(along)
+    count, mirrors = 60, 15
+    step, width = SIDE / count, 0.4
+    assert photographs_for(mirrors, along) == 16 == photographs_for(mirrors) // 2
+    codes = coded_movements(mirrors, along=along)
+    assert not codes[..., 1 - along].any()
+    np.testing.assert_array_equal(codes[..., along].T @ codes[..., along], 16.0 * np.eye(mirrors))
+    assert not codes.sum(axis=0).any()
+    moves = 0.15 * codes
+    true = rng.uniform(-1.6, 1.6, (mirrors, 2))
+    x = -0.5 * SIDE + step * (np.arange(count) + 0.5)
+    values = 0.15 + NOISE * rng.standard_normal((16, count, count))
+    stuck = 4
+    for k, i in np.ndindex(16, mirrors):
+        here = true[i] + (moves[k, i] if i != stuck else 0.0)
+        shape = np.array([width, 0.7 * width])
+        values[k] += 0.3 * bell(x, -x, here, shape)
+    seen = np.ones((count, count), bool)
+    stack = Stack(values, step, np.array([x[0], -x[0]]), seen, None, np.full((count, count), 0.15))
+    spread = np.diag([width**2, 0.5 * width**2])
+    beams = [ExpectedBeam(f"AA{i}", np.zeros(2), np.eye(2), spread) for i in range(mirrors)]
+    found = separate(stack, moves, beams)
+    assert set(verdicts(found)) == {f"AA{stuck}"}
+    away = np.delete(np.array([b.centroid for b in found.beams]) - true, stuck, axis=0)
+    assert np.abs(away).max() < 0.03
+    deviations = [
+        d @ np.linalg.solve(b.covariance, d) for b, d in zip(found.proven, away, strict=True)
+    ]
+    assert np.mean(np.array(deviations) < 2.0 * np.log(10.0)) > 0.7
+    with pytest.raises(InputError, match="depend on each other"):
+        separate(stack, np.zeros_like(moves), beams)
+
+
 def test_a_mirror_that_does_not_move_is_named_and_harms_no_other() -> None:
     found, true = separated(Field(stuck=(4,)))
     assert verdicts(found) == {"AA4": Verdict.STUCK}

@@ -70,11 +70,17 @@ class Fitted:
     mean: FloatArray
 
 
+def axes_of(moves: FloatArray) -> npt.NDArray[np.intp]:
+    """Return the A axes, both or one, along which mirrors move, for moves (K, M, 2)."""
+    return np.flatnonzero(np.any(moves != 0.0, axis=(0, 1)))
+
+
 def code_of(moves: FloatArray) -> npt.NDArray[np.intp]:
     """Return the first mirror with the same code as each mirror, (M,), for moves (K, M, 2).
 
     Mirrors share a code if their movements are in proportion, by one positive factor each axis.
     """
+    moves = moves[..., axes_of(moves)]
     size = np.sqrt((moves**2).sum(axis=0))
     unit = moves / np.where(size > 0.0, size, 1.0)
     same = np.einsum("kia,kja->ija", unit, unit).min(axis=-1) > 1.0 - 1e-9
@@ -82,13 +88,17 @@ def code_of(moves: FloatArray) -> npt.NDArray[np.intp]:
 
 
 def regression(moves: FloatArray, weights: FloatArray) -> FloatArray | None:
-    """Return the rows (2 M, K) that turn pixels' series into changes per metre of movement.
+    """Return the rows (A M, K) that turn pixels' series into changes per metre of movement.
 
-    The change of mirrors that share a code is the same but for the size of their movements. None
-    if other codes depend on each other over the photographs that count.
+    A is the number of axes along which mirrors move. The change of mirrors that share a code is the
+    same but for the size of their movements. None if other codes depend on each other over the
+    photographs that count.
     """
-    code = code_of(moves)
+    if not moves.any():
+        return None
+    code, moves = code_of(moves), moves[..., axes_of(moves)]
     first, group = np.unique(code, return_inverse=True)
+    shape = len(first), moves.shape[-1]
     codes = moves[:, first].reshape(len(moves), -1)
     codes = codes - weights @ codes / weights.sum()
     normal = codes.T @ (weights[:, None] * codes)
@@ -102,7 +112,7 @@ def regression(moves: FloatArray, weights: FloatArray) -> FloatArray | None:
     rows = rows - rows.sum(axis=1, keepdims=True) * weights / weights.sum()
     lengths = np.sqrt((moves**2).sum(axis=0))
     smaller = (lengths[code] / np.where(lengths > 0.0, lengths, np.inf))[..., None]
-    return np.asarray((rows.reshape(len(first), 2, -1)[group] * smaller).reshape(-1, len(moves)))
+    return np.asarray((rows.reshape(*shape, -1)[group] * smaller).reshape(-1, len(moves)))
 
 
 def fitted(
@@ -116,7 +126,7 @@ def fitted(
     """Fit the beams of a stack by Gauss and Newton.
 
     The residual is exact: what the photographs show beyond beams that moved as ordered. Each
-    mirror is improved from its own two pictures of that residual.
+    mirror is improved from its own pictures of that residual, one for each axis of its movement.
     """
     points = np.stack(np.meshgrid(*stack.axes), axis=-1)[stack.seen]
     fits: list[Fit | None] = [
@@ -125,7 +135,7 @@ def fitted(
         else None
         for top, beam in zip(tops, expected, strict=True)
     ]
-    start = list(fits)
+    start, axes = list(fits), axes_of(moves)
     for step in range(_STEPS + 1):
         change = np.zeros_like(values)
         for i, fit in enumerate(fits):
@@ -139,7 +149,7 @@ def fitted(
         rest = light.pictures - change
         mean = light.weights @ rest / light.weights.sum()
         rest -= mean
-        pictures = (rows @ rest).reshape(len(fits), 2, -1)
+        pictures = (rows @ rest).reshape(len(fits), len(axes), -1)
         last = step == _STEPS
         for i, fit in enumerate(fits):
             first = start[i]
@@ -147,11 +157,12 @@ def fitted(
                 continue
             window = _window(points, fit)
             if last:
-                own = rows[2 * i : 2 * i + 2]
                 used = light.weights > 0.0
-                fits[i] = _measured(points[window], rest[used][:, window], own[:, used], fit, stack)
+                own = rows.reshape(len(fits), len(axes), -1)[i][:, used]
+                left = rest[used][:, window]
+                fits[i] = _measured(points[window], left, own, fit, stack, axes)
             else:
-                fits[i] = _improved(points[window], pictures[i][:, window], fit, first)
+                fits[i] = _improved(points[window], pictures[i][:, window], fit, first, axes)
     return Fitted(tuple(fits), light, mean)
 
 
@@ -160,11 +171,13 @@ def _window(points: FloatArray, fit: Fit) -> npt.NDArray[np.bool_]:
     return np.asarray(np.einsum("ni,ni->n", d @ np.linalg.inv(fit.moments), d) < _WINDOW**2)
 
 
-def _improved(points: FloatArray, picture: FloatArray, fit: Fit, first: Fit) -> Fit:
+def _improved(
+    points: FloatArray, picture: FloatArray, fit: Fit, first: Fit, axes: npt.NDArray[np.intp]
+) -> Fit:
     """Return a fit improved by one step, which is bounded."""
     if len(points) < 12:
         return fit
-    terms = slope_derivatives(points, fit.place, fit.moments, fit.power).reshape(6, -1)
+    terms = slope_derivatives(points, fit.place, fit.moments, fit.power)[:, axes].reshape(6, -1)
     scale = np.sqrt((terms**2).sum(axis=1))
     scale[scale == 0.0] = 1.0
     step = np.linalg.lstsq((terms / scale[:, None]).T, picture.ravel(), rcond=1e-6)[0] / scale
@@ -188,12 +201,18 @@ def _bounded(moments: FloatArray, fit: Fit, first: Fit) -> FloatArray:
 
 
 def _measured(
-    points: FloatArray, rest: FloatArray, rows: FloatArray, fit: Fit, stack: Stack
+    points: FloatArray,
+    rest: FloatArray,
+    rows: FloatArray,
+    fit: Fit,
+    stack: Stack,
+    axes: npt.NDArray[np.intp],
 ) -> Fit:
     """Return a fit with its covariance, its place corrected by the moments of what it leaves.
 
     With x from the fitted place, ∫ x² Gₓ = ∫ 2 x y G_y = 2 p x̄ for any shape; 4 : 3 is the best
-    weight of the two in a round window with even noise. The correction counts as far as its own
+    weight of the two in a round window with even noise. One picture alone gives either. The
+    correction counts as far as its own
     noise allows. Noise is what each photograph's residual does to the place: neighbouring pixels
     may err together, photographs may not.
 
@@ -204,13 +223,16 @@ def _measured(
     rest
         Residuals of the photographs used, (K, N).
     rows
-        Regression on the mirror's codes, (2, K).
+        Regression on the mirror's codes, (A, K).
+    axes
+        The A axes of its movement.
     """
     x, y = (points - fit.place).T
-    cross = 3.0 / 7.0 * x * y
+    square, cross = (2.0 / 7.0, 3.0 / 7.0) if len(axes) == 2 else (0.5, 1.0)
     area = stack.step**2 / fit.power
-    moments = area * np.array([[2.0 / 7.0 * x**2, cross], [cross, 2.0 / 7.0 * y**2]])
-    terms = slope_derivatives(points, fit.place, fit.moments, fit.power)
+    both = area * np.array([[square * x**2, cross * x * y], [cross * x * y, square * y**2]])
+    moments = both[:, axes]
+    terms = slope_derivatives(points, fit.place, fit.moments, fit.power)[:, axes]
     flat = terms.reshape(6, -1)
     scale = np.maximum(np.sqrt((flat**2).sum(axis=1)), 1e-300)
     gauss = (np.linalg.pinv((flat / scale[:, None]).T) / scale[:, None]).reshape(terms.shape)
@@ -231,9 +253,9 @@ def _measured(
 
 
 def _covariance(levers: FloatArray, rest: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return the covariance of ∑ levers (I, 2, N) times the two pictures rows @ rest, (I, I)."""
+    """Return the covariance of ∑ levers (I, A, N) times the pictures rows @ rest, (I, I)."""
     total = np.zeros((len(levers), len(levers)))
-    for axis in range(2):
+    for axis in range(len(rows)):
         effect = rest @ levers[:, axis].T
         spread = effect.T @ effect / (len(rest) - 1)
         total += spread * float((rows[axis] ** 2).sum())

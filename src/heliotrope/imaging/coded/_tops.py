@@ -1,8 +1,10 @@
 """The place of a beam in the pictures of its movement, by a matched filter."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded._bells import slopes
@@ -34,42 +36,55 @@ class Top:
     second: float
 
 
-def find_top(stack: Stack, picture: FloatArray, moments: FloatArray) -> Top:
-    """Return the strongest beam in the two pictures (2, N) of a movement.
+def find_top(
+    stack: Stack,
+    picture: FloatArray,
+    moments: FloatArray,
+    axes: npt.NDArray[np.intp],
+    others: Sequence[FloatArray] = (),
+) -> Top:
+    """Return the strongest beam in the pictures (A, N) of a movement.
 
     Parameters
     ----------
     stack
         Prepared; its seen pixels are the N.
     picture
-        Change per metre of movement along each axis.
+        Change per metre of movement along each of the axes.
     moments
         Expected second moments of the beam, m², (2, 2).
+    axes
+        The A axes of the movement.
+    others
+        Places of beams that were taken away from the pictures: what is left near them is the error
+        of their shapes, and no beam.
     """
     from scipy.signal import fftconvolve
 
     reach = int(np.ceil(3.0 * np.sqrt(np.trace(moments)) / stack.step))
     line = stack.step * np.arange(-reach, reach + 1)
     right, up = np.meshgrid(line, -line)
-    template = slopes(np.stack([right.ravel(), up.ravel()], axis=-1), np.zeros(2), moments).reshape(
-        2, *right.shape
-    )
-    full = np.zeros((2, *stack.seen.shape))
+    points = np.stack([right.ravel(), up.ravel()], axis=-1)
+    template = slopes(points, np.zeros(2), moments)[axes].reshape(-1, *right.shape)
+    full = np.zeros((len(axes), *stack.seen.shape))
     full[:, stack.seen] = picture
     # A convolution turns the template, which is odd.
-    score = -sum(fftconvolve(full[a], template[a], mode="same") for a in range(2))
+    score = -sum(fftconvolve(full[a], template[a], mode="same") for a in range(len(axes)))
     norm = (template**2).sum()
     power = np.asarray(score / norm)
-    best = np.unravel_index(int(np.argmax(power)), power.shape)
     x, y = stack.axes
-    place = np.array([x[best[1]], y[best[0]]])
     spread = float(np.sqrt(0.5 * np.trace(moments)))
+    free = np.ones(power.shape, dtype=np.bool_)
+    for right_of, above in others:
+        free &= np.hypot(x[None, :] - right_of, y[:, None] - above) > _APART * spread
+    best = np.unravel_index(int(np.argmax(np.where(free, power, -np.inf))), power.shape)
+    place = np.array([x[best[1]], y[best[0]]])
     away = np.hypot(x[None, :] - place[0], y[:, None] - place[1]) > _APART * spread
     beside = power[away & stack.seen]
     # The filter's own noise, where this beam is not: half of the pixels lie within 0.674 σ.
     noise = float(np.median(np.abs(beside))) / 0.674 if beside.size else np.inf
     top = float(power[best])
-    second = float(beside.max(initial=0.0))
+    second = float(power[away & stack.seen & free].max(initial=0.0))
     return Top(
         place,
         top,

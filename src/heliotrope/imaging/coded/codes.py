@@ -13,17 +13,21 @@ _FEWEST, _MOST = 8, 1024
 APART = 4.5
 
 
-def photographs_for(mirrors: int) -> int:
+def photographs_for(mirrors: int, along: int | None = None) -> int:
     """Return the fewest photographs with orthogonal codes for a number of mirrors.
 
-    Each mirror takes two rows of a Hadamard matrix, one for each axis; the row of ones stays free.
+    Each mirror takes two rows of a Hadamard matrix, one for each axis, or one if all move along the
+    same axis; the row of ones stays free.
     """
     if mirrors < 1:
         raise InputError(f"codes: {mirrors} mirrors; give 1 or more")
-    return max(_FEWEST, 1 << (2 * mirrors).bit_length())
+    rows = 2 * mirrors if along is None else mirrors
+    return max(_FEWEST, 1 << rows.bit_length())
 
 
-def coded_movements(mirrors: int, photographs: int | None = None) -> FloatArray:
+def coded_movements(
+    mirrors: int, photographs: int | None = None, along: int | None = None
+) -> FloatArray:
     """Return the movements of mirrors over photographs, -1 or 1, (photographs, mirrors, 2).
 
     Columns are rows of Sylvester's Hadamard matrix without the row of ones: mean-free and
@@ -37,6 +41,8 @@ def coded_movements(mirrors: int, photographs: int | None = None) -> FloatArray:
         Number of mirrors.
     photographs
         Power of two; None: `photographs_for`.
+    along
+        The only axis of all movements, 0 or 1; None: both.
 
     Raises
     ------
@@ -45,7 +51,7 @@ def coded_movements(mirrors: int, photographs: int | None = None) -> FloatArray:
     """
     from scipy.linalg import hadamard
 
-    least = photographs_for(mirrors)
+    least = photographs_for(mirrors, along)
     count = least if photographs is None else photographs
     if count < least or count > _MOST or count & (count - 1):
         raise InputError(
@@ -56,8 +62,12 @@ def coded_movements(mirrors: int, photographs: int | None = None) -> FloatArray:
     # drift, is like none of the codes.
     order = np.random.default_rng(count).permutation(count)
     rows = hadamard(count).astype(np.float64)[:, order]
-    # Rows j and j + count/2 have the same product for each j: the row count/2.
     first = 1 + np.arange(mirrors)
+    if along is not None:
+        moves = np.zeros((count, mirrors, 2))
+        moves[..., along] = rows[first].T
+        return moves
+    # Rows j and j + count/2 have the same product for each j: the row count/2.
     return np.ascontiguousarray(
         np.stack([rows[first], rows[first + count // 2]], axis=-1).transpose(1, 0, 2)
     )

@@ -4,8 +4,10 @@ The regression of each pixel's series on the codes gives two pictures for each m
 by its movement along either axis. Orthogonal codes separate them even where beams overlap, and
 light that rests is in none of them. A beam of power p at x₀ has the pictures G = -p ∇f(x - x₀);
 their moments give power, ∫ x Gₓ = p, and place, ½ ∫ x² Gₓ = p x₀, without any assumption about its
-shape. A Gaussian is fitted first, which takes care of the finite size of the movements and of
-codes that lost photographs; the moments of what it leaves correct its place.
+shape. Where mirrors move along one axis only, half as many photographs are enough: the one picture
+gives the other coordinate, too, ∫ x y Gₓ = p y₀. A Gaussian is fitted first, which takes care of
+the finite size of the movements and of codes that lost photographs; the moments of what it leaves
+correct its place.
 """
 
 from collections.abc import Sequence
@@ -17,7 +19,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded._bells import slopes
-from heliotrope.imaging.coded._fitting import code_of, fitted, regression
+from heliotrope.imaging.coded._fitting import axes_of, code_of, fitted, regression
 from heliotrope.imaging.coded._judging import judged, lost
 from heliotrope.imaging.coded._still import still_light
 from heliotrope.imaging.coded._tops import Top, find_top
@@ -61,7 +63,8 @@ def separate(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) 
     stack
         K photographs.
     moves
-        Displacements on the surface that were ordered, m, (K, M, 2).
+        Displacements on the surface that were ordered, m, (K, M, 2): of all mirrors along both
+        axes, or of all along the same one.
     expected
         M mirrors.
 
@@ -90,7 +93,7 @@ def separate(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) 
             light.weights > 0.0,
             np.empty((0, 2)),
         )
-    pictures = (rows @ light.pictures).reshape(count, 2, -1)
+    pictures = (rows @ light.pictures).reshape(count, len(axes_of(moves)), -1)
     tops = _tops(work, pictures, moves, expected)
     result = fitted(work, values, empty, moves, expected, tops)
     still = None
@@ -121,7 +124,8 @@ def _tops(
     """
     from scipy.optimize import linear_sum_assignment
 
-    code, size = code_of(moves), np.sqrt((moves**2).sum(axis=0)).mean(axis=-1)
+    code, axes = code_of(moves), axes_of(moves)
+    size = np.sqrt((moves[..., axes] ** 2).sum(axis=0)).mean(axis=-1)
     seen = np.stack(np.meshgrid(*stack.axes), axis=-1)[stack.seen]
     found: dict[int, Top] = {}
     for first in np.unique(code):
@@ -131,11 +135,12 @@ def _tops(
         left = pictures[members[0]] * (size[members[0]] / usual)
         tops: list[Top] = []
         for _ in members:
-            tops.append(find_top(stack, left, shape))
-            left = left - tops[-1].power * slopes(seen, tops[-1].place, shape)
-        rest = find_top(stack, left, shape) if len(tops) > 1 else None
+            tops.append(find_top(stack, left, shape, axes))
+            left = left - tops[-1].power * slopes(seen, tops[-1].place, shape)[axes]
+        found_at = [top.place for top in tops]
+        rest = find_top(stack, left, shape, axes, found_at) if len(tops) > 1 else None
         places = np.array([expected[i].place for i in members])
-        away = np.linalg.norm(places[:, None] - [top.place for top in tops], axis=-1)
+        away = np.linalg.norm(places[:, None] - found_at, axis=-1)
         for i, k in zip(*linear_sum_assignment(away**2), strict=True):
             top = tops[k]
             if rest is not None:
