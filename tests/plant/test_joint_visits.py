@@ -5,10 +5,7 @@ test's cameras, from where the mirrors truly stand.
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
-from functools import partial
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,168 +14,22 @@ import pytest
 from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.errors import FetchError, InputError
-from heliotrope.field.example import roughly_installed
 from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
-from heliotrope.geometry import bisector, reflect
 from heliotrope.imaging.coded import Verdict
-from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.plant.authority import Person, RefusedError, Role
-from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.operations.parties import Parties
 from heliotrope.plant.operations.views import Planned
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits import (
-    CalibrationCycle,
-    Centring,
     CycleResult,
-    CycleSettings,
-    JointCycle,
 )
 from heliotrope.plant.visits.joint_layout import arranged
+from support.joint_scene import BIASES, ENGINEER, START, Scene, believe, joint, spoil
 from support.live import LiveOptions, LivePlant
 
-START = datetime(2026, 10, 21, 7, tzinfo=UTC)
-ENGINEER = Person("Egon", Role.ENGINEER)
-BIASES = ("azimuth_bias", "elevation_bias")
-#: One sighting is fitted, which the plant's own settings would not do.
-CYCLE = CycleSettings(least=1, model=BIASES, sigma=2e-4)
 _CALIBRATED = CalibrationOutcome.CALIBRATED
-
-
-@dataclass
-class Scene:
-    """A plant whose heliostats are up and calibrated to 0.3 mrad, and an engineer in command."""
-
-    live: LivePlant
-    cycle: JointCycle
-    token: int
-    stages: list[str] = field(default_factory=list)
-    during: Callable[[str], None] = lambda _: None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.live.plant.field.names
-
-    async def run(self, *names: str) -> dict[str, CycleResult]:
-        found = await self.cycle.run(ENGINEER, self.token, names or self.names, "left", self.tell)
-        return {result.heliostat: result for result in found}
-
-    def tell(self, stage: str) -> None:
-        self.stages.append(stage)
-        self.during(stage)
-
-    def photographs(self) -> int:
-        return sum(stage.startswith("photograph") for stage in self.stages)
-
-    def states(self) -> dict[str, str]:
-        rows = self.live.plant.field.rows["state"]
-        return {name: states.STATES[rows[i]] for i, name in enumerate(self.names)}
-
-    def lit(self) -> list[str]:
-        """Heliostats whose beams are on the target, in truth."""
-        target, light = self.live.design.targets[0], self.live.world.sun()
-        normals, vertices = self.live.field.stand()
-        points = target.intersect(vertices, reflect(light, normals))
-        on = target.holds(points)
-        return [name for name, here in zip(self.live.names, on, strict=True) if here]
-
-
-def joint(
-    scene: Callable[[Scene], Awaitable[None]],
-    count: int = 6,
-    *,
-    rendered: bool = False,
-    settings: PlantSettings | None = None,
-) -> None:
-    """Play a scene in virtual time."""
-
-    async def main(clock: VirtualClock) -> None:
-        design = malan_plant(count)
-        installed = partial(roughly_installed, seed=3, scale=0.03)
-        work = AutomaticSettings(wanted=True, calibrate=False)
-        options = LiveOptions(
-            rendered=rendered,
-            threads=0,
-            installed=installed,
-            work=work,
-            cycle=CYCLE,
-            plant=settings or PlantSettings(),
-        )
-        live = LivePlant(design, clock, options)
-        plant = live.plant
-        async with live.running():
-            try:
-                until = clock.monotonic() + 600.0
-                while not plant.field.among((states.TRACKING,), plant.now()).all():
-                    assert clock.monotonic() < until
-                    await asyncio.sleep(1.0)
-                await live.operations.automatic.halt()
-                believe(live, 3e-4)
-                whole = CalibrationCycle(plant, live.cameras, CYCLE, Centring())
-                cycle = JointCycle(plant, live.cameras, whole)
-                token = plant.take_authority(ENGINEER).token
-                await _in_command(Scene(live, cycle, token), scene)
-            finally:
-                await live.operations.automatic.halt()
-                await live.end()
-
-    run_virtual(main, start=START)
-
-
-def believe(live: LivePlant, sigma: float) -> None:
-    """Take all mirrors for calibrated, their zeros within ``sigma``, rad."""
-    at, spread = live.clock.utc().timestamp(), np.diag([sigma**2, sigma**2])
-    for name in live.plant.field.names:
-        record = HeliostatCalibration(name, at, BIASES, np.zeros(2), spread, np.full(2, 5e-3))
-        live.plant.beliefs.take(record)
-
-
-async def _in_command(made: Scene, scene: Callable[[Scene], Awaitable[None]]) -> None:
-    async def stay() -> None:
-        plant = made.live.plant
-        while True:
-            if plant.authority.token == made.token:
-                plant.authority.keep(ENGINEER, made.token)
-            await asyncio.sleep(1.0)
-
-    async with asyncio.TaskGroup() as group:
-        staying = group.create_task(stay())
-        try:
-            await scene(made)
-        finally:
-            staying.cancel()
-
-
-def spoil(scene: Scene, stuck: str = "", traded: tuple[str, ...] = ()) -> None:
-    """From the first photograph on a mirror stands still, and two send their beams crosswise."""
-    live, target = scene.live, scene.live.design.targets[0]
-    true, held, aims = live.field.stand, {}, []
-
-    def during(stage: str) -> None:
-        if stage.startswith("photograph 1 ") and not aims:
-            aims.append(live.plant.aims.copy())  # before the first movement
-
-    scene.during = during
-
-    def stand() -> tuple[np.ndarray, np.ndarray]:
-        normals, vertices = (np.array(each) for each in true())
-        if scene.photographs():
-            light = live.world.sun()
-            if stuck:
-                row = live.names.index(stuck)
-                normals[row] = held.setdefault(stuck, normals[row].copy())
-            rows = [live.names.index(name) for name in traded]
-            points = target.intersect(vertices, reflect(light, normals))
-            places = [live.plant.field.place(name) for name in traded]
-            for row, mine, other in zip(rows, places, places[::-1], strict=True):
-                there = points[row] + aims[0][other] - aims[0][mine]
-                way = there - vertices[row]
-                normals[row] = bisector(light, way / np.linalg.norm(way))
-        return normals, vertices
-
-    live.field.stand = stand  # type: ignore[method-assign]
 
 
 def test_mirrors_on_one_target_are_calibrated_together() -> None:
@@ -418,14 +269,23 @@ class _Alarms(list):  # type: ignore[type-arg]
         return [(alarm.subject, alarm.active) for alarm in self]
 
 
-def parties(known: float, first: int) -> tuple[Parties, _Alarms, np.ndarray]:
-    """Six heliostats, ``first`` of them without a calibration."""
+def parties(
+    known: float, first: int, together: int = 5, approaching: tuple[int, ...] = ()
+) -> tuple[Parties, _Alarms, np.ndarray]:
+    """Six heliostats, ``first`` of them without a calibration; three have a place at once."""
     names = tuple("ABCDEF")
     at = np.array([np.nan] * first + [1.0] * (6 - first))
-    plant = SimpleNamespace(field=SimpleNamespace(place=names.index, names=names))
+    coming = np.isin(np.arange(6), approaching)
+    field = SimpleNamespace(place=names.index, names=names, among=lambda *_: coming)
+    design = SimpleNamespace(targets=("left",))
+    now = iter(range(0, 1000, 40))
+    plant = SimpleNamespace(field=field, design=design, now=lambda: next(now))
     book = SimpleNamespace(calibrated_at=at, error=np.full(6, known))
     told = _Alarms()
-    cycle = SimpleNamespace(settings=JointSettings(most=5, least=2))
+    cycle = SimpleNamespace(
+        settings=JointSettings(most=5, least=2, first=together),
+        having_place=lambda names, target: names[:3],
+    )
     made = Parties(plant, book, cycle, told.append)  # type: ignore[arg-type]
     return made, told, np.ones(6, dtype=np.bool_)
 
@@ -437,7 +297,7 @@ def follow(target: str, ready: np.ndarray, beside: bool) -> Planned | None:
 
 
 def test_parties_leave_every_second_visit_to_those_without_a_calibration() -> None:
-    made, _, ready = parties(1e-3, first=2)
+    made, _, ready = parties(1e-3, first=2, together=0)
     # The first two are not known at all.
     made._book.error[:2] = np.nan
     assert asyncio.run(made.chosen("left", ready, follow)) == ("C", "D", "E", "F")
@@ -449,6 +309,32 @@ def test_parties_leave_every_second_visit_to_those_without_a_calibration() -> No
     assert asyncio.run(made.chosen("left", ready, follow)) == ("A", "B", "C", "D", "E")
     vague, _, ready = parties(1.6e-3, first=0)
     assert asyncio.run(vague.chosen("left", ready, follow)) == ()
+
+
+def test_parties_of_new_heliostats_come_first() -> None:
+    made, told, ready = parties(1e-3, first=4)
+    made._book.error[:4] = np.nan
+    # Four are new, and three of them have a place; the other waits for the next visit.
+    assert asyncio.run(made.chosen("left", ready, follow)) == ("A", "B", "C")
+    for name in "ABC":
+        made.begun("left")
+        faint = CycleResult(name, CalibrationOutcome.NOT_PROVEN, "x", verdict=Verdict.ELSEWHERE)
+        made.concluded(faint, joint=True)
+    assert told.active() == [], "nobody knows where the beam of a new mirror ought to be"
+    assert made.alone(ready).tolist() == [True, True, True, False, False, False]
+    # One new heliostat is no party: those that go alone are next, then those that are known.
+    assert asyncio.run(made.chosen("left", ready, follow)) == ()
+    assert asyncio.run(made.chosen("left", ready, follow)) == ("E", "F")
+
+
+def test_a_target_waits_a_minute_for_heliostats_that_are_raised() -> None:
+    made, _, ready = parties(1e-3, first=6, approaching=(4, 5))
+    ready[3:] = False
+    assert made.awaited("left", ready)
+    assert made.awaited("left", ready), "40 s later"
+    assert not made.awaited("left", ready)
+    assert not parties(1e-3, first=6, together=3, approaching=(4, 5))[0].awaited("left", ready)
+    assert not parties(1e-3, first=6)[0].awaited("left", ready), "nobody comes"
 
 
 def test_who_was_disproved_goes_alone_and_has_an_alarm_until_it_is_seen() -> None:

@@ -25,7 +25,10 @@ from heliotrope.twin.live import CYCLE, World, WorldOptions
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Options of the world, and settings of the plant; see `WorldOptions`, `AssemblySettings`."""
+    """Options of the world, and settings of the plant; see `WorldOptions`, `AssemblySettings`.
+
+    New mirrors go to a target one by one, which tests of single visits need, unless ``together``.
+    """
 
     seed: int = 0
     rendered: bool = True
@@ -37,6 +40,7 @@ class LiveOptions:
     cycle: CycleSettings = CYCLE
     work: AutomaticSettings = field(default_factory=lambda: AutomaticSettings(wanted=True))
     plant: PlantSettings = field(default_factory=PlantSettings)
+    together: bool = False
 
     def world(self) -> WorldOptions:
         """Return the options of the world."""
@@ -74,6 +78,9 @@ class LivePlant:
         learner: Learner | None = None,
     ) -> None:
         chosen = options or LiveOptions()
+        if design.joint_visits is not None and not chosen.together:
+            alone = replace(design.joint_visits, first=0)
+            design = replace(design, joint_visits=alone)
         self.design, self.clock = design, clock
         self.world = World(design, clock, chosen.world())
         ports = self.world.ports(

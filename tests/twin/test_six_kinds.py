@@ -27,7 +27,7 @@ def test_every_kind_of_mechanism_is_learnt_live(tmp_path: Path) -> None:
     design = read_plant(tmp_path / "six.toml")
 
     async def main(clock: VirtualClock) -> None:
-        options = LiveOptions(rendered=False, threads=0)
+        options = LiveOptions(rendered=False, threads=0, together=True)
         async with LivePlant(design, clock, options).running() as plant:
             before, done = plant.errors(), Counter[str]()
             end = clock.monotonic() + 1200.0

@@ -25,6 +25,10 @@ class JointSettings:
         Most light on a target, in suns.
     again
         Photographs that are taken at most, as a multiple of those that a visit needs.
+    first
+        Heliostats without a calibration on one target at once; 0: each goes alone.
+    first_movement
+        Coded movement of their beams, either way to the right, rad.
     """
 
     most: int = 49
@@ -35,6 +39,8 @@ class JointSettings:
     settle: float = 1.0
     brightest: float = 10.0
     again: float = 2.5
+    first: int = 63
+    first_movement: float = 2e-3
 
     def __post_init__(self) -> None:
         if not 2 <= self.least <= self.most <= 127:
@@ -46,6 +52,16 @@ class JointSettings:
             raise InputError(
                 f"joint visits: movements of {1e3 * self.movement:g} mrad that settle in "
                 f"{self.settle:g} s; give above 0 to 5 mrad, and 0 to 60 s"
+            )
+        if not (self.first == 0 or self.least <= self.first <= 127):
+            raise InputError(
+                f"joint visits: {self.first} heliostats without a calibration; give 0, or "
+                f"{self.least} to 127"
+            )
+        if not 0.0 < self.first_movement <= 5e-3:
+            raise InputError(
+                f"joint visits: first movements of {1e3 * self.first_movement:g} mrad; give above "
+                "0 to 5 mrad"
             )
         if not (self.brightest > 0.0 and self.known > 0.0 and self.again >= 1.0):
             raise InputError(

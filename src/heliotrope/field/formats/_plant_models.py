@@ -348,6 +348,16 @@ class JointVisitsTable(StrictTable):
     again: Number | None = Field(
         None, description="Photographs at most, over those that a visit needs; default: 2.5."
     )
+    first: int | None = Field(
+        None,
+        description="Heliostats without a calibration at once; 0: each goes alone; default: 63.",
+    )
+    first_movement_mrad: Number | None = Field(
+        None, description="Coded movement of their beams, either way to the right; default: 2."
+    )
+    first_movement_rad: Number | None = Field(
+        None, description="Instead, as the program writes it."
+    )
 
 
 class PlantDocument(StrictTable):

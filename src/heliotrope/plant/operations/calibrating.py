@@ -169,6 +169,8 @@ class Calibrating:
         photograph ends it. Then those for which a flight has brought a large change, which a
         photograph confirms.
         """
+        if self._parties is not None and not self.asked and self._parties.awaited(target, ready):
+            return ()
         if names := await self._party(target, ready):
             await self._together(names, target, person, token)
             return names
@@ -259,7 +261,9 @@ class Calibrating:
                 del self._asked[name]
                 return name, search
         changed = np.isin(self._plant.field.names, list(self._first()))
-        for rows in (ready & self._plant.doubts.standing, ready & changed, ready):
+        alone = ready if self._parties is None else self._parties.alone(ready)
+        doubted = ready & self._plant.doubts.standing
+        for rows in (doubted, ready & changed, alone, ready):
             chosen = self._scheduler.next(target, rows) if rows.any() else None
             if chosen is not None:
                 return chosen.heliostat, False

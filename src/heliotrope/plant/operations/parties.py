@@ -6,7 +6,9 @@ from collections.abc import Callable, Collection, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.imaging.coded import Verdict
+from heliotrope.lcu import states
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.views import Planned
@@ -20,6 +22,8 @@ Next = Callable[[str, Mask, bool], Planned | None]
 
 #: Share of the largest expected error that a heliostat may have which automatic control sends.
 _SURE = 0.75
+#: Longest wait of a target for a joint first visit while the field is raised, s.
+_PATIENCE = 60.0
 #: Verdicts that say that something is wrong with a mirror or with what is believed of it.
 _WRONG = (Verdict.STUCK, Verdict.EXCHANGED, Verdict.ELSEWHERE)
 
@@ -56,6 +60,8 @@ class Parties:
         self._disproved: set[str] = set()
         #: Targets whose last visit was a joint one.
         self._last: set[str] = set()
+        #: Since when a target has waited for a joint first visit.
+        self._waited: dict[str, float] = {}
         self._choosing = asyncio.Lock()
 
     @property
@@ -82,33 +88,69 @@ class Parties:
         return ()
 
     async def chosen(self, target: str, ready: Mask, following: Next) -> tuple[str, ...]:
-        """Return the ready heliostats (N,) that are due and known well enough; () if too few are.
+        """Return the ready heliostats (N,) that go to a target together; () if too few would.
 
+        Those that were never calibrated come first, then those that are due and known well enough.
         While others wait for their first calibration, every second visit to a target is a joint
         one at most.
         """
-        settings, field = self.cycle.settings, self._plant.field
+        settings = self.cycle.settings
+        alone = self.alone(ready)
         first = ready & ~np.isfinite(self._book.calibrated_at)
+        new = first & ~alone
+        if settings.first and int(new.sum()) >= settings.least:
+            names = await self._several(target, new, following, settings.first)
+            # What makes the target too bright waits for the next visit.
+            names = self.cycle.having_place(names, target) if names else ()
+            if len(names) >= settings.least:
+                return names
         if first.any() and target in self._last:
             self._last.discard(target)
             return ()
         # The book has errors of the normal at the receiver; a beam is off by twice as much, and on
         # the target a little more. One that has no place in the visit would count as failed.
         known = ready & (2.0 * self._book.error <= _SURE * settings.known)
-        known[[field.place(name) for name in self._alone]] = False
+        known &= ~alone
         if int(known.sum()) < settings.least:
             return ()
+        names = await self._several(target, known, following, settings.most)
+        return names if len(names) >= settings.least else ()
+
+    async def _several(
+        self, target: str, ready: Mask, following: Next, most: int
+    ) -> tuple[str, ...]:
+        """Return up to so many of the ready heliostats (N,), in the order of their gain."""
         names: list[str] = []
+        left = ready.copy()
         # Two targets that chose in turn would leave too few to both.
         async with self._choosing:
-            while len(names) < settings.most:
-                planned = following(target, known, bool(names))
+            while len(names) < most:
+                planned = following(target, left, bool(names))
                 if planned is None:
                     break
                 names.append(planned.heliostat)
-                known[field.place(planned.heliostat)] = False
+                left[self._plant.field.place(planned.heliostat)] = False
                 await asyncio.sleep(0.0)
-        return tuple(names) if len(names) >= settings.least else ()
+        return tuple(names)
+
+    def alone(self, ready: Mask) -> Mask:
+        """Return which of the ready heliostats (N,) go alone: a joint visit did not prove them."""
+        found = np.zeros_like(ready)
+        found[[self._plant.field.place(name) for name in self._alone]] = True
+        return found & ready
+
+    def awaited(self, target: str, ready: Mask) -> bool:
+        """Return whether a target waits for others: the field is raised, and few are ready.
+
+        It waits for `_PATIENCE` at most, once, for a joint first visit that is worth its way.
+        """
+        settings, now = self.cycle.settings, self._plant.now()
+        full = settings.first * len(self._plant.design.targets)
+        first = ~np.isfinite(self._book.calibrated_at)
+        coming = first & self._plant.field.among((states.APPROACHING,), now)
+        if int((ready & first).sum()) >= full or not coming.any():
+            return False
+        return now - self._waited.setdefault(target, now) < _PATIENCE
 
     def begun(self, target: str) -> None:
         """Note that a joint visit to a target begins."""
@@ -117,11 +159,13 @@ class Parties:
     def concluded(self, result: CycleResult, *, joint: bool) -> None:
         """Note the result of a visit: what it proves, or disproves, of a heliostat."""
         name, kind = result.heliostat, alarms.BEAM_DISPROVED
-        if result.verdict is not None:
+        # Nothing says where the beam of a mirror without a calibration ought to be.
+        known = np.isfinite(self._book.calibrated_at[self._plant.field.place(name)])
+        if result.verdict is not None or result.outcome is CalibrationOutcome.NOT_VERIFIED:
             self._alone.add(name)
         elif result.new and not joint:
             self._alone.discard(name)
-        if result.verdict in _WRONG:
+        if result.verdict in _WRONG and known:
             self._disproved.add(name)
             self._tell(kind.raised(name, problem=result.text.removeprefix("unchanged: ")))
         elif result.new and name in self._disproved:

@@ -44,7 +44,7 @@ from heliotrope.plant.visits.photographs import (
     Tell,
 )
 from heliotrope.plant.visits.settings import Centring, CycleSettings
-from heliotrope.plant.visits.verification import Verification
+from heliotrope.plant.visits.verification import Confirming, Verification
 from heliotrope.plant.visits.visit import Visit
 
 #: Step counts in doubt are confirmed by photographs that miss by no more than this, rad RMS: the
@@ -110,6 +110,8 @@ class CalibrationCycle:
     ----------
     settings
         See `CycleSettings`.
+    verification
+        Confirms new parameters.
     """
 
     def __init__(
@@ -127,7 +129,7 @@ class CalibrationCycle:
             else Centred(camera, self.settings, centring)
         )
         self._models, self._fitting = ModelOfEach(self.settings), asyncio.Lock()
-        self._verification = Verification(
+        self.verification = Verification(
             camera, self.settings, centring or Centring(), self._sighting
         )
 
@@ -213,7 +215,14 @@ class CalibrationCycle:
         )
 
     async def learn(
-        self, visit: Visit, taken: Photographs, boots: int, tell: Tell | None = None
+        self,
+        visit: Visit,
+        taken: Photographs,
+        boots: int,
+        tell: Tell | None = None,
+        *,
+        confirming: Confirming | None = None,
+        least: int | None = None,
     ) -> CycleResult:
         """Learn from the photographs of a heliostat that is at standby; see `run`.
 
@@ -225,13 +234,25 @@ class CalibrationCycle:
             Boots of its local controller before the photographs.
         tell
             Called with the name of each step.
+        confirming
+            Confirms new parameters; None: a photograph of this heliostat alone.
+        least
+            Sightings that the fit needs; None: as in the settings.
         """
-        result = await self._learn(visit, taken, tell or _nobody)
+        result = await self._learn(
+            visit,
+            taken,
+            tell or _nobody,
+            confirming or self.verification.problem,
+            self.settings.least if least is None else least,
+        )
         if taken.used and self._missed(visit.heliostat, taken) <= PLACED:
             self._plant.doubts.confirm(visit.heliostat, boots)
         return result
 
-    async def _learn(self, visit: Visit, taken: Photographs, tell: Tell) -> CycleResult:
+    async def _learn(
+        self, visit: Visit, taken: Photographs, tell: Tell, confirming: Confirming, least: int
+    ) -> CycleResult:
         """Fit all sightings once; push, verify and take a better fit."""
         name, beliefs = visit.heliostat, self._plant.beliefs
         new = [self._sighting(shot, counts) for shot, counts in taken.used]
@@ -246,12 +267,12 @@ class CalibrationCycle:
         every = join([*old, here])
         count = len(every) + beliefs.flights.count(name)
         measured = root_mean_square(beam_errors(beliefs.present(name), here).beam)
-        if count < self.settings.least:
+        if count < least:
             beliefs.note(name, visit.target.name, here)
             return CycleResult(
                 name,
                 CalibrationOutcome.TOO_FEW_SIGHTINGS,
-                f"unchanged: {count} sightings, {self.settings.least} are needed",
+                f"unchanged: {count} sightings, {least} are needed",
                 rejected,
                 count,
                 len(here),
@@ -264,7 +285,7 @@ class CalibrationCycle:
         pushed: tuple[str, ...] = ()
         if not found.problem:
             with self._plant.unverified(name):
-                found, pushed = await self._try(visit, found, here, taken, tell)
+                found, pushed = await self._try(visit, found, here, taken, tell, confirming)
         if found.problem and (not old or found.outcome is CalibrationOutcome.NOT_VERIFIED):
             # No earlier sighting supports these, or a later photograph contradicts them: drop them.
             text = f"unchanged: {found.problem}"
@@ -291,7 +312,13 @@ class CalibrationCycle:
         )
 
     async def _try(
-        self, visit: Visit, found: JudgedFit, here: Sightings, taken: Photographs, tell: Tell
+        self,
+        visit: Visit,
+        found: JudgedFit,
+        here: Sightings,
+        taken: Photographs,
+        tell: Tell,
+        confirming: Confirming,
     ) -> tuple[JudgedFit, tuple[str, ...]]:
         """Push a fit and verify it; return it, with why it was withdrawn, and the items pushed."""
         name, plant = visit.heliostat, self._plant
@@ -306,9 +333,7 @@ class CalibrationCycle:
                 return found, pushed
             plant.want(name, new[0])
             shots = [shot for shot, _ in taken.used]
-            problem = await self._verification.problem(
-                visit, found.fitted, found.nominal, shots, tell
-            )
+            problem = await confirming(visit, found.fitted, found.nominal, shots, tell)
             if not problem:
                 return found, pushed
             await self._push(visit, present[0], "the new ones were not verified")

@@ -262,12 +262,13 @@ def follow_flights(
     for name, joint in fits.items():
         known = beliefs.seen(name)
         seen = None if known is None else known.sightings
-        model = _first_model(settings, joint.nominal)
+        model = first_model(settings, joint.nominal)
         found[name] = _ended(_following(beliefs, flights, settings, model, joint, seen))
     return found
 
 
-def _first_model(settings: CycleSettings, mechanism: Mechanism) -> OwnModel:
+def first_model(settings: CycleSettings, mechanism: Mechanism) -> OwnModel:
+    """Return the model of a heliostat with few sightings."""
     first = settings.first_model
     if isinstance(first, str):
         return OwnModel(first, parameter_table.model(first, mechanism.parameters))
@@ -281,7 +282,7 @@ def _fit_names(
     rows = np.array([group.index(name) for name in names], dtype=np.intp)
     seen = [beliefs.seen(name) for name in names]
     photographed = [None if one is None else one.sightings for one in seen]
-    model = _first_model(settings, group.mechanism)
+    model = first_model(settings, group.mechanism)
     return _fit_group(beliefs, flights, settings, model, names, group.mechanism[rows], photographed)
 
 

@@ -4,34 +4,48 @@ The heliostats go to their places together. Over a stack of photographs each bea
 (`imaging.coded`); a photograph is taken only when all have settled. All go home before the stack is
 taken apart. Each proven beam is a sighting, which takes the way of an ordinary visit's: one fit,
 its safeguards, verification. What is not proven is named, and nothing is learnt from it.
+
+Heliostats that were never calibrated go together, each with a code of its own. Those that store
+their first parameters come back together, and a second stack must prove each at the place that its
+parameters predict; it is their second sighting.
 """
 
 import asyncio
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from heliotrope.calibration.record import CalibrationOutcome
+from heliotrope.calibration.uncertainty import expected_error
 from heliotrope.errors import HeliotropeError
 from heliotrope.field.joint_visits import JointSettings
+from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import SeparatedBeam, Separation, Verdict, separate
 from heliotrope.lcu import states
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
-from heliotrope.plant.visits.joint_layout import Layout, arranged
+from heliotrope.plant.visits.first_layout import newcomers
+from heliotrope.plant.visits.fitting import first_model
+from heliotrope.plant.visits.gathering import Gathering, Waiting
+from heliotrope.plant.visits.joint_layout import Layout, arranged, verifying
 from heliotrope.plant.visits.joint_visit import JointVisit
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.stacks import StackCamera, TargetLight, stack_of
+from heliotrope.plant.visits.verification import Confirming
 from heliotrope.plant.visits.visit import Visit
 
 #: Step counts that differ from those of the ordered movements by this share of them do not follow.
 _FOLLOWS = 0.5
 #: Rows of step counts that a sighting needs.
 _LEAST_ROWS = 3
+#: Sightings that a first fit needs: all photographs of a stack agree, and a second one verifies it.
+_FIRST = 1
+#: Verdicts that are no mirror's fault: a verification that ends so is made again, once.
+_AGAIN = (Verdict.JOINED, Verdict.CLOUD)
 
 
 @dataclass
@@ -120,8 +134,9 @@ class JointCycle:
         """
         plant = self._plant
         plant.authority.check(person, token, "PARAMETERS")
-        place = plant.design.target(target)
-        layout, wrong = arranged(plant, place, tuple(dict.fromkeys(heliostats)), self.settings)
+        place, names = plant.design.target(target), tuple(dict.fromkeys(heliostats))
+        first = self.first(names)
+        layout, wrong = self._arranged(place, names)
         results = {name: _refused(name, text) for name, text in wrong.items()}
         if layout.names:
             joint = JointVisit(plant, person, token, layout.names, place)
@@ -129,17 +144,48 @@ class JointCycle:
             before = {name: _Before.of(visit) for name, visit in visits.items()}
             tell("the empty target")
             empty = await self._camera.light(place)
-            async with joint:
-                tell(f"{len(layout.names)} on the way")
-                await joint.go(layout.start(), self._cycle.settings.arrival)
-                taken = await self._photograph(joint, layout, empty, tell)
-                tell(f"{len(joint.names)} on the way back")
-            results |= {name: _refused(name, text) for name, text in joint.lost.items()}
-            results |= await self._learn(joint, layout, empty, taken, tell)
+            proven, lost = await self._stack(joint, layout, empty, tell)
+            results |= lost
+            learn = self._learn_first if first else self._learn
+            results |= await learn(joint, proven, empty, tell)
             await self._back(visits, before)
-        return tuple(results[name] for name in dict.fromkeys(heliostats))
+        return tuple(results[name] for name in names)
+
+    def first(self, heliostats: Sequence[str]) -> bool:
+        """Return whether heliostats would make a joint first visit: none has a calibration."""
+        records = self._plant.beliefs.record
+        return bool(self.settings.first) and all(records(name) is None for name in heliostats)
+
+    def having_place(self, heliostats: Sequence[str], target: str) -> tuple[str, ...]:
+        """Return those of some heliostats that have a place in a visit now."""
+        return self._arranged(self._plant.design.target(target), tuple(heliostats))[0].names
+
+    def _arranged(self, target: Target, names: tuple[str, ...]) -> tuple[Layout, dict[str, str]]:
+        if not self.first(names):
+            return arranged(self._plant, target, names, self.settings)
+        nominal, cycle = self._plant.beliefs.nominal, self._cycle.settings
+        model = {name: first_model(cycle, nominal(name)).parameters for name in names}
+        return newcomers(self._plant, target, names, self.settings, model)
 
     # -- photographs -----------------------------------------------------------------------
+
+    async def _stack(
+        self, joint: JointVisit, layout: Layout, empty: TargetLight, tell: Tell
+    ) -> tuple[dict[str, Photographs], dict[str, CycleResult]]:
+        """Bring heliostats to their places, take a stack, bring them home, and take it apart.
+
+        Returns
+        -------
+            The sighting of each proven beam, and the results of the others, by heliostat.
+        """
+        async with joint:
+            tell(f"{len(joint.names)} on the way")
+            await joint.go(layout.start(), self._cycle.settings.arrival)
+            taken = await self._photograph(joint, layout, empty, tell)
+            tell(f"{len(joint.names)} on the way back")
+        lost = {name: _refused(name, text) for name, text in joint.lost.items()}
+        proven, others = await self._separated(joint, layout, empty, taken, tell)
+        return proven, lost | others
 
     async def _photograph(
         self, joint: JointVisit, layout: Layout, empty: TargetLight, tell: Tell
@@ -195,12 +241,10 @@ class JointCycle:
             raise made[0]
         return made[0]
 
-    # -- learning --------------------------------------------------------------------------
-
-    async def _learn(
+    async def _separated(
         self, joint: JointVisit, layout: Layout, empty: TargetLight, taken: _Taken, tell: Tell
-    ) -> dict[str, CycleResult]:
-        """Take the stack apart, and learn from each proven beam as from a visit of its own."""
+    ) -> tuple[dict[str, Photographs], dict[str, CycleResult]]:
+        """Take a stack apart into sightings of proven beams, and results of the others."""
         chosen = [layout.names.index(name) for name in joint.names]
         pictures = list(taken.pictures)
         moves = layout.moves[[number for number, _ in pictures]][:, chosen]
@@ -228,6 +272,16 @@ class JointCycle:
             point = np.asarray(layout.target.point(beam.centroid))
             shot = Shot(point, _middle(pictures), axes.T @ covariance @ axes)
             proven[name] = Photographs([(shot, counts)])
+        return proven, results
+
+    # -- learning --------------------------------------------------------------------------
+
+    async def _learn(
+        self, joint: JointVisit, proven: Mapping[str, Photographs], empty: TargetLight, tell: Tell
+    ) -> dict[str, CycleResult]:
+        """Learn from each proven beam as from a visit of its own."""
+        del empty
+        results: dict[str, CycleResult] = {}
         tell(f"learning from {len(proven)} proven beams")
 
         async def one(name: str) -> None:
@@ -238,10 +292,106 @@ class JointCycle:
                 group.create_task(one(name))
         return results
 
-    async def _learnt(self, visit: Visit, taken: Photographs) -> CycleResult:
+    async def _learn_first(
+        self, joint: JointVisit, proven: Mapping[str, Photographs], empty: TargetLight, tell: Tell
+    ) -> dict[str, CycleResult]:
+        """Learn first calibrations, which are verified together, and then from that, too."""
+        results: dict[str, CycleResult] = {}
+        seen: dict[str, Photographs] = {}
+        gathering = Gathering(proven)
+        tell(f"learning from {len(proven)} proven beams")
+
+        async def one(name: str) -> None:
+            visit = joint.visits[name]
+            try:
+                results[name] = await self._learnt(
+                    visit, proven[name], confirming=gathering.problem, least=_FIRST
+                )
+            finally:
+                gathering.leave(name)
+            if name in seen and results[name].outcome.calibrated:
+                again = await self._learnt(visit, seen[name], least=_FIRST)
+                results[name] = _both(results[name], again)
+
+        async with asyncio.TaskGroup() as group:
+            for name in proven:
+                group.create_task(one(name))
+            waiting = await gathering.all()
+            try:
+                if waiting:
+                    gathering.settle(await self._confirmed(joint, waiting, empty, seen, tell))
+            except HeliotropeError as error:
+                gathering.fail(error)
+        return results
+
+    async def _confirmed(
+        self,
+        joint: JointVisit,
+        waiting: Mapping[str, Waiting],
+        empty: TargetLight,
+        seen: dict[str, Photographs],
+        tell: Tell,
+    ) -> dict[str, str]:
+        """Verify new parameters together; return why each is not confirmed, "" if it is.
+
+        The sightings of those that are confirmed go to ``seen``. Those that other light hid come
+        once more, each with a code of its own.
+        """
+        problems, again = await self._verified(joint, waiting, tuple(waiting), empty, seen, tell)
+        if again:
+            more = await self._verified(joint, waiting, again, empty, seen, tell, own=True)
+            problems |= more[0]
+        return problems
+
+    async def _verified(
+        self,
+        joint: JointVisit,
+        waiting: Mapping[str, Waiting],
+        names: Sequence[str],
+        empty: TargetLight,
+        seen: dict[str, Photographs],
+        tell: Tell,
+        *,
+        own: bool = False,
+    ) -> tuple[dict[str, str], list[str]]:
+        """Take one stack of a verification; return problems, and who may come once more."""
+        plant, target = self._plant, joint.target
+        sun = plant.sun_vector()
+        errors = {name: _error(waiting[name], sun, target) for name in names}
+        layout, problems = verifying(plant, target, errors, self.settings, own=own)
+        again = JointVisit(plant, joint.person, joint.token, layout.names, target)
+        again.drop(
+            {
+                name: f"the new parameters have no free way to their photograph: {why}"
+                for name, point in layout.start().items()
+                if (why := plant.misled(name, point))
+            }
+        )
+        proven, others = await self._stack(
+            again, layout, empty, lambda stage: tell(f"verification: {stage}")
+        )
+        for name, result in others.items():
+            text = result.text.removeprefix("unchanged: ")
+            problems[name] = f"with the new parameters its beam was not proven: {text}"
+        for name, photographs in proven.items():
+            one, ((shot, counts),) = waiting[name], photographs.used
+            problem = self._cycle.verification.judge(one.nominal, one.fitted, shot, counts)
+            problems[name] = problem
+            if not problem:
+                seen[name] = photographs
+        return problems, [name for name, one in others.items() if one.verdict in _AGAIN]
+
+    async def _learnt(
+        self,
+        visit: Visit,
+        taken: Photographs,
+        *,
+        confirming: Confirming | None = None,
+        least: int | None = None,
+    ) -> CycleResult:
         name, boots = visit.heliostat, int(self._plant.field.rows["boots"][visit.row])
         try:
-            return await self._cycle.learn(visit, taken, boots)
+            return await self._cycle.learn(visit, taken, boots, confirming=confirming, least=least)
         except RefusedError as error:
             return _refused(name, str(error))
         except HeliotropeError as error:
@@ -324,6 +474,23 @@ def _idle(visit: Visit) -> bool:
 def _middle(pictures: Sequence[tuple[int, TargetLight]]) -> float:
     """Return the middle of the exposures, monotonic s."""
     return float(np.mean([picture.at for _, picture in pictures]))
+
+
+def _error(waiting: Waiting, sun: FloatArray, target: Target) -> float:
+    """Return the expected beam error of new parameters on a target, rad RMS (2-D)."""
+    fitted = waiting.fitted
+    found = expected_error(
+        waiting.mechanism, tuple(fitted.names), fitted.covariance[0], sun, target.center
+    )
+    return float(found.rms[0])
+
+
+def _both(first: CycleResult, again: CycleResult) -> CycleResult:
+    """Return the result of a first calibration that was fitted again with its verification."""
+    new = first.new + again.new
+    if again.record is None:
+        return replace(first, known=max(first.known, again.known), new=new)
+    return replace(again, new=new, measured=first.measured, before=first.before)
 
 
 def _refused(name: str, text: str) -> CycleResult:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.calibration.uncertainty import expected_error
 from heliotrope.field.joint_visits import JointSettings
@@ -17,7 +18,6 @@ from heliotrope.geometry import FloatArray, bisector
 from heliotrope.imaging.coded import (
     ExpectedBeam,
     coded_movements,
-    photographs_for,
     shared_codes,
 )
 from heliotrope.optics.beam import beam_sigma
@@ -31,8 +31,11 @@ _CURVED = 0.5
 _REFLECTED = 0.9
 #: A beam keeps this many of its standard deviations from the border, and those of its place.
 _BORDER, _PLACED = 2.0, 3.0
-#: Numbers of codes, for 8 to 256 photographs.
+#: Numbers of codes, for 8 to 256 photographs with movements along both axes, for 8 to 128 along
+#: one.
 _CODES = (3, 7, 15, 31, 63, 127)
+#: The verification's movements are up and down; those of first visits are to the right and left.
+_UP = 1
 
 
 def moments_on(
@@ -112,10 +115,19 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class _Beam:
+class SentBeam:
     """What is known of a beam before it is sent.
 
-    Slant range, its widest and its likely shape, the variance of its place, its power.
+    Attributes
+    ----------
+    slant
+        Slant range, m.
+    moments, likely
+        Its widest and its likely second moments, m², (2, 2).
+    variance
+        Of its place along each axis, m².
+    power
+        Of its light, in suns m².
     """
 
     slant: float
@@ -143,7 +155,7 @@ def arranged(
         See `JointSettings`.
     """
     wrong: dict[str, str] = {}
-    known: dict[str, _Beam] = {}
+    known: dict[str, SentBeam] = {}
     for name in heliostats:
         found = _known(plant, target, name, settings)
         if isinstance(found, str):
@@ -153,34 +165,72 @@ def arranged(
     for name in list(known)[settings.most :]:
         wrong[name] = f"{settings.most} heliostats are on {target.name} already"
         del known[name]
+    places = _darkened(target, known, settings, wrong)
+    code = _shared(known, places, along=None)
+    return coded(target, known, places, code, settings.movement), wrong
+
+
+def verifying(
+    plant: PlantController,
+    target: Target,
+    errors: Mapping[str, float],
+    settings: JointSettings,
+    *,
+    own: bool = False,
+) -> tuple[Layout, dict[str, str]]:
+    """Return the layout of a joint verification, and why some heliostats have no place in it.
+
+    Parameters
+    ----------
+    plant, target, settings
+        As for `arranged`.
+    errors
+        Expected beam error of each heliostat with its new parameters, rad RMS (2-D).
+    own
+        Whether each has a code of its own.
+    """
+    wrong: dict[str, str] = {}
+    known: dict[str, SentBeam] = {}
+    for name, error in errors.items():
+        found = beam_of(plant, target, name, float(np.hypot(error, np.sqrt(2.0) * settings.visit)))
+        if isinstance(found, str):
+            wrong[name] = found
+        else:
+            known[name] = found
+    places = _darkened(target, known, settings, wrong)
+    code = np.arange(len(known)) if own else _shared(known, places, along=_UP)
+    return coded(target, known, places, code, settings.movement, along=_UP), wrong
+
+
+def _darkened(
+    target: Target,
+    known: dict[str, SentBeam],
+    settings: JointSettings,
+    wrong: dict[str, str],
+) -> FloatArray:
+    """Return places; those that make the target too bright go from the known to the wrong ones."""
     while known:
         places = _places(target, known)
         if not (over := _too_bright(known, places, settings.brightest)):
-            break
+            return places
         wrong[over] = f"the light on {target.name} would exceed {settings.brightest:g} suns"
         del known[over]
-    else:
-        places = np.zeros((0, 2))
-    return _coded(target, known, places, settings), wrong
+    return np.zeros((0, 2))
 
 
 def _known(
     plant: PlantController, target: Target, name: str, settings: JointSettings
-) -> _Beam | str:
-    record, row = plant.beliefs.record(name), plant.field.place(name)
+) -> SentBeam | str:
+    record = plant.beliefs.record(name)
     if record is None:
-        return "it has no calibration yet; it is calibrated alone first"
-    group, place = plant.design.find(name)
-    vertex = np.asarray(plant.beams.armature.origin_1[row], dtype=np.float64)
-    way = target.center - vertex
-    slant = float(np.linalg.norm(way))
-    sun = plant.sun_vector()
-    if not float(way @ target.normal) < 0.0:
-        return f"it does not see the front of {target.name}"
-    normal = bisector(sun, way / slant)
+        return "it has no calibration yet; it goes alone, or with others that have none"
     now = plant.clock.utc().timestamp()
     expected = expected_error(
-        plant.beliefs.present(name), record.names, record.covariance_at(now), sun, target.center
+        plant.beliefs.present(name),
+        record.names,
+        record.covariance_at(now),
+        plant.sun_vector(),
+        target.center,
     )
     error = float(np.hypot(expected.rms[0], np.sqrt(2.0) * settings.visit))
     if not error <= settings.known:
@@ -188,6 +238,19 @@ def _known(
             f"its beam is known to {1e3 * error:.1f} mrad only, the limit is "
             f"{1e3 * settings.known:g} mrad; it is calibrated alone first"
         )
+    return beam_of(plant, target, name, error)
+
+
+def beam_of(plant: PlantController, target: Target, name: str, error: float) -> SentBeam | str:
+    """Return what is known of a beam with an expected error (rad RMS, 2-D), or why it cannot be."""
+    row, (group, place) = plant.field.place(name), plant.design.find(name)
+    vertex = np.asarray(plant.beams.armature.origin_1[row], dtype=np.float64)
+    way = target.center - vertex
+    slant = float(np.linalg.norm(way))
+    sun = plant.sun_vector()
+    if not float(way @ target.normal) < 0.0:
+        return f"it does not see the front of {target.name}"
+    normal = bisector(sun, way / slant)
     width, height = float(group.width[place]), float(group.height[place])
     slanted = abs(float(way @ target.normal)) / slant
     variance = 0.5 * (error * slant / slanted) ** 2
@@ -195,10 +258,10 @@ def _known(
     wide, likely = (
         moments_on(target, vertex, normal, width, height, flat) for flat in (1.0, _CURVED)
     )
-    return _Beam(slant, wide, likely, variance, power)
+    return SentBeam(slant, wide, likely, variance, power)
 
 
-def _places(target: Target, known: Mapping[str, _Beam]) -> FloatArray:
+def _places(target: Target, known: Mapping[str, SentBeam]) -> FloatArray:
     """Return places in a grid, right of and above the centre, m, (M, 2)."""
     sigma = np.sqrt(np.max([np.diag(beam.moments) for beam in known.values()], axis=0))
     placed = np.sqrt(max(beam.variance for beam in known.values()))
@@ -217,7 +280,7 @@ def _places(target: Target, known: Mapping[str, _Beam]) -> FloatArray:
     return np.array([(a, b) for b in y for a in x])[: len(known)]
 
 
-def _too_bright(known: Mapping[str, _Beam], places: FloatArray, limit: float) -> str:
+def _too_bright(known: Mapping[str, SentBeam], places: FloatArray, limit: float) -> str:
     """Return the beam at the brightest place if that is above a limit, in suns; else "".
 
     One that is alone may be as bright as in a visit of its own.
@@ -233,19 +296,43 @@ def _too_bright(known: Mapping[str, _Beam], places: FloatArray, limit: float) ->
     return list(known)[int(np.argmax(light))] if light.max() > limit else ""
 
 
-def _coded(
-    target: Target, known: Mapping[str, _Beam], places: FloatArray, settings: JointSettings
-) -> Layout:
+def _shared(
+    known: Mapping[str, SentBeam], places: FloatArray, along: int | None
+) -> npt.NDArray[np.intp]:
+    """Return the code of each beam: as few codes as keep beams of one code apart, (M,)."""
     spread = np.array([b.moments + b.variance * np.eye(2) for b in known.values()])
-    code, count = np.arange(len(known)), max(1, len(known))
-    for few in _CODES:
-        shared = shared_codes(places, spread, few) if len(known) else None
-        if shared is not None:
-            code, count = shared, few
-            break
+    for few in _CODES if len(known) else ():
+        # A stack of movements along one axis has twice as many codes.
+        code = shared_codes(places, spread, few if along is None else 2 * few + 1)
+        if code is not None:
+            return code
+    return np.arange(len(known), dtype=np.intp)
+
+
+def coded(
+    target: Target,
+    known: Mapping[str, SentBeam],
+    places: FloatArray,
+    code: npt.NDArray[np.intp],
+    movement: float,
+    along: int | None = None,
+) -> Layout:
+    """Return the layout of beams at places (M, 2) that move by codes (M,).
+
+    Parameters
+    ----------
+    target, known
+        The target, and what is known of the M beams, by name.
+    places, code
+        m right of and above the centre; numbers of the codes.
+    movement
+        Either way, rad.
+    along
+        The only axis of the movements; None: both.
+    """
     count = int(code.max(initial=0)) + 1
-    size = np.array([settings.movement * beam.slant for beam in known.values()])
-    moves = coded_movements(count, photographs_for(count))[:, code] * size[:, None]
+    size = np.array([movement * beam.slant for beam in known.values()])
+    moves = coded_movements(count, along=along)[:, code] * size[:, None]
     beams = tuple(
         ExpectedBeam(name, place, beam.variance * np.eye(2), beam.likely)
         for (name, beam), place in zip(known.items(), places, strict=True)

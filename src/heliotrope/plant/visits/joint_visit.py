@@ -20,8 +20,10 @@ from heliotrope.plant.visits.visit import ARRIVED, BroughtHome, Visit
 
 #: Longest time of an order, and of the way to standby, s.
 _ORDER, _HOME = 60.0, 120.0
-#: Longest wait for a turn to leave the receiver, s.
-_WAIT = 2.0
+#: A goal that has just moved on with the sun leaves an axis this far from it at most, rad.
+_STEP = 1e-3
+#: When all but this share are at their aims, the others get as long again and this time, s.
+_FEW, _LATE = 0.1, 10.0
 #: Time between looks at the field, s.
 _LOOK = 0.25
 #: States in which a beam may be on the target, and those that an order of others has led to, which
@@ -85,7 +87,8 @@ class JointVisit(BroughtHome):
         for name, visit in self.visits.items():
             try:
                 if visit.state != wanted:
-                    found[name] = f"{name} is {states.STATES[visit.state]}, no longer TRACKING"
+                    state, before = states.STATES[visit.state], states.STATES[wanted]
+                    found[name] = f"{name} is {state}, no longer {before}"
             except RefusedError as error:
                 found[name] = str(error)
         return found
@@ -107,12 +110,12 @@ class JointVisit(BroughtHome):
             except RefusedError as error:
                 self.drop({name: str(error)})
         # One that tracks the receiver while its new aim waits for its turn points beside its aim,
-        # and after some seconds is taken for one that disobeys. So few wait at a time.
-        few = max(1, round(_WAIT * self.plant.settings.join_rate))
-        for first in range(0, len(names := self.names), few):
-            part = [name for name in names[first : first + few] if name in self.visits]
-            self._away |= set(part)
-            await self.aim({name: points[name] for name in part}, limit)
+        # and after some seconds is taken for one that disobeys. The turns may all be taken while
+        # the field is raised, so all wait at standby.
+        self._away |= set(self.visits)
+        tracking = self.missing(states.IDLE)
+        await self._obeyed(lambda names: self._command("IDLE", names), tracking, limit)
+        await self.aim(points, limit)
         await self.track(limit)
         await self._arrived(limit)
 
@@ -154,8 +157,12 @@ class JointVisit(BroughtHome):
             self.drop({n: f"{n}: {text}" for n, text in (late | ticket.refusals).items()})
 
     async def _arrived(self, limit: float) -> None:
-        """Wait until all stay at their aims, in two rows running; who does not arrive drops out."""
-        until, seen = self.plant.now() + limit, dict.fromkeys(self.visits, (self.plant.now(), 0))
+        """Wait until all stay at their aims in two rows; who does not arrive drops out.
+
+        When most are there, the others get as long again, and some seconds.
+        """
+        begin = self.plant.now()
+        until, seen = begin + limit, dict.fromkeys(self.visits, (begin, 0))
         while any(seen[name][1] < 2 for name in self.visits):
             await self.look()
             self.drop(self.missing(states.TRACKING))
@@ -163,10 +170,15 @@ class JointVisit(BroughtHome):
                 counted = float(self.plant.field.counted_at[visit.row])
                 since, count = seen[name]
                 if counted > since:
-                    seen[name] = counted, count + 1 if visit.left() < ARRIVED else 0
-            if self.plant.now() >= until:
-                late = [name for name in self.visits if seen[name][1] < 2]
-                self.drop({name: f"{name}: not at its aim within {limit:g} s" for name in late})
+                    left = visit.left()
+                    kept = count if left < _STEP else 0
+                    seen[name] = counted, count + 1 if left < ARRIVED else kept
+            late = [name for name in self.visits if seen[name][1] < 2]
+            if (now := self.plant.now()) >= until:
+                gone = f"not at its aim within {now - begin:.0f} s"
+                self.drop({name: f"{name}: {gone}" for name in late})
+            elif len(late) <= _FEW * len(self.visits):
+                until = min(until, begin + 2.0 * (now - begin) + _LATE)
 
     async def look(self) -> None:
         """Let a little time pass, and note the step counts that are new."""

@@ -8,6 +8,7 @@ its beam must be where they predict it.
 import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,16 @@ from heliotrope.plant.visits.photographs import (
 )
 from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.plant.visits.visit import Visit
+
+
+class Confirming(Protocol):
+    """A way to confirm new parameters that a local controller stores."""
+
+    async def __call__(
+        self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
+    ) -> str:
+        """Return why they are not confirmed, "" if they are; see `Verification.problem`."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -102,6 +113,10 @@ class Verification:
         self._sighting = sighting
         self._alone: dict[str, asyncio.Lock] = {}
 
+    def judge(self, nominal: Mechanism, fitted: FieldFit, shot: Shot, counts: FloatArray) -> str:
+        """Return why a shot with its step counts does not confirm a fit, "" if it does."""
+        return self._judge(nominal, fitted, self._sighting(shot, counts))
+
     async def problem(
         self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
     ) -> str:
@@ -142,7 +157,7 @@ class Verification:
                 shot = await photographed(self._camera, visit)
                 if not shot.reasons and seen(visit.target, shot) is not None:
                     counts = await visit.counts_at(shot.at)
-                    return self._judge(nominal, fitted, self._sighting(shot, counts))
+                    return self.judge(nominal, fitted, shot, counts)
                 why = "; ".join(shot.reasons) or "no light on the target"
         return f"with the new parameters no photograph could be used: {why}"
 

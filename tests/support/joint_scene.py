@@ -1,0 +1,176 @@
+"""Joint visits to a target of a simulated plant, for tests.
+
+Mirrors drive, clusters poll and the plant commands as in operation; only the light is drawn by the
+test's cameras, from where the mirrors truly stand.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import partial
+
+import numpy as np
+
+from heliotrope.calibration.record import HeliostatCalibration
+from heliotrope.field.example import roughly_installed
+from heliotrope.field.layouts import malan_plant
+from heliotrope.geometry import bisector, reflect
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.settings import PlantSettings
+from heliotrope.plant.visits import (
+    CalibrationCycle,
+    Centring,
+    CycleResult,
+    CycleSettings,
+    JointCycle,
+)
+from support.live import LiveOptions, LivePlant
+
+START = datetime(2026, 10, 21, 7, tzinfo=UTC)
+ENGINEER = Person("Egon", Role.ENGINEER)
+BIASES = ("azimuth_bias", "elevation_bias")
+#: One sighting is fitted, which the plant's own settings would not do.
+CYCLE = CycleSettings(least=1, model=BIASES, sigma=2e-4)
+
+
+@dataclass
+class Scene:
+    """A plant whose heliostats are up, and an engineer in command."""
+
+    live: LivePlant
+    cycle: JointCycle
+    token: int
+    stages: list[str] = field(default_factory=list)
+    during: Callable[[str], None] = lambda _: None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.live.plant.field.names
+
+    async def run(self, *names: str) -> dict[str, CycleResult]:
+        found = await self.cycle.run(ENGINEER, self.token, names or self.names, "left", self.tell)
+        return {result.heliostat: result for result in found}
+
+    def tell(self, stage: str) -> None:
+        self.stages.append(stage)
+        self.during(stage)
+
+    def photographs(self) -> int:
+        return sum(stage.startswith("photograph") for stage in self.stages)
+
+    def states(self) -> dict[str, str]:
+        rows = self.live.plant.field.rows["state"]
+        return {name: states.STATES[rows[i]] for i, name in enumerate(self.names)}
+
+    def lit(self) -> list[str]:
+        """Heliostats whose beams are on the target, in truth."""
+        target, light = self.live.design.targets[0], self.live.world.sun()
+        normals, vertices = self.live.field.stand()
+        points = target.intersect(vertices, reflect(light, normals))
+        on = target.holds(points)
+        return [name for name, here in zip(self.live.names, on, strict=True) if here]
+
+
+def joint(
+    scene: Callable[[Scene], Awaitable[None]],
+    count: int = 6,
+    *,
+    rendered: bool = False,
+    settings: PlantSettings | None = None,
+    installed: float | None = None,
+    cycle: CycleSettings = CYCLE,
+) -> None:
+    """Play a scene in virtual time.
+
+    ``installed`` is the scale of the mirrors' errors; None: they are calibrated to 0.3 mrad.
+    """
+
+    async def main(clock: VirtualClock) -> None:
+        design = malan_plant(count)
+        rough = partial(roughly_installed, seed=3, scale=0.03 if installed is None else installed)
+        work = AutomaticSettings(wanted=True, calibrate=False)
+        options = LiveOptions(
+            rendered=rendered,
+            threads=0,
+            installed=rough,
+            work=work,
+            cycle=cycle,
+            plant=settings or PlantSettings(),
+        )
+        live = LivePlant(design, clock, options)
+        plant = live.plant
+        async with live.running():
+            try:
+                until = clock.monotonic() + 600.0
+                while not plant.field.among((states.TRACKING,), plant.now()).all():
+                    assert clock.monotonic() < until
+                    await asyncio.sleep(1.0)
+                await live.operations.automatic.halt()
+                if installed is None:
+                    believe(live, 3e-4)
+                whole = CalibrationCycle(plant, live.cameras, cycle, Centring())
+                token = plant.take_authority(ENGINEER).token
+                await _in_command(Scene(live, JointCycle(plant, live.cameras, whole), token), scene)
+            finally:
+                await live.operations.automatic.halt()
+                await live.end()
+
+    run_virtual(main, start=START)
+
+
+def believe(live: LivePlant, sigma: float) -> None:
+    """Take all mirrors for calibrated, their zeros within ``sigma``, rad."""
+    at, spread = live.clock.utc().timestamp(), np.diag([sigma**2, sigma**2])
+    for name in live.plant.field.names:
+        record = HeliostatCalibration(name, at, BIASES, np.zeros(2), spread, np.full(2, 5e-3))
+        live.plant.beliefs.take(record)
+
+
+async def _in_command(made: Scene, scene: Callable[[Scene], Awaitable[None]]) -> None:
+    async def stay() -> None:
+        plant = made.live.plant
+        while True:
+            if plant.authority.token == made.token:
+                plant.authority.keep(ENGINEER, made.token)
+            await asyncio.sleep(1.0)
+
+    async with asyncio.TaskGroup() as group:
+        staying = group.create_task(stay())
+        try:
+            await scene(made)
+        finally:
+            staying.cancel()
+
+
+def spoil(scene: Scene, stuck: str = "", traded: tuple[str, ...] = ()) -> None:
+    """From the first photograph on a mirror stands still, and two send their beams crosswise."""
+    live, target = scene.live, scene.live.design.targets[0]
+    true, held, aims = live.field.stand, {}, []
+
+    def during(stage: str) -> None:
+        if stage.startswith("photograph 1 ") and not aims:
+            aims.append(live.plant.aims.copy())  # before the first movement
+
+    scene.during = during
+
+    def stand() -> tuple[np.ndarray, np.ndarray]:
+        normals, vertices = (np.array(each) for each in true())
+        if scene.photographs():
+            light = live.world.sun()
+            if stuck:
+                row = live.names.index(stuck)
+                normals[row] = held.setdefault(stuck, normals[row].copy())
+            rows = [live.names.index(name) for name in traded]
+            points = target.intersect(vertices, reflect(light, normals))
+            places = [live.plant.field.place(name) for name in traded]
+            for row, mine, other in zip(rows, places, places[::-1], strict=True):
+                there = points[row] + aims[0][other] - aims[0][mine]
+                way = there - vertices[row]
+                normals[row] = bisector(light, way / np.linalg.norm(way))
+        return normals, vertices
+
+    live.field.stand = stand  # type: ignore[method-assign]
