@@ -230,6 +230,11 @@ def _uses(function: ast.AST) -> set[str]:
     return found
 
 
+def _is_compiled(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    """Whether numba compiles it, which knows no probes; kernels are parts of lower packages."""
+    return any("njit" in _uses(each) for each in function.decorator_list)
+
+
 def called_outside_functions() -> set[str]:
     """Return the names of functions that the sources call as they are imported."""
 
@@ -275,7 +280,8 @@ def probed(mutants: Sequence[Mutant]) -> dict[str, ast.Module]:
             _plant(number, mutants[number], chain, planting)
         if named:
             for node in ast.walk(tree):
-                if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                kinds = ast.FunctionDef | ast.AsyncFunctionDef
+                if isinstance(node, kinds) and not _is_compiled(node):
                     for word in named.keys() & _uses(node):
                         planting.entries[id(node)] |= named[word]
         if planting.wrappers or planting.outer or planting.marks or planting.entries:

@@ -336,6 +336,11 @@ class Bench:
                     function.__code__ = found[1]
         assert self._config is not None
         self._reach.begin(mutants)
+        for name in self._kills:
+            begin = time.process_time()
+            if simulate(name):
+                raise SystemExit(f"the simulation finds something in unchanged code: {name}")
+            self._reach.note(mutants, name, time.process_time() - begin)
         items = list(self._items.values())
         for item, after in zip(items, [*items[1:], None], strict=True):
             begin = time.process_time()
@@ -344,11 +349,6 @@ class Bench:
             if self._failures.any:
                 print(f"fails unchanged, with probes: {item.nodeid}", file=sys.stderr, flush=True)
                 self._failures.any = False
-        for name in self._kills:
-            begin = time.process_time()
-            if simulate(name):
-                raise SystemExit(f"the simulation finds something in unchanged code: {name}")
-            self._reach.note(mutants, name, time.process_time() - begin)
         self._reach.keep(self._kept)
 
     # -- the parent ------------------------------------------------------------------------

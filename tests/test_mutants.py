@@ -169,6 +169,19 @@ def test_operands_with_effects_are_computed_once(probed: Any) -> None:
     assert "self.seen += 1: assignment left out" in probed([], 1, True)[2]
 
 
+def test_a_compiled_function_has_no_probe(
+    scripts: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Numba would refuse it, and with it every test that needs the kernel."""
+    body = "    return LIMIT * age\n"
+    source = f"LIMIT = 6\n\n@njit(**OPTIONS)\ndef kernel(age):\n{body}\ndef plain(age):\n{body}"
+    (tmp_path / "a.py").write_text(source, encoding="utf-8")
+    monkeypatch.setattr(scripts.mutant_probes, "SOURCE", tmp_path)
+    (mutant,) = [m for m in scripts.mutant_operators.mutants_of("a.py", source) if m.line == 1]
+    kernel, plain = scripts.mutant_probes.probed([mutant])["a.py"].body[1:]
+    assert [len(function.body) for function in (kernel, plain)] == [1, 2]
+
+
 def test_what_is_called_as_the_sources_are_imported_is_known(scripts: Any) -> None:
     found = scripts.mutant_probes.called_outside_functions()
     assert "namedtuple" in found or "dataclass" in found
