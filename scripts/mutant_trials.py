@@ -65,6 +65,10 @@ def folders() -> list[str]:
     return [str(ROOT / "tests" / package) for package in operators.PACKAGES]
 
 
+def _file(test: str) -> str:
+    return test.partition("::")[0]
+
+
 def limit(seconds: float) -> None:
     """End this process by a signal once it has computed for this long."""
     signal.setitimer(signal.ITIMER_PROF, seconds)
@@ -84,13 +88,17 @@ def simulate(name: str) -> bool:
 # -- what feels a mutant ----------------------------------------------------------------------
 
 
-def stamp() -> str:
-    """Return a checksum of the sources and the tests."""
-    found = hashlib.sha256()
+def stamps() -> dict[str, str]:
+    """Return a checksum of each file of tests, and as "" one of all that they share."""
+    shared, found = hashlib.sha256(), {}
     for folder in (SOURCE, ROOT / "tests"):
         for path in sorted(folder.rglob("*.py")):
-            found.update(path.read_bytes())
-    return found.hexdigest()
+            if path.name.startswith("test_"):
+                name = path.relative_to(ROOT).as_posix()
+                found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+            else:
+                shared.update(path.read_bytes())
+    return {"": shared.hexdigest(), **found}
 
 
 @dataclass
@@ -111,15 +119,24 @@ class Reach:
 
     @classmethod
     def read(cls, path: Path) -> "Reach":
-        """Read what `keep` wrote; empty if it is not there or the sources have changed since."""
+        """Read what `keep` wrote, but for the tests of files that have changed since.
+
+        It is empty if it is not there, or if the sources or what tests share have changed.
+        """
         told = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        if told.get("sources") != stamp():
+        before, now = told.get("files", {}), stamps()
+        if before.get("") != now[""]:
             return cls()
+        seconds = {
+            name: each
+            for name, each in told["seconds"].items()
+            if "::" not in name or before.get(_file(name)) == now.get(_file(name))
+        }
         executed, felt = (
-            {key: set(names) for key, names in told[which].items()}
+            {key: seconds.keys() & names for key, names in told[which].items()}
             for which in ("executed", "felt")
         )
-        return cls(told["seconds"], executed, felt)
+        return cls(seconds, executed, felt)
 
     def keep(self, path: Path) -> None:
         """Write to a file."""
@@ -127,13 +144,17 @@ class Reach:
             {key: sorted(names) for key, names in some.items()}
             for some in (self.executed, self.felt)
         )
-        told = {"sources": stamp(), "seconds": self.seconds, "executed": executed, "felt": felt}
+        told = {"files": stamps(), "seconds": self.seconds, "executed": executed, "felt": felt}
         path.write_text(json.dumps(told), encoding="utf-8")
 
     def begin(self, mutants: Sequence[Mutant]) -> None:
-        """Prepare to note what feels some mutants."""
-        for each in mutants:
-            self.executed[each.key], self.felt[each.key] = set(), set()
+        """Prepare to note what feels some mutants; forget everything where one of them is new."""
+        if any(each.key not in self.felt for each in mutants):
+            self.seconds = {}
+        for by in (self.executed, self.felt):
+            kept = {each.key: by.get(each.key, set()) & self.seconds.keys() for each in mutants}
+            by.clear()
+            by.update(kept)
         probes.taken()
 
     def note(self, mutants: Sequence[Mutant], name: str, seconds: float) -> None:
@@ -244,10 +265,12 @@ class Bench:
 
     Parameters
     ----------
+    sample
+        All mutants of the sample.
     todo
         Kinds of trials, "unit" or "simulation", and mutants.
     kept
-        File of what feels them; measured first where it is not known.
+        File of what feels the sample; measured first where it is not known.
     processes
         Children at once.
     end
@@ -258,13 +281,14 @@ class Bench:
 
     def __init__(
         self,
+        sample: Sequence[Mutant],
         todo: Sequence[tuple[str, Mutant]],
         kept: Path,
         processes: int,
         end: float,
         keep: Keep,
     ) -> None:
-        self._todo = list(todo)
+        self._sample, self._todo = sample, list(todo)
         self._kept, self._processes, self._end, self._keep = kept, processes, end, keep
         self._reach = Reach.read(kept)
         self._at_import = probes.called_outside_functions()
@@ -289,9 +313,9 @@ class Bench:
         gc.collect()
         gc.freeze()
         signal.signal(signal.SIGTERM, self._stop)
-        unknown = {m.key: m for _, m in self._todo if m.key not in self._reach.felt}
-        if unknown:
-            self._measure(list(unknown.values()))
+        known = self._reach.seconds.keys() >= self._items.keys() | self._kills.keys()
+        if not known or any(each.key not in self._reach.felt for each in self._sample):
+            self._measure(self._sample)
         while self._fill() or self._running:
             self._reap()
         return True
@@ -305,7 +329,7 @@ class Bench:
     # -- the pass with probes --------------------------------------------------------------
 
     def _measure(self, mutants: Sequence[Mutant]) -> None:
-        """Run all tests and runs once with probes for all mutants, in a child."""
+        """Run the tests and runs of which nothing is known once with probes, in a child."""
         child = os.fork()
         if child == 0:
             try:
@@ -336,12 +360,12 @@ class Bench:
                     function.__code__ = found[1]
         assert self._config is not None
         self._reach.begin(mutants)
-        for name in self._kills:
+        for name in [each for each in self._kills if each not in self._reach.seconds]:
             begin = time.process_time()
             if simulate(name):
                 raise SystemExit(f"the simulation finds something in unchanged code: {name}")
             self._reach.note(mutants, name, time.process_time() - begin)
-        items = list(self._items.values())
+        items = [each for name, each in self._items.items() if name not in self._reach.seconds]
         for item, after in zip(items, [*items[1:], None], strict=True):
             begin = time.process_time()
             self._config.hook.pytest_runtest_protocol(item=item, nextitem=after)
@@ -547,6 +571,7 @@ class Bench:
 
 
 def try_all(
+    sample: Sequence[Mutant],
     todo: Sequence[tuple[str, Mutant]],
     kept: Path,
     processes: int,
@@ -554,7 +579,7 @@ def try_all(
     keep: Keep,
 ) -> None:
     """Try mutants; see `Bench`."""
-    bench = Bench(todo, kept, processes, end, keep)
+    bench = Bench(sample, todo, kept, processes, end, keep)
     os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
     pytest.main([*OPTIONS, *ELSEWHERE, *folders()], plugins=[bench])
 
@@ -586,7 +611,7 @@ def _alone(kind: str, names: list[str], folder: str, spare: float) -> int:
             if simulate(name):
                 return 1
         return 0
-    files = sorted({name.split("::")[0] for name in names})
+    files = sorted(set(map(_file, names)))
     return int(pytest.main([*OPTIONS, "-x", *files], plugins=[_Noting(trial)]))
 
 

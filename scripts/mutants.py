@@ -5,7 +5,8 @@ Each mutant is one change to one expression or statement of `lcu`, `links`, `clu
 simulation that feel it (`mutant_trials.py`). Run as
 ``python scripts/mutants.py --sample 500 --progress out/mutants.jsonl``; a run that was stopped goes
 on where it was. Which tests and runs feel a mutant is measured first, in one pass with probes for
-the whole sample (`mutant_probes.py`), and again when the sources or the tests have changed.
+the whole sample (`mutant_probes.py`). The tests of a file that has changed are measured again, and
+everything when the sources or what tests share have.
 """
 
 import argparse
@@ -120,7 +121,7 @@ def main() -> None:
         import mutant_trials
 
         end = time.monotonic() + 60.0 * given.minutes
-        mutant_trials.try_all(todo, given.reach, given.processes, end, keep)
+        mutant_trials.try_all(sample, todo, given.reach, given.processes, end, keep)
     done = joined(sample, known)
     print(f"{len(done)} of {len(sample)} mutants tried, seed {given.seed}\n\n{table(done)}")
 

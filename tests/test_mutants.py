@@ -201,16 +201,40 @@ def test_what_feels_a_mutant_is_noted_for_each_test(
     assert reach.seconds == dict.fromkeys(("one", "two", "three"), 0.25)
 
 
-def test_what_feels_a_mutant_is_kept_until_the_sources_change(
+def test_what_feels_a_mutant_is_kept_until_the_sources_or_its_test_change(
     scripts: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trials, path = scripts.mutant_trials, tmp_path / "reach.json"
+    monkeypatch.setattr(trials, "SOURCE", tmp_path / "src")
+    monkeypatch.setattr(trials, "ROOT", tmp_path)
+    for folder in ("src", "tests"):
+        (tmp_path / folder).mkdir()
+    for file in ("src/a.py", "tests/conftest.py", "tests/test_a.py", "tests/test_b.py"):
+        (tmp_path / file).write_text("pass", encoding="utf-8")
     assert trials.Reach.read(path) == trials.Reach()
-    kept = trials.Reach({"a test": 0.5}, {"a mutant": {"a test", "a run"}}, {"a mutant": {"a run"}})
+    one, two, run = "tests/test_a.py::test_one", "tests/test_b.py::test_two", "a run"
+    kept = trials.Reach({one: 0.5, two: 0.5, run: 3.0}, {"m": {one, two, run}}, {"m": {two, run}})
     kept.keep(path)
     assert trials.Reach.read(path) == kept
-    monkeypatch.setattr(trials, "stamp", lambda: "changed")
-    assert trials.Reach.read(path) == trials.Reach()
+    (tmp_path / "tests" / "test_b.py").write_text("changed", encoding="utf-8")
+    left = trials.Reach({one: 0.5, run: 3.0}, {"m": {one, run}}, {"m": {run}})
+    assert trials.Reach.read(path) == left
+    for file in ("src/a.py", "tests/conftest.py"):
+        kept.keep(path)
+        (tmp_path / file).write_text("changed", encoding="utf-8")
+        assert trials.Reach.read(path) == trials.Reach()
+
+
+def test_a_new_mutant_is_measured_with_all_tests_and_a_known_one_with_new_tests(
+    scripts: Any,
+) -> None:
+    old, new = (scripts.mutant_operators.Mutant("a", n, n, "x") for n in (1, 2))
+    reach = scripts.mutant_trials.Reach({"t": 0.5}, {old.key: {"t", "u"}}, {old.key: {"u"}})
+    reach.begin([old])
+    assert (reach.seconds, reach.executed) == ({"t": 0.5}, {old.key: {"t"}})
+    assert reach.felt == {old.key: set()}
+    reach.begin([old, new])
+    assert (reach.seconds, reach.executed) == ({}, {old.key: set(), new.key: set()})
 
 
 @pytest.mark.parametrize("most", [-1e9, 1e9])
