@@ -66,3 +66,7 @@ def test_the_aim_moves_right_and_up_as_seen_from_the_mirror(aim: tuple[float, ..
             across, 3e-3 * slant * np.cross(way, [0, 0, 1]) / np.hypot(way[0], way[1]), atol=1e-12
         )
         assert above[2] > 0.0
+
+
+def test_straight_up_right_is_east_and_up_is_north() -> None:
+    assert displaced((2.0, 3.0, 100.0), (2.0, 3.0, 0.0), 0.01, 0.02) == (3.0, 5.0, 100.0)

@@ -13,6 +13,7 @@ from heliotrope.links.clock import SystemClock, VirtualClock
 from heliotrope.links.papers import Papers, end_of
 from heliotrope.links.tls import RenewedTls, client_tls, server_tls
 from heliotrope.plant.links_file import read_links
+from heliotrope.safety import Alarm
 from support.papers import certificate
 
 
@@ -55,6 +56,25 @@ def test_an_alarm_comes_each_day_of_the_last_thirty(tmp_path: Path) -> None:
     (over,) = papers.look()
     assert not over.active
     assert papers.lines()[0].endswith("in 258 days")
+
+
+def test_alarms_come_while_a_block_runs_and_an_error_of_it_goes_on_as_it_came(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("heliotrope.links.papers.LOOKED", 0.01)
+    papers, heard = Papers(Days(0.0)), asyncio.Queue[Alarm]()
+    papers.watch_end(tmp_path / "x.pem")
+
+    async def main() -> None:
+        async with papers.watched(heard.put_nowait):
+            async with asyncio.timeout(60.0):
+                assert (await heard.get()).active
+                certificate(tmp_path, 100.0)[0].rename(tmp_path / "x.pem")
+                assert not (await heard.get()).active
+            raise KeyError("of the block")
+
+    with pytest.raises(KeyError, match="of the block"):
+        asyncio.run(main())
 
 
 def test_a_file_without_a_certificate_is_an_alarm(tmp_path: Path) -> None:

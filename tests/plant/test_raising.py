@@ -86,6 +86,28 @@ def test_only_what_cannot_go_on_is_sent_to_stow(tmp_path: Path) -> None:
     play(tmp_path, scene)
 
 
+def test_what_cannot_go_on_is_stowed_and_raised_again(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        cluster = bench.cluster_of(NAME)
+        row, log = cluster.names.index(NAME), Logbook(bench.clock)
+        settings = AutomaticSettings(wanted=True, calibrate=False)
+        control = AutomaticControl(
+            bench.plant, log, None, scheduler=None, records=None, truth=None, settings=settings
+        )
+        running = asyncio.create_task(control.run())
+        await bench.wait(20.0)
+        assert bench.count(states.IDLE) == len(bench.plant.field.names)
+        cluster.rows["flags"][row] = 0
+        await bench.until(lambda: cluster.rows["state"][row] == states.STOWED)
+        cluster.rows["flags"][row] = READY
+        await bench.until(lambda: bench.count(states.IDLE) == len(bench.plant.field.names))
+        assert [m.heliostats for m in cluster.commands("APPROACH")] == [(NAME,)]
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    play(tmp_path, scene)
+
+
 def test_who_is_stowed_while_its_aim_is_on_its_way_is_not_sent_to_the_receiver(
     tmp_path: Path,
 ) -> None:

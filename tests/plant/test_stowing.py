@@ -109,6 +109,23 @@ def test_an_emergency_waits_for_nobody(tmp_path: Path, act: Act) -> None:
     play(tmp_path, scene)
 
 
+def test_a_second_order_in_turn_takes_the_place_of_the_first(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        first = bench.plant.stow("anybody")
+        await bench.wait(0.5)
+        waits = [name for name in bench.plant.field.names if bench.plant.waits_to_stow(name)]
+        assert waits
+        second = bench.plant.stow("another")
+        # At once, and not when their turn comes.
+        assert {name: first.refusals.get(name) for name in waits} == dict.fromkeys(
+            waits, "superseded by STOW"
+        )
+        assert await second.end(20.0), second.text
+        assert bench.count(states.STOWED) == 18
+
+    play(tmp_path, scene)
+
+
 def test_what_waits_is_not_moved_but_locked(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         token = await bench.commanded()

@@ -378,7 +378,8 @@ def test_a_defocus_turns_the_other_way_before_a_stop() -> None:
     stow = (int(ends[0, 0]), int(ends[0, 1]))
     machine = Machine((limits[0], limits[1]), stow, (0.1, 0.1))
     narrow = Machine((limits[0], limits[1]), stow, (0.9, 0.9))
-    for at, wide, expected in ((0.5, False, 0.6), (0.95, False, 0.85), (0.4, True, 1.0)):
+    places = ((0.5, False, 0.6), (0.95, False, 0.85), (0.4, True, 1.0), (0.6, True, 0.0))
+    for at, wide, expected in places:
         found = turned_away(np.array([at, at]), narrow if wide else machine, drives)
         assert np.allclose(found, expected, atol=1e-3)
     # From standby it turns away from the aim.

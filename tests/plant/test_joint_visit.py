@@ -1,0 +1,124 @@
+"""Who drops out of a joint visit: the refused, the disobedient, and who does not arrive."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.beam_watch import BeamError
+from heliotrope.plant.visits.joint_visit import JointVisit
+from heliotrope.plant.visits.visit import ARRIVED
+
+NAMES = ("A", "B", "C")
+
+
+class Member:
+    """One that takes part, tracks, and is as far from its aim as it is told."""
+
+    state = states.TRACKING
+
+    def __init__(self, row: int, left: float) -> None:
+        self.row, self._left = row, left
+
+    def left(self) -> float:
+        return self._left
+
+    def note(self) -> None:
+        pass
+
+
+class Order:
+    """A ticket that has ended."""
+
+    name = "AIM"
+
+    def __init__(self, waits: tuple[str, ...] = (), refusals: dict[str, str] | None = None) -> None:
+        self.waits, self.refusals = waits, refusals or {}
+
+    async def end(self, limit: float) -> bool:
+        return not (self.waits or self.refusals)
+
+    def waiting(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(name for name in names if name in self.waits)
+
+
+def visit_of(clock: VirtualClock, left: dict[str, float]) -> Any:
+    """A visit of a plant that reports a row of step counts each second."""
+    found = object.__new__(JointVisit)
+    counted = SimpleNamespace(counted_at=np.zeros(len(NAMES)))
+
+    def now() -> float:
+        counted.counted_at[:] = np.floor(clock.monotonic())
+        return clock.monotonic()
+
+    found.plant = SimpleNamespace(clock=clock, now=now, field=counted)
+    found.visits = {name: Member(row, left[name]) for row, name in enumerate(NAMES)}
+    found.lost, found._away = {}, set()
+    return found
+
+
+def play(left: dict[str, float], scene: Any) -> Any:
+    async def main(clock: VirtualClock) -> Any:
+        visit = visit_of(clock, left)
+        await scene(visit, clock)
+        return visit
+
+    return run_virtual(main)
+
+
+def test_the_order_is_given_again_without_those_that_it_is_refused_for() -> None:
+    asked = []
+
+    def order(names: tuple[str, ...]) -> Order:
+        assert len(asked) < 3, "it is asked for ever"
+        asked.append(names)
+        if "B" in names:
+            raise BeamError("AIM", {"B": "its beam enters the walkway"})
+        return Order()
+
+    async def scene(visit: Any, _: VirtualClock) -> None:
+        await visit._obeyed(order, NAMES, 60.0)
+
+    visit = play(dict.fromkeys(NAMES, 0.0), scene)
+    assert asked == [NAMES, ("A", "C")]
+    assert visit.names == ("A", "C")
+    assert visit.lost == {"B": "B: its beam enters the walkway"}
+
+
+def test_a_refusal_that_names_none_of_them_ends_the_visit() -> None:
+    def order(names: tuple[str, ...]) -> Order:
+        raise BeamError("AIM", {"X": "another's"})
+
+    async def scene(visit: Any, _: VirtualClock) -> None:
+        with pytest.raises(BeamError, match="another's"):
+            await visit._obeyed(order, NAMES, 60.0)
+
+    assert play(dict.fromkeys(NAMES, 0.0), scene).names == NAMES
+
+
+def test_who_does_not_obey_in_time_drops_out_with_the_reason() -> None:
+    async def scene(visit: Any, _: VirtualClock) -> None:
+        await visit._obeyed(lambda _: Order(("A",), {"C": "not in this state"}), NAMES, 60.0)
+
+    visit = play(dict.fromkeys(NAMES, 0.0), scene)
+    assert visit.names == ("B",)
+    assert visit.lost == {"A": "A: AIM not done in 60 s", "C": "C: not in this state"}
+
+
+def test_two_rows_in_place_are_waited_for_and_who_is_not_there_by_then_drops_out() -> None:
+    took = []
+
+    async def scene(visit: Any, clock: VirtualClock) -> None:
+        begin = clock.monotonic()
+        await visit._arrived(10.0)
+        took.append(clock.monotonic() - begin)
+
+    visit = play({"A": 0.0, "B": 0.9 * ARRIVED, "C": 0.0}, scene)
+    assert visit.names == NAMES
+    assert 1.0 < took[0] <= 2.5, "the second row of counts is the first proof, not the first alone"
+    visit = play({"A": 0.0, "B": 1.1 * ARRIVED, "C": 0.0}, scene)
+    assert 10.0 <= took[1] < 11.0
+    assert visit.lost == {"B": "B: not at its aim within 10 s"}
