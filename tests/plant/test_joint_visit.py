@@ -1,4 +1,4 @@
-"""Who drops out of a joint visit: the refused, the disobedient, and who does not arrive."""
+"""Places of beams in a joint visit, and who drops out: refused, disobedient, or not there."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -6,9 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from heliotrope.field.layouts import malan_plant
+from heliotrope.field.target import Target
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.beam_watch import BeamError
+from heliotrope.plant.visits.joint_layout import _Beam, _places
 from heliotrope.plant.visits.joint_visit import JointVisit
 from heliotrope.plant.visits.visit import ARRIVED
 
@@ -122,3 +125,18 @@ def test_two_rows_in_place_are_waited_for_and_who_is_not_there_by_then_drops_out
     visit = play({"A": 0.0, "B": 1.1 * ARRIVED, "C": 0.0}, scene)
     assert 10.0 <= took[1] < 11.0
     assert visit.lost == {"B": "B: not at its aim within 10 s"}
+
+
+@pytest.mark.parametrize(("wide", "high"), [(12.0, 3.0), (3.0, 12.0), (6.0, 6.0)])
+def test_beams_stand_in_a_grid_of_the_targets_shape(wide: float, high: float) -> None:
+    target = malan_plant(1).targets[0]
+    plane = target.plane_coordinates(target.corners)
+    corners = 0.5 * np.array([wide, high]) * np.sign(plane)
+    target = Target("wide", target.center + corners @ target.axes, target.center)
+    beam = _Beam(50.0, 1e-6 * np.eye(2), 1e-6 * np.eye(2), 1e-8, 1.0)
+    places = _places(target, {str(number): beam for number in range(16)})
+    columns, rows = (len(np.unique(np.round(places[:, k], 6))) for k in (0, 1))
+    assert len(np.unique(np.round(places, 6), axis=0)) == 16
+    assert columns * rows == 16
+    assert columns / rows == pytest.approx(wide / high, rel=0.01)
+    assert (np.abs(places) < 0.5 * np.array([wide, high])).all()
