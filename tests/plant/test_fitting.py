@@ -4,16 +4,22 @@ from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
+import pytest
 
+from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.learn import drift
 from heliotrope.calibration.learn.own_model import OwnModel
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.calibration.sightings import Sightings, sightings
+from heliotrope.calibration.uncertainty import expected_error
+from heliotrope.field.example import roughly_installed
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import MRAD, FloatArray, reflect
 from heliotrope.mechanism import parameters
+from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
+from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.visits.fitting import JudgedFit, fit_heliostat, surprise_of
 from heliotrope.plant.visits.settings import CycleSettings
@@ -95,3 +101,60 @@ def test_photographs_surprise_less_the_older_the_calibration() -> None:
         surprise.append(surprise_of(record, nominal, later))
     assert surprise[0] > 4.0
     assert (np.diff(surprise) < -0.3).all()
+
+
+#: Photographs of a first visit: where on the target, m right and up of its middle.
+CORNERS = np.array([(0.0, 0.0), (3.0, 3.0), (-3.0, -3.0), (3.0, -3.0)])
+MODEL = "malan8+canting"
+
+
+def first_visit(
+    truth: Mechanism, begin: float, rng: np.random.Generator, swing: float
+) -> Sightings:
+    """Four photographs in half a minute, each in a swing of the first axis with 6 %."""
+    target = PLANT.targets[0]
+    aims, times = target.center + CORNERS @ target.axes, begin + 8.0 * np.arange(4)
+    suns, many = vector(times, PLANT.site), truth[np.zeros(4, np.intp)]
+    counts = track(many, suns, aims).best_counts
+    steps = swing / np.abs(truth.drives.radians_per_count(counts[0]))[..., 0]
+    away = np.linalg.norm(aims - many.pose(counts).vertex, axis=1)
+    seen = aims + (1e-4 * away[:, None] * rng.standard_normal((4, 2))) @ target.axes
+    counts[:, 0] -= (rng.random(4) < 0.06) * steps
+    return sightings(np.zeros(4, np.intp), counts, suns, seen, time=times, sigma=2e-4)
+
+
+@pytest.mark.parametrize("case", ["as wrong as the priors say", "a quick installation that swings"])
+def test_a_field_freshly_commissioned_knows_its_errors(case: str) -> None:
+    """The 90 % ellipse of each beam on the receiver: at once, an hour, and a day after a visit."""
+    plant, rng = malan_plant(320), np.random.default_rng(4)
+    beliefs, settings = Beliefs(plant), CycleSettings(sigma=2e-4)
+    (group,) = plant.groups.values()
+    known = group.mechanism.parameters
+    names = parameters.model(MODEL, known)
+    swings = case.endswith("swings")
+    truth = (
+        roughly_installed(group.mechanism, seed=1)
+        if swings
+        else group.mechanism.with_parameters(
+            {name: rng.normal(0.0, known[name].prior, len(group)) for name in names}
+        )
+    )
+    aim, inside = plant.receivers[0].center, []
+    for i in rng.permutation(len(group))[:40]:
+        here, name = truth[np.array([i])], group.names[i]
+        seen = first_visit(here, BEGIN, rng, 0.63 * MRAD if swings else 0.0)
+        found = fit_heliostat(beliefs, settings, OwnModel(MODEL, names), name, seen)
+        for later in (0.0, HOUR, DAY):
+            sun = vector(np.array([BEGIN + later]), PLANT.site)
+            spread = beliefs.growth(name).grown(
+                found.fitted.covariance[0], found.fitted.names, later / DAY
+            )
+            expected = expected_error(found.mechanism, found.fitted.names, spread, sun, aim)
+            sent = sightings(
+                np.zeros(1, np.intp), track(found.mechanism, sun, aim).best_counts, sun, aim
+            )
+            off = beam_errors(here, sent).offset[0]
+            inside.append(off @ np.linalg.solve(expected.covariance[0], off) <= CHI_SQUARE_90)
+    share = np.mean(np.reshape(inside, (40, 3)), axis=0)
+    assert (share >= 0.85).all(), share
+    assert share.mean() <= 0.98, share

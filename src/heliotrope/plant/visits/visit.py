@@ -73,6 +73,7 @@ class Visit(BroughtHome):
         self.away = False
         self._times: list[float] = []
         self._counts: list[FloatArray] = []
+        self._there: list[bool] = []
 
     @property
     def state(self) -> int:
@@ -192,32 +193,38 @@ class Visit(BroughtHome):
         if np.isfinite(counted) and (not self._times or counted > self._times[-1] + _LOOK):
             self._times.append(counted)
             self._counts.append(np.array([node["primary"], node["secondary"]], dtype=np.float64))
+            self._there.append(self.left() < ARRIVED)
 
     async def counts_at(self, instant: float, limit: float = 10.0) -> FloatArray:
         """Return the step counts at an instant, between the rows before and after it, (2,).
 
+        Only rows at the goals count. An axis that goes down with the sun swings below its goal now
+        and then, to come from below: a row from such a moment says nothing of the next second.
+
         Raises
         ------
         RefusedError
-            If it was not heard before, and within ``limit`` s after.
+            If it was not heard at its goals before, and within ``limit`` s after.
         """
         until = self.plant.now() + limit
-        while not (len(self._times) > 1 and self._times[-1] >= instant):
+        while not (sum(self._there) > 1 and self._heard_there()[-1] >= instant):
             if self.plant.now() >= until:
                 raise RefusedError(
-                    f"{self.heliostat}: not heard within {limit:g} s of the photograph, so its "
-                    "position in it is unknown"
+                    f"{self.heliostat}: not heard at its aim within {limit:g} s of the photograph, "
+                    "so its position in it is unknown"
                 )
             await self.look()
-        after = bisect_right(self._times, instant)
-        after = min(max(after, 1), len(self._times) - 1)
-        if not self._times[0] <= instant:
+        times = self._heard_there()
+        counts = [row for row, there in zip(self._counts, self._there, strict=True) if there]
+        after = min(max(bisect_right(times, instant), 1), len(times) - 1)
+        if not times[0] <= instant:
             raise RefusedError(f"{self.heliostat}: the photograph is older than all known counts")
-        gap = self._times[after] - self._times[after - 1]
-        share = (instant - self._times[after - 1]) / gap
-        return np.asarray(
-            self._counts[after - 1] + share * (self._counts[after] - self._counts[after - 1])
-        )
+        share = (instant - times[after - 1]) / (times[after] - times[after - 1])
+        return np.asarray(counts[after - 1] + share * (counts[after] - counts[after - 1]))
+
+    def _heard_there(self) -> list[float]:
+        """Return the times of the rows in which both axes are at their goals."""
+        return [at for at, there in zip(self._times, self._there, strict=True) if there]
 
     @property
     def counted(self) -> tuple[FloatArray, FloatArray]:
