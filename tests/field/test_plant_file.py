@@ -14,7 +14,9 @@ from heliotrope.field.example import example_plant
 from heliotrope.field.formats import paint, plant_file
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.joint_visits import JointSettings
+from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
+from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.stellenbosch import prototype
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere
@@ -453,6 +455,48 @@ def test_warnings_of_check(tmp_path: Path) -> None:
     assert any("no receiver" in t for t in texts)
     assert any("1 pairs of mirrors can touch: the nearest, A and B" in t for t in texts)
     assert any("1 heliostats stand behind its plane" in t for t in texts)
+
+
+def receiver_document(folder: Path, more: str = "") -> Path:
+    """A plant file with a located camera and settings of receiver visits."""
+    plant = malan_plant(2)
+    settings = ReceiverSettings("camera-left", "receiver", most=30)
+    plant_file.write_plant(replace(plant, receiver_visits=settings), folder / "plant.toml")
+    path = folder / "plant.toml"
+    text = path.read_text(encoding="utf-8")
+    assert text.count("most = 30") == 1
+    path.write_text(text.replace("most = 30", f"most = 30\n{more}"), encoding="utf-8")
+    return path
+
+
+def test_receiver_visits_are_read_and_survive(tmp_path: Path) -> None:
+    path = receiver_document(tmp_path, "worth_mrad = 0.2")
+    plant = plant_file.read_plant(path)
+    usual = ReceiverSettings("camera-left", "receiver")
+    assert plant.receiver_visits == replace(usual, most=30, worth=2e-4)
+    for one in fields(ReceiverSettings):
+        value = getattr(usual, one.name)
+        if not isinstance(value, str):
+            changed = value + (1 if isinstance(value, int) else value / 7)
+            odd = replace(usual, **{one.name: changed})
+            plant_file.write_plant(replace(plant, receiver_visits=odd), tmp_path / "odd.toml")
+            assert plant_file.read_plant(tmp_path / "odd.toml").receiver_visits == odd
+    plant_file.write_plant(replace(plant, receiver_visits=None), tmp_path / "none.toml")
+    assert plant_file.read_plant(tmp_path / "none.toml").receiver_visits is None
+
+
+@pytest.mark.parametrize(
+    ("more", "text"),
+    [
+        ("power = 0.02", "receiver_visits: receiver visits: movements that cost 2 % of the power"),
+        ("movement = 1", "receiver_visits.movement: "),
+        ("worth_mrad = 1\nworth_rad = 0.001", "worth is given twice"),
+    ],
+)
+def test_receiver_visits_that_cannot_be_are_one_line(more: str, text: str, tmp_path: Path) -> None:
+    with pytest.raises(FormatError) as caught:
+        plant_file.read_plant(receiver_document(tmp_path, more))
+    assert text in str(caught.value)
 
 
 def test_schema_in_the_docs_is_current() -> None:

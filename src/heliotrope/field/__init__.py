@@ -32,6 +32,9 @@ from heliotrope.field.marks import (
 from heliotrope.field.plant import (
     Plant,
 )
+from heliotrope.field.receiver_visits import (
+    ReceiverSettings,
+)
 from heliotrope.field.stellenbosch import (
     prototype,
 )
@@ -60,6 +63,7 @@ __all__ = [
     "Plant",
     "Prism",
     "Receiver",
+    "ReceiverSettings",
     "Sphere",
     "Target",
     "TrackedDay",

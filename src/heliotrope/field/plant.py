@@ -12,6 +12,7 @@ from heliotrope.field.camera import Camera
 from heliotrope.field.heliostat import Heliostat
 from heliotrope.field.heliostats import Heliostats, rows_in
 from heliotrope.field.joint_visits import JointSettings
+from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Volume
 from heliotrope.frames import ENU, Framed, Labelled, Variable
@@ -52,6 +53,8 @@ class Plant(Value, Framed):
     joint_visits
         Settings of visits of several heliostats to one target at once; None: each is calibrated
         alone.
+    receiver_visits
+        How heliostats in production are measured on the receiver; None: they are not.
     """
 
     name: str
@@ -64,6 +67,7 @@ class Plant(Value, Framed):
     keep_outs: tuple[Volume, ...] = ()
     eyes: Mapping[str, FloatArray] = field(default_factory=dict)
     joint_visits: JointSettings | None = field(default_factory=JointSettings)
+    receiver_visits: ReceiverSettings | None = None
 
     def __post_init__(self) -> None:
         check_site(self.site)
@@ -90,6 +94,10 @@ class Plant(Value, Framed):
         for name in names:
             if names.count(name) > 1:
                 raise InputError(f"keep-out volume {name}: the name occurs twice")
+        if self.receiver_visits is not None:
+            # Both must be known: the camera's place, and a face that it can see.
+            _ = self.receiver(self.receiver_visits.receiver).face
+            _ = self.camera(self.receiver_visits.camera).pose
 
     def _card(self) -> Card:
         s = self.site

@@ -188,6 +188,30 @@ class Receiver(Value):
         normal = normalize(self.normal, f"receiver {self.name}: normal")
         object.__setattr__(self, "normal", normal)
 
+    @cached_property
+    def face(self) -> Target:
+        """The aperture of a planar receiver as a surface that a camera sees.
+
+        Raises
+        ------
+        InputError
+            A receiver of another kind.
+        """
+        if self.kind != "planar":
+            raise InputError(
+                f"receiver {self.name}: it is {self.kind.replace('_', ' ')}, and only a planar one "
+                "has a face"
+            )
+        corners = self.corners
+        if corners is None:
+            # An aperture that looks straight up or down has no upper edge of its own.
+            level = np.cross([0.0, 0.0, 1.0], self.normal)
+            steep = np.linalg.norm(level) < 1e-9
+            right = np.array([1.0, 0.0, 0.0]) if steep else normalize(level)
+            across, up = 0.5 * self.width * right, 0.5 * self.height * np.cross(self.normal, right)
+            corners = self.center + np.stack([up - across, up + across, across - up, -up - across])
+        return Target(self.name, corners, self.center)
+
 
 def point_of(
     aim: str | Target | Receiver | npt.ArrayLike, targets: Sequence[Target] = ()

@@ -14,10 +14,12 @@ from heliotrope.lcu import messages as wire
 from heliotrope.lcu import states
 from heliotrope.mechanism.board_items import Wanted
 from heliotrope.plant.assigned import grouped, points_of
-from heliotrope.plant.authority import Person
+from heliotrope.plant.audit import AuditError
+from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoiningJob, JoinQueue, in_slices
+from heliotrope.plant.movements import Movements
 from heliotrope.plant.orders import PlantOrders, whole
 from heliotrope.plant.permission import JOINING, Permission
 from heliotrope.plant.tickets import Ticket
@@ -49,6 +51,8 @@ class Commands:
         Parameters that local controllers should store, their standby points among them.
     patience
         Time that a heliostat waits for its turn to join, s.
+    movements
+        Beams that are a little beside their aims.
     """
 
     def __init__(
@@ -62,10 +66,12 @@ class Commands:
         targets: Sequence[Target],
         wanted: Wanted,
         patience: float,
+        movements: Movements,
     ) -> None:
         self._now, self._field, self._orders, self._joining = now, field, orders, joining
         self._permission, self._ways = permission, ways
         self._targets, self._wanted, self._patience = targets, wanted, patience
+        self._movements = movements
 
     def give(
         self,
@@ -155,33 +161,121 @@ class Commands:
         self, person: Person, token: int, name: str, points: Mapping[str, npt.ArrayLike]
     ) -> Ticket:
         """Give AIM or STANDBY with a point (3,) for each heliostat; see `PlantController.aim`."""
-        out = self._permission.locked_out(name, points)
-        points = {n: point for n, point in points.items() if n not in out}
-        names = tuple(points)
-        rows = np.array([self._field.place(n) for n in names], dtype=np.intp)
-        wanted = points_of(name, points)
+        names, rows, wanted, out = self._pointed(name, points)
         self._prove_points(name, names, rows, wanted)
-        groups, keep = grouped(names, wanted), self._ways.points
+        keep = self._ways.points
+
+        def assign() -> frozenset[str]:
+            here = self._stays(rows, wanted)
+            keep.assign(name, rows, wanted)
+            if name == "AIM":
+                self._movements.forget(names)
+            else:
+                for each, place in zip(names, wanted, strict=True):
+                    self._wanted.rest(each, tuple(place))
+            return frozenset(names[i] for i in np.flatnonzero(here))
+
+        groups = grouped(names, wanted)
         values = next(iter(groups)) if len(groups) == 1 else ()
         all_names, note = (*names, *out), f"{len(groups)} points"
         store = keep.storing(name, rows, wanted)
         ticket = self._permission.accept(person, token, name, values, all_names, note, store)
         ticket.block(out)
+        self._when_recorded(ticket, names, wanted, token, assign)
+        return ticket
+
+    def move(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
+        """Move beams a little beside their aims; see `PlantController.move`."""
+        names, rows, wanted, out = self._pointed("AIM", points)
+        tracking, aims = self._field.among((states.TRACKING,), self._now())[rows], self._aims(rows)
+        if wrong := self._movements.refused(names, rows, aims, wanted, tracking):
+            raise BeamError("AIM", wrong)
+        self._prove_points("AIM", names, rows, wanted)
+
+        def assign() -> frozenset[str]:
+            self._movements.take(names, self._aims(rows), token, self._now())
+            self._ways.points.assign("AIM", rows, wanted)
+            return frozenset(names)
+
+        all_names, note = (*names, *out), f"{len(names)} coded movements"
+        ticket = self._permission.accept(person, token, "AIM", (), all_names, note)
+        ticket.block(out)
+        self._when_recorded(ticket, names, wanted, token, assign)
+        return ticket
+
+    def bring_back(self, token: int) -> None:
+        """Send moved beams back to their aims that are due, as far as motions are accepted now.
+
+        ``token`` is that of the present command authority, whoever has it.
+        """
+        due = self._movements.due(self._now(), token)
+        if not due:
+            return
+        self._movements.wait(due, token, self._now())
+        names = self._free_to_return(due)
+        if not names:
+            return
+        rows = np.array([self._field.place(n) for n in names], dtype=np.intp)
+        wanted = np.stack([due[n] for n in names])
+
+        def assign() -> frozenset[str]:
+            self._ways.points.assign("AIM", rows, wanted)
+            return frozenset(names)
+
+        note = f"{len(names)} beams go back to their aims"
+        try:
+            ticket = self._orders.accept(("plant", "anybody", "AIM"), (), names, note)
+        except AuditError:
+            return
+        self._movements.sent(ticket, token, self._now())
+        self._when_recorded(ticket, names, wanted, token, assign)
+
+    def _free_to_return(self, due: Mapping[str, FloatArray]) -> tuple[str, ...]:
+        """Return which moved beams may go back now."""
+        names = tuple(due)
+        while names:
+            rows = np.array([self._field.place(n) for n in names], dtype=np.intp)
+            try:
+                self._permission.refuse_now("AIM", names)
+                self._prove_points("AIM", names, rows, np.stack([due[n] for n in names]))
+                break
+            except BeamError as error:
+                names = tuple(n for n in names if n not in error.refusals)
+            except RefusedError:
+                return ()
+        return names
+
+    def _aims(self, rows: npt.NDArray[np.intp]) -> FloatArray:
+        return np.asarray(self._ways.points.aims[rows])
+
+    def _pointed(
+        self, name: str, points: Mapping[str, npt.ArrayLike]
+    ) -> tuple[tuple[str, ...], npt.NDArray[np.intp], FloatArray, dict[str, str]]:
+        """Return heliostats, rows (K,) and points (K, 3), and which are out of service, and why."""
+        out = self._permission.locked_out(name, points)
+        points = {n: point for n, point in points.items() if n not in out}
+        rows = np.array([self._field.place(n) for n in points], dtype=np.intp)
+        return tuple(points), rows, points_of(name, points), out
+
+    def _when_recorded(
+        self,
+        ticket: Ticket,
+        names: tuple[str, ...],
+        wanted: FloatArray,
+        token: int,
+        assign: Callable[[], frozenset[str]],
+    ) -> None:
+        """Assign and send points once they are recorded; ``assign`` returns who needs no turn."""
 
         def send(again: bool) -> None:
             if again:
-                self._permission.refuse_now(name, names)
-                self._prove_points(name, names, rows, wanted)
-            here = self._stays(rows, wanted)
-            stays = frozenset(names[i] for i in np.flatnonzero(here))
-            keep.assign(name, rows, wanted)
-            if name == "STANDBY":
-                for each, place in zip(names, wanted, strict=True):
-                    self._wanted.rest(each, tuple(place))
-            self._send_points(ticket, name, groups, token, stays)
+                rows = np.array([self._field.place(n) for n in names], dtype=np.intp)
+                self._permission.refuse_now(ticket.name, names)
+                self._prove_points(ticket.name, names, rows, wanted)
+            stays = assign()
+            self._send_points(ticket, ticket.name, grouped(names, wanted), token, stays)
 
         self._orders.when_recorded(ticket, send)
-        return ticket
 
     def _prove_points(
         self, name: str, names: tuple[str, ...], rows: npt.NDArray[np.intp], wanted: FloatArray

@@ -56,6 +56,7 @@ from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.joining import JoinDispatcher, JoinQueue
 from heliotrope.plant.lockouts import Lockout
+from heliotrope.plant.movements import Movements
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.parameters import ParameterSync, Tables, change_of_beam
 from heliotrope.plant.permission import Permission
@@ -118,7 +119,9 @@ class PlantController:
     out_of_service
         Heliostats that only EMERGENCY, DEFOCUS and STOW move, by name; see `Lockout`.
     aims, standbys
-        Assigned points, ENU, m, (N, 3); NaN where there is none.
+        Points where the beams are sent, ENU, m, (N, 3); NaN where there is none.
+    movements
+        Beams that are a little beside their assigned aims, for a measurement.
 
     Raises
     ------
@@ -149,8 +152,7 @@ class PlantController:
         members = _checked(design, links, clusters)
         self.design, self.settings = design, settings or PlantSettings()
         self.clock, self._on_alarm = clock, on_alarm
-        self.alarms: deque[Alarm] = deque(maxlen=1000)
-        self.counters = Counters()
+        self.alarms, self.counters = deque[Alarm](maxlen=1000), Counters()
         self.field = FieldState(members, self.settings.stale)
         self.authority = Authority(clock, self.settings.authority, entropy)
         self.wanted = wanted or Wanted()
@@ -160,6 +162,7 @@ class PlantController:
         self.out_of_service: dict[str, Lockout] = {}
         points = Points(self.field.names, assigned)
         self.aims, self.standbys = points.aims, points.standbys
+        self.movements = Movements(design.receivers, self.beams.armature)
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, self.beams.machines)
         self._agreement = Agreement(
             self.field, points, self.beams, design.site, lambda: clock.utc().timestamp()
@@ -256,6 +259,7 @@ class PlantController:
             self.design.targets,
             self.wanted,
             self.settings.join_wait,
+            self.movements,
         )
 
     # -- running ---------------------------------------------------------------------------
@@ -339,6 +343,7 @@ class PlantController:
         token = self.authority.token
         self._joiner.beat(now, token)
         self._orders.beat(now)
+        self._commands.bring_back(token)
         slow = now - self._slow_at >= _SLOW_BEAT
         if self._orders.owing or slow:
             self._orders.pay()
@@ -619,6 +624,24 @@ class PlantController:
     def standby(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
         """Set standby points, beyond which beams go on; see `aim`."""
         return self._commands.point(person, token, "STANDBY", points)
+
+    def move(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
+        """Move beams a little on their receiver, for a measurement; their aims stay assigned.
+
+        The beams go back to their aims by themselves; see `movements`. No turn is needed, since
+        they bring no light to the receiver.
+
+        Parameters
+        ----------
+        person, token, points
+            As for `aim`.
+
+        Raises
+        ------
+        RefusedError
+            If it is not accepted, or one of the beams may not go there.
+        """
+        return self._commands.move(person, token, points)
 
     def parameters(
         self,

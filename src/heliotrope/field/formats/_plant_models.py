@@ -360,6 +360,52 @@ class JointVisitsTable(StrictTable):
     )
 
 
+class ReceiverVisitsTable(StrictTable):
+    """``[receiver_visits]``: heliostats in production, measured where they shine."""
+
+    camera: str = Field(min_length=1, description="A camera with a place that sees the receiver.")
+    receiver: str = Field(min_length=1, description="A planar receiver.")
+    most: int | None = Field(None, description="Heliostats at once; default: 50.")
+    least: int | None = Field(
+        None, description="Heliostats that a visit of automatic control needs; default: 8."
+    )
+    known_mrad: Number | None = Field(
+        None, description="Largest expected beam error of one that takes part, RMS; default: 4."
+    )
+    known_rad: Number | None = Field(None, description="Instead, as the program writes it.")
+    visit_mrad: Number | None = Field(
+        None, description="Part of it that is drawn anew at each visit, each axis; default: 0.5."
+    )
+    visit_rad: Number | None = Field(None, description="Instead, as the program writes it.")
+    movement_mrad: Number | None = Field(
+        None, description="Coded movement of a beam, either way along each axis; default: 1."
+    )
+    movement_rad: Number | None = Field(None, description="Instead, as the program writes it.")
+    settle_s: Number | None = Field(
+        None, description="From the moment that all stand at their aims; default: 1."
+    )
+    exposures: int | None = Field(
+        None, description="Frames that are averaged for a photograph; default: 1."
+    )
+    power: Number | None = Field(
+        None,
+        description="Largest share of the power that the movements cost; default: 0.005.",
+    )
+    steady: Number | None = Field(
+        None, description="Largest change of the light between photographs; default: 0.05."
+    )
+    again: Number | None = Field(
+        None, description="Photographs at most, over those that a visit needs; default: 1.5."
+    )
+    worth_mrad: Number | None = Field(
+        None, description="Least change of a beam that takes a mirror off; default: 0.3."
+    )
+    worth_rad: Number | None = Field(None, description="Instead, as the program writes it.")
+    every_s: Number | None = Field(
+        None, description="Least time between two visits of a heliostat; default: 7200."
+    )
+
+
 class PlantDocument(StrictTable):
     """The whole file."""
 
@@ -380,4 +426,7 @@ class PlantDocument(StrictTable):
     )
     joint_visits: JointVisitsTable | None = Field(
         None, description="Without: joint visits with the default settings."
+    )
+    receiver_visits: ReceiverVisitsTable | None = Field(
+        None, description="Without: no heliostat in production is measured."
     )

@@ -20,7 +20,12 @@ from heliotrope.field.formats._plant_cameras import (
     mark_document,
 )
 from heliotrope.field.formats._plant_groups import build_group, group_document
-from heliotrope.field.formats._plant_joint import build_joint, joint_document
+from heliotrope.field.formats._plant_joint import (
+    build_joint,
+    build_receiver_visits,
+    joint_document,
+    receiver_visits_document,
+)
 from heliotrope.field.formats._plant_models import PlantDocument, ReceiverTable, TargetTable
 from heliotrope.field.formats._plant_table import HeliostatColumns, read_table, write_table
 from heliotrope.field.formats._plant_volumes import build_volume, volume_document
@@ -127,11 +132,9 @@ def _assemble(
     cameras = _each(path, "cameras", document.cameras, build_camera, problems)
     keep_outs = _each(path, "keep_out", document.keep_out, build_volume, problems)
     eyes = {name: np.array(point) for name, point in document.eyes_m.items()}
-    joint = None
-    try:
-        joint = build_joint(document.joint_visits)
-    except InputError as error:
-        problems.append(FormatError(path, str(error), "joint_visits"))
+    joint = _one(path, "joint_visits", document.joint_visits, build_joint, problems)
+    given = document.receiver_visits
+    receiver_visits = _one(path, "receiver_visits", given, build_receiver_visits, problems)
     if problems:
         return None
     try:
@@ -145,9 +148,25 @@ def _assemble(
             keep_outs=keep_outs,
             eyes=eyes,
             joint_visits=joint,
+            receiver_visits=receiver_visits,
         )
     except InputError as error:
         problems.append(FormatError(path, str(error)))
+        return None
+
+
+def _one(
+    path: Path,
+    key: str,
+    table: Table | None,
+    build: Callable[[Table | None], Made | None],
+    problems: list[FormatError],
+) -> Made | None:
+    """Build from a table that may be missing; an error is added to ``problems``."""
+    try:
+        return build(table)
+    except InputError as error:
+        problems.append(FormatError(path, str(error), key))
         return None
 
 
@@ -271,6 +290,7 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
         "keep_out": [volume_document(volume) for volume in plant.keep_outs],
         "eyes_m": {name: np.asarray(point).tolist() for name, point in plant.eyes.items()},
         **joint_document(plant.joint_visits),
+        **receiver_visits_document(plant.receiver_visits),
         "groups": groups,
     }
     write_text(place, tomli_w.dumps(document))

@@ -6,13 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.field.camera import Camera, distort, undistort
+from heliotrope.errors import InputError
+from heliotrope.field.camera import Camera, distort, project, undistort
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 
 #: Standard deviation of k1 of an unknown lens, at a focal length of the frame's longer side.
 #: Photographic lenses stay below.
 LENS_DEVIATION = 0.1
+#: Least error of a located camera as a whole, and of single points by its lens, px.
+_TURNED, _FITTED = 0.33, 0.1
 
 
 @dataclass(frozen=True)
@@ -238,6 +241,30 @@ def fit_view(
         H_norm_plane=H,
         covariance=np.asarray(factor * np.linalg.pinv(information, hermitian=True), np.float64),
         residual=float(np.sqrt(np.mean(np.sum(miss**2, axis=-1)))),
+    )
+
+
+def posed_view(camera: Camera, target: Target) -> FaceView:
+    """Return the view of a surface without marks, by the camera's place alone.
+
+    Its covariance is that of a camera that is turned as a whole by its ``deviation``, at least by
+    a third of a pixel.
+
+    Raises
+    ------
+    InputError
+        If the camera has not been located, or the surface is behind it.
+    """
+    face = faces((target,))[0]
+    low, high = face.span
+    plane = np.array([(x, y) for y in (0.0, 0.5, 1.0) for x in (0.0, 0.5, 1.0)])
+    plane = low + plane * (high - low)
+    pixels = project(camera, face.point(plane))
+    if not np.isfinite(pixels).all():
+        raise InputError(f"camera {camera.name}: {target.name} is not in front of it; turn it")
+    turned = max(camera.deviation, _TURNED) ** 2 * np.tile(np.eye(2), (len(plane), len(plane)))
+    return fit_view(
+        face, plane, pixels, turned + _FITTED**2 * np.eye(2 * len(plane)), camera, lens_known=True
     )
 
 

@@ -2,13 +2,15 @@
 
 Begin with `CalibrationCycle`: it sends a heliostat to a target, takes photographs (plainly, or with
 a search for the beam: `Centring`), fits them, and lets the plant believe a better calibration.
-`JointCycle` calibrates several on one target at once, told apart by their movements.
+`JointCycle` calibrates several on one target at once, told apart by their movements;
+`ReceiverCycle` does so on a receiver, in production.
 `Visit` is the way there and back; `TargetCamera` is the protocol of a camera.
 """
 
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
 from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.photographs import Photographs, Shot, TargetCamera
+from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.plant.visits.visit import Visit
 
@@ -19,6 +21,7 @@ __all__ = [
     "CycleSettings",
     "JointCycle",
     "Photographs",
+    "ReceiverCycle",
     "Shot",
     "TargetCamera",
     "Visit",

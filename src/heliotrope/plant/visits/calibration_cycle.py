@@ -12,6 +12,7 @@ parameters are pushed back.
 """
 
 import asyncio
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 from datetime import timedelta
 
@@ -90,6 +91,25 @@ class CycleResult:
     after: float = float("nan")
     record: HeliostatCalibration | None = None
     verdict: Verdict | None = None
+
+
+@dataclass(frozen=True)
+class Production:
+    """A heliostat that was seen on a receiver, and leaves it for nothing but new parameters.
+
+    Attributes
+    ----------
+    surface
+        Name of the receiver.
+    worth
+        Least change of its beam for which it leaves, rad.
+    leave
+        Brings it to standby.
+    """
+
+    surface: str
+    worth: float
+    leave: Callable[[Visit], Awaitable[None]]
 
 
 class CalibrationCycle:
@@ -223,6 +243,7 @@ class CalibrationCycle:
         *,
         confirming: Confirming | None = None,
         least: int | None = None,
+        production: Production | None = None,
     ) -> CycleResult:
         """Learn from the photographs of a heliostat that is at standby; see `run`.
 
@@ -238,6 +259,9 @@ class CalibrationCycle:
             Confirms new parameters; None: a photograph of this heliostat alone.
         least
             Sightings that the fit needs; None: as in the settings.
+        production
+            It tracks a receiver, and leaves it if its parameters change. A change that a photograph
+            must confirm is left to a visit to a target; None: it is at standby.
         """
         result = await self._learn(
             visit,
@@ -245,16 +269,24 @@ class CalibrationCycle:
             tell or _nobody,
             confirming or self.verification.problem,
             self.settings.least if least is None else least,
+            production,
         )
         if taken.used and self._missed(visit.heliostat, taken) <= PLACED:
             self._plant.doubts.confirm(visit.heliostat, boots)
         return result
 
     async def _learn(
-        self, visit: Visit, taken: Photographs, tell: Tell, confirming: Confirming, least: int
+        self,
+        visit: Visit,
+        taken: Photographs,
+        tell: Tell,
+        confirming: Confirming,
+        least: int,
+        production: Production | None,
     ) -> CycleResult:
         """Fit all sightings once; push, verify and take a better fit."""
         name, beliefs = visit.heliostat, self._plant.beliefs
+        surface = visit.target.name if production is None else production.surface
         new = [self._sighting(shot, counts) for shot, counts in taken.used]
         known, rejected = beliefs.seen(name), tuple(taken.rejected)
         old = [] if known is None else [known.sightings]
@@ -268,7 +300,7 @@ class CalibrationCycle:
         count = len(every) + beliefs.flights.count(name)
         measured = root_mean_square(beam_errors(beliefs.present(name), here).beam)
         if count < least:
-            beliefs.note(name, visit.target.name, here)
+            beliefs.note(name, surface, here)
             return CycleResult(
                 name,
                 CalibrationOutcome.TOO_FEW_SIGHTINGS,
@@ -283,17 +315,20 @@ class CalibrationCycle:
             model = await self._models.of(name, beliefs.nominal(name), every)
             found = await stepwise(fitting(beliefs, self.settings, model, name, every))
         pushed: tuple[str, ...] = ()
+        if not found.problem and production is not None:
+            found = await self._leaving(visit, found, here, production)
         if not found.problem:
             with self._plant.unverified(name):
                 found, pushed = await self._try(visit, found, here, taken, tell, confirming)
-        if found.problem and (not old or found.outcome is CalibrationOutcome.NOT_VERIFIED):
+        alone = not old and found.outcome is not CalibrationOutcome.UNCHANGED
+        if found.problem and (alone or found.outcome is CalibrationOutcome.NOT_VERIFIED):
             # No earlier sighting supports these, or a later photograph contradicts them: drop them.
             text = f"unchanged: {found.problem}"
             count = 0 if known is None else len(known)
             return CycleResult(
                 name, found.outcome, text, rejected, count, 0, np.nan, found.before, found.after
             )
-        beliefs.note(name, visit.target.name, here)
+        beliefs.note(name, surface, here)
         record = None if found.problem else self._take(visit, found, pushed)
         better = f"beam error {1e3 * found.before:.2f} to {1e3 * found.after:.2f} mrad RMS"
         return CycleResult(
@@ -311,6 +346,31 @@ class CalibrationCycle:
             record,
         )
 
+    def _sure(self, found: JudgedFit, here: Sightings) -> bool:
+        """Return whether a fit needs no photograph that confirms it."""
+        beliefs, settings = self._plant.beliefs, self.settings
+        last, present = beliefs.record(found.name), beliefs.present(found.name)
+        # Photographs that the calibration did not expect show a step of the mirror, or other light.
+        sure = last is not None and surprise_of(last, found.nominal, here) <= settings.agreement
+        return sure and change_of(present, found.mechanism, found.seen) <= settings.large
+
+    async def _leaving(
+        self, visit: Visit, found: JudgedFit, here: Sightings, production: Production
+    ) -> JudgedFit:
+        """Return a fit for whose parameters a heliostat has left production, or why it has not."""
+        if not self._sure(found, here):
+            text = "a photograph on a target must confirm the new parameters; calibrate it there"
+            return replace(found, outcome=CalibrationOutcome.NOT_VERIFIED, problem=text)
+        present = self._plant.beliefs.present(found.name)
+        change = change_of(present, found.mechanism, here)
+        if change >= production.worth:
+            await production.leave(visit)
+            return found
+        text = (
+            f"new parameters would move its beam by {1e3 * change:.2f} mrad; it stays in production"
+        )
+        return replace(found, outcome=CalibrationOutcome.UNCHANGED, problem=text)
+
     async def _try(
         self,
         visit: Visit,
@@ -323,10 +383,7 @@ class CalibrationCycle:
         """Push a fit and verify it; return it, with why it was withdrawn, and the items pushed."""
         name, plant = visit.heliostat, self._plant
         present, new = plant.beliefs.present(name), found.mechanism
-        settings, last = self.settings, plant.beliefs.record(name)
-        # Photographs that the calibration did not expect show a step of the mirror, or other light.
-        sure = last is not None and surprise_of(last, found.nominal, here) <= settings.agreement
-        sure = sure and change_of(present, new, found.seen) <= settings.large
+        sure = self._sure(found, here)
         try:
             pushed = await self._push(visit, new[0], f"fit of {len(found.seen)} sightings")
             if sure:

@@ -34,14 +34,11 @@ from heliotrope.plant.visits.gathering import Gathering, Waiting
 from heliotrope.plant.visits.joint_layout import Layout, arranged, verifying
 from heliotrope.plant.visits.joint_visit import JointVisit
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
-from heliotrope.plant.visits.stacks import StackCamera, TargetLight, stack_of
+from heliotrope.plant.visits.stack_counts import counts_at_rest
+from heliotrope.plant.visits.stacks import StackCamera, TargetLight, noting, stack_of
 from heliotrope.plant.visits.verification import Confirming
 from heliotrope.plant.visits.visit import Visit
 
-#: Step counts that differ from those of the ordered movements by this share of them do not follow.
-_FOLLOWS = 0.5
-#: Rows of step counts that a sighting needs.
-_LEAST_ROWS = 3
 #: Sightings that a first fit needs: all photographs of a stack agree, and a second one verifies it.
 _FIRST = 1
 #: Verdicts that are no mirror's fault: a verification that ends so is made again, once.
@@ -224,22 +221,7 @@ class JointCycle:
 
     async def _light(self, joint: JointVisit, layout: Layout, empty: TargetLight) -> TargetLight:
         """Photograph the target, and go on noting step counts meanwhile."""
-        made: list[TargetLight | HeliotropeError] = []
-
-        async def look() -> None:
-            while True:
-                await joint.look()
-
-        async with asyncio.TaskGroup() as group:
-            looking = group.create_task(look())
-            try:
-                made.append(await self._camera.light(layout.target, empty.view))
-            except HeliotropeError as error:
-                made.append(error)  # a group would wrap it
-            looking.cancel()
-        if isinstance(made[0], HeliotropeError):
-            raise made[0]
-        return made[0]
+        return await noting(joint.look, self._camera.light(layout.target, empty.view))
 
     async def _separated(
         self, joint: JointVisit, layout: Layout, empty: TargetLight, taken: _Taken, tell: Tell
@@ -262,7 +244,11 @@ class JointCycle:
             if beam.verdict is not Verdict.PROVEN:
                 results[name] = _not_proven(name, beam)
                 continue
-            counts = self._counts(joint.visits[name], layout.aims[i], layout, i, taken)
+            still = [
+                (begin, end, layout.aims[i] + layout.moves[number, i] @ layout.target.axes)
+                for begin, end, number in taken.still
+            ]
+            counts = counts_at_rest(joint.visits[name], layout.aims[i], still, _middle(pictures))
             if isinstance(counts, str):
                 text = f"unchanged: {counts}"
                 results[name] = CycleResult(name, CalibrationOutcome.NOT_PROVEN, text)
@@ -397,40 +383,6 @@ class JointCycle:
         except HeliotropeError as error:
             text = f"{type(error).__name__}: {error}"
             return CycleResult(name, CalibrationOutcome.ERROR, text)
-
-    def _counts(
-        self, visit: Visit, base: FloatArray, layout: Layout, i: int, taken: _Taken
-    ) -> FloatArray | str:
-        """Return the step counts of a heliostat at its aim without movement, (2,), or why not.
-
-        The local controller reports counts while it stands still for a photograph. They differ from
-        those that the aim of the photograph asks for by what its tracking lags; the median of
-        the differences belongs to all of them.
-        """
-        plant, axes = self._plant, layout.target.axes
-        times, counts = visit.counted
-        rows, aims = [], []
-        for begin, end, number in taken.still:
-            for r in np.flatnonzero((times >= begin) & (times <= end)):
-                rows.append(int(r))
-                aims.append(base + layout.moves[number, i] @ axes)
-        if len(rows) < _LEAST_ROWS:
-            return f"its step counts were heard {len(rows)} times at its aims; {_LEAST_ROWS} needed"
-        now = plant.now()
-        middle = _middle(list(taken.pictures))
-        when = [*times[rows], middle]
-        suns = np.stack([plant.sun_vector(float(at) - now) for at in when])
-        heard = np.concatenate([counts[rows], counts[rows[-1:]]])
-        which = np.full(len(when), visit.row, dtype=np.intp)
-        ordered = plant.beams.poses(which, np.array([*aims, base]), suns, heard).best_counts
-        still = plant.beams.poses(which, np.tile(base, (len(when), 1)), suns, heard).best_counts
-        off = counts[rows] - ordered[:-1]
-        # Medians: a drive with play overshoots for a moment when it turns back.
-        lag = np.median(off, axis=0)
-        loose = float(np.median(np.abs(off - lag).max(axis=-1)))
-        if not loose <= _FOLLOWS * float(np.median(np.abs((ordered - still)[:-1]).max(axis=-1))):
-            return "its step counts do not follow the movements of its aim"
-        return np.asarray(still[-1] + lag)
 
     async def _back(self, visits: dict[str, Visit], before: "dict[str, _Before]") -> None:
         """Send those that tracked back to their aims, as far as they are at standby."""

@@ -1,11 +1,13 @@
 """Photographs of a target for a stack: its light, seen from the front, without a reading."""
 
-from collections.abc import Callable, Sequence
+import asyncio
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 import numpy as np
 
+from heliotrope.errors import HeliotropeError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Stack
@@ -96,3 +98,29 @@ class StackCamera(TargetCamera, Protocol):
     async def beside(self, work: Callable[[], T]) -> T:
         """Return the result of a computation that must not hold up the loop."""
         ...
+
+
+async def noting(look: Callable[[], Awaitable[None]], made: Awaitable[T]) -> T:
+    """Return what is made, and look at the heliostats again and again meanwhile.
+
+    Raises
+    ------
+    HeliotropeError
+        As what is made raises it.
+    """
+    found: list[T | HeliotropeError] = []
+
+    async def looks() -> None:
+        while True:
+            await look()
+
+    async with asyncio.TaskGroup() as group:
+        looking = group.create_task(looks())
+        try:
+            found.append(await made)
+        except HeliotropeError as error:
+            found.append(error)  # a group would wrap it
+        looking.cancel()
+    if isinstance(found[0], HeliotropeError):
+        raise found[0]
+    return found[0]

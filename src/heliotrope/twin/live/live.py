@@ -24,6 +24,7 @@ from heliotrope.errors import InputError
 from heliotrope.field.example import roughly_installed
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
+from heliotrope.field.target import Target
 from heliotrope.files.disk import Disk
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.synthetic.scenes import Scene
@@ -221,6 +222,8 @@ class World:
                     "to the plant file, or take exact centroids"
                 )
             scenes.append(Scene(cameras[0], (target,)))
+        if (visits := self.design.receiver_visits) is not None:
+            scenes += [Scene(self.design.camera(visits.camera), (face,)) for face in self._faces]
         # Malan's small mirrors are of one piece.
         optics = Optics(facets=(1, 1))
         return RenderedCamera(sight, scenes, optics=optics, seed=seed, threads=self.options.threads)
@@ -267,10 +270,16 @@ class World:
         """Return the mirrors whose light may be on a target."""
         light, stand = self.sun(), self.field.stand()
         found: dict[str, TrueMirror] = {}
-        for target in self.design.targets:
+        for target in (*self.design.targets, *self._faces):
             for mirror in mirrors_near(target, light, stand, self.names, self._sizes):
                 found[mirror.heliostat] = mirror
         return list(found.values())
+
+    @property
+    def _faces(self) -> tuple[Target, ...]:
+        """The face of the receiver on which mirrors in production are measured."""
+        visits = self.design.receiver_visits
+        return () if visits is None else (self.design.receiver(visits.receiver).face,)
 
     def errors(self) -> FloatArray:
         """Return the true tracking errors at the design's aims, rad, (N,), in the plant's order."""

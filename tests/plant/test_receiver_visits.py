@@ -1,0 +1,391 @@
+"""Receiver visits: mirrors in production, measured on the receiver by small coded movements.
+
+Mirrors drive, clusters poll and the plant commands as in operation; only the light is drawn by the
+simulated camera, from where the mirrors truly stand.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from functools import partial
+
+import numpy as np
+import pytest
+
+from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
+from heliotrope.errors import InputError
+from heliotrope.field import ReceiverSettings
+from heliotrope.field.example import roughly_installed
+from heliotrope.field.layout_tower import watching_camera
+from heliotrope.field.layouts import malan_plant
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import bisector, reflect
+from heliotrope.imaging.coded import SeparatedBeam, Verdict
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.beam_watch import BeamError
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.visits import CalibrationCycle, Centring, CycleResult, CycleSettings
+from heliotrope.plant.visits.receiver_cycle import ReceiverCycle, judged
+from support.live import LiveOptions, LivePlant
+
+START = datetime(2026, 10, 21, 7, tzinfo=UTC)
+ENGINEER, OPERATOR = Person("Egon", Role.ENGINEER), Person("Olga", Role.OPERATOR)
+BIASES = ("azimuth_bias", "elevation_bias")
+#: One sighting is fitted, which the plant's own settings would not do.
+CYCLE = CycleSettings(least=1, model=BIASES, sigma=2e-4)
+
+
+def design_of(count: int, **chosen: float) -> Plant:
+    """A plant whose receiver is seen by a camera."""
+    plain = malan_plant(count)
+    face = plain.receivers[0].face
+    # Far above the ground the camera would look along the aperture: it stands in front of it.
+    camera = replace(watching_camera(face, "eye", 120.0, 30.0, 10.0), targets=("left",))
+    settings = ReceiverSettings("eye", face.name, **{"power": 0.01} | chosen)  # type: ignore[arg-type]
+    return replace(plain, cameras=(*plain.cameras, camera), receiver_visits=settings)
+
+
+@dataclass
+class Scene:
+    """A plant whose heliostats track the receiver, and an engineer in command."""
+
+    live: LivePlant
+    cycle: ReceiverCycle
+    token: int
+    stages: list[str] = field(default_factory=list)
+    during: Callable[[str], None] = lambda _: None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.live.plant.field.names
+
+    async def run(self, *names: str) -> dict[str, CycleResult]:
+        found = await self.cycle.run(ENGINEER, self.token, names or self.names, self.tell)
+        return {result.heliostat: result for result in found}
+
+    def tell(self, stage: str) -> None:
+        self.stages.append(stage)
+        self.during(stage)
+
+    def photographs(self) -> int:
+        return sum(stage.startswith("photograph") for stage in self.stages)
+
+    def states(self) -> dict[str, str]:
+        rows = self.live.plant.field.rows["state"]
+        return {name: states.STATES[rows[i]] for i, name in enumerate(self.names)}
+
+    async def until(self, what: Callable[[], bool], limit: float = 600.0) -> None:
+        end = self.live.clock.monotonic() + limit
+        while not what():
+            assert self.live.clock.monotonic() < end, self.states()
+            await asyncio.sleep(0.5)
+
+    def tracking(self) -> bool:
+        field_, now = self.live.plant.field, self.live.plant.now()
+        return bool(field_.among((states.TRACKING,), now).all())
+
+
+def production(
+    scene: Callable[[Scene], Awaitable[None]], count: int = 6, *, rendered: bool = False
+) -> None:
+    """Play a scene in virtual time: the beams stand about the middle of the receiver."""
+
+    async def main(clock: VirtualClock) -> None:
+        options = LiveOptions(
+            rendered=rendered,
+            threads=0,
+            installed=partial(roughly_installed, seed=3, scale=0.03),
+            work=AutomaticSettings(wanted=True, calibrate=False),
+            cycle=CYCLE,
+        )
+        live = LivePlant(design_of(count), clock, options)
+        plant = live.plant
+        async with live.running():
+            try:
+                whole = CalibrationCycle(plant, live.cameras, CYCLE, Centring())
+                assert live.design.receiver_visits is not None
+                cycle = ReceiverCycle(plant, live.cameras, whole, live.design.receiver_visits)
+                here = Scene(live, cycle, 0)
+                await here.until(here.tracking)
+                await live.operations.automatic.halt()
+                believe(live, 3e-4)
+                here.token = plant.take_authority(ENGINEER).token
+                await _in_command(here, scene)
+            finally:
+                await live.operations.automatic.halt()
+                await live.end()
+
+    run_virtual(main, start=START)
+
+
+async def _in_command(made: Scene, scene: Callable[[Scene], Awaitable[None]]) -> None:
+    plant = made.live.plant
+
+    async def stay() -> None:
+        while True:
+            if plant.authority.token == made.token:
+                plant.authority.keep(ENGINEER, made.token)
+            await asyncio.sleep(1.0)
+
+    async with asyncio.TaskGroup() as group:
+        staying = group.create_task(stay())
+        try:
+            turn = 2.0 * np.pi * np.arange(len(made.names)) / len(made.names)
+            places = 1.5 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+            aims = dict(zip(made.names, made.cycle.face.point(places), strict=True))
+            await asyncio.sleep(3.0)  # the clusters hear of the command authority
+            ticket = plant.aim(ENGINEER, made.token, aims)
+            assert await ticket.end(60.0), ticket.text
+            await asyncio.sleep(20.0)
+            await scene(made)
+        finally:
+            staying.cancel()
+
+
+def believe(live: LivePlant, sigma: float) -> None:
+    """Take all mirrors for calibrated, their zeros within ``sigma``, rad."""
+    at, spread = live.clock.utc().timestamp(), np.diag([sigma**2, sigma**2])
+    for name in live.plant.field.names:
+        record = HeliostatCalibration(name, at, BIASES, np.zeros(2), spread, np.full(2, 5e-3))
+        live.plant.beliefs.take(record)
+
+
+def test_mirrors_in_production_are_calibrated_where_they_shine() -> None:
+    async def scene(here: Scene) -> None:
+        plant = here.live.plant
+        aims, before = plant.aims.copy(), here.live.errors()
+        lowest = [1.0]
+        flux = here.live.world.flux
+        assert flux is not None
+        full = flux.share()
+        here.during = lambda stage: (
+            lowest.append(flux.share() / full) if stage.startswith("photograph") else None
+        )
+        results = await here.run()
+        assert here.photographs() == 16, "six mirrors, each with a code of its own"
+        assert min(lowest) > 0.99, "the beams stay on the receiver"
+        for name, result in results.items():
+            assert result.verdict is None, result
+            assert result.new == 1, result
+            seen, row = plant.beliefs.seen(name), here.live.names.index(name)
+            assert seen is not None
+            assert seen.targets == ("receiver",)
+            true = here.live.truth[np.array([row])]
+            assert beam_errors(true, seen.sightings).beam[0] < 0.5e-3, "what it saw is true"
+        changed = [r.outcome is CalibrationOutcome.CALIBRATED for r in results.values()]
+        assert any(changed)
+        await here.until(here.tracking)
+        np.testing.assert_array_equal(plant.aims, aims)
+        assert not plant.movements.names
+        await asyncio.sleep(20.0)
+        after = here.live.errors()
+        assert np.median(after[changed]) < np.median(before[changed])
+
+    production(scene)
+
+
+def spoil(scene: Scene, stuck: str = "", traded: tuple[str, ...] = (), cloudy: str = "") -> None:
+    """From the first photograph on a mirror stands still, two send their beams crosswise.
+
+    A cloud stands over a fourth one all the time: none of its light comes.
+    """
+    live, face = scene.live, scene.cycle.face
+    true, held = live.field.stand, {}
+    aims = live.plant.aims.copy()
+
+    def stand() -> tuple[np.ndarray, np.ndarray]:
+        normals, vertices = (np.array(each) for each in true())
+        if cloudy:
+            normals[live.names.index(cloudy)] = (0.0, 0.0, -1.0)
+        if scene.photographs():
+            light = live.world.sun()
+            if stuck:
+                row = live.names.index(stuck)
+                normals[row] = held.setdefault(stuck, normals[row].copy())
+            rows = [live.names.index(name) for name in traded]
+            points = face.intersect(vertices, reflect(light, normals))
+            places = [live.plant.field.place(name) for name in traded]
+            for row, mine, other in zip(rows, places, places[::-1], strict=True):
+                there = points[row] + aims[other] - aims[mine]
+                way = there - vertices[row]
+                normals[row] = bisector(light, way / np.linalg.norm(way))
+        return normals, vertices
+
+    live.field.stand = stand  # type: ignore[method-assign]
+
+
+def test_drawn_photographs_prove_nothing_of_a_stuck_mirror_or_an_exchanged_pair() -> None:
+    async def scene(here: Scene) -> None:
+        plant = here.live.plant
+        stuck, one, other, shaded = (here.names[i] for i in (1, 2, 5, 6))
+        spoil(here, stuck, (one, other), shaded)
+        version = {name: plant.beliefs.record(name) for name in here.names}
+        results = await here.run()
+        bad = {name: r.verdict for name, r in results.items() if r.verdict is not None}
+        assert bad == {
+            stuck: Verdict.FAINT,
+            one: Verdict.EXCHANGED,
+            other: Verdict.EXCHANGED,
+            shaded: Verdict.FAINT,
+        }, results
+        assert f"({other})" in results[one].text
+        for name in bad:
+            assert results[name].outcome is CalibrationOutcome.NOT_PROVEN
+            assert plant.beliefs.record(name) is version[name], "nothing is pushed"
+            assert plant.beliefs.seen(name) is None
+        good = [r for name, r in results.items() if name not in bad]
+        assert all(r.new == 1 for r in good), results
+
+    production(scene, 7, rendered=True)
+
+
+def test_an_emergency_another_person_or_a_cloud_ends_it_with_the_aims_as_they_were() -> None:
+    async def scene(here: Scene) -> None:
+        plant, camera = here.live.plant, here.live.cameras
+        aims = plant.aims.copy()
+
+        # Another person takes the command authority: the beams go back under it.
+        def at_fourth(act: Callable[[], object]) -> Callable[[str], None]:
+            return lambda stage: act() and None if stage.startswith("photograph 4 ") else None
+
+        def handed_over() -> None:
+            assert np.abs(plant.aims - aims).max() > 0.05, "the beams are beside their aims"
+            plant.release_authority(ENGINEER, here.token)
+            plant.take_authority(OPERATOR)
+
+        here.during = at_fourth(handed_over)
+        with pytest.raises(RefusedError, match="Olga"):
+            await here.run()
+        await here.until(lambda: not plant.movements.names, 30.0)
+        np.testing.assert_array_equal(plant.aims, aims)
+        assert here.tracking(), "production goes on"
+        plant.release_authority(OPERATOR, plant.authority.token)
+        here.token = plant.take_authority(ENGINEER).token
+        await asyncio.sleep(3.0)
+
+        # A cancelled task: nobody waits, the plant takes the beams back.
+        here.stages.clear()
+        here.during = lambda _: None
+        task = asyncio.create_task(here.run())
+        await here.until(lambda: here.photographs() >= 3)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        await here.until(lambda: not plant.movements.names, 30.0)
+        np.testing.assert_array_equal(plant.aims, aims)
+
+        # A cloud over the whole field.
+        here.stages.clear()
+        real = camera.light
+
+        async def clouded(*given: object) -> object:
+            seen = await real(*given)  # type: ignore[arg-type]
+            shade = 0.3 if here.photographs() > 5 else 1.0
+            return replace(seen, values=seen.values * shade)
+
+        camera.light = clouded  # type: ignore[method-assign, assignment]
+        results = await here.run()
+        assert {r.verdict for r in results.values()} == {Verdict.CLOUD}
+        camera.light = real  # type: ignore[method-assign]
+
+        # An emergency in the middle of a movement goes before everything.
+        here.stages.clear()
+        here.during = at_fourth(lambda: plant.raise_emergency("anybody"))
+        with pytest.raises(RefusedError, match="emergency"):
+            await here.run()
+        await asyncio.sleep(10.0)
+        assert set(here.states().values()) == {"DEFOCUSED"}
+        assert plant.movements.names, "no order follows an emergency"
+        plant.withdraw_emergency(ENGINEER)
+        await asyncio.sleep(4.0)
+        plant.acknowledge(ENGINEER, "operator_emergency")
+        await here.until(lambda: not plant.movements.names, 60.0)
+        np.testing.assert_array_equal(plant.aims, aims)
+        left = set(here.states().values())
+        assert left <= {"DEFOCUSED", "STOWING", "STOWED"}, "nothing returns by itself after it"
+        assert all(plant.beliefs.seen(name) is None for name in here.names)
+
+    production(scene)
+
+
+def test_a_movement_is_refused_that_leaves_the_receiver_or_its_neighbourhood() -> None:
+    async def scene(here: Scene) -> None:
+        plant, face = here.live.plant, here.cycle.face
+        name = here.names[0]
+        row = plant.field.place(name)
+        aim = plant.aims[row].copy()
+        beside = {name: aim + 0.6 * face.axes[0]}
+        with pytest.raises(BeamError, match="a movement has 3 mrad at most"):
+            plant.move(ENGINEER, here.token, beside)
+        small = aim + 0.1 * face.axes[0]
+        stowed = here.names[1]
+        assert await plant.stow("Vera", (stowed,)).end(300.0)
+        with pytest.raises(BeamError, match="it does not track the receiver"):
+            plant.move(ENGINEER, here.token, {stowed: small})
+        assert await plant.move(ENGINEER, here.token, {name: small}).end(30.0)
+        np.testing.assert_array_equal(plant.aims[row], small)
+        # A new aim of a person is not undone.
+        other = face.point((0.5, 0.5))
+        assert await plant.aim(ENGINEER, here.token, {name: other}).end(30.0)
+        assert not plant.movements.names
+        # Nobody renews the movement: after a while the beam goes back.
+        assert await plant.move(ENGINEER, here.token, {name: other + 0.1 * face.axes[1]}).end(30.0)
+        await here.until(lambda: not plant.movements.names, 200.0)
+        np.testing.assert_array_equal(plant.aims[row], other)
+        edge = face.point((3.45, 0.0))
+        assert await plant.aim(ENGINEER, here.token, {name: edge}).end(30.0)
+        with pytest.raises(BeamError, match="not on a planar receiver"):
+            plant.move(ENGINEER, here.token, {name: face.point((3.55, 0.0))})
+        results = await here.run(name, stowed)
+        assert "inside the edge of receiver" in results[name].text
+        assert "does not track receiver" in results[stowed].text
+
+    production(scene, 2)
+
+
+def test_a_beam_too_bright_or_too_dim_for_its_mirror_is_joined_with_other_light() -> None:
+    def beam(name: str, power: float, verdict: Verdict = Verdict.PROVEN) -> SeparatedBeam:
+        at = np.zeros(2)
+        return SeparatedBeam(name, verdict, at, np.eye(2), np.eye(2), power, np.nan, np.nan)
+
+    powers = np.array([1.0, 1.0, 2.0, 1.0, 1.0])
+    seen = [beam("A", 5.0), beam("B", 5.2), beam("C", 9.9), beam("D", 9.0)]
+    found = judged([*seen, beam("E", 0.0, Verdict.FAINT)], powers)
+    proven = Verdict.PROVEN
+    verdicts = [proven, proven, proven, Verdict.JOINED, Verdict.FAINT]
+    assert [b.verdict for b in found] == verdicts
+    assert found[2].gain == pytest.approx(4.95 / 5.1)
+    dim = judged([*seen[:3], beam("D", 2.0)], powers[:4])
+    assert dim[3].verdict is Verdict.JOINED
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"least": 9, "most": 8}, "9 to 8 heliostats"),
+        ({"movement": 0.003}, "movements of 3 mrad"),
+        ({"power": 0.02}, "cost 2 % of the power; give above 0 to 1 %"),
+        ({"known": 0.0}, "known to 0 mrad"),
+        ({"steady": 0.9}, "changes by 90 %"),
+        ({"again": 0.5}, "0.5 times the photographs"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(wrong: dict[str, float], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        ReceiverSettings("eye", "receiver", **wrong)  # type: ignore[arg-type]
+
+
+def test_a_plant_refuses_receiver_visits_without_a_camera_or_a_face() -> None:
+    whole = design_of(2)
+    unplaced = tuple(replace(c, position=None, R_enu_camera=None) for c in whole.cameras)
+    with pytest.raises(InputError, match="its position is not known"):
+        replace(whole, cameras=unplaced)
+    around = replace(whole.receivers[0], kind="external_cylinder")
+    with pytest.raises(InputError, match="only a planar one has a face"):
+        replace(whole, receivers=(around,))
+    face = replace(whole.receivers[0], corners=None).face
+    np.testing.assert_allclose(face.corners, whole.receivers[0].face.corners, atol=1e-9)
