@@ -16,7 +16,7 @@ from benchmarks._run import BUSY, BenchmarkError, Neighbours, keep, machine
 NAMES = (
     "tracking", "calibration", "imaging", "sun", "field", "startup", "bus", "frames", "clusters",
     "control", "plant", "airborne", "console", "day", "learning", "signing",
-    "splits", "coded", "commission", "drifting", "obstruction", "floor",
+    "splits", "coded", "production", "commission", "drifting", "obstruction", "floor",
 )  # fmt: skip
 #: Width of a table that goes to a file or a pipe, characters.
 WIDTH = 180

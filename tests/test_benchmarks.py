@@ -70,6 +70,10 @@ COLUMNS = {
         "learner_on_drawn_within_90", "oracle_mrad", "oracle_low_mrad", "oracle_high_mrad",
         "visit_mrad", "photograph_mrad", "constants_mrad",
     },
+    "production": {
+        "field", "mirrors", "photographs", "seen", "rms_mrad", "worst_mrad", "within_90",
+        "power_lost_share", "production_m2", "stack_s", "visit_s", "cpu_s", "changed",
+    },
     "obstruction": {
         "distance_m", "hidden", "predicted_right_mrad", "predicted_up_mrad", "read_right_mrad",
         "read_up_mrad", "left_mrad", "left_of_flux_mrad",
@@ -119,8 +123,11 @@ def _no_number(text: str) -> float:
 
 @pytest.mark.parametrize(
     "name",
-    # A browser, fifty viewers and a plant take their time.
-    [pytest.param(n, marks=pytest.mark.slow) if n == "console" else n for n in COLUMNS],
+    # A browser with fifty viewers, and plants, take their time.
+    [
+        pytest.param(n, marks=pytest.mark.slow) if n in ("console", "production") else n
+        for n in COLUMNS
+    ],
 )
 def test_quick_run_gives_json(name: str) -> None:
     result = _quick(name)

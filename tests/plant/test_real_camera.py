@@ -15,7 +15,9 @@ import pytest
 
 from heliotrope.errors import FetchError, InputError
 from heliotrope.field.plant import Plant
+from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.stellenbosch import prototype
+from heliotrope.field.target import Receiver
 from heliotrope.geometry import normalize
 from heliotrope.imaging.files import read_image, write_image
 from heliotrope.imaging.frame import Frame
@@ -27,6 +29,7 @@ from heliotrope.imaging.sources import (
     open_source,
 )
 from heliotrope.imaging.synthetic.scenes import Scene
+from heliotrope.imaging.targets.view import posed_view
 from heliotrope.links.clock import SystemClock
 from heliotrope.plant.cameras import RealCameras, source_of
 from heliotrope.safety import Alarm
@@ -282,3 +285,32 @@ def test_the_light_on_a_target_is_seen_from_its_front(plant: Plant, frame: Frame
             asyncio.run(cameras.light(target))
     finally:
         cameras.close()
+
+
+def test_the_camera_of_a_receiver_serves_it_and_no_target(plant: Plant, frame: Frame) -> None:
+    target, (camera,) = plant.targets[0], plant.cameras
+    # A receiver in the place of the target, seen by a camera that names no target.
+    receiver = Receiver(
+        "receiver", "planar", target.center, target.normal, target.width, target.height
+    )
+    lit = replace(camera, name="lit", targets=())
+    settings = ReceiverSettings("lit", "receiver")
+    whole = replace(plant, cameras=(lit, camera), receivers=(receiver,), receiver_visits=settings)
+    cameras = RealCameras(whole, Path(), SystemClock(), sources=Scripted(frame))
+    cameras.start(unheard)
+    try:
+        assert cameras.eye(target.name).name == camera.name
+        assert cameras.eye("receiver").name == "lit"
+        light = asyncio.run(cameras.light(receiver.face, posed_view(lit, receiver.face)))
+        shown = np.where(light.seen, light.values, 0.0)
+        row, column = np.unravel_index(int(np.argmax(shown)), shown.shape)
+        place = light.first + light.step * np.array([column, -row])
+        assert place == pytest.approx([OFF, 0.0], abs=0.2)
+        deviation = np.sqrt(np.trace(light.covariance_at(place)))
+        per_metre = np.sqrt(abs(np.linalg.det(light.view.scale(light.shift))))  # type: ignore[union-attr]
+        assert deviation == pytest.approx(0.33 * np.sqrt(2.0) / per_metre, rel=0.3)
+    finally:
+        cameras.close()
+    away = replace(lit, R_enu_camera=lit.R_enu_camera @ np.diag([-1.0, 1.0, -1.0]))  # type: ignore[operator]
+    with pytest.raises(InputError, match="receiver is not in front of it"):
+        posed_view(away, receiver.face)

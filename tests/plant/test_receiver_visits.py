@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.production import ProductionVisits
 from heliotrope.plant.visits import CalibrationCycle, Centring, CycleResult, CycleSettings
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle, judged
 from support.live import LiveOptions, LivePlant
@@ -90,7 +92,11 @@ class Scene:
 
 
 def production(
-    scene: Callable[[Scene], Awaitable[None]], count: int = 6, *, rendered: bool = False
+    scene: Callable[[Scene], Awaitable[None]],
+    count: int = 6,
+    *,
+    rendered: bool = False,
+    least: int = 8,
 ) -> None:
     """Play a scene in virtual time: the beams stand about the middle of the receiver."""
 
@@ -102,7 +108,7 @@ def production(
             work=AutomaticSettings(wanted=True, calibrate=False),
             cycle=CYCLE,
         )
-        live = LivePlant(design_of(count), clock, options)
+        live = LivePlant(design_of(count, least=least), clock, options)
         plant = live.plant
         async with live.running():
             try:
@@ -345,6 +351,105 @@ def test_a_movement_is_refused_that_leaves_the_receiver_or_its_neighbourhood() -
         assert "does not track receiver" in results[stowed].text
 
     production(scene, 2)
+
+
+def test_automatic_control_measures_those_that_track_the_receiver() -> None:
+    async def scene(here: Scene) -> None:
+        plant, operations, names = here.live.plant, here.live.operations, here.names
+        plant.release_authority(ENGINEER, here.token)
+        operations.automatic.want(names, wanted=True)
+        operations.automatic.switch(on=True)
+        await here.until(lambda: operations.calibration().on)
+        operations.calibrate(ENGINEER, names[4], together=names[2:4], receiver=True)
+        assert operations.calibration().asked == (names[4], *names[2:4])
+        with pytest.raises(RefusedError, match="no beam is searched for"):
+            operations.calibrate(ENGINEER, names[0], search=True, receiver=True)
+        seen: set[str] = set()
+
+        def told() -> list[str]:
+            for one in operations.calibration().running:
+                if one.target == "receiver":
+                    seen.update(one.heliostats)
+            events = here.live.assembly.logbook.events(100)
+            return [e.text for e in events if e.who == "receiver"]
+
+        await here.until(lambda: len(told()) > 0)
+        assert seen == set(names[2:5]), "what a person asked for comes first"
+        assert told() == ["receiver visit: 3 of 3 heliostats proven together"]
+        # The others are measured by themselves; who was measured already waits for its time.
+        await here.until(lambda: len(told()) > 1, 1200.0)
+        assert all(plant.beliefs.count(name) for name in names)
+        operations.automatic.switch(on=False)
+
+    production(scene, least=1)
+
+
+class Rows(SimpleNamespace):
+    """A field of six."""
+
+    def __len__(self) -> int:
+        return 6
+
+
+def chooser(error: float = 1e-3, **chosen: float) -> tuple[ProductionVisits, SimpleNamespace]:
+    """Six heliostats that track the receiver, and the plant's clock."""
+    names = tuple("ABCDEF")
+    face = malan_plant(1).receivers[0].face
+    clock = SimpleNamespace(at=1000.0)
+    everyone = np.ones(6, dtype=np.bool_)
+    plant = SimpleNamespace(
+        field=Rows(names=names, place=names.index, among=lambda *_: everyone),
+        aims=np.tile(face.center, (6, 1)),
+        now=lambda: clock.at,
+    )
+    settings = ReceiverSettings("eye", "receiver", **({"most": 4, "least": 2} | chosen))  # type: ignore[arg-type]
+    cycle = SimpleNamespace(settings=settings, face=face)
+    book = SimpleNamespace(error=np.full(6, error))
+    made = ProductionVisits(plant, book, cycle)  # type: ignore[arg-type]
+    return made, clock
+
+
+def told(name: str, verdict: Verdict | None = None, new: int = 1) -> CycleResult:
+    return CycleResult(name, CalibrationOutcome.UNCHANGED, "x", new=new, verdict=verdict)
+
+
+def test_those_whose_errors_may_be_largest_are_measured_first_and_then_wait() -> None:
+    made, clock = chooser()
+    ready = np.ones(6, dtype=np.bool_)
+    made._book.error[[2, 5]] = 1.4e-3
+    made._book.error[0] = np.nan
+    assert made.chosen(ready) == ("C", "F", "B", "D")
+    made._book.error[1] = 1.6e-3  # its beam may be off by more than three quarters of 4 mrad
+    assert made.chosen(ready) == ("C", "F", "D", "E")
+    assert made.concluded([told(n) for n in "CFDE"]) == ()
+    assert made.chosen(ready) == ()
+    clock.at += 7200.0
+    assert len(made.chosen(ready)) == 4
+    ready[2:] = False
+    made.ask(("A", "F"))
+    assert made.chosen(ready) == (), "persons wait until all of them track the receiver"
+    ready[5] = True
+    assert made.chosen(ready) == ("A", "F")
+    assert made.asked == ()
+    made.ask(("A", "B"))
+    made.withdraw(("B",))
+    assert made.asked == ("A",)
+
+
+def test_the_odd_ones_go_to_a_target_unless_the_light_is_to_blame() -> None:
+    made, clock = chooser()
+    odd = [told("A"), told("B"), told("C", Verdict.FAINT, 0), told("D", Verdict.EXCHANGED, 0)]
+    assert made.concluded(odd) == ("C", "D")
+    surprise = CycleResult("E", CalibrationOutcome.NOT_VERIFIED, "x")
+    assert made.concluded([told("A"), surprise]) == ("E",)
+    clock.at += 7200.0
+    assert made.concluded([told("A"), *(told(n, Verdict.FAINT, 0) for n in "BCD")]) == ()
+    made, clock = chooser()
+    ready = np.ones(6, dtype=np.bool_)
+    assert made.concluded([told(n, Verdict.CLOUD, 0) for n in "ABCD"]) == ()
+    assert made.chosen(ready) == (), "it is tried again after ten minutes"
+    clock.at += 600.0
+    assert len(made.chosen(ready)) == 4
 
 
 def test_a_beam_too_bright_or_too_dim_for_its_mirror_is_joined_with_other_light() -> None:

@@ -363,15 +363,20 @@ def calibrate(
     together: Annotated[
         bool, typer.Option("--together", help="All at once on one target, in a joint visit.")
     ] = False,
+    receiver: Annotated[
+        bool, typer.Option("--receiver", help="All at once where they shine, in production.")
+    ] = False,
 ) -> None:
     """Have automatic control calibrate heliostats next, as soon as a target is free."""
-    if search and together:
-        raise InputError("calibrate: --search looks for one beam; leave out --together")
+    if search and (together or receiver):
+        raise InputError("calibrate: --search looks for one beam; leave out --together, --receiver")
+    if receiver and (together or target):
+        raise InputError("calibrate: --receiver needs no target; leave out --target, --together")
     with _client(context) as client:
-        first = heliostats[:1] if together else heliostats
+        first = heliostats[:1] if together or receiver else heliostats
         for name in first:
-            order = {"heliostat": name, "target": target, "search": search}
-            if together:
+            order = {"heliostat": name, "target": target, "search": search, "receiver": receiver}
+            if together or receiver:
                 order["together"] = heliostats[1:]
             found = client.ask("POST", "calibration/next", order)
     print(f"asked for: {', '.join(found['asked'])}")

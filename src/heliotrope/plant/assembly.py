@@ -35,6 +35,7 @@ from heliotrope.plant.schedule.scheduler import Scheduler
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.joint_cycle import JointCycle
+from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.safety import alarms
 
@@ -126,12 +127,14 @@ class PlantAssembly:
             disk=ports.disk,
         )
         cameras = ports.cameras if design.targets else None
-        cycle = joint = None
+        cycle = joint = receiver = None
         if cameras is not None:
             eye = cameras if ports.pictures is None else KeptCamera(cameras, ports.pictures)
             cycle = CalibrationCycle(self.plant, eye, chosen.cycle, Centring())
             if design.joint_visits is not None:
                 joint = JointCycle(self.plant, cameras, cycle, design.joint_visits)
+            if design.receiver_visits is not None:
+                receiver = ReceiverCycle(self.plant, cameras, cycle, design.receiver_visits)
         self.schedule = None if cycle is None else self._schedule(cycle)
         self.operations = Operations(
             self.plant,
@@ -147,6 +150,7 @@ class PlantAssembly:
             marking=None if cameras is None else self._marking(cameras),
             learner=ports.learner,
             joint=joint,
+            receiver=receiver,
         )
         if chosen.machines is not MachineTables.UNKNOWN:
             self._rest_on_machines()

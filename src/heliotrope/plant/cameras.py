@@ -142,7 +142,8 @@ class RealCameras:
     Parameters
     ----------
     design
-        The plant; the first camera that names a target serves it.
+        The plant; the first camera that names a target serves it. One of receiver visits serves the
+        receiver, and the targets that it names.
     folder
         Folder of the plant file.
     clock
@@ -183,9 +184,16 @@ class RealCameras:
         self._folder, self._views, self._taken = memory, Views(), 0
         self.silent: set[str] = set()
         self._eyes: dict[str, _Eye] = {}
-        for camera, targets in _watching(design.cameras, design.targets):
+        visits = design.receiver_visits
+        lit = None if visits is None else design.camera(visits.camera)
+        watching = [camera for camera in design.cameras if camera is not lit or camera.targets]
+        for camera, targets in _watching(watching, design.targets):
             eye = _Eye(camera, targets, Feed(sources(camera, folder, self._stop)))
             self._eyes |= {target.name: eye for target in targets}
+        if visits is not None and lit is not None:
+            known = [eye for eye in self._eyes.values() if eye.camera is lit]
+            own = known or [_Eye(lit, (), Feed(sources(lit, folder, self._stop)))]
+            self._eyes[visits.receiver] = own[0]
         self._settings = PhotographSettings(pictures=read_pictures(folder, design.targets))
 
     def start(self, on_alarm: Callable[[Alarm], None]) -> None:

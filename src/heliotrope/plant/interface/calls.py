@@ -127,7 +127,12 @@ def _switch(desk: Desk, who: Person, given: orders.Switch, _: bytes) -> Any:
 
 def _calibrate(desk: Desk, who: Person, given: orders.OneCalibration, _: bytes) -> Any:
     desk.operations.calibrate(
-        who, given.heliostat, given.target, search=given.search, together=given.together
+        who,
+        given.heliostat,
+        given.target,
+        search=given.search,
+        together=given.together,
+        receiver=given.receiver,
     )
     return desk.operations.calibration()
 

@@ -89,13 +89,15 @@ class Picture(Strict):
 class OneCalibration(Strict):
     """A heliostat to be calibrated next, and the target ("": any).
 
-    Only its beam is searched; or others are calibrated together with it, in one joint visit.
+    Only its beam is searched; or others are calibrated together with it, in one joint visit; or all
+    are measured on the receiver, in production.
     """
 
     heliostat: Name
     target: Annotated[str, Field(max_length=64)] = ""
     search: bool = False
     together: Annotated[list[Name], Field(max_length=127)] = []
+    receiver: bool = False
 
 
 class OneGroup(Strict):

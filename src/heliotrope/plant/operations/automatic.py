@@ -31,11 +31,13 @@ from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.parties import Parties
 from heliotrope.plant.operations.pictures import Pictures
+from heliotrope.plant.operations.production import ProductionVisits
 from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.operations.service import Service
 from heliotrope.plant.operations.views import CalibrationView, Planned
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.joint_cycle import JointCycle
+from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.safety import alarms
 from heliotrope.store.records import Records
@@ -142,6 +144,7 @@ class AutomaticControl:
         pictures: Pictures | None = None,
         learner: Learner | None = None,
         joint: JointCycle | None = None,
+        receiver: ReceiverCycle | None = None,
     ) -> None:
         self._plant, self._log, self._settings = plant, logbook, settings
         self._on, self._day, self._gave_way_at = settings.calibrate, True, -math.inf
@@ -182,6 +185,7 @@ class AutomaticControl:
                 self.flights.first,
                 pictures,
                 None if joint is None else Parties(plant, self.book, joint, logbook.take_alarm),
+                None if receiver is None else ProductionVisits(plant, self.book, receiver),
             )
             if settings.foresee > 0.0:
                 self._foresight = Foresight(plant, self._keeping, scheduler, settings.foresee)
@@ -212,6 +216,7 @@ class AutomaticControl:
         *,
         search: bool = False,
         together: Sequence[str] = (),
+        receiver: bool = False,
     ) -> None:
         """Calibrate a heliostat before all others; see `Operations.calibrate`."""
         if target:
@@ -221,7 +226,17 @@ class AutomaticControl:
             self._check_calibration(name)
         if self._calibrating is None:
             return
-        if len(names) > 1:
+        if receiver:
+            why = "" if self._calibrating.receiver else "the plant file names no camera for that"
+            why = (
+                "on the receiver no beam is searched for or sent to a target"
+                if search or target
+                else why
+            )
+            if why:
+                raise refusals.NO_CALIBRATION.error(heliostat=heliostat, why=why)
+            self._calibrating.ask_in_production(names)
+        elif len(names) > 1:
             if not self._calibrating.together:
                 why = "the plant file allows no joint visits; ask for one heliostat at a time"
                 raise refusals.NO_CALIBRATION.error(heliostat=heliostat, why=why)
@@ -303,6 +318,9 @@ class AutomaticControl:
                 for target in self._plant.design.targets:
                     visits = self._visits(self._calibrating, target.name)
                     group.create_task(self._again(f"target {target.name}", visits, 1.0))
+                if self._calibrating.receiver:
+                    lit = self._in_production(self._calibrating)
+                    group.create_task(self._again(self._calibrating.receiver, lit, _LOOK_EVERY))
             if self._foresight is not None:
                 look = self._foresee(self._foresight)
                 group.create_task(self._again("prediction", look, POINT_EVERY))
@@ -439,6 +457,15 @@ class AutomaticControl:
             if self._why_not():
                 return
             for name in await calibrating.visit(target, self._ready(), AUTOMATIC, self._token):
+                self._raising.release(name)
+
+        return visit
+
+    def _in_production(self, calibrating: Calibrating) -> Callable[[], Awaitable[None]]:
+        async def visit() -> None:
+            if self._why_not():
+                return
+            for name in await calibrating.in_production(self._ready(), AUTOMATIC, self._token):
                 self._raising.release(name)
 
         return visit

@@ -1,7 +1,7 @@
 """Calibrating the field: one visit after another to each target, as the schedule says."""
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Protocol
 
@@ -11,6 +11,7 @@ import numpy.typing as npt
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.errors import HeliotropeError
 from heliotrope.geometry import FloatArray
+from heliotrope.imaging.coded import Verdict
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
@@ -19,8 +20,10 @@ from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.parties import Parties
 from heliotrope.plant.operations.pictures import Pictures
+from heliotrope.plant.operations.production import ProductionVisits
 from heliotrope.plant.operations.views import CalibrationEntry, Planned, Running
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
+from heliotrope.plant.visits.photographs import Tell
 
 #: Time between computations of the true errors, s.
 _TRUTH_EVERY = 5.0
@@ -99,6 +102,8 @@ class Calibrating:
         Keeps the photographs with the results; None: they are not kept.
     parties
         Heliostats of joint visits; None: there are none.
+    production
+        Heliostats of receiver visits; None: there are none.
     """
 
     def __init__(
@@ -113,8 +118,9 @@ class Calibrating:
         first: Callable[[], Collection[str]],
         pictures: Pictures | None = None,
         parties: Parties | None = None,
+        production: ProductionVisits | None = None,
     ) -> None:
-        self._first, self._parties = first, parties
+        self._first, self._parties, self._production = first, parties, production
         self._plant, self._log, self._cycle, self._scheduler = plant, log, cycle, scheduler
         self._book, self._keeping, self._truth = book, keeping, truth
         self._pictures = pictures
@@ -125,7 +131,8 @@ class Calibrating:
     def asked(self) -> tuple[str, ...]:
         """Heliostats that persons want calibrated next, in the order in which they were asked."""
         together = () if self._parties is None else self._parties.asked
-        return (*self._asked, *together)
+        lit = () if self._production is None else self._production.asked
+        return (*self._asked, *together, *lit)
 
     def ask(self, heliostat: str, target: str, *, search: bool = False) -> None:
         """Calibrate a heliostat before all others, on a target or, for "", on the next free one.
@@ -144,10 +151,22 @@ class Calibrating:
         if self._parties is not None:
             self._parties.ask(heliostats, target)
 
+    @property
+    def receiver(self) -> str:
+        """Name of the receiver on which heliostats in production are measured; "" if none is."""
+        return "" if self._production is None else self._production.surface
+
+    def ask_in_production(self, heliostats: Sequence[str]) -> None:
+        """Calibrate heliostats on the receiver as soon as all of them track it."""
+        if self._production is not None:
+            self._production.ask(heliostats)
+
     def withdraw(self, heliostats: Sequence[str]) -> None:
         """Forget that persons wanted these heliostats calibrated."""
         if self._parties is not None:
             self._parties.withdraw(heliostats)
+        if self._production is not None:
+            self._production.withdraw(heliostats)
         for name in heliostats:
             self._asked.pop(name, None)
 
@@ -171,8 +190,12 @@ class Calibrating:
         """
         if self._parties is not None and not self.asked and self._parties.awaited(target, ready):
             return ()
-        if names := await self._party(target, ready):
-            await self._together(names, target, person, token)
+        if self._parties is not None and (names := await self._party(target, ready)):
+            cycle = self._parties.cycle
+            self._parties.begun(target)
+            await self._together(
+                names, target, lambda tell: cycle.run(person, token, names, target, tell)
+            )
             return names
         name, search = self._chosen(target, ready)
         if not name:
@@ -218,36 +241,58 @@ class Calibrating:
         free = tuple(name for name in names if name not in away)
         return free if len(free) > 1 else ()
 
+    async def in_production(
+        self, ready: npt.NDArray[np.bool_], person: Person, token: int
+    ) -> tuple[str, ...]:
+        """Calibrate those of the ready heliostats (N,) on the receiver that are due; return which.
+
+        One of which something is wrong there is looked at on a target next.
+        """
+        if self._production is None:
+            return ()
+        names, cycle = self._production.chosen(ready & ~self._pressing()), self._production.cycle
+        if not names:
+            return ()
+        results = await self._together(
+            names, self.receiver, lambda tell: cycle.run(person, token, names, tell)
+        )
+        for name in self._production.concluded(results):
+            self.ask(name, "")
+        return names
+
     async def _together(
-        self, names: tuple[str, ...], target: str, person: Person, token: int
-    ) -> None:
-        """Calibrate heliostats on one target at once."""
-        assert self._parties is not None
+        self,
+        names: tuple[str, ...],
+        place: str,
+        visit: Callable[[Tell], Awaitable[tuple[CycleResult, ...]]],
+    ) -> tuple[CycleResult, ...]:
+        """Calibrate heliostats at one place at once."""
         begun, field = self._now(), self._plant.field
 
         def tell(stage: str) -> None:
-            self._running[target] = Running(names[0], target, stage, begun, names[1:])
+            self._running[place] = Running(names[0], place, stage, begun, names[1:])
 
         tell("on the way")
-        self._parties.begun(target)
         truth = [self._truth.now(field.place(name)) for name in names]
         sigma = [float(self._book.error[field.place(name)]) for name in names]
         outcome, said = CalibrationOutcome.REFUSED, ""
         try:
-            results = await self._parties.cycle.run(person, token, names, target, tell)
+            results = await visit(tell)
         except RefusedError as error:
             said = str(error)
         except HeliotropeError as error:
             outcome, said = CalibrationOutcome.ERROR, f"{type(error).__name__}: {error}"
         finally:
-            self._running.pop(target, None)
+            self._running.pop(place, None)
         if said:
             results = tuple(CycleResult(name, outcome, said) for name in names)
         for result, true, expected in zip(results, truth, sigma, strict=True):
-            self._conclude(target, result, true, begun, expected, joint=True)
+            self._conclude(place, result, true, begun, expected, joint=True)
         proven = sum(result.new > 0 for result in results)
         text = f"{proven} of {len(names)} heliostats proven together"
-        self._log.event("calibration", target, f"joint visit: {text}{said and f'; {said}'}")
+        what = "receiver visit" if place == self.receiver else "joint visit"
+        self._log.event("calibration", place, f"{what}: {text}{said and f'; {said}'}")
+        return results
 
     def _pressing(self) -> npt.NDArray[np.bool_]:
         """Return which heliostats are in doubt or changed by a flight, (N,): they go alone."""
@@ -300,10 +345,13 @@ class Calibrating:
             "; ".join((result.text, *result.rejected[:2])),
             0 if record is None else record.version,
         )
-        if self._parties is not None:
+        lit = target == self.receiver
+        if self._parties is not None and not (lit and result.verdict is Verdict.CLOUD):
             self._parties.concluded(result, joint=joint)
         self._book.conclude(entry)
-        self._scheduler.done(entry)
+        # The schedule plans visits to targets: one in production that brings nothing is no failure.
+        if good or not lit:
+            self._scheduler.done(entry)
         self._log.event("calibration", entry.heliostat, f"at {target}: {entry.text}")
         self._keeping.keep(entry, begun, sigma)
         if self._pictures is not None:

@@ -5,7 +5,11 @@ from collections import deque
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.record import HeliostatCalibration, covariances_at
+from heliotrope.calibration.record import (
+    CalibrationOutcome,
+    HeliostatCalibration,
+    covariances_at,
+)
 from heliotrope.calibration.uncertainty import expected_error, precision
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism import parameters as parameter_table
@@ -78,7 +82,7 @@ class CalibrationBook:
         if np.isfinite(entry.measured):
             # The normal is off by half as much as the beam.
             self.measured[row] = 0.5 * entry.measured
-        self.failed += not entry.good
+        self.failed += not (entry.good or entry.outcome is CalibrationOutcome.UNCHANGED)
         self.results.append(entry)
 
     def refresh(self) -> None:

@@ -59,6 +59,7 @@ from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.photographs import Shot
+from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import Act
 from heliotrope.store.records import Records
 
@@ -124,6 +125,8 @@ class Operations:
         Learns groups of mirrors at night; None: nothing is learnt.
     joint
         Calibrates several heliostats on one target; None: each is calibrated alone.
+    receiver
+        Calibrates heliostats in production; None: they go to targets.
 
     Attributes
     ----------
@@ -147,6 +150,7 @@ class Operations:
         marking: Marking | None = None,
         learner: Learner | None = None,
         joint: JointCycle | None = None,
+        receiver: ReceiverCycle | None = None,
     ) -> None:
         self.plant, self.logbook, self.pictures, self.marking = plant, logbook, pictures, marking
         self._cameras, self._extra = dict(cameras or {}), extra
@@ -161,6 +165,7 @@ class Operations:
             pictures=pictures,
             learner=learner,
             joint=joint,
+            receiver=receiver,
         )
         self.security = SecurityLog(logbook, plant.clock)
         self._viewer = Viewer(plant, self.automatic)
@@ -348,10 +353,12 @@ class Operations:
         *,
         search: bool = False,
         together: Sequence[str] = (),
+        receiver: bool = False,
     ) -> None:
         """Calibrate a heliostat, or only search its beam, on the next free target, before others.
 
         With others (``together``) it is calibrated in one joint visit, as soon as all are ready.
+        With ``receiver`` it is measured in production, as soon as all track the receiver.
 
         Raises
         ------
@@ -361,9 +368,12 @@ class Operations:
             If there is no such heliostat or target.
         """
         _operator(person, "calibration")
-        self.automatic.calibrate(heliostat, target, search=search, together=together)
+        self.automatic.calibrate(
+            heliostat, target, search=search, together=together, receiver=receiver
+        )
         what = "search for the beam" if search else "calibration"
         what = "joint calibration" if together else what
+        what = "calibration in production" if receiver else what
         whose = ", ".join((heliostat, *together))
         self._tell(person, f"asked for a {what} of {whose}{target and f' on {target}'}")
 

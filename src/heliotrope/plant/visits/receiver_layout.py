@@ -134,8 +134,8 @@ def _known(
     moments = moments_on(face, vertex, normal, width, height, _CURVED)
     power = width * height * float(normal @ sun)
     slanted = abs(float(way @ face.normal)) / slant
-    there = _caught(face, place, moments)
-    moved = float(np.mean([_caught(face, place + size * end, moments) for end in _ENDS]))
+    there = caught(face, place, moments)
+    moved = float(np.mean([caught(face, place + size * end, moments) for end in _ENDS]))
     return _Beam(
         place,
         moments,
@@ -146,7 +146,7 @@ def _known(
     )
 
 
-def _caught(face: Target, place: FloatArray, moments: FloatArray) -> float:
+def caught(face: Target, place: FloatArray, moments: FloatArray) -> float:
     """Return the share of a beam that a face catches."""
     corners = face.plane_coordinates(face.corners)
     low, high = corners.min(axis=0), corners.max(axis=0)

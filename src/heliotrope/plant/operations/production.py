@@ -1,0 +1,104 @@
+"""Receiver visits of automatic calibration: which heliostats are measured in production."""
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration.record import CalibrationOutcome
+from heliotrope.imaging.coded import Verdict
+from heliotrope.lcu import states
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.plant.visits.calibration_cycle import CycleResult
+from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
+
+Mask = npt.NDArray[np.bool_]
+
+#: Share of the largest expected error that a heliostat may have which automatic control measures.
+_SURE = 0.75
+#: Time after which automatic control tries again where a visit came to nothing, s.
+_LATER = 600.0
+#: Verdicts after which a heliostat is looked at on a target.
+_ODD = (Verdict.STUCK, Verdict.EXCHANGED, Verdict.ELSEWHERE, Verdict.JOINED, Verdict.FAINT)
+
+
+class ProductionVisits:
+    """The heliostats of receiver visits.
+
+    Parameters
+    ----------
+    plant, book
+        The controller, and the predicted errors.
+    cycle
+        Makes a receiver visit.
+
+    Attributes
+    ----------
+    cycle
+        As given.
+    """
+
+    def __init__(self, plant: PlantController, book: CalibrationBook, cycle: ReceiverCycle) -> None:
+        self._plant, self._book, self.cycle = plant, book, cycle
+        self._asked: list[tuple[str, ...]] = []
+        #: When each heliostat was measured last, and when the next visit may begin, monotonic s.
+        self._at, self._next = np.full(len(plant.field), -np.inf), -np.inf
+
+    @property
+    def surface(self) -> str:
+        """Name of the receiver."""
+        return self.cycle.settings.receiver
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """Heliostats that persons want measured on the receiver."""
+        return tuple(name for names in self._asked for name in names)
+
+    def ask(self, heliostats: Sequence[str]) -> None:
+        """Measure heliostats together, as soon as all of them track the receiver."""
+        self._asked.append(tuple(dict.fromkeys(heliostats)))
+
+    def withdraw(self, heliostats: Collection[str]) -> None:
+        """Forget that persons wanted these heliostats measured."""
+        left = [tuple(n for n in names if n not in heliostats) for names in self._asked]
+        self._asked = [names for names in left if names]
+
+    def chosen(self, ready: Mask) -> tuple[str, ...]:
+        """Return the ready heliostats (N,) that are measured next; () if there are too few.
+
+        Those that persons asked for come first, then those whose errors may be largest.
+        """
+        field, settings, now = self._plant.field, self.cycle.settings, self._plant.now()
+        lit = ready & field.among((states.TRACKING,), now)
+        lit &= self.cycle.face.holds(self._plant.aims)
+        for i, names in enumerate(self._asked):
+            if lit[[field.place(name) for name in names]].all():
+                del self._asked[i]
+                return names
+        # The book has errors of the normal; a beam is off by twice as much.
+        due = lit & (2.0 * self._book.error <= _SURE * settings.known)
+        due &= now - self._at >= settings.every
+        if now < self._next or int(due.sum()) < settings.least:
+            return ()
+        rows = np.flatnonzero(due)
+        first = rows[np.argsort(-self._book.error[rows], kind="stable")][: settings.most]
+        return tuple(field.names[row] for row in first)
+
+    def concluded(self, results: Sequence[CycleResult]) -> tuple[str, ...]:
+        """Note a visit's results; return the heliostats that are to be looked at on a target.
+
+        Where less than half of the beams are proven, the light is to blame and not the mirrors.
+        """
+        now, seen = self._plant.now(), [r.heliostat for r in results if r.verdict is None]
+        good = [r for r in results if r.new > 0 or r.outcome is CalibrationOutcome.NOT_VERIFIED]
+        if not good:
+            self._next = now + _LATER
+        self._at[[self._plant.field.place(name) for name in seen]] = now
+        if 2 * len(good) < len(results):
+            return ()
+        return tuple(
+            result.heliostat
+            for result in results
+            if result.verdict in _ODD or result.outcome is CalibrationOutcome.NOT_VERIFIED
+        )
