@@ -27,6 +27,7 @@ from heliotrope.links.messages import (
     Stage,
     decode,
 )
+from heliotrope.safety import Alarm, alarms
 from heliotrope.twin.boards.bus import TwinBus
 from support.clusters import AIM, TOKEN, Board, Field, SlotBus, config_of, run
 from support.lcu_machines import heliostat, items_of_heliostat
@@ -285,6 +286,32 @@ def test_nodes_out_of_step_get_a_new_epoch() -> None:
         await field.order("aim", "AIM", *AIM, heliostats=("A1",))
         assert await final(field, "aim") is Stage.DONE
         assert node.controller.gate.replay.epoch > epoch
+
+    run(main)
+
+
+def test_one_node_out_of_step_gets_a_new_epoch_though_the_others_are_in_step() -> None:
+    """Simulated run 960397: what others took hid that one node took a stranger's frame for new."""
+
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        replay = field.boards[0].node.controller.gate.replay
+        epoch = replay.epoch
+        replay.count += 30000
+        await field.order("aim", "AIM", *AIM, heliostats=("A1",))
+        for number in range(9):
+            await field.order(f"other-{number}", "AIM", *AIM, heliostats=("A2",))
+            await asyncio.sleep(0.5)
+        assert replay.epoch > epoch
+        assert await final(field, "aim") is Stage.DONE
+        # It is no help for a node that answers so always, and is not tried each time.
+        epoch = replay.epoch
+        for number in range(6):
+            replay.count += 30000
+            await field.order(f"aim-{number}", "AIM", *AIM, heliostats=("A1",))
+            await field.order(f"more-{number}", "AIM", *AIM, heliostats=("A2",))
+            await asyncio.sleep(1.0)
+        assert replay.epoch == epoch
 
     run(main)
 
@@ -783,6 +810,70 @@ def test_an_answer_that_was_read_late_is_as_old_as_its_question(name: str) -> No
         assert ages[-1] < 0.2
 
     run(main, count=1, bus=lambda clock, boards: Standing(clock, [*boards]))
+
+
+def test_a_status_that_waited_in_a_frozen_program_is_not_sent() -> None:
+    """Simulated run 960174: a status left 43 s after it was made, with the ages of then."""
+
+    async def main(field: Field) -> None:
+        send, ages, waits = field.link.send, list[float](), [5.0]
+        reports = field.cluster._reports
+        tell = reports.status
+
+        async def slow(
+            data: bytes, *, expires: float | None = None, hold: bool = False
+        ) -> SendOutcome:
+            message = decode(data)
+            if isinstance(message, Alarm) and waits:
+                await asyncio.sleep(waits.pop())
+            outcome = await send(data, expires=expires, hold=hold)
+            if isinstance(message, ClusterStatus) and outcome is SendOutcome.SENT:
+                ages.append(field.clock.utc().timestamp() - message.utc_s)
+            return outcome
+
+        def after_an_alarm(status: ClusterStatus) -> None:
+            reports.alarm(alarms.LEASE_REFUSED.raised("A1", problem="a test"))
+            tell(status)
+
+        field.link.send = slow  # type: ignore[method-assign]
+        reports.status = after_an_alarm  # type: ignore[method-assign]
+        await asyncio.sleep(10.0)
+        assert not waits
+        assert len(ages) >= 3
+        assert max(ages) < 2.0
+
+    run(main)
+
+
+def test_alarms_are_repeated_and_listed_since_each_may_be_lost() -> None:
+    """Simulated run 960094: a plant that stood still never learnt why its cluster sent no sun."""
+
+    async def main(field: Field) -> None:
+        send = field.link.send
+        alarm = alarms.LEASE_REFUSED.raised("A1", problem="a test")
+
+        async def losing(
+            data: bytes, *, expires: float | None = None, hold: bool = False
+        ) -> SendOutcome:
+            if isinstance(decode(data), Alarm):
+                return SendOutcome.SENT
+            return await send(data, expires=expires, hold=hold)
+
+        field.link.send = losing  # type: ignore[method-assign]
+        await field.until(lambda: bool(field.plant.all(ClusterStatus)))
+        field.cluster.take_alarm(alarm)
+        await asyncio.sleep(2.0)
+        field.link.send = send  # type: ignore[method-assign]
+        await field.until(lambda: alarm in field.plant.all(Alarm))
+        await field.until(lambda: f"{alarm.condition} A1" in field.plant.status().alarms)
+        field.cluster.take_alarm(dataclasses.replace(alarm, active=False))
+        heard = len(field.plant.all(ClusterStatus))
+        await asyncio.sleep(12.0)
+        listing = [s for s in field.plant.all(ClusterStatus)[heard:] if s.alarms_listed]
+        assert listing
+        assert not any(status.alarms for status in listing)
+
+    run(main)
 
 
 def test_a_status_is_not_delivered_later_than_the_next_one_is_due() -> None:

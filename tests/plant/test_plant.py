@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -33,7 +34,8 @@ from heliotrope.mechanism.tracking import track
 from heliotrope.plant.audit import AuditError, read
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.safety import Alarm, Severity
+from heliotrope.plant.told_alarms import ToldAlarms
+from heliotrope.safety import Alarm, Severity, alarms
 from support.plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
 
 Play = Callable[[Bench], Awaitable[None]]
@@ -527,6 +529,52 @@ def test_nothing_that_a_cluster_says_ends_the_plant(tmp_path: Path) -> None:
         assert {a.subject for a in plant.alarms if a.condition == "x"} == {"pod-1"}
         token = await bench.commanded()
         assert await plant.command(OPERATOR, token, "APPROACH").end(5.0)
+
+    play(tmp_path, scene)
+
+
+def test_an_alarm_of_a_cluster_ends_with_its_list_though_its_end_was_lost() -> None:
+    told = ToldAlarms()
+    bus = Alarm("bus_failed", "", Severity.ALARM, "text")
+    node = Alarm("node_fault", "P1A", Severity.ALARM, "text")
+    event = alarms.PLANT_UNINTELLIGIBLE.raised(problem="a test")
+    status = ClusterStatus("pod-1", 0, 0.0, "gps", 0.0, 3.0, 0.1)
+
+    assert told.take("pod-1", bus) == [replace(bus, subject="pod-1")]
+    assert told.take("pod-1", node) == [node]
+    assert told.take("pod-2", bus) == [replace(bus, subject="pod-2")]
+    assert told.take("pod-1", bus) == []  # it is repeated
+    for _ in range(2):
+        assert told.take("pod-1", event) == [replace(event, subject="pod-1")]
+    worse = replace(node, severity=Severity.EMERGENCY)
+    assert told.take("pod-1", worse) == [worse]
+
+    assert told.compare("pod-1", status) == []  # it lists nothing
+    lists = replace(status, alarms=("bus_failed ",), alarms_listed=True)
+    (over,) = told.compare("pod-1", lists)
+    assert over == replace(worse, text="node_fault: over", active=False)
+    assert told.compare("pod-1", lists) == []
+    assert told.take("pod-1", node) == [node]  # it is back
+    ends = [replace(each, active=False) for each in (node, replace(bus, subject="pod-1"))]
+    assert [told.take("pod-1", each) for each in ends] == [[each] for each in ends]
+    assert told.compare("pod-1", replace(lists, alarms=())) == []
+    assert [each.subject for each in told.compare("pod-2", replace(lists, alarms=()))] == ["pod-2"]
+
+
+def test_a_plant_tells_the_end_of_an_alarm_that_its_cluster_no_longer_lists(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        cluster = bench.clusters["pod-1"]
+        for _ in range(3):
+            await cluster.send(Alarm("bus_failed", "", Severity.ALARM, "text"))
+        lists = ClusterStatus("pod-1", 0, 0.0, "gps", 0.0, 3.0, 0.1, alarms_listed=True)
+        await cluster.send(replace(lists, alarms=("bus_failed pod-1",)))
+        await bench.wait(1.0)
+        told = [a for a in bench.plant.alarms if a.condition == "bus_failed"]
+        assert [(a.subject, a.active) for a in told] == [("pod-1", True)]
+        await cluster.send(lists)
+        await bench.wait(1.0)
+        told = [a for a in bench.plant.alarms if a.condition == "bus_failed"]
+        assert [(a.subject, a.active) for a in told] == [("pod-1", True), ("pod-1", False)]
 
     play(tmp_path, scene)
 

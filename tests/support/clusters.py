@@ -32,6 +32,7 @@ from heliotrope.links.messages import (
     decode,
     encode,
 )
+from heliotrope.plant.told_alarms import ToldAlarms
 from heliotrope.safety import Alarm
 from heliotrope.sun import Site
 from heliotrope.twin.boards.bus import TwinBus
@@ -141,8 +142,12 @@ class Plant:
         self.run = "first"
 
     async def listen(self) -> None:
+        told = ToldAlarms()
         async for data in received(self.link):
-            self.heard.append(decode(data))
+            message = decode(data)
+            repeated = isinstance(message, Alarm) and not told.take("C1", message)
+            if not repeated:
+                self.heard.append(message)
 
     async def lease(self) -> None:
         while True:

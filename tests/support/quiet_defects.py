@@ -9,7 +9,7 @@ import pytest
 from heliotrope.cluster import _goals
 from heliotrope.cluster._broadcast import Broadcast
 from heliotrope.cluster._exchange import Exchange
-from heliotrope.lcu import messages, states
+from heliotrope.lcu import messages, motion, states
 from heliotrope.lcu.controller import Controller
 from heliotrope.lcu.lease import SunLease
 from heliotrope.lcu.search import Spiral
@@ -103,6 +103,18 @@ def _search_stands(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Spiral, "advance", standing)
 
 
+def _beside(patch: pytest.MonkeyPatch) -> None:
+    """A mirror keeps its beam 0.9 m beside its aim, or beside its standby point."""
+    follow = motion.Motion._follow
+
+    def beside(self: Any, aim: tuple[float, float, float]) -> bool:
+        if self.kind in (motion.TRACK, motion.STANDBY):
+            aim = aim[0] + 0.9, aim[1], aim[2]
+        return bool(follow(self, aim))
+
+    patch.setattr(motion.Motion, "_follow", beside)
+
+
 def _never_back(patch: pytest.MonkeyPatch) -> None:
     """The plant's end of a line does not speak again after the connection was lost."""
     converse = CarriedLink._converse
@@ -183,6 +195,7 @@ ROWS: tuple[tuple[str, Plant, tuple[str, ...], bool], ...] = (
     ("nobody is told that a command is done", _never_told, ("calm",), True),
     ("no emergency is ever proven", _never_proven, (), True),
     ("leases every fourth second", _seldom_leases, ("calm",), False),
+    ("a beam 0.9 m beside its point", _beside, ("swarm",), True),
     ("a refusal names the wrong holder", _wrong_holder, (), False),
     ("TRACK is left to engineers", _role_too_high, (), True),
 )

@@ -1,13 +1,17 @@
 """The epoch of a cluster: a new one makes all earlier frames void."""
 
+from collections import Counter
+
 from heliotrope.cluster._exchange import Exchange
 from heliotrope.cluster._reports import Reports
 from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.timekeeping import Time
 from heliotrope.safety import alarms
 
-#: A new epoch begins after this many consecutive unexplained "duplicate" answers to commands.
-_OUT_OF_STEP = 3
+#: A new epoch begins after this many consecutive unexplained "duplicate" answers to commands, of
+#: all local controllers together or of one, but one by one only every so many seconds: it voids
+#: the commands that are under way to all.
+_OUT_OF_STEP, _REST = 3, 30
 
 
 class Epoch:
@@ -35,21 +39,33 @@ class Epoch:
         self._kept, self._exchange, self._reports = kept, exchange, reports
         self._of_time = present.usable
         self._duplicates = 0
+        self._of_one: Counter[int] = Counter()  # by the place of the local controller
+        self._rest = 0
         self._storing = False
         self._next: int | None = None  # stored, and not in use yet
         exchange.begin_epoch(kept.start(int(present.gps_s) if self._of_time else 0))
 
-    def taken(self) -> None:
+    def taken(self, place: int) -> None:
         """Note that a local controller has taken a command: it is in step."""
         self._duplicates = 0
+        self._of_one.pop(place, None)
 
-    def duplicate(self) -> None:
-        """Note that a new command was answered "duplicate"."""
+    def duplicate(self, place: int) -> None:
+        """Note that a local controller answered a new command with "duplicate".
+
+        A single one is out of step after a frame that somebody else has sent under the cluster's
+        address with a later number.
+        """
         self._duplicates += 1
+        self._of_one[place] += 1
 
     def second(self) -> None:
         """Begin an epoch if the local controllers are out of step, or one that is stored."""
-        if self._duplicates >= _OUT_OF_STEP:
+        self._rest = max(0, self._rest - 1)
+        one = max(self._of_one.values(), default=0) >= _OUT_OF_STEP and not self._rest
+        if one:
+            self._rest = _REST
+        if one or self._duplicates >= _OUT_OF_STEP:
             self._begin(0)
         self._use()
 
@@ -64,6 +80,7 @@ class Epoch:
         if self._storing or self._next is not None:
             return
         self._storing, self._duplicates = True, 0
+        self._of_one.clear()
 
         def told(epoch: int, error: Exception | None) -> None:
             self._storing = False

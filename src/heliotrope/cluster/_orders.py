@@ -384,7 +384,7 @@ class Orders:
         """Continue after an ACK; ``lost``: an earlier answer may have been lost."""
         name = job.step.name
         if result == messages.DONE:
-            self._epoch.taken()
+            self._epoch.taken(job.node.index)
             return self._advance(job)
         text = f"{name}: {self._why(job.node, result)}"
         if lost and result == messages.DUPLICATE and name in _ANEW:
@@ -394,7 +394,7 @@ class Orders:
             return self._advance(job, sure=False)
         if result in _AGAIN:
             if result == messages.DUPLICATE and not lost:
-                self._epoch.duplicate()
+                self._epoch.duplicate(job.node.index)
             return self._again(job, text)
         self._reports.add(job.order.identity, Stage.REFUSED, job.node.name, text)
         return None

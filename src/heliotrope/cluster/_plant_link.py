@@ -29,10 +29,12 @@ from heliotrope.links.messages import (
 from heliotrope.safety import AcknowledgeRole, Alarm, alarms
 from heliotrope.sun import Site
 
-#: Life of a message to the plant, s.
+#: Life of a message to the plant, s. The ages in a status count from when it was made: it is not
+#: sent later than `_STATUS_WAITS`, since the program may have been frozen meanwhile.
 _NEWS_LIFE = 5.0
-_STATUS_LIFE = 1.0
-#: The names of the rows are repeated after this many statuses: one may have been lost.
+_STATUS_LIFE, _STATUS_WAITS = 1.0, 1.0
+#: The names of the rows and the alarms are repeated after this many statuses: one may have been
+#: lost.
 _NAMES_EVERY = 10
 #: Stands for an unknown error of the time, s.
 _UNBOUNDED = 1e9
@@ -73,6 +75,8 @@ class PlantLink:
         self._was_connected = False
         self._number = 0  # of the status
         self._told_names = 0  # in which status
+        self._names_lost = False
+        self._made_at = clock.monotonic()  # the status
 
     @property
     def connected(self) -> bool:
@@ -130,10 +134,13 @@ class PlantLink:
         connected, opened = self._link.connected, self._link.statistics.opened
         if connected and (opened != self._opened or not self._was_connected):
             self._opened, self._told_names = opened, self._number
-            self._reports.greet()
         self._was_connected = connected
-        now = self._clock.monotonic()
+        now = self._made_at = self._clock.monotonic()
         told = (self._number - self._told_names) % _NAMES_EVERY == 0
+        if told:
+            self._reports.repeat()
+        # Alarms are not repeated at once: on a slow line they may be what kept the status back.
+        told, self._names_lost = told or self._names_lost, False
         self._reports.status(
             ClusterStatus(
                 cluster=self._cluster,
@@ -158,13 +165,16 @@ class PlantLink:
         with contextlib.suppress(LinkClosedError):
             while True:
                 if self._link.connected:
+                    made_at = self._made_at
                     for message in self._reports.take():
-                        await self._send(message)
+                        await self._send(message, made_at)
                 await self._reports.published()
 
-    async def _send(self, message: Message) -> None:
-        status = isinstance(message, ClusterStatus)
-        expires = self._clock.monotonic() + (_STATUS_LIFE if status else _NEWS_LIFE)
+    async def _send(self, message: Message, made_at: float) -> None:
+        status, now = isinstance(message, ClusterStatus), self._clock.monotonic()
+        expires = now + _NEWS_LIFE
+        if status:
+            expires = min(now, made_at + _STATUS_WAITS) + _STATUS_LIFE
         outcome = await self._link.send(encode(message), expires=expires)
         if status and outcome is not SendOutcome.SENT:
-            self._opened = -1  # the names may not have arrived
+            self._names_lost = True

@@ -15,7 +15,7 @@ class Reports:
     """An outbox.
 
     The same stage of one command at several heliostats is one message. An alarm is reported when
-    it changes, and to each new connection while it is active.
+    it changes, and again at intervals while it is active. A status with names lists those that are.
     """
 
     def __init__(self) -> None:
@@ -61,8 +61,8 @@ class Reports:
         """Active alarms."""
         return tuple(self._alarms.values())
 
-    def greet(self) -> None:
-        """Report all active alarms to a new connection."""
+    def repeat(self) -> None:
+        """Report all active alarms: to a new connection, and since each may have been lost."""
         waiting = {id(message) for message in self._out}
         self._out.extend(alarm for alarm in self._alarms.values() if id(alarm) not in waiting)
 
@@ -86,6 +86,13 @@ class Reports:
             messages.append(Progress(identity, stage, tuple(n for n in names if n), text))
         self._groups.clear()
         if self._status is not None:
-            messages.append(self._status)
+            messages.append(self._listing(self._status))
             self._status = None
         return messages
+
+    def _listing(self, status: ClusterStatus) -> ClusterStatus:
+        """Return a status with the alarms that are active now, if it has names."""
+        if not status.names:
+            return status
+        listed = tuple(f"{condition} {subject}" for condition, subject in self._alarms)
+        return replace(status, alarms=listed, alarms_listed=True)

@@ -203,6 +203,8 @@ class ClusterStatus:
     ``site`` holds `Site.numbers`, for which it computes the sun; () from an older cluster.
     ``lease_left`` in s; below 0 the plant's lease is over. ``cycle_s`` is the last poll cycle.
     ``run`` is the run of the plant that it belongs to, ``barred`` those that get no lease.
+    With the names come the ``alarms`` of the cluster that are active, each as "condition subject",
+    and ``alarms_listed`` is true: what is not among them is over, though its end may be lost.
     """
 
     kind: ClassVar[str] = "status"
@@ -219,6 +221,8 @@ class ClusterStatus:
     site: tuple[float, ...] = ()
     run: str = ""
     barred: tuple[str, ...] = ()
+    alarms: tuple[str, ...] = ()
+    alarms_listed: bool = False
 
     def nodes(self) -> "npt.NDArray[Any]":
         """Return the rows, of dtype `NODE`, read only.

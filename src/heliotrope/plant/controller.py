@@ -16,7 +16,6 @@ import secrets
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -63,6 +62,7 @@ from heliotrope.plant.permission import Permission
 from heliotrope.plant.rivals import Rivals
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.told_alarms import ToldAlarms
 from heliotrope.safety import Act, Alarm, Condition, alarms, conditions
 from heliotrope.sun import fast_vector
 
@@ -177,7 +177,7 @@ class PlantController:
         )
         self.doubts = Doubts(self.field, design, self.aims, self._tell)
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
-        self._rivals = Rivals(self.name, self._tell)
+        self._rivals, self._told_alarms = Rivals(self.name, self._tell), ToldAlarms()
         self._orders = PlantOrders(
             clock,
             audit,
@@ -302,10 +302,9 @@ class PlantController:
                 found = self._orders.take(end.name, message)
                 if found is not None:
                     self._sentinel.take_progress(*found, message)
-            case Alarm(subject=""):
-                self._tell(replace(message, subject=end.name))
             case Alarm():
-                self._tell(message)
+                for alarm in self._told_alarms.take(end.name, message):
+                    self._tell(alarm)
             case Answer():
                 self._clusters.take_answer(message)
             case _:
@@ -318,6 +317,8 @@ class PlantController:
         self.counters.problems.extend(self.field.take(end.name, status, now))
         self._agreement.take(end.name, status)
         self._rivals.take(end.name, status)
+        for alarm in self._told_alarms.compare(end.name, status):
+            self._tell(alarm)
         self._give_up(self._identities.look(end.name))
         self.doubts.look(end.name)
         if not self.field.knows_order(end.name) and now - self._named_at[end.name] >= _ASK_NAMES:

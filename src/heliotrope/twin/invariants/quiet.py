@@ -24,6 +24,7 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.safety import Act, Alarm
 from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STANDBY
 from heliotrope.twin.invariants._account import HeliostatAccount
+from heliotrope.twin.invariants.beams import slew
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
 
 #: A stretch is quiet this long after the last fault, a board's boot, and the end of the last alarm
@@ -38,7 +39,8 @@ SUN_EVERY, STATUS_EVERY = 3.0, 5.0
 SOON, APPROACH_WITHIN, STOW_WITHIN = 5.0, 150.0, 120.0
 #: From the state to the plant's knowledge of it, and to the proof of an emergency, s.
 TOLD_WITHIN, PROVEN_WITHIN = 8.0, 20.0
-#: Time for a beam to come to its point after an order or a change of state, s.
+#: Time for a beam to come to its point after an order or a change of state, s; if it is not there
+#: by then, its drives have the time that they need from there, see `beams.slew`.
 ON_POINT_WITHIN = 12.0
 #: A beam is this near its point: share of its length, rad, and m. Backlash is 0.6 mrad of the
 #: mirror, rough stepping 0.25 mrad, pushed biases 0.1 mrad; beams turn by twice as much.
@@ -112,6 +114,7 @@ class _Mirror:
     aim: tuple[float, ...] | None = None
     standby: tuple[float, ...] | None = STANDBY
     pointed_at: float = -inf
+    due_at: float = inf
     state: int = -1
     since: float = -inf
     node: Node | None = None
@@ -411,14 +414,19 @@ class QuietObserver:
         stands = mirror.state == states.IDLE and mirror.account.by_way and not mirror.elsewhere
         settled = now - max(mirror.pointed_at, mirror.since, mirror.ordered_at) > ON_POINT_WITHIN
         if not (tracks or stands) or point is None or not settled or not self._is_own(mirror):
+            mirror.due_at = inf
             return
         board = mirror.account.board
         goal = (point[0], point[1], point[2])
         miss = board.miss(sun, goal, believed=True)
         far = float(np.linalg.norm(np.subtract(goal, board.outfit.mechanism.position)))
         limit = NEAR * far + NEAR_M
+        if miss <= limit:
+            mirror.due_at = inf
+        elif mirror.due_at == inf:
+            mirror.due_at = now + slew(board, sun, goal)
         saw = f"its beam is {miss:.2f} m beside its point, limit {limit:.2f} m"
-        self._check(miss <= limit, now, mirror, saw)
+        self._check(miss <= limit or now < mirror.due_at, now, mirror, saw)
 
     def _proven(self, mirror: _Mirror, plant: PlantController, sun: FloatArray, now: float) -> None:
         """Check that an emergency that has been carried out is proven."""
