@@ -92,7 +92,7 @@ def resumes_by_itself(patch: pytest.MonkeyPatch) -> None:
         if names and not self.emergency_on and not self.waiting:
             run = self._orders._prefix
             ticket = Ticket(f"{run}-by itself", "REFOCUS", names, self.clock, 60.0)
-            self._join(ticket, "REFOCUS", (), names, self.authority.token)
+            self._commands._join(ticket, "REFOCUS", (), names, self.authority.token)
 
     def quiet(self: Any, number: int, *rest: Any) -> None:
         """Leave the missing record to a defect of its own."""
