@@ -1,6 +1,7 @@
 """Compiling the kernels: once for each, and not in silence."""
 
 import ast
+import gc
 import io
 import os
 import subprocess
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from numba import njit
 from numba.core import event
+from numba.core.errors import TypingError
 
 import heliotrope as ht
 from heliotrope import warm
@@ -18,8 +20,10 @@ from heliotrope.calibration.fit import _fit_kernels, estimator
 from heliotrope.calibration.learn import _drift_kernels, _regime_kernels
 from heliotrope.calibration.learn.learning import learn
 from heliotrope.calibration.median import median
-from heliotrope.jit import FIRST, FirstCompilation, as_input, is_compiled
+from heliotrope.jit import COMPILATION, Compilation, as_input, is_compiled
 from heliotrope.mechanism import kinds
+from heliotrope.mechanism.kernels import track as track_kernels
+from heliotrope.mechanism.kernels import warm as kernels_of_warm
 from heliotrope.mechanism.kernels.block import track_block
 from heliotrope.mechanism.kernels.chain import jacobian_block, pose_block
 
@@ -36,10 +40,10 @@ class Terminal(io.StringIO):
 
 
 @pytest.fixture
-def listening(monkeypatch: pytest.MonkeyPatch) -> Iterator[FirstCompilation]:
+def listening(monkeypatch: pytest.MonkeyPatch) -> Iterator[Compilation]:
     """A listener beside that of this process, which is kept quiet."""
-    monkeypatch.setattr(FIRST, "told", True)
-    listener = FirstCompilation()
+    monkeypatch.setattr(COMPILATION, "told", True)
+    listener = Compilation()
     event.register("numba:compile", listener)
     yield listener
     event.unregister("numba:compile", listener)
@@ -47,7 +51,7 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> Iterator[FirstCompilation]:
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_a_terminal_is_told_once(
-    terminal: bool, listening: FirstCompilation, monkeypatch: pytest.MonkeyPatch
+    terminal: bool, listening: Compilation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = Terminal(terminal=terminal)
     monkeypatch.setattr("sys.stderr", told)
@@ -57,6 +61,44 @@ def test_a_terminal_is_told_once(
     lines = told.getvalue().splitlines()
     assert len(lines) == terminal
     assert all("compiling kernels, once after an installation" in line for line in lines)
+
+
+@pytest.mark.parametrize("collecting", [True, False])
+def test_garbage_lies_while_a_kernel_is_compiled(
+    collecting: bool, listening: Compilation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+    end = Compilation.on_end
+
+    def ending(self: Compilation, what: object) -> None:
+        if self is COMPILATION:
+            asked.append(gc.isenabled())
+        end(self, what)
+
+    monkeypatch.setattr(Compilation, "on_end", ending)
+    inner = njit(lambda x: x + 1)
+    kernel = njit(lambda x: inner(x) + inner(1.0 * x))
+    before = gc.isenabled()
+    try:
+        (gc.enable if collecting else gc.disable)()
+        assert kernel(1) == 4.0
+        assert gc.isenabled() == collecting
+        with pytest.raises(TypingError):
+            njit(lambda x: x.nothing)(1)
+        assert gc.isenabled() == collecting
+    finally:
+        (gc.enable if before else gc.disable)()
+    assert len(asked) >= 4
+    assert not any(asked)
+    assert listening.depth == COMPILATION.depth == 0
+
+
+def test_numbers_in_calls_make_no_versions_of_a_function() -> None:
+    mechanism = kinds.azimuth_elevation(np.array([[0.0, 50.0, 0.0]]))
+    ht.track(mechanism, SUN, AIM)
+    for inner, versions in ((kernels_of_warm._put, 1), (track_kernels._difference_column, 1)):
+        # Those loaded with their kernel from the disk are not compiled again.
+        assert len(inner.signatures) <= versions, inner.signatures
 
 
 def test_arrays_that_may_be_written_or_not_are_one_type() -> None:

@@ -128,13 +128,17 @@ def cost_and_gradient(
     for k in range(2 * n):
         matrix[k, k] += noise * noise
     gradient = np.zeros(1 + parts + times)
-    inverse = np.linalg.inv(matrix)
-    flat = np.ascontiguousarray(residual).reshape(2 * n)
-    alpha = inverse @ flat
-    cost = 0.5 * np.dot(flat, alpha) + np.sum(np.log(np.diag(np.linalg.cholesky(matrix))))
-    trace = 0.0
+    inverse, factor = np.linalg.inv(matrix), np.linalg.cholesky(matrix)
+    flat, alpha, cost, trace = np.empty(2 * n), np.empty(2 * n), 0.0, 0.0
+    for i in range(n):
+        flat[2 * i], flat[2 * i + 1] = residual[i, 0], residual[i, 1]
     for k in range(2 * n):
-        trace += inverse[k, k] - alpha[k] * alpha[k]
+        total = 0.0
+        for j in range(2 * n):
+            total += inverse[k, j] * flat[j]
+        alpha[k] = total
+        cost += 0.5 * total * flat[k] + math.log(factor[k, k])
+        trace += inverse[k, k] - total * total
     gradient[0] = trace * noise * noise
     for i in range(n):
         for j in range(i + 1):

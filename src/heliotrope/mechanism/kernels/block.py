@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import INLINED, INNER, OPTIONS
+from heliotrope.jit import INLINED, INNER, OPTIONS, plain
 from heliotrope.mechanism.kernels.drives import (
     count_range,
     drive_angle,
@@ -252,7 +252,7 @@ def track_block(
                 warm_start(armatures, suns, aims, index, i, stop, sign, begin[b])
         row, now = index[i, 1], index[i, 4]
         g = load_armature(armatures, index[i, 0])
-        d1 = load_drive(drives, row, 0)
+        d1 = load_drive(drives, row, plain(0))
         d2 = load_drive(drives, row, axes - 1)
         s = (suns[index[i, 2], 0], suns[index[i, 2], 1], suns[index[i, 2], 2])
         p = (aims[index[i, 3], 0], aims[index[i, 3], 1], aims[index[i, 3], 2])

@@ -13,7 +13,12 @@ import numpy as np
 from numba import njit
 
 from heliotrope.jit import INNER, OPTIONS
-from heliotrope.mechanism.kernels.drives import angle_per_count, angle_per_slot, drive_angle
+from heliotrope.mechanism.kernels.drives import (
+    angle_per_count,
+    angle_per_slot,
+    drive_angle,
+    load_drive,
+)
 from heliotrope.mechanism.kernels.slots import (
     MOVES_ALONG_NORMAL,
     MOVES_DRIVE,
@@ -163,7 +168,7 @@ def pose_block(
     for i in range(start, stop):
         r = rows[i]
         for k in range(driven.shape[0]):
-            joint_angles[k] = drive_angle(drives[r, k], counts[i, k])
+            joint_angles[k] = drive_angle(load_drive(drives, r, k), counts[i, k])
         chain_pose(
             position[r],
             orientation[r],

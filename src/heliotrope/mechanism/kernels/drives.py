@@ -206,7 +206,7 @@ def angles_block(drives, counts, rows, out, start, stop):
     """θ of every drive: ``drives`` (N, D, S), ``counts`` (M, D), ``rows`` (M,)."""
     for i in range(start, stop):
         for k in range(counts.shape[1]):
-            out[i, k] = drive_angle(drives[rows[i], k], counts[i, k])
+            out[i, k] = drive_angle(load_drive(drives, rows[i], k), counts[i, k])
 
 
 @njit(**OPTIONS)
@@ -214,7 +214,7 @@ def counts_block(drives, angles, rows, out, start, stop):
     """Counts of every drive, the inverse of `angles_block`."""
     for i in range(start, stop):
         for k in range(angles.shape[1]):
-            out[i, k] = drive_counts(drives[rows[i], k], angles[i, k])
+            out[i, k] = drive_counts(load_drive(drives, rows[i], k), angles[i, k])
 
 
 @njit(**OPTIONS)
@@ -222,4 +222,4 @@ def slopes_block(drives, counts, rows, out, start, stop):
     """dθ/dcounts of every drive."""
     for i in range(start, stop):
         for k in range(counts.shape[1]):
-            out[i, k] = angle_per_count(drives[rows[i], k], counts[i, k])
+            out[i, k] = angle_per_count(load_drive(drives, rows[i], k), counts[i, k])

@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import INLINED, INNER
+from heliotrope.jit import INLINED, INNER, plain
 from heliotrope.mechanism.kernels.vectors import (
     about,
     across,
@@ -250,8 +250,8 @@ def _gradient(g, s, p, one, two):
         return np.nan, np.nan
     n = mirror_normal(g, t)
     gap = minus(n, v)
-    first = _difference_column(g, t, n, m, v, way, distance, 0)
-    second = _difference_column(g, t, n, m, v, way, distance, 1)
+    first = _difference_column(g, t, n, m, v, way, distance, plain(0))
+    second = _difference_column(g, t, n, m, v, way, distance, plain(1))
     return dot(first, gap), dot(second, gap)
 
 
@@ -284,8 +284,8 @@ def _newton(g, s, p, t, tolerance):
     for iteration in range(NEWTON_LIMIT):
         if beam_miss(s, way, distance, n) <= tolerance:
             return OK, iteration, t
-        first = _difference_column(g, t, n, m, v, way, distance, 0)
-        second = _difference_column(g, t, n, m, v, way, distance, 1)
+        first = _difference_column(g, t, n, m, v, way, distance, plain(0))
+        second = _difference_column(g, t, n, m, v, way, distance, plain(1))
         h00, h01, h11 = dot(first, first), dot(first, second), dot(second, second)
         e0, e1 = dot(first, gap), dot(second, gap)
         if iteration >= PATIENCE:

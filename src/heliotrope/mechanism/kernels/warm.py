@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import INLINED, INNER
+from heliotrope.jit import INLINED, INNER, plain
 from heliotrope.mechanism.kernels.track import axis_1, axis_2, constants, load_armature
 from heliotrope.mechanism.kernels.vectors import across, add, cross, dot, minus, times
 
@@ -39,16 +39,16 @@ def _gather(table, lane, g, s, p):
     o = (g[3], g[4], g[5])
     arm = (g[12] - g[9], g[13] - g[10], g[14] - g[11])
     along = dot(arm, b)
-    _put(table, _A, lane, a)
-    _put(table, _B, lane, b)
-    _put(table, _C, lane, c)
-    _put(table, _AIM, lane, minus(p, o))
+    _put(table, plain(_A), lane, a)
+    _put(table, plain(_B), lane, b)
+    _put(table, plain(_C), lane, c)
+    _put(table, plain(_AIM), lane, minus(p, o))
     # Turned about b by θ₂, the vertex is K0 + cos θ₂ K1 + sin θ₂ K2 from the first origin.
-    _put(table, _K0, lane, add((g[9] - o[0], g[10] - o[1], g[11] - o[2]), times(along, b)))
-    _put(table, _K1, lane, across(arm, b))
-    _put(table, _K2, lane, cross(b, arm))
-    _put(table, _SUN, lane, s)
-    _put(table, _Y, lane, minus((g[12], g[13], g[14]), o))
+    _put(table, plain(_K0), lane, add((g[9] - o[0], g[10] - o[1], g[11] - o[2]), times(along, b)))
+    _put(table, plain(_K1), lane, across(arm, b))
+    _put(table, plain(_K2), lane, cross(b, arm))
+    _put(table, plain(_SUN), lane, s)
+    _put(table, plain(_Y), lane, minus((g[12], g[13], g[14]), o))
     k = constants(g, (g[15], g[16], g[17]))
     table[_AB, lane], table[_UB, lane], table[_INV, lane] = k[0], k[1], k[2]
     table[_SA, lane], table[_SC, lane] = k[3], k[4]
