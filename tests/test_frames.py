@@ -11,6 +11,7 @@ import xarray
 import heliotrope as ht
 from heliotrope.calibration import predict
 from heliotrope.errors import InputError
+from heliotrope.mechanism.kernels import slots
 
 PLANT = ht.example_plant()
 NOMINAL = PLANT["P6A"].nominal
@@ -104,6 +105,12 @@ def test_every_record_has_a_frame_and_a_dataset(learned: ht.Learned, tmp_path: P
         "fits": learned.static,
         "heliostats": PLANT.groups["azel"].with_parameters({"canting": 1e-3}),
         "plant": PLANT,
+        "heliostat": PLANT["P6A"],
+        "mechanism": NOMINAL,
+        "moved": TRUTH,
+        "mechanisms": PLANT.nominal,
+        "drive": NOMINAL.drives[0],
+        "drives": PLANT.drives,
     }
     for name, record in records.items():
         frame, data = record.to_frame(), record.to_xarray()
@@ -116,6 +123,13 @@ def test_every_record_has_a_frame_and_a_dataset(learned: ht.Learned, tmp_path: P
                     np.asarray(back[variable]).astype(data[variable].dtype), data[variable]
                 )
         frame.to_parquet(tmp_path / f"{name}.parquet")
+    one = records["moved"].to_frame()
+    assert one["position_north"].item() == TRUTH.position[1]
+    assert one["drive_rate_elevation"].item() == TRUTH.drives[1].table[slots.RATE]
+    assert one["deviation_azimuth_bias"].item() == TRUTH.deviations["azimuth_bias"]
+    assert one.attrs["units"]["deviation_azimuth_bias"] == "rad"
+    assert len(records["mechanisms"].to_frame()) == len(PLANT)
+    assert records["heliostat"].to_frame().index.tolist() == ["P6A"]
     frame = records["day"].to_frame()
     assert frame.index.names == ["time", "heliostat"]
     one = frame.xs("P6A", level="heliostat")

@@ -123,6 +123,13 @@ class Framed:
         )
 
 
+def batch_rows(shape: tuple[int, ...]) -> dict[str, npt.ArrayLike]:
+    """Return names and labels of batch axes; a single object (no axes) is one row."""
+    if not shape:
+        return {"row": np.arange(1)}
+    return {f"axis_{k}": np.arange(n) for k, n in enumerate(shape)}
+
+
 def times(seconds: npt.ArrayLike) -> npt.NDArray[np.datetime64]:
     """Return Unix seconds as UTC times; NaN becomes NaT."""
     given = np.asarray(seconds, dtype=np.float64)

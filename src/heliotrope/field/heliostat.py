@@ -6,6 +6,7 @@ from functools import cached_property
 
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.target import Target
+from heliotrope.frames import Framed, Labelled
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Calibrated, Mechanism
@@ -16,7 +17,7 @@ from heliotrope.values import Card, Value
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Heliostat(Value):
+class Heliostat(Value, Framed):
     """One heliostat, as ``plant["P6A"]`` gives it; `track` takes it like a plant of one.
 
     Attributes
@@ -43,6 +44,9 @@ class Heliostat(Value):
         for name, value in self.calibrated.deviations.items():
             rows.append((name, f"{float(value):.4g} {self.nominal.parameter(name).unit}"))
         return Card(line, ("part", "value"), rows)
+
+    def _labelled(self) -> Labelled:
+        return self.heliostats.labelled()
 
     @property
     def name(self) -> str:

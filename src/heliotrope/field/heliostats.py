@@ -132,6 +132,10 @@ class Heliostats(Value, Framed):
         return Card(line, header, rows, dots(places[:, 0], places[:, 1], "map"))
 
     def _labelled(self) -> Labelled:
+        return self.labelled()
+
+    def labelled(self) -> Labelled:
+        """Return the arrays with their axes, as a frame of one heliostat takes them too."""
         row = ("heliostat",)
         variables = {
             "position": Variable((*row, "axis"), self.position, "m"),

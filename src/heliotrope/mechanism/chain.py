@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError, kind_of
+from heliotrope.frames import ENU, Framed, Labelled, Variable, batch_rows
 from heliotrope.geometry import TAU, FloatArray, as_angles, as_numbers
 from heliotrope.jit import as_input
 from heliotrope.mechanism import parameters as parameter_table
@@ -109,7 +110,7 @@ def check_calibration(given: object) -> None:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Mechanism(Value):
+class Mechanism(Value, Framed):
     """One mechanism, or an array of mechanisms of one kind; batch shape (...).
 
     Build one with a function of `heliotrope.mechanism.kinds`.
@@ -171,6 +172,39 @@ class Mechanism(Value):
             rows,
             dots(self.position[..., 0], self.position[..., 1], "map") if self.shape else "",
         )
+
+    def _labelled(self) -> Labelled:
+        labels = batch_rows(self.shape)
+        rows = tuple(labels)
+
+        def of(array: FloatArray, *axes: str, unit: str = "") -> Variable:
+            return Variable((*rows, *axes), array if self.shape else array[None], unit)
+
+        drives = self.drives if self.shape else Drive(self.drives.table[None])
+        variables = {
+            "position": of(self.position, "axis", unit="m"),
+            "vertex": of(self.vertex, "mirror_axis", unit="m"),
+            "normal": of(self.normal, "mirror_axis"),
+            "orientation": of(self.orientation, "axis", "own_axis"),
+            "joint_axis": of(self.axes, "joint", "own_axis"),
+            "origin": of(self.origins, "joint", "own_axis", unit="m"),
+            "angle": of(self.angles, "joint", unit="rad"),
+        }
+        for name, one in drives.variables((*rows, "drive")).items():
+            variables[f"drive_{name}"] = one
+        for name, values in self.deviations.items():
+            variables[f"deviation_{name}"] = of(
+                np.asarray(values), unit=self.parameter(name).unit.strip("1")
+            )
+        labels |= {
+            "axis": ENU,
+            "own_axis": ("x", "y", "z"),
+            "mirror_axis": ("x", "y", "z"),
+            "joint": self.joints,
+            "drive": [self.joints[k] for k in self.driven],
+        }
+        large = frozenset({"orientation", "joint_axis", "origin", "angle"})
+        return Labelled(rows, labels, variables, large, {"kind": self.kind})
 
     @property
     def shape(self) -> tuple[int, ...]:

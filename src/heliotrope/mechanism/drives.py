@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, shown
+from heliotrope.frames import Framed, Labelled, Variable, batch_rows
 from heliotrope.geometry import (
     MOST_TURNS,
     TAU,
@@ -40,7 +41,7 @@ from heliotrope.values import Card, Value, span
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Drive(Value):
+class Drive(Value, Framed):
     """One drive, or an array of drives of the same or of different kinds.
 
     Attributes
@@ -61,6 +62,20 @@ class Drive(Value):
         ]
         size = "" if not self.shape else f"{' × '.join(map(str, self.shape))} "
         return Card(f"{size}{self.kinds}, {self.describe()}", ("number", "value"), rows)
+
+    def _labelled(self) -> Labelled:
+        rows = batch_rows(self.shape)
+        return Labelled(tuple(rows), rows, self.variables(tuple(rows)))
+
+    def variables(self, axes: tuple[str, ...]) -> dict[str, Variable]:
+        """Return the numbers for a frame, by name; ``axes`` name the batch axes."""
+        table = self.table if self.shape else self.table[None]
+        rotary = table[..., slot.KIND] == slot.ROTARY
+        found = {"kind": Variable(axes, np.where(rotary, "rotary", "jack"))}
+        for name, place in SLOTS.items():
+            if name != "initial_angle":
+                found[name] = Variable(axes, table[..., place], _UNITS.get(name, ""))
+        return found
 
     @property
     def kinds(self) -> str:
@@ -172,6 +187,14 @@ _SHOWN = {
     **dict.fromkeys(("stroke_offset", "offset", "pivot_radius"), _METRES),
     "rate": (1e6, "µrad or µm a count"),
     "speed": (1.0, "counts/s"),
+}
+#: Unit of each number in a frame; a jack's rate is in metres.
+_UNITS = {
+    **dict.fromkeys(("zero", "bias", "worm_cos", "worm_sin", "sag", "sag_phase"), "rad"),
+    **dict.fromkeys(("min_angle", "max_angle"), "rad"),
+    **dict.fromkeys(("stroke_offset", "offset", "pivot_radius"), "m"),
+    "rate": "rad or m",
+    "speed": "1/s",
 }
 #: Name of each number for errors.
 _NAMES = {index: name for name, index in SLOTS.items()} | {
