@@ -327,6 +327,19 @@ def test_parties_of_new_heliostats_come_first() -> None:
     assert asyncio.run(made.chosen("left", ready, follow)) == ("E", "F")
 
 
+def test_two_targets_share_the_new_heliostats() -> None:
+    made, _, ready = parties(1e-3, first=6)
+    made._plant.design.targets = ("left", "right")
+    asked: list[int] = []
+
+    def following(target: str, left: np.ndarray, beside: bool) -> Planned | None:
+        asked.append(int(left.sum()))
+        return follow(target, left, beside)
+
+    assert asyncio.run(made.chosen("left", ready, following)) == ("A", "B", "C")
+    assert asked == [6, 5, 4], "three of six are left to the other target"
+
+
 def test_a_target_waits_a_minute_for_heliostats_that_are_raised() -> None:
     made, _, ready = parties(1e-3, first=6, approaching=(4, 5))
     ready[3:] = False

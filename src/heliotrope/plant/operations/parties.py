@@ -99,7 +99,10 @@ class Parties:
         first = ready & ~np.isfinite(self._book.calibrated_at)
         new = first & ~alone
         if settings.first and int(new.sum()) >= settings.least:
-            names = await self._several(target, new, following, settings.first)
+            # The targets share those that are left.
+            share = -(-int(new.sum()) // len(self._plant.design.targets))
+            most = min(settings.first, max(settings.least, share))
+            names = await self._several(target, new, following, most)
             # What makes the target too bright waits for the next visit.
             names = self.cycle.having_place(names, target) if names else ()
             if len(names) >= settings.least:
