@@ -307,8 +307,10 @@ def test_parties_leave_every_second_visit_to_those_without_a_calibration() -> No
     made, _, ready = parties(1e-3, first=0)
     made.begun("left")
     assert asyncio.run(made.chosen("left", ready, follow)) == ("A", "B", "C", "D", "E")
-    vague, _, ready = parties(1.6e-3, first=0)
+    vague, _, ready = parties(1.6e-3, first=0, together=0)
     assert asyncio.run(vague.chosen("left", ready, follow)) == ()
+    vague, _, ready = parties(1.6e-3, first=0)
+    assert asyncio.run(vague.chosen("left", ready, follow)) == ("A", "B", "C")
 
 
 def test_parties_of_new_heliostats_come_first() -> None:

@@ -90,14 +90,16 @@ class Parties:
     async def chosen(self, target: str, ready: Mask, following: Next) -> tuple[str, ...]:
         """Return the ready heliostats (N,) that go to a target together; () if too few would.
 
-        Those that were never calibrated come first, then those that are due and known well enough.
+        Those that were never calibrated, or are known badly, come first; then those that are due.
         While others wait for their first calibration, every second visit to a target is a joint
         one at most.
         """
         settings = self.cycle.settings
         alone = self.alone(ready)
         first = ready & ~np.isfinite(self._book.calibrated_at)
-        new = first & ~alone
+        # Few sightings on one target leave much open elsewhere: these keep a code of their own.
+        vague = ready & (2.0 * self._book.error > _SURE * settings.known)
+        new = (first | vague) & ~alone
         if settings.first and int(new.sum()) >= settings.least:
             # The targets share those that are left.
             share = -(-int(new.sum()) // len(self._plant.design.targets))

@@ -16,7 +16,7 @@ from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.visits.joint_layout import Layout, SentBeam, beam_of, coded
+from heliotrope.plant.visits.joint_layout import Layout, SentBeam, beam_of, coded, error_on
 
 #: A beam keeps this many of its standard deviations from the border, and those of its place.
 _BORDER, _PLACED = 1.5, 1.5
@@ -42,7 +42,7 @@ def newcomers(
     plant
         Knows mirrors and the sun.
     target, heliostats
-        The target, and names of heliostats that were never calibrated.
+        The target, and names of heliostats that are known badly, or were never calibrated.
     settings
         See `JointSettings`.
     model
@@ -52,9 +52,11 @@ def newcomers(
     sent: dict[str, SentBeam] = {}
     sun = plant.sun_vector()
     for name in heliostats:
-        present, names = plant.beliefs.present(name), model[name]
-        prior = np.linalg.inv(precision(plant.beliefs.nominal(name), names))[0]
-        error = float(expected_error(present, names, prior, sun, target.center).rms[0])
+        error = error_on(plant, target, name, settings)
+        if error is None:
+            present, names = plant.beliefs.present(name), model[name]
+            prior = np.linalg.inv(precision(plant.beliefs.nominal(name), names))[0]
+            error = float(expected_error(present, names, prior, sun, target.center).rms[0])
         found = beam_of(plant, target, name, error) if np.isfinite(error) else "out of its reach"
         if isinstance(found, str):
             wrong[name] = found

@@ -31,7 +31,7 @@ from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleRes
 from heliotrope.plant.visits.first_layout import newcomers
 from heliotrope.plant.visits.fitting import first_model
 from heliotrope.plant.visits.gathering import Gathering, Waiting
-from heliotrope.plant.visits.joint_layout import Layout, arranged, verifying
+from heliotrope.plant.visits.joint_layout import Layout, arranged, error_on, verifying
 from heliotrope.plant.visits.joint_visit import JointVisit
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.stack_counts import counts_at_rest
@@ -132,7 +132,7 @@ class JointCycle:
         plant = self._plant
         plant.authority.check(person, token, "PARAMETERS")
         place, names = plant.design.target(target), tuple(dict.fromkeys(heliostats))
-        first = self.first(names)
+        first = self.first(names, place)
         layout, wrong = self._arranged(place, names)
         results = {name: _refused(name, text) for name, text in wrong.items()}
         if layout.names:
@@ -148,17 +148,18 @@ class JointCycle:
             await self._back(visits, before)
         return tuple(results[name] for name in names)
 
-    def first(self, heliostats: Sequence[str]) -> bool:
-        """Return whether heliostats would make a joint first visit: none has a calibration."""
-        records = self._plant.beliefs.record
-        return bool(self.settings.first) and all(records(name) is None for name in heliostats)
+    def first(self, heliostats: Sequence[str], target: Target) -> bool:
+        """Return whether a visit is one of own codes: some are new, or not known well enough."""
+        errors = [error_on(self._plant, target, name, self.settings) for name in heliostats]
+        known = self.settings.known
+        return bool(self.settings.first) and any(e is None or not e <= known for e in errors)
 
     def having_place(self, heliostats: Sequence[str], target: str) -> tuple[str, ...]:
         """Return those of some heliostats that have a place in a visit now."""
         return self._arranged(self._plant.design.target(target), tuple(heliostats))[0].names
 
     def _arranged(self, target: Target, names: tuple[str, ...]) -> tuple[Layout, dict[str, str]]:
-        if not self.first(names):
+        if not self.first(names, target):
             return arranged(self._plant, target, names, self.settings)
         nominal, cycle = self._plant.beliefs.nominal, self._cycle.settings
         model = {name: first_model(cycle, nominal(name)).parameters for name in names}

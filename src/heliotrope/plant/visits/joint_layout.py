@@ -221,24 +221,29 @@ def _darkened(
 def _known(
     plant: PlantController, target: Target, name: str, settings: JointSettings
 ) -> SentBeam | str:
-    record = plant.beliefs.record(name)
-    if record is None:
-        return "it has no calibration yet; it goes alone, or with others that have none"
-    now = plant.clock.utc().timestamp()
-    expected = expected_error(
-        plant.beliefs.present(name),
-        record.names,
-        record.covariance_at(now),
-        plant.sun_vector(),
-        target.center,
-    )
-    error = float(np.hypot(expected.rms[0], np.sqrt(2.0) * settings.visit))
+    error = error_on(plant, target, name, settings)
+    if error is None:
+        return "it has no calibration yet; it is calibrated alone first"
     if not error <= settings.known:
         return (
             f"its beam is known to {1e3 * error:.1f} mrad only, the limit is "
             f"{1e3 * settings.known:g} mrad; it is calibrated alone first"
         )
     return beam_of(plant, target, name, error)
+
+
+def error_on(
+    plant: PlantController, target: Target, name: str, settings: JointSettings
+) -> float | None:
+    """Return the expected error of a beam on a target, rad RMS (2-D); None if never calibrated."""
+    record = plant.beliefs.record(name)
+    if record is None:
+        return None
+    covariance = record.covariance_at(plant.clock.utc().timestamp())
+    expected = expected_error(
+        plant.beliefs.present(name), record.names, covariance, plant.sun_vector(), target.center
+    )
+    return float(np.hypot(expected.rms[0], np.sqrt(2.0) * settings.visit))
 
 
 def beam_of(plant: PlantController, target: Target, name: str, error: float) -> SentBeam | str:
