@@ -312,6 +312,35 @@ def test_from_standby_a_defocus_turns_away_from_the_aim_and_not_onto_it(kind: st
     assert "UNREACHABLE" not in flags(bench)
 
 
+@pytest.mark.parametrize("kind", ["LOCK", "JOG"])
+@pytest.mark.parametrize("cause", ["DEFOCUS", "the cluster is gone"])
+def test_a_mirror_that_is_held_beside_its_aim_does_not_turn_onto_it(kind: str, cause: str) -> None:
+    bench = standing_by()
+    if kind == "LOCK":
+        assert bench.order("LOCK") == DONE
+    else:
+        assert bench.order("JOG", 0, 400) == DONE
+        bench.run(5)
+    # An aim where the usual turn, by 0.1 and 0.05 rad, would lead the beam.
+    turned = bench.machine.drives.angles(np.array(bench.made)) + [0.1, 0.05]
+    normal, vertex = bench.machine.armature.pose(turned)
+    sun = bench.sun(bench.gps_ms() / 1000)
+    east, north, up = vertex + 100.0 * (2.0 * (normal @ sun) * normal - sun)
+    aim = (float(east), float(north), float(up))
+    assert bench.order("AIM", *aim) == DONE
+    if cause == "DEFOCUS":
+        assert bench.order("DEFOCUS") == DONE
+    else:
+        bench.sends_sun = bench.sends_time = False
+    nearest = math.inf
+    for _ in range(40):
+        bench.run(0.5)
+        nearest = min(nearest, bench.miss(aim))
+    begin = bench.machine.drives.angles(np.array(bench.made))
+    assert begin == pytest.approx(turned - [0.2, 0.1], abs=2e-3)
+    assert nearest > OFF
+
+
 def test_from_an_aim_far_from_standby_a_defocus_does_not_turn_back_to_it() -> None:
     """Simulated run 910267: from a target below, the usual sense led onto the receiver."""
     bench = standing_by()

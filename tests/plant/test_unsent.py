@@ -15,6 +15,7 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.aims import BeamCheck
+from heliotrope.plant.assigned import Points
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.unsent import UnsentBeams
@@ -141,6 +142,10 @@ def test_stow_is_ordered_where_defocus_ends_on_the_receiver(share: float, act: A
     counts = Drive(check.drives.table[row[0]]).counts(begin).round()
     field.rows["primary"][row], field.rows["secondary"][row] = counts
     field.rows["state"][row] = states.LOCKED
-    unsent = UnsentBeams(check, field, lambda _: SUN, {})
+    points = Points(field.names, None)
+    unsent = UnsentBeams(check, field, points, lambda _: SUN, {})
     assert unsent.way_out("P5A", again=False) is act
     assert unsent.way_out("P5A", again=True) is Act.STOW
+    # Held beside its aim on the receiver, it turns away from that.
+    points.aims[row], points.standbys[row] = ON, BESIDE
+    assert unsent.way_out("P5A", again=False) is Act.DEFOCUS

@@ -11,6 +11,8 @@ NIGHT = -UNIT // 50
 MODULO = 1 << 32
 #: No sun moves faster, rad/ms: 15.05 arcsec/s (a turn in 86,164 s), seen from the earth's axis.
 FASTEST = 7.3e-8
+#: For this long after its second a vector shows where the sun is, to 4 mrad, ms.
+RECENT_MS = 60_000
 #: Time that tells apart the vectors of a whole day, ms.
 LONGEST_MS = 1 << 29
 
@@ -62,6 +64,8 @@ class SunLease:
 
     Attributes
     ----------
+    since_ms
+        Time since the second of the vector, at most 1,000,000, as before the first.
     bad
         Vectors that were refused.
     leaps
@@ -74,7 +78,7 @@ class SunLease:
         self._second = -1
         self._sun = [0, 0, 0]
         self._rate = [0, 0, 0]
-        self._since_ms = self._passed_ms = 0
+        self.since_ms, self._passed_ms = 1_000_000, 0
         self.bad = self.leaps = 0
 
     def take(self, values: "tuple[int, ...]", clock: Clock, now: int) -> bool:
@@ -100,7 +104,7 @@ class SunLease:
         self._second = second
         for i in (0, 1, 2):
             self._sun[i], self._rate[i] = values[1 + i], values[4 + i] * RATE_FACTOR
-        self._since_ms, self._passed_ms = delay, 0
+        self.since_ms, self._passed_ms = delay, 0
         self._left.start(now, self.span_ms - max(0, delay))
         return True
 
@@ -115,7 +119,7 @@ class SunLease:
 
     def look(self, now: int, elapsed: int) -> bool:
         """Charge the time that has passed, and return whether the lease runs."""
-        self._since_ms = min(self._since_ms + elapsed, 1_000_000)
+        self.since_ms = min(self.since_ms + elapsed, 1_000_000)
         self._passed_ms = min(self._passed_ms + elapsed, LONGEST_MS)
         return not self._left.over(now)
 
@@ -133,6 +137,6 @@ class SunLease:
 
     def vector(self, ahead_ms: int) -> tuple[float, float, float]:
         """Return the direction to the sun, of length near 1, some time from now."""
-        ms = self._since_ms + ahead_ms
+        ms = self.since_ms + ahead_ms
         east, north, up = [self._sun[i] + self._rate[i] * ms // 1000 for i in (0, 1, 2)]
         return east / UNIT, north / UNIT, up / UNIT

@@ -8,7 +8,7 @@ back the same way.
 import math
 
 from .config import Config
-from .lease import SunLease
+from .lease import RECENT_MS, SunLease
 from .pointing import OK, Pose
 from .search import Spiral, displaced
 from .stepper import BOTH, PRIMARY_FIRST, SECONDARY_FIRST, Stepper
@@ -267,12 +267,13 @@ class Motion:
 
         From standby, and on the way there, it turns off the aim, since the usual sense may lead
         the beam onto the receiver. From an aim, an axis that the usual sense would bring nearer to
-        standby, which is beside the receiver, turns the other way.
+        standby, which is beside the receiver, turns the other way. A mirror that is held, wherever
+        a person has left it, turns off the aim too, if it knows where the sun is.
         """
         one, two = self.config.defocus
         tracks = self.kind in (TRACK, SEARCH)
         other = self.config.standby if tracks else self.aim
-        if other is None or not (tracks or self.kind in (APPROACH, STANDBY)):
+        if other is None or not self.known or self.sun.since_ms > RECENT_MS:
             return one, two
         unreachable = self.unreachable
         pose = self.pose(other, 0)

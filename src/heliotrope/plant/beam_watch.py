@@ -18,7 +18,7 @@ from heliotrope.mechanism.tracking import TrackingStatus
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import Points
 from heliotrope.plant.field_state import FieldState
-from heliotrope.plant.leaving import way_out
+from heliotrope.plant.leaving import turns_from, way_out
 from heliotrope.plant.parameters import Tables
 from heliotrope.plant.refusals import BEAM_REFUSED, RefusedError
 from heliotrope.plant.unsent import TURNS, UnsentBeams
@@ -31,10 +31,6 @@ Rows = npt.NDArray[np.intp]
 LOOK_PERIOD = 1.0
 #: A heliostat moves if its counts and goals differ by more steps than this.
 _MOVES = 200
-#: States from which a mirror turns away from its aim.
-_AT_STANDBY = (states.APPROACHING, states.IDLE)
-#: States from which it does not turn nearer to its standby point.
-_AT_AIM = (states.TRACKING, states.SEARCHING)
 #: States whose motions were commanded: the whole way is looked at. Of every other state the present
 #: pose and the end of the motion are, as a way to safety is never held up.
 _COMMANDED = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)
@@ -105,7 +101,7 @@ class BeamWatch:
         self._check, self._field, self.points, self._sun = check, field, points, sun
         self._machines = machines
         self._ways = Ways(check, machines)
-        self.unsent = UnsentBeams(check, field, sun, machines)
+        self.unsent = UnsentBeams(check, field, points, sun, machines)
         #: Tables that unverified ones have replaced, by row.
         self._earlier: dict[int, Tables] = {}
         self._seen: frozenset[str] = frozenset()
@@ -374,8 +370,7 @@ class BeamWatch:
             return Act.STOW
         machine = self._machines.get(name)
         points, counts, sun = self.points, self._field.posed[row], self._sun(0.0)
-        aim = points.aims[row] if node["state"] in _AT_STANDBY else None
-        standby = points.standbys[row] if node["state"] in _AT_AIM else None
+        aim, standby = turns_from(int(node["state"]), points.aims[row], points.standbys[row])
         return way_out(self._check, machine, row, counts, sun, aim, standby)
 
     def _look(self, now: float) -> None:

@@ -8,12 +8,15 @@ stow, azimuth last.
 import numpy as np
 
 from heliotrope.geometry import FloatArray, as_float
+from heliotrope.lcu import states
 from heliotrope.lcu.config import Config
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.safety import Act
 
+#: States from which a mirror does not turn nearer to its standby point, wherever it stands.
+_AT_AIM = (states.TRACKING, states.SEARCHING)
 #: Turn of the axes between two poses that are looked at, rad.
 _PIECE = 0.02
 
@@ -40,7 +43,7 @@ def way_out(
     sun
         Unit vector to the sun, (3,).
     aim
-        Aim of a heliostat at standby or on its way there, m, (3,), from which it turns away.
+        Aim of a heliostat that does not track, m, (3,), from which it turns away.
     standby
         Standby point of a heliostat that tracks, m, (3,), which it does not turn nearer to.
     """
@@ -51,13 +54,34 @@ def way_out(
     end = as_float(drives.angles(np.asarray(machine.stow, dtype=np.float64)))
     corner = end.copy()
     corner[machine.azimuth_axis] = begin[machine.azimuth_axis]
-    aimed, stood = (_angles(check, row, point, counts, sun) for point in (aim, standby))
     ways = {
-        Act.DEFOCUS: np.stack([begin, turned_away(begin, machine, drives, aimed, stood)]),
+        Act.DEFOCUS: np.stack([begin, defocused(check, machine, row, counts, sun, aim, standby)]),
         Act.STOW: np.stack([begin, corner, end]),
     }
     costs = {act: _cost(check, row, path, sun) for act, path in ways.items()}
     return min(ways, key=lambda act: (costs[act], act))
+
+
+def defocused(
+    check: BeamCheck,
+    machine: Machine | None,
+    row: int,
+    counts: FloatArray,
+    sun: FloatArray,
+    aim: FloatArray | None = None,
+    standby: FloatArray | None = None,
+) -> FloatArray:
+    """Return the angles (2,) where DEFOCUS ends; parameters as of `way_out`."""
+    drives = Drive(check.drives.table[row])
+    begin = as_float(drives.angles(counts))
+    aimed, stood = (_angles(check, row, point, counts, sun) for point in (aim, standby))
+    return turned_away(begin, machine, drives, aimed, stood)
+
+
+def turns_from(state: int, aim: FloatArray, standby: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return aim and standby point as DEFOCUS goes by them in a state, NaN where it does not."""
+    nowhere = np.full(3, np.nan)
+    return (nowhere, standby) if state in _AT_AIM else (aim, nowhere)
 
 
 def _angles(
@@ -79,9 +103,9 @@ def turned_away(
 ) -> FloatArray:
     """Return the angles (2,) of the defocus from some angles, as a local controller chooses them.
 
-    From standby, and on the way there, it turns away from the angles of the aim (``aimed``). From
-    an aim, an axis that the usual sense would bring nearer to the angles of ``standby`` turns the
-    other way. So does one that is near a stop, as in `lcu.motion`.
+    From standby, on the way there, and where it is held, it turns away from the angles of the aim
+    (``aimed``). From an aim, an axis that the usual sense would bring nearer to the angles of
+    ``standby`` turns the other way. So does one that is near a stop, as in `lcu.motion`.
     """
     offsets = as_float(Config().defocus if machine is None else machine.defocus)
     if aimed is not None and np.isfinite(aimed).all():

@@ -16,8 +16,9 @@ from heliotrope.lcu import states
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.plant.aims import BeamCheck
+from heliotrope.plant.assigned import Points
 from heliotrope.plant.field_state import FieldState, Mask
-from heliotrope.plant.leaving import turned_away
+from heliotrope.plant.leaving import defocused, turns_from
 from heliotrope.safety import Act
 
 #: A heliostat that stands still is looked at once in this many looks.
@@ -41,6 +42,8 @@ class UnsentBeams:
         Mirrors and receivers.
     field
         State of the field, with the positions of the axes.
+    points
+        Assigned aims and standby points.
     sun
         Returns the unit vector to the sun, (3,), some seconds from now.
     machines
@@ -56,10 +59,12 @@ class UnsentBeams:
         self,
         check: BeamCheck,
         field: FieldState,
+        points: Points,
         sun: Callable[[float], FloatArray],
         machines: Mapping[str, Machine],
     ) -> None:
-        self._check, self._field, self._sun, self._machines = check, field, sun, machines
+        self._check, self._field, self._points = check, field, points
+        self._sun, self._machines = sun, machines
         self.seen: frozenset[str] = frozenset()
         self._left = np.full(len(field), np.inf)
         self._turn = 0
@@ -96,7 +101,8 @@ class UnsentBeams:
         row = self._field.place(name)
         if again or self._field.rows["state"][row] in _TURNED:
             return Act.STOW
-        rows, drives = np.array([row]), Drive(self._check.drives.table[row])
-        begin = np.asarray(drives.angles(self._field.counts(rows)[0]))
-        end = turned_away(begin, self._machines.get(name), drives)
-        return Act.STOW if self._check.lights(rows, end[None], self._sun(0.0))[0] else Act.DEFOCUS
+        rows, sun, state = np.array([row]), self._sun(0.0), int(self._field.rows["state"][row])
+        aim, standby = turns_from(state, self._points.aims[row], self._points.standbys[row])
+        machine, counts = self._machines.get(name), self._field.counts(rows)[0]
+        end = defocused(self._check, machine, row, counts, sun, aim, standby)
+        return Act.STOW if self._check.lights(rows, end[None], sun)[0] else Act.DEFOCUS

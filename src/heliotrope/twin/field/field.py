@@ -19,7 +19,7 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, bisector, normalize
 from heliotrope.lcu import states
 from heliotrope.lcu.controller import LATCHED, NO_FAULT
-from heliotrope.lcu.lease import RATE_FACTOR, UNIT
+from heliotrope.lcu.lease import RATE_FACTOR, RECENT_MS, UNIT
 from heliotrope.lcu.motion import (
     APPROACH,
     DEFOCUS,
@@ -168,6 +168,7 @@ class Field:
         self._way, self._way_length = self._all_ways()
         self._sun = np.zeros((2, 3), dtype=np.int64)
         self._sun_ms = 0
+        self._sunned = np.full(count, -RECENT_MS)  # when each took it last, ms
 
     def __len__(self) -> int:
         return len(self.state)
@@ -273,10 +274,12 @@ class Field:
     def _sense(self, rows: Rows) -> None:
         """Choose in which sense heliostats turn away: `Motion._turn`."""
         self._senses[rows] = 1.0
-        ready = among(self.kind[rows], APPROACH, STANDBY) & np.isfinite(self.aim[rows, 0])
-        some, off = self._off(rows[ready], self.aim[rows[ready]])
+        knows = self.now_ms - self._sunned[rows] < RECENT_MS
+        aims = among(self.kind[rows], TRACK)
+        leaves = rows[~aims & knows & np.isfinite(self.aim[rows, 0])]
+        some, off = self._off(leaves, self.aim[leaves])
         self._senses[some] = np.copysign(1.0, off * self._defocus[some])
-        tracks = rows[among(self.kind[rows], TRACK)]
+        tracks = rows[aims]
         some, off = self._off(tracks, self.journals.standby[tracks])
         nearer = np.abs(off + self._defocus[some]) < np.abs(off)
         self._senses[some] = np.where(nearer, -1.0, 1.0)
@@ -358,7 +361,8 @@ class Field:
         self._sun[0], self._sun[1] = values[1:4], np.multiply(values[4:7], RATE_FACTOR)
         self._sun_ms = delay_ms
         heard = np.arange(len(self)) if rows is None else rows
-        self._lease[heard[self.state[heard] >= 0]] = LEASE_MS - max(0, delay_ms)
+        takes = heard[self.state[heard] >= 0]
+        self._lease[takes], self._sunned[takes] = LEASE_MS - max(0, delay_ms), self.now_ms
         self.hear(heard)
 
     def hear(self, rows: Rows) -> None:
@@ -521,6 +525,7 @@ class Field:
         self._kept[rows], self.state[rows] = self.state[rows], -1
         self.kind[rows] = self._base[rows] = HOLD
         self._lease[rows] = self._queued[rows] = self._order[rows] = 0
+        self._sunned[rows] = -RECENT_MS
         self._ready[rows] = self._present[rows] = False
         for name in ("speed", "phase", "led", "braking"):
             self.axes[name][rows] = 0
