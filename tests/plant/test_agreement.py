@@ -173,10 +173,13 @@ def test_a_heliostat_on_its_way_is_left_in_peace_and_one_that_stands_is_not(tmp_
     play(tmp_path, scene)
 
 
-def test_a_new_aim_that_waits_for_its_turn_is_no_disagreement(tmp_path: Path) -> None:
+@pytest.mark.parametrize("seconds", [5, 0])
+def test_a_new_aim_that_waits_for_its_turn_is_no_disagreement(seconds: int, tmp_path: Path) -> None:
+    """Nor is one that comes before the plant has seen the beam at the aim before it."""
+
     async def scene(bench: Bench) -> None:
         await tracking(bench)
-        await go(bench, 5, 0.0)
+        await go(bench, seconds, 0.0)
         still = steps_at(bench, 0.0)
         cluster = bench.cluster_of(NAME)
         row = cluster.names.index(NAME)

@@ -122,6 +122,9 @@ class Agreement:
         changed = ~np.all((aims == self._aims) | (np.isnan(aims) & np.isnan(self._aims)), axis=-1)
         begins = ~tracking | changed
         self._lag[begins], self._stands[begins] = np.inf, False
+        # A new aim may wait for its turn: until then the beam is on the one before, found or not.
+        unfound = changed & np.isnan(self._found).any(axis=-1)
+        self._found[unfound] = self._aims[unfound]
         self._aimed_at[changed], self._aims[changed] = now, aims[changed]
         # Counts from before a new aim say nothing about it.
         begun = np.maximum(self._since, self._aimed_at) + _SETTLE
