@@ -142,7 +142,7 @@ def test_every_record_has_a_frame_and_a_dataset(learned: ht.Learned, tmp_path: P
     assert units["value_tilt_north"] == units["sigma_canting"] == "rad"
     assert learned.to_frame().attrs["units"]["value_tilt_north"] == "rad"
     assert set(learned.to_xarray()["value"].attrs["units"].split(", ")) == {"rad"}
-    assert records["heliostats"].to_frame().loc["P6A", "canting"] == 1e-3
+    assert records["heliostats"].to_frame().loc["P6A", "deviation_canting"] == 1e-3
     place = PLANT.to_frame().loc["P6A", ["position_east", "position_north", "position_up"]]
     np.testing.assert_array_equal(place.to_numpy(float), PLANT["P6A"].nominal.position)
     value = learned.to_frame().loc["P6A", "value_tilt_north"]
@@ -160,3 +160,11 @@ def test_a_single_axis_has_the_models_by_role() -> None:
     fitted = ht.fit(machine, seen, "guo6")
     assert fitted.names == ("tilt_east", "tilt_up", "rotation_bias")
     assert np.abs(fitted.values).max() < 1e-6
+
+
+def test_a_deviation_of_the_position_leaves_the_position_alone() -> None:
+    moved = PLANT.groups["azel"].with_parameters({"position_north": 0.01})
+    frame = moved.to_frame()
+    np.testing.assert_array_equal(frame["position_north"], moved.position[:, 1])
+    assert (frame["deviation_position_north"] == 0.01).all()
+    assert frame.attrs["units"]["deviation_position_north"] == "m"

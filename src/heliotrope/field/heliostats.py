@@ -147,7 +147,8 @@ class Heliostats(Value, Framed):
         if self.cluster:
             variables["cluster"] = Variable(row, np.array(self.cluster, dtype=str))
         for name, values in self.parameters.items():
-            variables[name] = Variable(row, values, unit_of(name))
+            # One of them is called position_north, like a column of the position.
+            variables[f"deviation_{name}"] = Variable(row, values, unit_of(name))
         labels = {"heliostat": self.names, "axis": ENU}
         return Labelled(row, labels, variables, notes={"kind": self.mechanism.kind})
 
