@@ -10,7 +10,10 @@ import xarray
 
 import heliotrope as ht
 from heliotrope.calibration import predict
+from heliotrope.calibration.fit import DriveTerm, fit_terms
+from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.errors import InputError
+from heliotrope.frames import Framed
 from heliotrope.mechanism.kernels import slots
 
 PLANT = ht.example_plant()
@@ -87,6 +90,20 @@ def test_times_in_are_times_out(learned: ht.Learned, tmp_path: Path) -> None:
     assert back.attrs["units"] == frame.attrs["units"]
 
 
+def back_from_files(name: str, record: Framed, folder: Path) -> None:
+    """A frame and a dataset have units, and come back from Parquet and NetCDF."""
+    frame, data = record.to_frame(), record.to_xarray()
+    assert len(frame), name
+    assert set(frame.attrs["units"]) == set(frame.columns)
+    data.to_netcdf(folder / f"{name}.nc", engine="scipy")
+    with xarray.open_dataset(folder / f"{name}.nc", engine="scipy") as back:
+        for variable in data:
+            np.testing.assert_array_equal(
+                np.asarray(back[variable]).astype(data[variable].dtype), data[variable]
+            )
+    frame.to_parquet(folder / f"{name}.parquet")
+
+
 def test_every_record_has_a_frame_and_a_dataset(learned: ht.Learned, tmp_path: Path) -> None:
     seen = measured()
     day = ht.track_day(PLANT, "2026-09-02", every=timedelta(hours=2))
@@ -113,16 +130,7 @@ def test_every_record_has_a_frame_and_a_dataset(learned: ht.Learned, tmp_path: P
         "drives": PLANT.drives,
     }
     for name, record in records.items():
-        frame, data = record.to_frame(), record.to_xarray()
-        assert len(frame), name
-        assert set(frame.attrs["units"]) == set(frame.columns)
-        data.to_netcdf(tmp_path / f"{name}.nc", engine="scipy")
-        with xarray.open_dataset(tmp_path / f"{name}.nc", engine="scipy") as back:
-            for variable in data:
-                np.testing.assert_array_equal(
-                    np.asarray(back[variable]).astype(data[variable].dtype), data[variable]
-                )
-        frame.to_parquet(tmp_path / f"{name}.parquet")
+        back_from_files(name, record, tmp_path)
     one = records["moved"].to_frame()
     assert one["position_north"].item() == TRUTH.position[1]
     assert one["drive_rate_elevation"].item() == TRUTH.drives[1].table[slots.RATE]
@@ -168,3 +176,68 @@ def test_a_deviation_of_the_position_leaves_the_position_alone() -> None:
     np.testing.assert_array_equal(frame["position_north"], moved.position[:, 1])
     assert (frame["deviation_position_north"] == 0.01).all()
     assert frame.attrs["units"]["deviation_position_north"] == "m"
+
+
+def single_records() -> dict[str, Framed]:
+    """Records of one topic each: the sun, poses and derivatives, light, terms, a calibration."""
+    sun = ht.sun.position(TIMES[UP][:4], PLANT.site)
+    counts = ht.track(NOMINAL, sun.vector, AIM).best_counts
+    seen, names = measured(), ("tilt_north", "position_up")
+    fitted = ht.fit(PLANT["P6A"].heliostats, seen, "guo6")
+    term = DriveTerm("eccentric", "azimuth", lambda angles: np.sin(angles[..., 0]), 5e-3)
+    offsets = ht.image_offsets(NOMINAL, TRUTH, sun.vector, AIM)
+    return {
+        "sun": sun,
+        "sun now": ht.sun.position(TIMES[UP][0], PLANT.site),
+        "pose": NOMINAL.pose(counts),
+        "pose of one": NOMINAL.pose(counts[0]),
+        "jacobian": NOMINAL.jacobian(counts, names),
+        "armature": NOMINAL.armature,
+        "armatures": PLANT.nominal.armature,
+        "flux": ht.flux(PLANT, TIMES[UP][3]),
+        "offsets": offsets,
+        "terms": fit_terms(PLANT["P6A"], seen, "guo6", [term]),
+        "calibration": HeliostatCalibration.from_fit(
+            "P6A",
+            TIMES[0].timestamp(),
+            fitted,
+            PLANT["P6A"].heliostats.mechanism,
+            seen,
+            np.arange(1, len(seen) + 1),
+            model="guo6",
+        ),
+    }
+
+
+def test_records_of_one_topic_have_frames_and_datasets(tmp_path: Path) -> None:
+    records = single_records()
+    for name, record in records.items():
+        back_from_files(name, record, tmp_path)
+    frames = {name: record.to_frame() for name, record in records.items()}
+    np.testing.assert_array_equal(frames["sun"]["azimuth"], records["sun"].azimuth)
+    np.testing.assert_array_equal(frames["pose"]["vertex_up"], records["pose"].vertex[:, 2])
+    assert len(frames["sun now"]) == len(frames["pose of one"]) == len(frames["armature"]) == 1
+    assert len(frames["armatures"]) == len(PLANT)
+    jacobian = frames["jacobian"]
+    np.testing.assert_array_equal(
+        jacobian["vertex_by_north_tilt_north"], records["jacobian"].vertex[:, 0, 1]
+    )
+    np.testing.assert_array_equal(
+        jacobian["normal_by_count_up_2"], records["jacobian"].normal_counts[:, 1, 2]
+    )
+    units = jacobian.attrs["units"]
+    assert units["vertex_by_north_tilt_north"] == "m/rad"
+    assert units["normal_by_up_position_up"] == "1/m"
+    assert units["vertex_by_up_position_up"] == ""
+    flux = records["flux"]
+    cell = frames["flux"].loc[(flux.up[2], flux.right[5])]
+    assert cell["flux"] == flux.flux[2, 5]
+    assert cell["power"] == flux.power
+    np.testing.assert_array_equal(frames["offsets"]["slant"], records["offsets"].slant)
+    assert frames["terms"].loc["P6A", "value_eccentric"] == records["terms"].values[0, 0]
+    kept = frames["calibration"].loc["P6A"]
+    assert (
+        kept["value_tilt_north"]
+        == records["calibration"].values[records["calibration"].names.index("tilt_north")]
+    )
+    assert kept["at"] == TIMES[0].tz_localize(None)

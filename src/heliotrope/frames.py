@@ -94,7 +94,9 @@ class Framed:
             for k, names in enumerate(labels):
                 column = "_".join((name, *names))
                 columns[column] = np.array(flat[:, k])
-                units[column] = one.unit if isinstance(one.unit, str) else one.unit[k]
+                units[column] = (
+                    one.unit if isinstance(one.unit, str) else one.unit[k % len(one.unit)]
+                )
         parts = [_index(given.labels[axis]) for axis in given.rows]
         index: Any = parts[0] if len(parts) == 1 else pd.MultiIndex.from_product(parts)
         index.names = list(given.rows)
@@ -128,6 +130,37 @@ def batch_rows(shape: tuple[int, ...]) -> dict[str, npt.ArrayLike]:
     if not shape:
         return {"row": np.arange(1)}
     return {f"axis_{k}": np.arange(n) for k, n in enumerate(shape)}
+
+
+def batched(
+    shape: tuple[int, ...],
+    own: Mapping[str, Variable],
+    labels: Mapping[str, npt.ArrayLike],
+    large: frozenset[str] = frozenset(),
+) -> Labelled:
+    """Return arrays of a batch with a row for each of its objects.
+
+    Parameters
+    ----------
+    shape
+        The batch shape; the batch axes of the arrays are broadcast to it.
+    own
+        Arrays by name, with the axes behind those of the batch.
+    labels
+        Labels of these axes.
+    large
+        As in `Labelled`.
+    """
+    rows = batch_rows(shape)
+    full = shape or (1,)
+
+    def of(one: Variable) -> Variable:
+        values = np.asarray(one.values)
+        behind = values.shape[values.ndim - len(one.axes) :]
+        return Variable((*rows, *one.axes), np.broadcast_to(values, (*full, *behind)), one.unit)
+
+    variables = {name: of(one) for name, one in own.items()}
+    return Labelled(tuple(rows), {**rows, **labels}, variables, large)
 
 
 def times(seconds: npt.ArrayLike) -> npt.NDArray[np.datetime64]:

@@ -21,8 +21,10 @@ from heliotrope.calibration.growth import Growth, default_growth
 from heliotrope.calibration.learn.drift import DAY
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError
+from heliotrope.frames import ACROSS, Framed, Labelled, Variable, times
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.parameters import unit_of
 from heliotrope.values import Card, Value, amount
 
 Identities = npt.NDArray[np.int64]
@@ -73,7 +75,7 @@ def _no_residuals() -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class HeliostatCalibration(Value):
+class HeliostatCalibration(Value, Framed):
     """The calibration of one heliostat: P parameters from M sightings. Arrays are read-only.
 
     Attributes
@@ -173,6 +175,33 @@ class HeliostatCalibration(Value):
                 raise InputError(
                     f"calibration of {self.heliostat}: {name} is not finite; keep no failed fit"
                 )
+
+    def _labelled(self) -> Labelled:
+        row, units = ("heliostat",), tuple(map(unit_of, self.names))
+        both, seen = ("parameter", "parameter_2"), ("sighting", "across")
+        variables = {
+            "at": Variable(row, times([self.at])),
+            "value": Variable(("parameter",), self.values, units),
+            "sigma": Variable(("parameter",), np.sqrt(np.diagonal(self.covariance)), units),
+            "prior": Variable(("parameter",), self.prior, units),
+            "covariance": Variable(both, self.covariance),
+            "before": Variable(row, [self.before], "rad"),
+            "after": Variable(row, [self.after], "rad"),
+            "scale": Variable(row, [self.scale]),
+            "outcome": Variable(row, [int(self.outcome)]),
+            "version": Variable(row, [self.version]),
+            "residual_before": Variable(seen, self.residual_before, "rad"),
+            "residual_after": Variable(seen, self.residual_after, "rad"),
+        }
+        labels: dict[str, npt.ArrayLike] = {
+            "heliostat": (self.heliostat,),
+            "parameter": self.names,
+            "parameter_2": self.names,
+            "sighting": self.sightings,
+            "across": ACROSS,
+        }
+        large = frozenset({"covariance", "residual_before", "residual_after"})
+        return Labelled(row, labels, variables, large, {"model": self.model})
 
     @classmethod
     def from_fit(

@@ -11,13 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
+from heliotrope.frames import ENU, Framed, Labelled, Variable, batched
 from heliotrope.geometry import FloatArray, as_vectors, normalize, rotation
 from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.values import Card, Value, card_of_arrays
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Armature(Value):
+class Armature(Value, Framed):
     """Two axes with a point on each, a vertex and its normal, at zero joint angles.
 
     Attributes
@@ -32,6 +33,12 @@ class Armature(Value):
 
     def _card(self) -> Card:
         return card_of_arrays(self)
+
+    def _labelled(self) -> Labelled:
+        units = {"origin_1": "m", "origin_2": "m", "vertex": "m"}
+        names = ("axis_1", "origin_1", "axis_2", "origin_2", "vertex", "normal")
+        own = {n: Variable(("axis",), getattr(self, n), units.get(n, "")) for n in names}
+        return batched(self.shape, own, {"axis": ENU})
 
     @classmethod
     def of(

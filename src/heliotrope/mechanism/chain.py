@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError, kind_of
-from heliotrope.frames import ENU, Framed, Labelled, Variable, batch_rows
+from heliotrope.frames import ENU, Framed, Labelled, Variable, batch_rows, batched
 from heliotrope.geometry import TAU, FloatArray, as_angles, as_numbers
 from heliotrope.jit import as_input
 from heliotrope.mechanism import parameters as parameter_table
@@ -36,7 +36,7 @@ Index = (
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Pose(Value):
+class Pose(Value, Framed):
     """Normals and vertices of mirrors.
 
     Attributes
@@ -53,9 +53,16 @@ class Pose(Value):
     def _card(self) -> Card:
         return card_of_arrays(self)
 
+    def _labelled(self) -> Labelled:
+        own = {
+            "normal": Variable(("axis",), self.normal),
+            "vertex": Variable(("axis",), self.vertex, "m"),
+        }
+        return batched(self.normal.shape[:-1], own, {"axis": ENU})
+
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Jacobian(Value):
+class Jacobian(Value, Framed):
     """A pose with its derivatives by P parameters and by the counts of D drives.
 
     Attributes
@@ -79,6 +86,26 @@ class Jacobian(Value):
 
     def _card(self) -> Card:
         return card_of_arrays(self)
+
+    def _labelled(self) -> Labelled:
+        by = [parameter_table.unit_of(name) for name in self.names]
+
+        def derived(values: FloatArray, axis: str, unit: str | tuple[str, ...]) -> Variable:
+            return Variable(("axis", axis), np.swapaxes(values, -1, -2), unit)
+
+        normal = tuple(f"1/{unit}" if unit else "" for unit in by)
+        vertex = tuple({"": "m", "m": ""}.get(unit, f"m/{unit}") for unit in by)
+        own = {
+            "normal": Variable(("axis",), self.pose.normal),
+            "vertex": Variable(("axis",), self.pose.vertex, "m"),
+            "normal_by": derived(self.normal, "parameter", normal),
+            "vertex_by": derived(self.vertex, "parameter", vertex),
+            "normal_by_count": derived(self.normal_counts, "drive", ""),
+            "vertex_by_count": derived(self.vertex_counts, "drive", "m"),
+        }
+        drives = np.arange(1, self.normal_counts.shape[-2] + 1)
+        labels: dict[str, npt.ArrayLike] = {"axis": ENU, "parameter": self.names, "drive": drives}
+        return batched(self.pose.normal.shape[:-1], own, labels)
 
 
 @runtime_checkable

@@ -25,6 +25,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver
+from heliotrope.frames import Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
 from heliotrope.mechanism.tracking import track
 from heliotrope.optics.beam import beam_sigma
@@ -39,7 +40,7 @@ MARGIN = 1.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FluxView(Value):
+class FluxView(Value, Framed):
     """The predicted flux on a receiver.
 
     Attributes
@@ -70,6 +71,17 @@ class FluxView(Value):
         line = f"{amount(self.heliostats, 'beam')} on {self.receiver}, {1e-3 * self.power:.4g} kW, "
         line += f"intercept {100 * self.intercept:.3g} %, "
         return Card(f"{line}{span(self.flux, 1e-3, 'kW/m²')} in {self.flux.shape} cells")
+
+    def _labelled(self) -> Labelled:
+        rows = ("up", "right")
+        variables = {
+            "flux": Variable(rows, self.flux, "W/m²"),
+            "power": Variable((), self.power, "W"),
+            "intercept": Variable((), self.intercept),
+            "heliostats": Variable((), self.heliostats),
+        }
+        notes = {"receiver": self.receiver, "cells": "centres, m from that of the aperture"}
+        return Labelled(rows, {"up": self.up, "right": self.right}, variables, notes=notes)
 
 
 def air_loss(distance: npt.ArrayLike) -> FloatArray:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target
+from heliotrope.frames import ENU, Framed, Labelled, Variable, batched
 from heliotrope.geometry import FloatArray, as_float, as_vectors, reflect, tangent_axes
 from heliotrope.mechanism.chain import Mechanism, Pose
 from heliotrope.mechanism.tracking import TrackingStatus, track
@@ -23,7 +24,7 @@ from heliotrope.values import Card, Value, dots, span
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ImageOffsets(Value):
+class ImageOffsets(Value, Framed):
     """Where beams cross the plane through the aim perpendicular to the line of sight.
 
     NaN where the nominal mechanism cannot send the sun to the aim, or the beam never
@@ -51,6 +52,11 @@ class ImageOffsets(Value):
         size = " × ".join(map(str, self.right.shape)) or "one"
         line = f"{size}, beam error {1e3 * float(self.rms()):.3g} mrad RMS"
         return Card(line, ("offset", "range"), rows, dots(self.right, self.up, "offsets"))
+
+    def _labelled(self) -> Labelled:
+        own = {name: Variable((), getattr(self, name), "m") for name in ("right", "up", "slant")}
+        own |= {name: Variable(("axis",), getattr(self, name)) for name in ("normal", "beam")}
+        return batched(np.shape(self.right), own, {"axis": ENU})
 
     @property
     def distance(self) -> FloatArray:

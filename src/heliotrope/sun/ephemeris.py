@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, TimeError, UnknownNameError, kind_of
+from heliotrope.frames import ENU, Framed, Labelled, Variable, batched
 from heliotrope.geometry import FloatArray, as_float, direction, wrap_positive
 from heliotrope.parallel import run_blocks
 from heliotrope.sun import grena
@@ -141,7 +142,7 @@ _SITE_LIMITS = (
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SunPosition(Value):
+class SunPosition(Value, Framed):
     """The position of the sun; the shape (...) is that of the times.
 
     Attributes
@@ -176,6 +177,16 @@ class SunPosition(Value):
         size = " × ".join(map(str, self.azimuth.shape)) or "one"
         line = ", ".join(f"{name} {value}" for name, value in rows[:2])
         return Card(f"{size}, {line}", ("angle", "range"), rows)
+
+    def _labelled(self) -> Labelled:
+        own = {
+            name: Variable((), getattr(self, name), "rad")
+            for name in ("azimuth", "elevation", "true_elevation")
+        }
+        own |= {
+            name: Variable(("axis",), getattr(self, name)) for name in ("vector", "true_vector")
+        }
+        return batched(np.shape(self.azimuth), own, {"axis": ENU})
 
 
 @dataclass(frozen=True)

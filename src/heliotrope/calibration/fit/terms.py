@@ -21,6 +21,7 @@ from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.named import Field, Members, members
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.frames import Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray, as_float, as_numbers
 from heliotrope.mechanism.chain import Mechanism
 
@@ -87,7 +88,7 @@ def table_terms(joint: str, drive: int, knots: npt.ArrayLike, prior: float) -> l
 
 
 @dataclass(frozen=True)
-class TermFit:
+class TermFit(Framed):
     """Parameters of N heliostats with K coefficients of own terms each.
 
     Attributes
@@ -117,6 +118,25 @@ class TermFit:
     def sigma(self) -> FloatArray:
         """Standard deviations of the coefficients, (N, K)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    def _labelled(self) -> Labelled:
+        row, names = ("heliostat",), [term.name for term in self.terms]
+        return Labelled(
+            row,
+            {
+                "heliostat": self.given.names or np.arange(len(self.values)),
+                "term": names,
+                "term_2": names,
+            },
+            {
+                "value": Variable((*row, "term"), self.values, "rad"),
+                "sigma": Variable((*row, "term"), self.sigma, "rad"),
+                "prior": Variable(("term",), [term.prior for term in self.terms], "rad"),
+                "covariance": Variable((*row, "term", "term_2"), self.covariance, "rad²"),
+            },
+            frozenset({"covariance"}),
+            {"terms": "rad over the unit of the term's function, if that has one"},
+        )
 
     def without_terms(self, seen: Sightings) -> Sightings:
         """Return sightings with the counts at which ``mechanism`` stands as the terms move it."""
