@@ -37,6 +37,7 @@ from heliotrope.links.messages import (
 )
 from heliotrope.plant.agreement import Agreement
 from heliotrope.plant.aims import BeamCheck
+from heliotrope.plant.assigned import Points
 from heliotrope.plant.audit import JsonLines
 from heliotrope.plant.beam_watch import BeamWatch
 from heliotrope.plant.controller import PlantController
@@ -293,7 +294,8 @@ def _at_rest(count: int) -> float:
     for end, place in (("primary", primary - 3000), ("secondary", secondary - 9000)):
         field.rows[end] = field.rows[f"{end}_goal"] = place
     light = vector(_MORNING, design.site)
-    beams = UnsentBeams(check, field, lambda _: light, check.machines)
+    points = Points(field.names, None)
+    beams = UnsentBeams(check, field, points, lambda _: light, check.machines)
     beams.look(0.1)  # the first compiles
     spent = []
     for _ in range(9):
