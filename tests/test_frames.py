@@ -215,9 +215,12 @@ def test_records_of_one_topic_have_frames_and_datasets(tmp_path: Path) -> None:
         back_from_files(name, record, tmp_path)
     frames = {name: record.to_frame() for name, record in records.items()}
     np.testing.assert_array_equal(frames["sun"]["azimuth"], records["sun"].azimuth)
+    assert (frames["sun"].index == TIMES[UP][:4]).all()
     np.testing.assert_array_equal(frames["pose"]["vertex_up"], records["pose"].vertex[:, 2])
     assert len(frames["sun now"]) == len(frames["pose of one"]) == len(frames["armature"]) == 1
     assert len(frames["armatures"]) == len(PLANT)
+    assert frames["sun now"]["time"].iloc[0] == TIMES[UP][0].tz_localize(None)
+    assert "time" not in ht.sun.position(2.5e10, PLANT.site).to_frame()  # beyond nanoseconds
     jacobian = frames["jacobian"]
     np.testing.assert_array_equal(
         jacobian["vertex_by_north_tilt_north"], records["jacobian"].vertex[:, 0, 1]

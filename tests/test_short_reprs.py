@@ -13,6 +13,7 @@ import pytest
 from lxml import etree
 
 import heliotrope as ht
+from heliotrope.calibration.fit import DriveTerm, fit_terms
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.mechanism import kinds, linear_paint, rotary
 from heliotrope.values import MOST_ROWS
@@ -42,6 +43,12 @@ def seen() -> ht.Sightings:
 @cache
 def fitted() -> Any:
     return ht.fit(mechs()[:1], seen(), "guo6")
+
+
+@cache
+def terms() -> Any:
+    own = DriveTerm("eccentric", "azimuth", lambda angles: np.sin(angles[..., 0]), 5e-3)
+    return fit_terms(mechs()[:1], seen(), "guo6", [own])
 
 
 @cache
@@ -90,6 +97,7 @@ VALUES: list[tuple[Callable[[], Any], str, str]] = [
     (lambda: ht.track(mechs(), SUN, AIM), "Tracking: 18 of 2 branches: 18 ok", "the beam reaches"),
     (seen, "Sightings: 12 of 1 heliostat, 2026-09-02", "0.5 mrad"),
     (fitted, "FieldFit: 6 parameters of 1 heliostat from 12 sightings: 1 converged", "mrad"),
+    (terms, "TermFit: 1 term of 1 heliostat: eccentric", "mrad"),
     (learned, "Learned: 1 heliostat from 12 sightings, 0 outliers", "tilt_north"),
     (lambda: ht.predict(learned(), seen()), "Prediction: 12 beams, 0 unusable", ""),
     (lambda: ht.beam_errors(mechs()[:1], seen()), "BeamErrors: 12 sightings, beam", "upwards"),

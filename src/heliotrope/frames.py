@@ -163,6 +163,10 @@ def batched(
     return Labelled(tuple(rows), {**rows, **labels}, variables, large)
 
 
+#: Times up to so far from 1970 fit into the nanoseconds of a frame, s.
+LATEST = 9.2e9
+
+
 def times(seconds: npt.ArrayLike) -> npt.NDArray[np.datetime64]:
     """Return Unix seconds as UTC times; NaN becomes NaT."""
     given = np.asarray(seconds, dtype=np.float64)

@@ -10,7 +10,7 @@ Times carry a time zone or they are refused; inside they are unix seconds (UTC).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeAlias
@@ -19,7 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, TimeError, UnknownNameError, kind_of
-from heliotrope.frames import ENU, Framed, Labelled, Variable, batched
+from heliotrope.frames import ENU, LATEST, Framed, Labelled, Variable, batched
+from heliotrope.frames import times as frame_times
 from heliotrope.geometry import FloatArray, as_float, direction, wrap_positive
 from heliotrope.parallel import run_blocks
 from heliotrope.sun import grena
@@ -147,6 +148,8 @@ class SunPosition(Value, Framed):
 
     Attributes
     ----------
+    time
+        Times, Unix seconds, shape (...).
     azimuth
         Clockwise from north in [0, 2π), shape (...), rad.
     elevation
@@ -161,6 +164,7 @@ class SunPosition(Value, Framed):
         Unit vectors to the true sun, ENU, shape (..., 3).
     """
 
+    time: FloatArray
     azimuth: FloatArray
     elevation: FloatArray
     true_elevation: FloatArray
@@ -186,7 +190,13 @@ class SunPosition(Value, Framed):
         own |= {
             name: Variable(("axis",), getattr(self, name)) for name in ("vector", "true_vector")
         }
-        return batched(np.shape(self.azimuth), own, {"axis": ENU})
+        if not bool((np.abs(self.time) < LATEST).all()):
+            return batched(np.shape(self.time), own, {"axis": ENU})
+        if np.ndim(self.time) != 1:
+            own["time"] = Variable((), frame_times(self.time))
+            return batched(np.shape(self.time), own, {"axis": ENU})
+        rows = {name: replace(one, axes=("time", *one.axes)) for name, one in own.items()}
+        return Labelled(("time",), {"time": frame_times(self.time), "axis": ENU}, rows)
 
 
 @dataclass(frozen=True)
@@ -257,6 +267,7 @@ def position(times: Times, site: Site, *, algorithm: str = "spa") -> SunPosition
     azimuth, elevation, true_elevation = found.reshape(3, *seconds.shape)
     azimuth = wrap_positive(azimuth)
     return SunPosition(
+        time=seconds,
         azimuth=azimuth,
         elevation=as_float(elevation),
         true_elevation=as_float(true_elevation),

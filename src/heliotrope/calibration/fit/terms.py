@@ -24,6 +24,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.frames import Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray, as_float, as_numbers
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.values import Card, Value, amount
 
 #: Most rounds of fit and step; terms of milliradians need three or four.
 _ROUNDS = 20
@@ -87,8 +88,8 @@ def table_terms(joint: str, drive: int, knots: npt.ArrayLike, prior: float) -> l
     return [DriveTerm(f"{joint}_table_{k + 1}", joint, hat(k), prior) for k in range(len(at))]
 
 
-@dataclass(frozen=True)
-class TermFit(Framed):
+@dataclass(frozen=True, eq=False, repr=False)
+class TermFit(Value, Framed):
     """Parameters of N heliostats with K coefficients of own terms each.
 
     Attributes
@@ -118,6 +119,18 @@ class TermFit(Framed):
     def sigma(self) -> FloatArray:
         """Standard deviations of the coefficients, (N, K)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    def _card(self) -> Card:
+        count, names = len(self.values), [term.name for term in self.terms]
+        middle, sigma = np.median(np.abs(self.values), axis=0), np.median(self.sigma, axis=0)
+        values = self.values[0] if count == 1 else middle
+        rows = [
+            (name, f"{1e3 * value:.3g} mrad", f"{1e3 * around:.2g} mrad")
+            for name, value, around in zip(names, values, sigma, strict=True)
+        ]
+        header = ("term", "value", "σ") if count == 1 else ("term", "median size", "median σ")
+        line = f"{amount(len(names), 'term')} of {amount(count, 'heliostat')}: {', '.join(names)}"
+        return Card(line, header, rows)
 
     def _labelled(self) -> Labelled:
         row, names = ("heliostat",), [term.name for term in self.terms]
