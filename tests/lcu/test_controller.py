@@ -288,15 +288,19 @@ def test_defocus_turns_the_beam_away_and_refocus_brings_it_back() -> None:
     assert bench.miss(AIM) < 0.01
 
 
-@pytest.mark.parametrize("kind", ["DEFOCUS", "the plant is gone"])
-def test_from_standby_a_defocus_turns_away_from_the_aim_and_not_onto_it(kind: str) -> None:
-    bench = standing_by()
-    # An aim where the usual turn, by 0.1 and 0.05 rad, would lead the beam.
+def usual_turn(bench: Bench) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """Angles to which the usual turn, by 0.1 and 0.05 rad, leads, and a point of the beam there."""
     turned = bench.machine.drives.angles(np.array(bench.made)) + [0.1, 0.05]
     normal, vertex = bench.machine.armature.pose(turned)
     sun = bench.sun(bench.gps_ms() / 1000)
     east, north, up = vertex + 100.0 * (2.0 * (normal @ sun) * normal - sun)
-    aim = (float(east), float(north), float(up))
+    return turned, (float(east), float(north), float(up))
+
+
+@pytest.mark.parametrize("kind", ["DEFOCUS", "the plant is gone"])
+def test_from_standby_a_defocus_turns_away_from_the_aim_and_not_onto_it(kind: str) -> None:
+    bench = standing_by()
+    _, aim = usual_turn(bench)
     assert bench.order("AIM", *aim) == DONE
     assert bench.miss(aim) > OFF
     if kind == "DEFOCUS":
@@ -321,12 +325,7 @@ def test_a_mirror_that_is_held_beside_its_aim_does_not_turn_onto_it(kind: str, c
     else:
         assert bench.order("JOG", 0, 400) == DONE
         bench.run(5)
-    # An aim where the usual turn, by 0.1 and 0.05 rad, would lead the beam.
-    turned = bench.machine.drives.angles(np.array(bench.made)) + [0.1, 0.05]
-    normal, vertex = bench.machine.armature.pose(turned)
-    sun = bench.sun(bench.gps_ms() / 1000)
-    east, north, up = vertex + 100.0 * (2.0 * (normal @ sun) * normal - sun)
-    aim = (float(east), float(north), float(up))
+    turned, aim = usual_turn(bench)
     assert bench.order("AIM", *aim) == DONE
     if cause == "DEFOCUS":
         assert bench.order("DEFOCUS") == DONE

@@ -17,8 +17,9 @@ from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.plant.visits.first_layout import newcomers
 from heliotrope.plant.visits.fitting import first_model
 from heliotrope.plant.visits.settings import CycleSettings
-from support.joint_scene import START, Scene, believe, joint, spoil
+from support.joint_scene import Scene, joint, spoil
 from support.live import LiveOptions, LivePlant
+from support.visit_scene import START, believe
 
 #: As a plant's own: three sightings for a fit, unless a stack proves one.
 CYCLE = CycleSettings(least=3, sigma=2e-4)

@@ -26,8 +26,9 @@ from heliotrope.plant.visits import (
     CycleResult,
 )
 from heliotrope.plant.visits.joint_layout import arranged
-from support.joint_scene import BIASES, ENGINEER, START, Scene, believe, joint, spoil
+from support.joint_scene import Scene, joint, spoil
 from support.live import LiveOptions, LivePlant
+from support.visit_scene import BIASES, ENGINEER, START, believe
 
 _CALIBRATED = CalibrationOutcome.CALIBRATED
 

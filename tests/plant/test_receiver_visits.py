@@ -6,8 +6,7 @@ simulated camera, from where the mirrors truly stand.
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 
 from heliotrope.calibration.evaluation import beam_errors
-from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
+from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.errors import InputError
 from heliotrope.field import ReceiverSettings
 from heliotrope.field.example import roughly_installed
@@ -30,15 +29,12 @@ from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.production import ProductionVisits
-from heliotrope.plant.visits import CalibrationCycle, Centring, CycleResult, CycleSettings
+from heliotrope.plant.visits import CalibrationCycle, Centring, CycleResult
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle, judged
 from support.live import LiveOptions, LivePlant
+from support.visit_scene import CYCLE, ENGINEER, START, VisitScene, believe, in_command
 
-START = datetime(2026, 10, 21, 7, tzinfo=UTC)
-ENGINEER, OPERATOR = Person("Egon", Role.ENGINEER), Person("Olga", Role.OPERATOR)
-BIASES = ("azimuth_bias", "elevation_bias")
-#: One sighting is fitted, which the plant's own settings would not do.
-CYCLE = CycleSettings(least=1, model=BIASES, sigma=2e-4)
+OPERATOR = Person("Olga", Role.OPERATOR)
 
 
 def design_of(count: int, **chosen: float) -> Plant:
@@ -51,34 +47,15 @@ def design_of(count: int, **chosen: float) -> Plant:
     return replace(plain, cameras=(*plain.cameras, camera), receiver_visits=settings)
 
 
-@dataclass
-class Scene:
+@dataclass(kw_only=True)
+class Scene(VisitScene):
     """A plant whose heliostats track the receiver, and an engineer in command."""
 
-    live: LivePlant
     cycle: ReceiverCycle
-    token: int
-    stages: list[str] = field(default_factory=list)
-    during: Callable[[str], None] = lambda _: None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.live.plant.field.names
 
     async def run(self, *names: str) -> dict[str, CycleResult]:
         found = await self.cycle.run(ENGINEER, self.token, names or self.names, self.tell)
         return {result.heliostat: result for result in found}
-
-    def tell(self, stage: str) -> None:
-        self.stages.append(stage)
-        self.during(stage)
-
-    def photographs(self) -> int:
-        return sum(stage.startswith("photograph") for stage in self.stages)
-
-    def states(self) -> dict[str, str]:
-        rows = self.live.plant.field.rows["state"]
-        return {name: states.STATES[rows[i]] for i, name in enumerate(self.names)}
 
     async def until(self, what: Callable[[], bool], limit: float = 600.0) -> None:
         end = self.live.clock.monotonic() + limit
@@ -115,12 +92,12 @@ def production(
                 whole = CalibrationCycle(plant, live.cameras, CYCLE, Centring())
                 assert live.design.receiver_visits is not None
                 cycle = ReceiverCycle(plant, live.cameras, whole, live.design.receiver_visits)
-                here = Scene(live, cycle, 0)
+                here = Scene(live=live, token=0, cycle=cycle)
                 await here.until(here.tracking)
                 await live.operations.automatic.halt()
                 believe(live, 3e-4)
                 here.token = plant.take_authority(ENGINEER).token
-                await _in_command(here, scene)
+                await in_command(here, lambda: _aimed(here, scene))
             finally:
                 await live.operations.automatic.halt()
                 await live.end()
@@ -128,36 +105,15 @@ def production(
     run_virtual(main, start=START)
 
 
-async def _in_command(made: Scene, scene: Callable[[Scene], Awaitable[None]]) -> None:
-    plant = made.live.plant
-
-    async def stay() -> None:
-        while True:
-            if plant.authority.token == made.token:
-                plant.authority.keep(ENGINEER, made.token)
-            await asyncio.sleep(1.0)
-
-    async with asyncio.TaskGroup() as group:
-        staying = group.create_task(stay())
-        try:
-            turn = 2.0 * np.pi * np.arange(len(made.names)) / len(made.names)
-            places = 1.5 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-            aims = dict(zip(made.names, made.cycle.face.point(places), strict=True))
-            await asyncio.sleep(3.0)  # the clusters hear of the command authority
-            ticket = plant.aim(ENGINEER, made.token, aims)
-            assert await ticket.end(60.0), ticket.text
-            await asyncio.sleep(20.0)
-            await scene(made)
-        finally:
-            staying.cancel()
-
-
-def believe(live: LivePlant, sigma: float) -> None:
-    """Take all mirrors for calibrated, their zeros within ``sigma``, rad."""
-    at, spread = live.clock.utc().timestamp(), np.diag([sigma**2, sigma**2])
-    for name in live.plant.field.names:
-        record = HeliostatCalibration(name, at, BIASES, np.zeros(2), spread, np.full(2, 5e-3))
-        live.plant.beliefs.take(record)
+async def _aimed(made: Scene, scene: Callable[[Scene], Awaitable[None]]) -> None:
+    turn = 2.0 * np.pi * np.arange(len(made.names)) / len(made.names)
+    places = 1.5 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    aims = dict(zip(made.names, made.cycle.face.point(places), strict=True))
+    await asyncio.sleep(3.0)  # the clusters hear of the command authority
+    ticket = made.live.plant.aim(ENGINEER, made.token, aims)
+    assert await ticket.end(60.0), ticket.text
+    await asyncio.sleep(20.0)
+    await scene(made)
 
 
 def test_mirrors_in_production_are_calibrated_where_they_shine() -> None:

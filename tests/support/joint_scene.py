@@ -6,19 +6,16 @@ test's cameras, from where the mirrors truly stand.
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.field.example import roughly_installed
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import bisector, reflect
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits import (
@@ -29,42 +26,18 @@ from heliotrope.plant.visits import (
     JointCycle,
 )
 from support.live import LiveOptions, LivePlant
-
-START = datetime(2026, 10, 21, 7, tzinfo=UTC)
-ENGINEER = Person("Egon", Role.ENGINEER)
-BIASES = ("azimuth_bias", "elevation_bias")
-#: One sighting is fitted, which the plant's own settings would not do.
-CYCLE = CycleSettings(least=1, model=BIASES, sigma=2e-4)
+from support.visit_scene import CYCLE, ENGINEER, START, VisitScene, believe, in_command
 
 
-@dataclass
-class Scene:
+@dataclass(kw_only=True)
+class Scene(VisitScene):
     """A plant whose heliostats are up, and an engineer in command."""
 
-    live: LivePlant
     cycle: JointCycle
-    token: int
-    stages: list[str] = field(default_factory=list)
-    during: Callable[[str], None] = lambda _: None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.live.plant.field.names
 
     async def run(self, *names: str) -> dict[str, CycleResult]:
         found = await self.cycle.run(ENGINEER, self.token, names or self.names, "left", self.tell)
         return {result.heliostat: result for result in found}
-
-    def tell(self, stage: str) -> None:
-        self.stages.append(stage)
-        self.during(stage)
-
-    def photographs(self) -> int:
-        return sum(stage.startswith("photograph") for stage in self.stages)
-
-    def states(self) -> dict[str, str]:
-        rows = self.live.plant.field.rows["state"]
-        return {name: states.STATES[rows[i]] for i, name in enumerate(self.names)}
 
     def lit(self) -> list[str]:
         """Heliostats whose beams are on the target, in truth."""
@@ -114,36 +87,14 @@ def joint(
                     believe(live, 3e-4)
                 whole = CalibrationCycle(plant, live.cameras, cycle, Centring())
                 token = plant.take_authority(ENGINEER).token
-                await _in_command(Scene(live, JointCycle(plant, live.cameras, whole), token), scene)
+                joint_cycle = JointCycle(plant, live.cameras, whole)
+                made = Scene(live=live, token=token, cycle=joint_cycle)
+                await in_command(made, lambda: scene(made))
             finally:
                 await live.operations.automatic.halt()
                 await live.end()
 
     run_virtual(main, start=START)
-
-
-def believe(live: LivePlant, sigma: float) -> None:
-    """Take all mirrors for calibrated, their zeros within ``sigma``, rad."""
-    at, spread = live.clock.utc().timestamp(), np.diag([sigma**2, sigma**2])
-    for name in live.plant.field.names:
-        record = HeliostatCalibration(name, at, BIASES, np.zeros(2), spread, np.full(2, 5e-3))
-        live.plant.beliefs.take(record)
-
-
-async def _in_command(made: Scene, scene: Callable[[Scene], Awaitable[None]]) -> None:
-    async def stay() -> None:
-        plant = made.live.plant
-        while True:
-            if plant.authority.token == made.token:
-                plant.authority.keep(ENGINEER, made.token)
-            await asyncio.sleep(1.0)
-
-    async with asyncio.TaskGroup() as group:
-        staying = group.create_task(stay())
-        try:
-            await scene(made)
-        finally:
-            staying.cancel()
 
 
 def spoil(scene: Scene, stuck: str = "", traded: tuple[str, ...] = ()) -> None:
