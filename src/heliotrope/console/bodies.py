@@ -1,6 +1,7 @@
 """Bodies of requests: largest size, and the shape of JSON checked before it is parsed."""
 
 import asyncio
+import contextlib
 import re
 
 from starlette.datastructures import Headers
@@ -17,8 +18,48 @@ MOST_VALUES = 1_000_000
 _MOST_ESCAPES = 500_000
 #: A larger body is checked in a thread, bytes.
 _SMALL = 1 << 16
+#: A refused request is answered when its sender pauses for so long, s.
+_PAUSE = 1.0
 _ESCAPED = re.compile(rb"\\.", re.DOTALL)
 _OTHER = bytes(sorted(set(range(256)) - set(b"[]{}")))
+
+
+class Incoming:
+    """A `receive` that knows whether the body of its request has come to its end.
+
+    Parameters
+    ----------
+    receive
+        The server's.
+    headers
+        Of the request.
+    """
+
+    def __init__(self, receive: Receive, headers: Headers) -> None:
+        self._receive, self._headers = receive, headers
+        self._over = "transfer-encoding" not in headers and _length(headers) == 0
+
+    async def __call__(self) -> Message:
+        """Return the next message."""
+        message = await self._receive()
+        self._over = not message.get("more_body", False)
+        return message
+
+    async def discard(self, most: int) -> None:
+        """Read what is left of the body and forget it, unless it is announced as longer than this.
+
+        A server that answers and closes while its client still sends makes the client's system
+        forget the answer: the client is told that the connection was reset, instead of why it was
+        refused. A sender that pauses for longer than a second is not waited for, and one that
+        waits for leave to send its body (Expect) is not asked for it.
+        """
+        length = _length(self._headers)
+        if length is None or length > most or "expect" in self._headers:
+            return
+        with contextlib.suppress(TimeoutError):
+            while not self._over and most >= 0:
+                async with asyncio.timeout(_PAUSE):
+                    most -= len((await self()).get("body", b""))
 
 
 async def read_body(receive: Receive, most: int) -> bytes | None:
@@ -42,10 +83,16 @@ def length_of(headers: Headers, most: int) -> int:
     """Return the length of a body, bytes; raises `HTTPException` if it is not allowed."""
     if "transfer-encoding" in headers:
         raise HTTPException(411, "send the length of the body (Content-Length)")
-    length = headers.get("content-length", "0")
-    if not (length.isascii() and length.isdigit() and len(length) < 20) or int(length) > most:
+    length = _length(headers)
+    if length is None or length > most:
         raise HTTPException(413, f"the body is longer than {most} bytes")
-    return int(length)
+    return length
+
+
+def _length(headers: Headers) -> int | None:
+    """Return the announced length of a body, bytes, 0 without one; None if it is no such number."""
+    length = headers.get("content-length", "0")
+    return int(length) if length.isascii() and length.isdigit() and len(length) < 20 else None
 
 
 def replayed(body: bytes, receive: Receive) -> Receive:

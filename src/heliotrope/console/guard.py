@@ -27,7 +27,7 @@ from heliotrope.console.auth import (
 from heliotrope.console.connections import FOUND
 from heliotrope.console.edge import Edge
 from heliotrope.console.headers import host_known, parts_of
-from heliotrope.console.routes import FORM, READ, TINY, Found, Routes
+from heliotrope.console.routes import FORM, LARGEST, READ, TINY, Found, Routes
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.plant.operations.security import SecurityEvent
 
@@ -76,6 +76,7 @@ class Guard:
             return
         console = self._console()
         scope["heliotrope"] = console
+        incoming = bodies.Incoming(receive, Headers(scope=scope))
 
         async def reply(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -83,12 +84,12 @@ class Guard:
             await send(message)
 
         try:
-            await self._admit(console, scope, receive, reply)
+            await self._admit(console, scope, incoming, reply)
         except HTTPException as refusal:
-            await _refuse(refusal, scope, receive, reply)
+            await _refuse(refusal, scope, incoming, reply)
         except HeliotropeError as error:
             # The store cannot be read, so that nobody is known.
-            await _refuse(HTTPException(503, str(error)), scope, receive, reply)
+            await _refuse(HTTPException(503, str(error)), scope, incoming, reply)
 
     async def _admit(self, console: Console, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on.
@@ -230,15 +231,18 @@ def _is_emergency(scope: Scope) -> bool:
     return (scope["method"], scope["path"]) == ("POST", "/api/v1/emergency")
 
 
-async def _refuse(refusal: HTTPException, scope: Scope, receive: Receive, send: Send) -> None:
-    """Answer a refused request; close the connection if much of a body is still to come."""
+async def _refuse(
+    refusal: HTTPException, scope: Scope, incoming: bodies.Incoming, send: Send
+) -> None:
+    """Answer a refused request; close the connection if its body is long."""
     if scope["type"] == "websocket":
-        await receive()
+        await incoming()
         await send({"type": "websocket.close", "code": 4403})
         return
     headers = dict(refusal.headers or {})
     length = Headers(scope=scope).get("content-length", "0")
     if not length.isdigit() or int(length[:20]) > TINY:
         headers["Connection"] = "close"
+    await incoming.discard(FORM if scope.get(FOUND) is None else LARGEST)
     answer = JSONResponse({"detail": refusal.detail}, refusal.status_code, headers)
-    await answer(scope, receive, send)
+    await answer(scope, incoming, send)

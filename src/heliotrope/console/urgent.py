@@ -46,6 +46,8 @@ _STORE, _TRUSTED = 1.0, 3600.0
 _MOST_KNOWN = 2000
 #: Largest body, bytes.
 _LARGEST = 2048
+#: A refused request may announce so much and still hear why it was refused, bytes.
+_DISCARDED = 1 << 14
 #: What an order may say; the plant checks each.
 _SAID = frozenset({"act", "reason", "call", "csrf"})
 #: Statuses of refusals by the plant.
@@ -79,16 +81,18 @@ class EmergencyWay:
             await send({"type": "websocket.close", "code": 4403})
             return
         headers = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+        incoming = bodies.Incoming(receive, Headers(scope=scope))
         try:
-            status, text = 200, await self._take(scope, receive, headers)
+            status, text = 200, await self._take(scope, incoming, headers)
         except HTTPException as refusal:
+            await incoming.discard(_DISCARDED)
             status, text = refusal.status_code, {"detail": refusal.detail}
             headers |= {"Connection": "close", **(refusal.headers or {})}
         except CallError as error:
             status, text = _STATUS.get(error.kind, 503), {"detail": str(error)}
         except HeliotropeError as error:
             status, text = 503, {"detail": str(error)}
-        await JSONResponse(text, status, headers)(scope, receive, send)
+        await JSONResponse(text, status, headers)(scope, incoming, send)
 
     async def _take(self, scope: Scope, receive: Receive, answer: dict[str, str]) -> Any:
         """Give the order; return its view, and what the answer needs for the page's origin."""
