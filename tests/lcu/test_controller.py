@@ -288,6 +288,21 @@ def test_defocus_turns_the_beam_away_and_refocus_brings_it_back() -> None:
     assert bench.miss(AIM) < 0.01
 
 
+@pytest.mark.parametrize("name", ["DEFOCUS", "STOW"])
+def test_an_approach_that_is_called_off_before_its_first_step_does_not_begin(name: str) -> None:
+    """Simulated run 980557: told DEFOCUS so early, a mirror went on to standby all the same."""
+    bench = Bench()
+    bench.run(1.5)
+    assert bench.order("APPROACH") == DONE
+    assert bench.order(name) == DONE
+    for _ in range(160):
+        bench.run(0.5, until="STOWED")
+        assert tuple(bench.made) == STOW
+    assert bench.state == "STOWED"
+    assert bench.order("IDLE") == DONE
+    assert bench.order("TRACK") == REFUSED_STATE
+
+
 def usual_turn(bench: Bench) -> tuple[np.ndarray, tuple[float, float, float]]:
     """Angles to which the usual turn, by 0.1 and 0.05 rad, leads, and a point of the beam there."""
     turned = bench.machine.drives.angles(np.array(bench.made)) + [0.1, 0.05]

@@ -197,6 +197,16 @@ def test_a_lock_and_a_hold_end_with_the_cluster_as_on_the_boards() -> None:
     assert both.angles_apart() < 1e-9
 
 
+def test_an_approach_called_off_at_once_ends_as_on_the_boards() -> None:
+    both = Both()
+    both.run(1.5)
+    both.order("APPROACH")
+    both.order("DEFOCUS", rows=(0, 1))
+    both.order("STOW", rows=(2,))
+    both.run(3)
+    assert (both.field.axes["count"] == MACHINE.stow).all()
+
+
 def test_gears_faults_locks_and_supplies_are_those_of_the_boards() -> None:
     wind = Wind(speed=7.0, towards=1.0, seed=3)
     both = Both(play=35.0, wind=wind)

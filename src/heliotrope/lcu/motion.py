@@ -298,9 +298,10 @@ class Motion:
 
     def defocus(self) -> None:
         """Turn away from the present position; where the counts are unknown, once, by as much."""
-        if self.kind in (DEFOCUS, STOW) or self.at_stow():
+        if self.kind in (DEFOCUS, STOW):
             return
-        if self.stepper is None or None in self.config.drives:
+        # At stow an approach may have begun that has not made its first step.
+        if self.at_stow() or self.stepper is None or None in self.config.drives:
             self.hold()
             return
         sense = 1
@@ -334,7 +335,7 @@ class Motion:
             self.stow_directly()
             return
         if self.kind == APPROACH:
-            self._path = self._path[: self._place][::-1]
+            self._path = self._path[: max(0, self._place)][::-1]
         elif self.ready and self.config.standby is not None:
             way = self.way()[::-1]
             on_aim = self.kind in (TRACK, SEARCH) and self.aim is not None

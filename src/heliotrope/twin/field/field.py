@@ -263,7 +263,10 @@ class Field:
     def _turn_away(self, rows: Rows) -> None:
         if not len(rows):
             return
-        rows = rows[~among(self.kind[rows], DEFOCUS, STOW) & ~self.at_stow(rows)]
+        rows = rows[~among(self.kind[rows], DEFOCUS, STOW)]
+        home = self.at_stow(rows)
+        self._hold(rows[home])
+        rows = rows[~home]
         self._sense(rows)
         self._base[rows] = self.kind[rows]
         self.kind[rows] = DEFOCUS
