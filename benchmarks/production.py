@@ -34,6 +34,7 @@ from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.joint_layout import moments_on
+from heliotrope.plant.visits.neighbours import Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.receiver_layout import caught, production
 from heliotrope.plant.visits.settings import Centring, CycleSettings
@@ -130,7 +131,8 @@ async def _stay(built: PlantAssembly, token: int) -> None:
 async def _measured(built: PlantAssembly, world: World, token: int, most: int) -> Row:
     plant, settings = built.plant, built.design.receiver_visits
     assert settings is not None
-    whole = CalibrationCycle(plant, world.cameras, CYCLE, Centring())
+    unhidden = Unhidden(plant, world.cameras.beside)
+    whole = CalibrationCycle(plant, world.cameras, CYCLE, Centring(), unhidden)
     cycle = ReceiverCycle(plant, world.cameras, whole, settings)
     light = Light(world, cycle.face)
     before, begun, spent = light.now(), plant.now(), time.process_time()

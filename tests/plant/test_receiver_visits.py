@@ -29,7 +29,7 @@ from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.production import ProductionVisits
-from heliotrope.plant.visits import CalibrationCycle, Centring, CycleResult
+from heliotrope.plant.visits import CalibrationCycle, Centring, CycleResult, Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle, judged
 from support.live import LiveOptions, LivePlant
 from support.visit_scene import CYCLE, ENGINEER, START, VisitScene, believe, in_command
@@ -89,7 +89,8 @@ def production(
         plant = live.plant
         async with live.running():
             try:
-                whole = CalibrationCycle(plant, live.cameras, CYCLE, Centring())
+                unhidden = Unhidden(plant, live.cameras.beside)
+                whole = CalibrationCycle(plant, live.cameras, CYCLE, Centring(), unhidden)
                 assert live.design.receiver_visits is not None
                 cycle = ReceiverCycle(plant, live.cameras, whole, live.design.receiver_visits)
                 here = Scene(live=live, token=0, cycle=cycle)

@@ -24,6 +24,7 @@ from heliotrope.plant.visits import (
     CycleResult,
     CycleSettings,
     JointCycle,
+    Unhidden,
 )
 from support.live import LiveOptions, LivePlant
 from support.visit_scene import CYCLE, ENGINEER, START, VisitScene, believe, in_command
@@ -85,7 +86,8 @@ def joint(
                 await live.operations.automatic.halt()
                 if installed is None:
                     believe(live, 3e-4)
-                whole = CalibrationCycle(plant, live.cameras, cycle, Centring())
+                unhidden = Unhidden(plant, live.cameras.beside)
+                whole = CalibrationCycle(plant, live.cameras, cycle, Centring(), unhidden)
                 token = plant.take_authority(ENGINEER).token
                 joint_cycle = JointCycle(plant, live.cameras, whole)
                 made = Scene(live=live, token=token, cycle=joint_cycle)

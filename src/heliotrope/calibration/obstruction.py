@@ -8,22 +8,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, bisector, normalize
 from heliotrope.optics.mirror_surface import equal_facets
-from heliotrope.optics.obstruction import Neighbours, centroid_shift
+from heliotrope.optics.obstruction import Neighbours, centroid_shift, nearest
 
-#: Neighbours that can shade or block a mirror.
-NEAREST = 12
 #: The focal length of a mirror whose facets are not known is that of its distance to the target,
 #: within this share.
 _FOCAL = 0.25
 #: Part of a shift that stays unknown, as the neighbours need not look where they are assumed to.
-_UNKNOWN = 0.25
+UNKNOWN = 0.25
 #: A destination is on a target if it is this near to its plane, m.
 _ON_PLANE = 0.1
 
@@ -94,8 +91,7 @@ def unobstructed(
     place = heliostats.position
     own = np.full_like(place, np.nan) if heliostats.aim is None else heliostats.aim
     aims = np.where(np.isfinite(own), own, aim)
-    count = min(NEAREST + 1, len(place))
-    near = np.asarray(cKDTree(place).query(place, k=count)[1]).reshape(len(place), count)[:, 1:]
+    near = nearest(place)
     shift, hidden = np.zeros((len(seen), 2)), np.zeros(len(seen))
     destination, covariance = seen.destination.copy(), seen.destination_covariance.copy()
     for m in np.flatnonzero(seen.source_at_infinity & ~seen.destination_at_infinity):
@@ -111,7 +107,9 @@ def unobstructed(
             heliostats.width[others],
             heliostats.height[others],
         )
-        found, spread, hidden[m] = _shift(heliostats, i, target, seen.destination[m], sun, beside)
+        found, spread, hidden[m] = shift_of(
+            heliostats, i, target, seen.destination[m], sun, place[i], beside
+        )
         if not hidden[m] > 0.0 or not np.isfinite(found).all():
             hidden[m] = 0.0
             continue
@@ -132,27 +130,56 @@ def _under(targets: tuple[Target, ...], point: FloatArray) -> Target | None:
     return None
 
 
-def _shift(
+def shift_of(
     heliostats: Heliostats,
     i: int,
     target: Target,
     centroid: FloatArray,
     sun: FloatArray,
-    beside: Neighbours,
+    center: FloatArray,
+    neighbours: Neighbours,
+    *,
+    unknown: float = UNKNOWN,
 ) -> tuple[FloatArray, npt.NDArray[np.float64], float]:
-    """Return the shift (2,), its covariance (2, 2), m and m², and the hidden share."""
-    center = heliostats.position[i]
+    """Return how far neighbours moved a centroid, its covariance, and the hidden share.
+
+    Parameters
+    ----------
+    heliostats, i
+        A group, and the row of the mirror in it.
+    target, centroid
+        The centroid, ENU metres, (3,), is on the target.
+    sun
+        Unit vector to the sun, (3,).
+    center
+        Middle of the mirror, ENU metres, (3,).
+    neighbours
+        Mirrors beside it.
+    unknown
+        Part of the shift that stays unknown.
+
+    Returns
+    -------
+        Right and up on the target, m, (2,), and m², (2, 2); zeros if nothing is hidden.
+    """
     slant = float(np.linalg.norm(centroid - center))
-    normal = bisector(sun, (centroid - center) / slant)
+    way = (centroid - center) / slant
+    normal = bisector(sun, way)
+    size = float(heliostats.width[i]), float(heliostats.height[i])
+    hides = neighbours.before(center, normal, size, sun, way)
+    nothing = np.zeros(2), np.zeros((2, 2)), 0.0
+    if not hides.any():
+        return nothing
+    near = neighbours.of(hides)
     found = []
     for focal in (slant, slant / (1.0 + _FOCAL), slant * (1.0 + _FOCAL)):
         facets = _facets(heliostats, i, focal)
-        found.append(centroid_shift(target, center, sun, normal, facets, beside, facet_focal=focal))
+        found.append(centroid_shift(target, center, sun, normal, facets, near, facet_focal=focal))
         if not found[0].hidden:
-            return np.zeros(2), np.zeros((2, 2)), 0.0
+            return nothing
     usual = found[0].shift
-    unknown = np.max([np.linalg.norm(one.shift - usual) for one in found[1:]])
-    covariance = unknown**2 * np.eye(2) + _UNKNOWN**2 * np.outer(usual, usual)
+    other = np.max([np.linalg.norm(one.shift - usual) for one in found[1:]])
+    covariance = other**2 * np.eye(2) + unknown**2 * np.outer(usual, usual)
     return usual, covariance, found[0].hidden
 
 

@@ -62,7 +62,7 @@ from heliotrope.optics.mirror_image import (
     sun_profile,
 )
 from heliotrope.optics.mirror_surface import equal_facets
-from heliotrope.optics.obstruction import CentroidShift, Neighbours, centroid_shift
+from heliotrope.optics.obstruction import CentroidShift, Neighbours, centroid_shift, nearest
 from heliotrope.optics.offsets import ImageOffsets, image_offsets, target_offsets
 
 __all__ = [
@@ -111,6 +111,7 @@ __all__ = [
     "intercept_disks",
     "intercept_rectangle",
     "mean_concentration",
+    "nearest",
     "predict_flux",
     "reflected_beam",
     "safe_distance",

@@ -10,11 +10,24 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from heliotrope.field.heliostats import Facets
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, reflect, tangent_axes
 from heliotrope.optics.mirror_surface import elements_of, mirror_axes
+
+#: Neighbours that can shade or block a mirror.
+NEAREST = 12
+#: Room about a mirror for its curvature and for rays that are not parallel, as a share of its size.
+_ROOM = 0.1
+
+
+def nearest(places: FloatArray, count: int = NEAREST) -> npt.NDArray[np.intp]:
+    """Return the rows of the nearest other places of each place (N, 3), (N, J)."""
+    most = min(count + 1, len(places))
+    found = np.asarray(cKDTree(places).query(places, k=most)[1]).reshape(len(places), most)
+    return np.asarray(found[:, 1:], dtype=np.intp)
 
 
 @dataclass(frozen=True)
@@ -56,6 +69,43 @@ class Neighbours:
         # Parallel rays give infinities or NaN, which are within nothing.
         within = (across <= half).all(axis=-1) & (along > 0.0)
         return np.asarray(within.any(axis=1))
+
+    def of(self, chosen: npt.NDArray[np.bool_]) -> "Neighbours":
+        """Return some of them, chosen (J,)."""
+        return Neighbours(
+            self.center[chosen], self.normal[chosen], self.width[chosen], self.height[chosen]
+        )
+
+    def before(
+        self, center: FloatArray, normal: FloatArray, size: tuple[float, float], *ways: FloatArray
+    ) -> npt.NDArray[np.bool_]:
+        """Return which may hide a part of a mirror along ways, (J,): mostly none, and soon told.
+
+        Their corners are projected into the mirror's plane, where their boxes must touch its own.
+
+        Parameters
+        ----------
+        center, normal
+            Middle of the mirror, ENU metres, and its unit normal, (3,).
+        size
+            Its width and height, m.
+        ways
+            Unit vectors to the sun and to the target, (3,) each.
+        """
+        axes = tangent_axes(self.normal)
+        half = 0.5 * np.stack([self.width, self.height], axis=-1)
+        signs = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)], dtype=np.float64)
+        corners = self.center[:, None] + np.einsum("ka,ja,jac->jkc", signs, half, axes) - center
+        height = corners @ normal
+        room = (0.5 + _ROOM) * np.array(size)
+        hides = np.zeros(len(self.center), dtype=np.bool_)
+        for way in ways:
+            along = height / max(float(way @ normal), 1e-6)
+            plane = (corners - along[..., None] * way) @ tangent_axes(normal).T
+            low, high = plane.min(axis=1), plane.max(axis=1)
+            touches = (low <= room).all(axis=-1) & (high >= -room).all(axis=-1)
+            hides |= touches & (height > 0.0).any(axis=-1)
+        return hides
 
 
 @dataclass(frozen=True)

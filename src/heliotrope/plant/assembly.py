@@ -35,6 +35,7 @@ from heliotrope.plant.schedule.scheduler import Scheduler
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.joint_cycle import JointCycle
+from heliotrope.plant.visits.neighbours import Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.safety import alarms
@@ -130,7 +131,8 @@ class PlantAssembly:
         cycle = joint = receiver = None
         if cameras is not None:
             eye = cameras if ports.pictures is None else KeptCamera(cameras, ports.pictures)
-            cycle = CalibrationCycle(self.plant, eye, chosen.cycle, Centring())
+            unhidden = Unhidden(self.plant, cameras.beside)
+            cycle = CalibrationCycle(self.plant, eye, chosen.cycle, Centring(), unhidden)
             if design.joint_visits is not None:
                 joint = JointCycle(self.plant, cameras, cycle, design.joint_visits)
             if design.receiver_visits is not None:

@@ -26,7 +26,7 @@ from heliotrope.imaging.synthetic.rendering import render
 from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.links.clock import Clock, sleep_until
-from heliotrope.optics.mirror_image import reflected_beam
+from heliotrope.optics import Neighbours, centroid_shift, equal_facets, reflected_beam
 from heliotrope.plant.camera_views import SEVERAL, Views, light_of, picture_of, shot_of
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.joint_layout import moments_on
@@ -39,6 +39,8 @@ from heliotrope.twin.boards.board import Board
 NEAR = 2.0
 #: Cosine of the incidence below which the light of a mirror is not worth drawing.
 GRAZING = 0.05
+#: Least share of a mirror that is left by its neighbours for a beam to be drawn.
+LEAST = 0.01
 #: Brightest reading after exposure, as a share of full scale.
 PEAK = 0.7
 #: Share of a mirror's size in its exact beam.
@@ -63,6 +65,8 @@ class TrueMirror:
         Unit normal, (3,).
     width, height
         m.
+    neighbours
+        Mirrors that may shade or block it; None: none does.
     """
 
     heliostat: str
@@ -70,6 +74,29 @@ class TrueMirror:
     normal: FloatArray
     width: float = 3.0
     height: float = 2.0
+    neighbours: Neighbours | None = None
+
+    def lit(self, target: Target, sun: FloatArray) -> tuple[FloatArray, float]:
+        """Return where its centroid is on the plane of a target, ENU, m, (3,), and its lit share.
+
+        NaN and 0 if neighbours hide all of it. Its facets are canted at the target's distance.
+        """
+        point = self.on(target, sun)
+        if self.neighbours is None or not np.isfinite(point).all():
+            return point, 1.0
+        slant = float(np.linalg.norm(point - self.vertex))
+        facets = equal_facets(self.width, self.height, (1, 1), slant)
+        found = centroid_shift(
+            target,
+            self.vertex,
+            sun,
+            self.normal,
+            facets,
+            self.neighbours,
+            facet_focal=slant,
+            elements=24,
+        )
+        return point + found.shift @ target.axes, 1.0 - found.hidden
 
     def on(self, target: Target, sun: FloatArray) -> FloatArray:
         """Return where its ray meets the plane of a target, ENU, m, (3,); NaN if it does not."""
@@ -123,6 +150,7 @@ def mirrors_near(
     names: tuple[str, ...],
     sizes: FloatArray,
     reach: float = NEAR,
+    beside: npt.NDArray[np.intp] | None = None,
 ) -> list[TrueMirror]:
     """Return the mirrors whose rays meet the plane of a target near its centre.
 
@@ -140,6 +168,8 @@ def mirrors_near(
         Width and height of the mirrors, m, (N, 2).
     reach
         Largest distance from the centre, in half diagonals of the target.
+    beside
+        Rows of the neighbours of each mirror, (N, J); None: they hide nothing.
     """
     middle = np.asarray(target.corners).mean(axis=0)
     limit = reach * 0.5 * float(np.hypot(target.width, target.height))
@@ -150,10 +180,17 @@ def mirrors_near(
         along = ((middle - vertex) @ target.normal) / (rays @ target.normal)
     away = np.linalg.norm(vertex + along[:, None] * rays - middle, axis=-1)
     hits = np.flatnonzero((cosine > GRAZING) & (along > 0.0) & (away <= limit)).tolist()
-    return [
-        TrueMirror(names[i], vertex[i], facing[i], float(sizes[i, 0]), float(sizes[i, 1]))
-        for i in hits
-    ]
+    found = []
+    for i in hits:
+        size = float(sizes[i, 0]), float(sizes[i, 1])
+        hiding = None
+        if beside is not None and beside.shape[1]:
+            near = beside[i]
+            others = Neighbours(vertex[near], facing[near], *sizes[near].T)
+            hides = others.before(vertex[i], facing[i], size, sun, rays[i])
+            hiding = others.of(hides) if hides.any() else None
+        found.append(TrueMirror(names[i], vertex[i], facing[i], *size, hiding))
+    return found
 
 
 class ExactCamera:
@@ -233,7 +270,7 @@ class ExactCamera:
         at = await self._sight.exposure()
         mirrors = {mirror.heliostat: mirror for mirror in self._sight.mirrors()}
         sun = self._sight.sun()
-        places = {name: mirror.on(target, sun) for name, mirror in mirrors.items()}
+        places = {name: mirror.lit(target, sun)[0] for name, mirror in mirrors.items()}
         true = places.get(heliostat, np.full(3, np.nan))
         point = true + (self._root @ self._chance.standard_normal(2)) @ target.axes
         reasons = []
@@ -257,12 +294,12 @@ class ExactCamera:
         values = _PAINT + _GRAIN * self._chance.standard_normal((len(y), len(x)))
         points = np.stack(np.meshgrid(x, y), axis=-1)
         for mirror in self._sight.mirrors():
-            place = mirror.on(target, sun)
+            place, share = mirror.lit(target, sun)
             if not _within(target, place, NEAR):
                 continue
             size = mirror.width, mirror.height
             shape = moments_on(target, mirror.vertex, mirror.normal, *size, flat=_FLAT)
-            power = mirror.width * mirror.height * float(mirror.normal @ sun)
+            power = share * mirror.width * mirror.height * float(mirror.normal @ sun)
             away = points - target.plane_coordinates(place)
             form = np.einsum("hwi,ij,hwj->hw", away, np.linalg.inv(shape), away)
             peak = _SUN * power / (2.0 * np.pi * np.sqrt(np.linalg.det(shape)))
@@ -535,7 +572,8 @@ def _thrown(
     """Return the beams of mirrors on a target, and near enough beside it."""
     thrown = []
     for mirror in mirrors:
-        if not _within(target, mirror.on(target, sun), NEAR):
+        place, share = mirror.lit(target, sun)
+        if not (_within(target, place, NEAR) and share >= LEAST):
             continue
         # Facets are canted at the distance of the target, wherever the mirror looks.
         slant = float(np.linalg.norm(target.center - mirror.vertex))
@@ -551,6 +589,7 @@ def _thrown(
             slope_error=optics.slope_error,
             reflectivity=optics.reflectivity,
             dni=optics.dni,
+            neighbours=mirror.neighbours,
         )
         thrown.append(Thrown(target.name, beam))
     return tuple(thrown)

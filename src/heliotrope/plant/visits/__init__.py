@@ -9,6 +9,7 @@ a search for the beam: `Centring`), fits them, and lets the plant believe a bett
 
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
 from heliotrope.plant.visits.joint_cycle import JointCycle
+from heliotrope.plant.visits.neighbours import Unhidden
 from heliotrope.plant.visits.photographs import Photographs, Shot, TargetCamera
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.settings import Centring, CycleSettings
@@ -24,5 +25,6 @@ __all__ = [
     "ReceiverCycle",
     "Shot",
     "TargetCamera",
+    "Unhidden",
     "Visit",
 ]

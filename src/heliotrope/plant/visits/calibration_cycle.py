@@ -26,6 +26,7 @@ from heliotrope.calibration.record import (
     root_mean_square,
 )
 from heliotrope.calibration.sightings import Sightings, camera_target, join
+from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.lcu import states
@@ -35,6 +36,7 @@ from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.fitting import JudgedFit, change_of, fitting, surprise_of
 from heliotrope.plant.visits.model_of_each import ModelOfEach, stepwise
+from heliotrope.plant.visits.neighbours import Standing, Unhidden, UnhiddenCamera
 from heliotrope.plant.visits.photographs import (
     Centred,
     Photographing,
@@ -125,11 +127,15 @@ class CalibrationCycle:
         See `CycleSettings`.
     centring
         Search and centring of a beam that misses; None: photographs are taken where it is.
+    unhidden
+        Corrects centroids for neighbours that shade and block; None: they count as they are.
 
     Attributes
     ----------
     settings
         See `CycleSettings`.
+    unhidden
+        As given.
     verification
         Confirms new parameters.
     """
@@ -140,8 +146,10 @@ class CalibrationCycle:
         camera: TargetCamera,
         settings: CycleSettings | None = None,
         centring: Centring | None = None,
+        unhidden: Unhidden | None = None,
     ) -> None:
-        self._plant, self.settings = plant, settings or CycleSettings()
+        self._plant, self.settings, self.unhidden = plant, settings or CycleSettings(), unhidden
+        camera = camera if unhidden is None else UnhiddenCamera(camera, unhidden)
         self._camera, self._centring = camera, centring or Centring()
         self._photographing: Photographing = (
             Plain(camera, self.settings)
@@ -233,6 +241,14 @@ class CalibrationCycle:
             sigma=self.settings.sigma,
             centroid_covariance=np.asarray(shot.covariance, dtype=np.float64),
         )
+
+    async def alone(
+        self, target: Target, heliostat: str, shot: Shot, standing: Standing | None
+    ) -> Shot:
+        """Return a shot as if no neighbour hid a part of its mirror; see `Unhidden.shot`."""
+        if self.unhidden is None:
+            return shot
+        return await self.unhidden.shot(target, heliostat, shot, standing)
 
     async def learn(
         self,

@@ -33,6 +33,7 @@ from heliotrope.plant.visits.fitting import first_model
 from heliotrope.plant.visits.gathering import Gathering, Waiting
 from heliotrope.plant.visits.joint_layout import Layout, arranged, error_on, verifying
 from heliotrope.plant.visits.joint_visit import JointVisit
+from heliotrope.plant.visits.neighbours import Standing
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.stack_counts import counts_at_rest
 from heliotrope.plant.visits.stacks import StackCamera, TargetLight, noting, stack_of
@@ -57,11 +58,14 @@ class _Taken:
         From when to when all stood at the aims of a photograph, and its number.
     count
         Photographs in all.
+    standing
+        How the field stood in the middle of them.
     """
 
     pictures: deque[tuple[int, TargetLight]]
     still: list[tuple[float, float, int]] = field(default_factory=list)
     count: int = 0
+    standing: Standing | None = None
 
 
 class JointCycle:
@@ -210,6 +214,8 @@ class JointCycle:
             picture = await self._light(joint, layout, empty)
             joint.drop(joint.missing(states.TRACKING))
             taken.count += 1
+            if len(taken.pictures) == needed // 2:
+                taken.standing = Standing.of(self._plant.field)
             taken.still.append((begin + 0.5 * self.settings.settle, picture.at, number))
             taken.pictures.append((number, picture))
             if joint.astray:
@@ -258,6 +264,7 @@ class JointCycle:
             axes = layout.target.axes
             point = np.asarray(layout.target.point(beam.centroid))
             shot = Shot(point, _middle(pictures), axes.T @ covariance @ axes)
+            shot = await self._cycle.alone(layout.target, name, shot, taken.standing)
             proven[name] = Photographs([(shot, counts)])
         return proven, results
 

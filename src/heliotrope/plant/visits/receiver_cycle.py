@@ -27,6 +27,7 @@ from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult, Production
 from heliotrope.plant.visits.joint_visit import JointVisit
+from heliotrope.plant.visits.neighbours import Standing
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.receiver_layout import ReceiverLayout, arranged_on, production
 from heliotrope.plant.visits.stack_counts import counts_at_rest
@@ -52,6 +53,7 @@ class _Taken:
 
     pictures: list[TargetLight] = field(default_factory=list)
     still: list[tuple[float, float, int]] = field(default_factory=list)
+    standing: Standing | None = None
 
     @property
     def middle(self) -> float:
@@ -181,6 +183,8 @@ class ReceiverCycle:
                 usual += _FOLLOW * (level - usual)
                 taken.still.append((begin + 0.5 * self.settings.settle, picture.at, number))
                 taken.pictures.append(picture)
+                if number == needed // 2:
+                    taken.standing = Standing.of(plant.field)
         return taken
 
     async def _move(self, joint: JointVisit, points: dict[str, FloatArray]) -> None:
@@ -244,7 +248,7 @@ class ReceiverCycle:
         results: dict[str, CycleResult] = {}
         proven: dict[str, Photographs] = {}
         for i, beam in zip(chosen, found, strict=True):
-            seen = self._sighting(joint, made, taken, i, beam)
+            seen = await self._sighting(joint, made, taken, i, beam)
             if isinstance(seen, CycleResult):
                 results[beam.heliostat] = seen
             else:
@@ -261,7 +265,7 @@ class ReceiverCycle:
                 group.create_task(one(name))
         return results
 
-    def _sighting(
+    async def _sighting(
         self, joint: JointVisit, made: ReceiverLayout, taken: _Taken, i: int, beam: SeparatedBeam
     ) -> Photographs | CycleResult:
         """Return what a beam shows of its mirror, or why it shows nothing."""
@@ -278,6 +282,7 @@ class ReceiverCycle:
         axes = self.face.axes
         covariance = beam.covariance + taken.pictures[0].covariance_at(beam.centroid)
         shot = Shot(self.face.point(beam.centroid), taken.middle, axes.T @ covariance @ axes)
+        shot = await self._cycle.alone(self.face, name, shot, taken.standing)
         return Photographs([(shot, counts)])
 
     async def _learnt(

@@ -36,6 +36,7 @@ from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
+from heliotrope.optics import nearest
 from heliotrope.plant.aims import default_aims
 from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.audit import Audit, Forgetful
@@ -161,6 +162,7 @@ class World:
             else Field(self.truth, machines, believed=believed)
         )
         self._sizes = np.concatenate([np.stack([g.width, g.height], axis=-1) for g in groups])
+        self._beside = nearest(design.position)
         self._sun: tuple[float, FloatArray] | None = None
         self.beats = 0
         self._parts: list[Any] = []
@@ -271,7 +273,9 @@ class World:
         light, stand = self.sun(), self.field.stand()
         found: dict[str, TrueMirror] = {}
         for target in (*self.design.targets, *self._faces):
-            for mirror in mirrors_near(target, light, stand, self.names, self._sizes):
+            for mirror in mirrors_near(
+                target, light, stand, self.names, self._sizes, beside=self._beside
+            ):
                 found[mirror.heliostat] = mirror
         return list(found.values())
 

@@ -1,0 +1,157 @@
+"""Takes off a photographed centroid how far neighbours that shade and block the mirror moved it.
+
+The plant knows how the neighbours stood: their step counts are reported, and their mechanisms are
+believed. Most mirrors are clear, which a test of corners tells at once; the shift of one that is
+not takes some milliseconds, and is computed where it does not hold up the loop.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from heliotrope.calibration.obstruction import UNKNOWN, shift_of
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.drives import Drive
+from heliotrope.optics import Neighbours, nearest
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.visits.photographs import Shot, TargetCamera
+
+#: An axis turns that is further than this from its goal, rad.
+_TURNS = 2e-3
+#: Step counts older than this leave the shift unknown, s.
+_OLD = 30.0
+
+T = TypeVar("T")
+
+
+class Beside(Protocol):
+    """A place for computations that must not hold up the loop."""
+
+    async def __call__(self, work: Callable[[], T]) -> T:
+        """Return the result of a computation."""
+        ...
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How the N heliostats of a field stood when a photograph was taken.
+
+    Attributes
+    ----------
+    counts, goals
+        Step counts as last known, and their goals, (N, 2).
+    at
+        When the counts were true, monotonic s, (N,); minus infinity if they were never known.
+    """
+
+    counts: FloatArray
+    goals: FloatArray
+    at: FloatArray
+
+    @classmethod
+    def of(cls, field: FieldState) -> "Standing":
+        """Return how a field stands now."""
+        every = np.arange(len(field), dtype=np.intp)
+        return cls(field.posed.copy(), field.goals(every), field.posed_at.copy())
+
+
+class Unhidden:
+    """Centroids as if no neighbour stood in the light.
+
+    Parameters
+    ----------
+    plant
+        Knows the mirrors' places, sizes and step counts.
+    beside
+        Computes a shift.
+    """
+
+    def __init__(self, plant: PlantController, beside: Beside) -> None:
+        self._plant, self._beside = plant, beside
+        found = [plant.design.find(name) for name in plant.field.names]
+        self._size = np.array([(group.width[i], group.height[i]) for group, i in found])
+        self._near = nearest(plant.beams.position)
+
+    async def shot(
+        self, target: Target, heliostat: str, shot: Shot, standing: Standing | None = None
+    ) -> Shot:
+        """Return a shot with the centroid that its mirror would have alone.
+
+        Parameters
+        ----------
+        target, heliostat
+            The target (or face of a receiver), and the name of the mirror.
+        shot
+            As photographed.
+        standing
+            Of the field at the exposure; None: it has not changed since.
+
+        Notes
+        -----
+        The shift of the centroid is uncertain by a quarter of itself (`calibration.obstruction`),
+        and by all of it if a neighbour in the way was turning, or was not heard for half a minute.
+        Neighbours whose step counts were never known are left out.
+        """
+        if shot.reasons or not np.isfinite(shot.point).all():
+            return shot
+        plant, row = self._plant, self._plant.field.place(heliostat)
+        stood = Standing.of(plant.field) if standing is None else standing
+        rows = np.array([row, *self._near[row]], dtype=np.intp)
+        rows = rows[np.isfinite(stood.at[rows])]
+        if not (len(rows) > 1 and rows[0] == row):
+            return shot
+        drives = Drive(plant.beams.drives.table[rows])
+        angles = np.asarray(drives.angles(stood.counts[rows]))
+        normals, vertices = Armature(plant.beams.armature.table[rows]).pose(angles)
+        turns = np.abs(np.asarray(drives.angles(stood.goals[rows])) - angles).max(axis=-1) > _TURNS
+        unsure = (turns | (shot.at - stood.at[rows] > _OLD))[1:]
+        beside = Neighbours(vertices[1:], normals[1:], *self._size[rows[1:]].T)
+        sun = plant.sun_vector(shot.at - plant.now())
+        way = (shot.point - vertices[0]) / np.linalg.norm(shot.point - vertices[0])
+        size = float(self._size[row, 0]), float(self._size[row, 1])
+        hides = beside.before(vertices[0], normals[0], size, sun, way)
+        if not hides.any():
+            return shot
+        group, place = plant.design.find(heliostat)
+        unknown = 1.0 if (unsure & hides).any() else UNKNOWN
+
+        def work() -> tuple[FloatArray, FloatArray, float]:
+            return shift_of(
+                group, place, target, shot.point, sun, vertices[0], beside.of(hides),
+                unknown=unknown,
+            )  # fmt: skip
+
+        shift, spread, hidden = await self._beside(work)
+        if not hidden or not np.isfinite(shift).all():
+            return shot
+        given = np.asarray(shot.covariance, dtype=np.float64)
+        before = given * np.eye(3) if given.ndim == 0 else given
+        axes = target.axes
+        return replace(
+            shot, point=shot.point - shift @ axes, covariance=before + axes.T @ spread @ axes
+        )
+
+
+class UnhiddenCamera:
+    """A camera of targets whose shots are corrected for what neighbours hide.
+
+    Parameters
+    ----------
+    camera
+        Takes the photographs.
+    unhidden
+        Corrects them.
+    """
+
+    def __init__(self, camera: TargetCamera, unhidden: Unhidden) -> None:
+        self._camera, self._unhidden = camera, unhidden
+
+    async def photograph(self, target: Target, heliostat: str) -> Shot:
+        """Return what a new photograph shows of a heliostat's beam, as if it stood alone."""
+        shot = await self._camera.photograph(target, heliostat)
+        return await self._unhidden.shot(target, heliostat, shot)
