@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numba import njit
+from numba import njit, types
 from numba.core import event
 from numba.core.errors import TypingError
 
@@ -94,11 +94,14 @@ def test_garbage_lies_while_a_kernel_is_compiled(
 
 
 def test_numbers_in_calls_make_no_versions_of_a_function() -> None:
-    mechanism = kinds.azimuth_elevation(np.array([[0.0, 50.0, 0.0]]))
-    ht.track(mechanism, SUN, AIM)
-    for inner, versions in ((kernels_of_warm._put, 1), (track_kernels._difference_column, 1)):
-        # Those loaded with their kernel from the disk are not compiled again.
-        assert len(inner.signatures) <= versions, inner.signatures
+    # Inner functions are not kept on the disk: these are compiled here even where kernels are kept.
+    table, rows = types.Array(types.float64, 2, "C"), types.Array(types.int64, 2, "C")
+    number, whole = types.float64, types.int64
+    three, turn = types.UniTuple(number, 3), types.UniTuple(number, 4)
+    kernels_of_warm.warm_start.compile((table, table, table, rows, whole, whole, number, table))
+    track_kernels._newton.compile((types.UniTuple(number, 18), three, three, turn, number))
+    for inner in (kernels_of_warm._put, track_kernels._difference_column):
+        assert len(inner.signatures) == 1, inner.signatures
 
 
 def test_arrays_that_may_be_written_or_not_are_one_type() -> None:
@@ -179,12 +182,12 @@ def test_two_processes_share_the_compiling(
     monkeypatch.setenv("HELIOTROPE_THREADS", str(cores))
     monkeypatch.setattr(estimator, "is_compiled", lambda: compiled)
     monkeypatch.setattr(subprocess, "Popen", Second)
-    monkeypatch.setattr(warm, "tracking", lambda: done.append("tracking"))
-    monkeypatch.setattr(warm, "searching", lambda: done.append("searching"))
+    for part in ("searching", "breaking", "tracking", "fitting"):
+        monkeypatch.setattr(warm, part, lambda part=part: done.append(part))
     with warm.compiling():
         done.append("work")
     if cores == 2 and not compiled:
-        assert done == [warm.OTHER_HALF, "tracking", "searching", "work", "waited"]
+        assert done == [warm.OTHER_HALF, "searching", "breaking", "tracking", "work", "waited"]
     else:
         assert done == ["work"]
 
