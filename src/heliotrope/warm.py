@@ -27,11 +27,10 @@ def main() -> None:
     """Run the kernels of tracking and learning once, in two processes where there are two cores."""
     if OTHER_HALF in sys.argv[1:]:
         fitting()
-        breaking()
         return
     with compiling():
         following()
-    for part in (tracking, searching, fitting, breaking):
+    for part in (searching, breaking, tracking, fitting):
         part()
 
 
@@ -40,7 +39,9 @@ def compiling() -> Iterator[None]:
     """Compile what a calibration takes, in two processes, if it has not been compiled.
 
     Tracking is compiled when the block begins, fitting when it ends. With one core, or where
-    machine code cannot be kept, kernels are compiled when they are needed.
+    machine code cannot be kept, kernels are compiled when they are needed. The halves take as
+    long as each other, on condition that tracking comes last: by then the other process has
+    compiled and kept the chain of joints, which both need.
     """
     from heliotrope.calibration.fit import estimator
 
@@ -50,8 +51,9 @@ def compiling() -> Iterator[None]:
     command = [sys.executable, "-m", "heliotrope.warm", OTHER_HALF]
     # What goes wrong there goes wrong here too, where it is seen.
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL):  # noqa: S603
-        tracking()
         searching()
+        breaking()
+        tracking()
         yield
 
 
@@ -65,10 +67,12 @@ def tracking() -> None:
 
 
 def fitting() -> None:
-    """Fit a mirror."""
+    """Place a mirror and fit it."""
     from heliotrope.calibration.fit.estimator import fit
 
     mechanism, seen = _case()
+    mechanism.pose(seen.counts)
+    mechanism.armature  # noqa: B018
     mechanism.jacobian(seen.counts, ("tilt_north", "position_up"))
     fit(mechanism, seen, "malan8")
 

@@ -97,9 +97,9 @@ def cholesky_solve(matrix, right, factor, out):
 
 @njit(**INNER)
 def inverse_from(factor, out):
-    """Inverse of factor · factorᵀ."""
+    """Inverse of factor · factorᵀ, of which the lower half is read."""
     size = factor.shape[0]
-    lower = np.zeros((size, size))
+    lower = np.empty((size, size))
     for j in range(size):
         lower[j, j] = 1.0 / factor[j, j]
         for i in range(j + 1, size):
@@ -262,11 +262,11 @@ def fit_block(
     size, joints = codes.shape[0], arrays[2].shape[1]
     drives = arrays[6].shape[0]
     scratch = scratch_mechanism(joints, drives, arrays[5].shape[2], size)
-    wrenches, jacobian = np.zeros((3, 2, 6)), np.empty((2, size))
+    wrenches, jacobian = np.empty((3, 2, 6)), np.empty((2, size))
     # Matrices of the present point and of the trial; they swap when the trial is accepted.
     solver = (
         np.empty((2, size, size)), np.empty((2, size)), np.empty((size, size)),
-        np.zeros((size, size)), np.empty(size), np.empty(size),
+        np.empty((size, size)), np.empty(size), np.empty(size),
     )  # fmt: skip
     hessian, gradient, y = solver[0][0], solver[1][0], np.empty(size)
     keep = data[7]

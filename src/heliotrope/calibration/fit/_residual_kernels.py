@@ -68,8 +68,11 @@ def scratch_mechanism(joints, drives, slots, size):
         np.empty(3), np.empty((joints, 3)), np.empty(joints), np.empty((1, drives, slots)),
         np.empty(3), np.empty(size),
     )  # fmt: skip
+    zero = np.empty(drives)
+    for k in range(drives):
+        zero[k] = 0.0
     pose = (
-        np.zeros(drives), np.empty((joints + 1, 3, 3)), np.empty((joints, 3)),
+        zero, np.empty((joints + 1, 3, 3)), np.empty((joints, 3)),
         np.empty((joints, 3)), np.empty(3), np.empty(3),
     )  # fmt: skip
     twists, places = np.empty((size, 6)), np.empty((size, 3), dtype=np.int64)
