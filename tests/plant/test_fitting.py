@@ -23,6 +23,7 @@ from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.visits.fitting import JudgedFit, fit_heliostat, surprise_of
 from heliotrope.plant.visits.settings import CycleSettings
+from heliotrope.plant.visits.swings import swung
 from heliotrope.sun import vector
 
 PLANT = malan_plant(4)
@@ -158,3 +159,49 @@ def test_a_field_freshly_commissioned_knows_its_errors(case: str) -> None:
     share = np.mean(np.reshape(inside, (40, 3)), axis=0)
     assert (share >= 0.85).all(), share
     assert share.mean() <= 0.98, share
+
+
+def test_a_photograph_in_a_swing_leaves_a_mirror_that_knows_its_error() -> None:
+    """One photograph of four at the deepest point of a swing, told or not that it may be one."""
+    plant, rng, settings = malan_plant(320), np.random.default_rng(4), CycleSettings(sigma=2e-4)
+    (group,) = plant.groups.values()
+    axis, target = plant.machine(group.names[0]).axes[0], PLANT.targets[0]
+    truth = roughly_installed(group.mechanism, seed=1)
+    names = parameters.model(MODEL, group.mechanism.parameters)
+    aim, sun = plant.receivers[0].center, vector(np.array([BEGIN]), PLANT.site)
+    inside, error = np.zeros((24, 2)), np.zeros((24, 2))
+    for k, i in enumerate(rng.permutation(len(group))[:24]):
+        here, name = truth[np.array([i])], group.names[i]
+        seen = first_visit(here, BEGIN, rng, 0.0)
+        swings, m = np.zeros_like(seen.counts), int(rng.integers(4))
+        swings[m, 0] = axis.backlash
+        beams = [
+            target.intersect(p.vertex, reflect(seen.source, p.normal))
+            for p in (
+                here[np.zeros(4, np.intp)].pose(seen.counts - s) for s in (0.0 * swings, swings)
+            )
+        ]
+        off = (beams[1] - beams[0])[m]
+        slope = off / axis.backlash
+        wider = np.zeros((4, 3, 3))
+        wider[m] = swung(axis, 10.0, 1.0) * np.outer(slope, slope)
+        moved = seen.destination.copy()
+        moved[m] += off
+        for told in (0, 1):
+            covariance = seen.destination_covariance + told * wider
+            made = replace(seen, destination=moved, destination_covariance=covariance)
+            beliefs = Beliefs(plant)
+            found = fit_heliostat(beliefs, settings, OwnModel(MODEL, names), name, made)
+            expected = expected_error(
+                found.mechanism, found.fitted.names, found.fitted.covariance[0], sun, aim
+            )
+            sent = sightings(
+                np.zeros(1, np.intp), track(found.mechanism, sun, aim).best_counts, sun, aim
+            )
+            miss = beam_errors(here, sent).offset[0]
+            error[k, told] = np.linalg.norm(miss)
+            inside[k, told] = miss @ np.linalg.solve(expected.covariance[0], miss) <= CHI_SQUARE_90
+    share, worst = inside.mean(axis=0), np.percentile(error, 90, axis=0)
+    assert share[0] < 0.75, share
+    assert share[1] >= 0.8, share
+    assert worst[1] < 0.7 * worst[0], worst

@@ -1,5 +1,6 @@
 """The step counts of a visit at a photograph, between rows that are heard once a second."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -7,11 +8,20 @@ import numpy as np
 import pytest
 
 from heliotrope.field.layouts import malan_plant
+from heliotrope.geometry import direction
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.visits.photographs import Shot, measured
+from heliotrope.plant.visits.swings import swung
 from heliotrope.plant.visits.visit import Visit
 
 DESIGN = malan_plant(1)
+BEAMS = BeamCheck(DESIGN, DESIGN.names)
+TARGET = DESIGN.targets[0]
+SUN = direction(np.radians(80.0), np.radians(30.0))
+#: The mirror stands on the middle of the target, and so do the counts of the rows.
+POSE = BEAMS.poses(np.array([0]), TARGET.center[None], SUN).best_counts[0]
 GOAL = 100_000
 
 
@@ -19,9 +29,8 @@ def visit(clock: VirtualClock) -> tuple[Visit, Any]:
     names = ("primary", "secondary", "primary_goal", "secondary_goal")
     rows = np.zeros(1, [(name, float) for name in names])
     field = SimpleNamespace(place=lambda _: 0, rows=rows, counted_at=np.array([-np.inf]))
-    drives = SimpleNamespace(table=DESIGN.drives.table)
     plant = SimpleNamespace(
-        field=field, now=clock.monotonic, clock=clock, beams=SimpleNamespace(drives=drives)
+        field=field, now=clock.monotonic, clock=clock, beams=BEAMS, sun_vector=lambda _: SUN
     )
     person = Person("Egon", Role.ENGINEER)
     made = Visit(plant, person, 1, DESIGN.names[0], DESIGN.targets[0])  # type: ignore[arg-type]
@@ -44,6 +53,44 @@ def test_a_row_from_a_swing_is_left_out() -> None:
         np.testing.assert_allclose(await made.counts_at(2.5), (GOAL - 7.5, GOAL))
 
     run_virtual(main)
+
+
+@pytest.mark.parametrize(("fall", "turn"), [(10.0, 0), (10.0, 1), (0.0, 0), (-10.0, 0)])
+def test_a_photograph_is_less_sure_where_an_axis_may_have_taken_up_its_play(
+    fall: float, turn: int
+) -> None:
+    """A goal that falls begins a swing, which the rows at the goals before and after it miss."""
+
+    async def main(clock: VirtualClock) -> Shot:
+        made, field = visit(clock)
+        for at in (1.0, 2.0, 3.0, 4.0):
+            here = POSE - (fall * np.eye(2)[turn] if at > 2.5 else 0.0)
+            field.rows[0] = (*here, *here)
+            field.counted_at[0] = at
+            made.note()
+        for early in (1.5, 3.5):
+            clear, _ = await measured(made, Shot(TARGET.center, early, 1e-4))
+            np.testing.assert_array_equal(clear.covariance, 1e-4 * np.eye(3))
+        return (await measured(made, Shot(TARGET.center, 2.5, 1e-4)))[0]
+
+    wider = TARGET.axes @ (np.asarray(run_virtual(main).covariance) - 1e-4 * np.eye(3))
+    spread = np.sqrt(np.clip(np.linalg.eigvalsh(wider @ TARGET.axes.T), 0.0, None))
+    if fall <= 0.0:
+        assert not spread.any()
+        return
+    # 40 steps of play turn the beam by 1.26 mrad at most; the deepest point is 2 deviations away.
+    slant = float(np.linalg.norm(TARGET.center - DESIGN.position[0]))
+    assert spread[0] < 0.05 * spread[1]
+    assert 0.3e-3 * slant < spread[1] < 1.26e-3 * slant
+
+
+def test_a_swing_is_as_likely_as_the_reports_leave_it() -> None:
+    axis = DESIGN.machine(DESIGN.names[0]).axes[0]
+    close, far = swung(axis, 10.0, 1.0), swung(axis, 10.0, 10.0)
+    assert close == pytest.approx(10.0 * far)
+    assert swung(axis, 30.0, 10.0) == pytest.approx(3.0 * far)
+    assert swung(axis, 1e4, 10.0) < axis.backlash**2
+    assert swung(replace(axis, backlash=0), 10.0, 1.0) == 0.0
 
 
 def test_a_mirror_that_is_not_heard_at_its_aim_is_not_measured() -> None:

@@ -129,12 +129,8 @@ class Unhidden:
         shift, spread, hidden = await self._beside(work)
         if not hidden or not np.isfinite(shift).all():
             return shot
-        given = np.asarray(shot.covariance, dtype=np.float64)
-        before = given * np.eye(3) if given.ndim == 0 else given
         axes = target.axes
-        return replace(
-            shot, point=shot.point - shift @ axes, covariance=before + axes.T @ spread @ axes
-        )
+        return replace(shot, point=shot.point - shift @ axes).wider(axes.T @ spread @ axes)
 
 
 class UnhiddenCamera:

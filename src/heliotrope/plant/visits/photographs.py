@@ -8,7 +8,7 @@ moves as the aim moves: other beams cross targets while a field is raised.
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +19,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.visits.settings import Centring, CycleSettings
+from heliotrope.plant.visits.swings import spread_at
 from heliotrope.plant.visits.visit import Visit
 
 #: Where the photographs after the first are taken: right and up, in turn.
@@ -54,6 +55,12 @@ class Shot:
     at: float
     covariance: npt.ArrayLike = 0.0
     reasons: tuple[str, ...] = ()
+
+    def wider(self, covariance: FloatArray) -> "Shot":
+        """Return the shot with a point that is less sure by a covariance, m², (3, 3)."""
+        given = np.asarray(self.covariance, dtype=np.float64)
+        own = given * np.eye(3) if given.ndim == 0 else given
+        return replace(self, covariance=own + covariance)
 
 
 class TargetCamera(Protocol):
@@ -107,7 +114,7 @@ class Plain:
             if shot.reasons:
                 taken.rejected.append(f"photograph {k + 1}: {'; '.join(shot.reasons)}")
             else:
-                taken.used.append((shot, await visit.counts_at(shot.at)))
+                taken.used.append(await measured(visit, shot))
             while plant.now() < due and k + 1 < self._settings.shots:
                 await visit.look()
         return taken
@@ -213,7 +220,7 @@ class Centred:
             if good:
                 moves += bool(np.linalg.norm(aim - last) > _SAME)
                 last = aim
-                taken.used.append((shot, await visit.counts_at(shot.at)))
+                taken.used.append(await measured(visit, shot))
             else:
                 taken.rejected.append(f"photograph {k + 1}: {astray or '; '.join(shot.reasons)}")
             if len(taken.used) >= settings.shots or (astray and not taken.used):
@@ -279,6 +286,20 @@ async def photographed(camera: TargetCamera, visit: Visit) -> Shot:
     if visit.state != states.TRACKING:
         raise RefusedError(f"{visit.heliostat}: it left its aim while it was photographed")
     return shot
+
+
+async def measured(visit: Visit, shot: Shot) -> tuple[Shot, FloatArray]:
+    """Return a shot and the step counts at its exposure, (2,).
+
+    Its point is less sure where an axis may have been taking up its play; see `swings`.
+
+    Raises
+    ------
+    RefusedError
+        As `Visit.counts_at`.
+    """
+    counts = await visit.counts_at(shot.at)
+    return shot.wider(spread_at(visit, shot.at, counts)), counts
 
 
 def seen(target: Target, shot: Shot) -> FloatArray | None:

@@ -25,6 +25,7 @@ from heliotrope.plant.visits.photographs import (
     Shot,
     TargetCamera,
     Tell,
+    measured,
     photographed,
     room_of,
     seen,
@@ -156,8 +157,7 @@ class Verification:
             for _ in range(self._settings.shots):
                 shot = await photographed(self._camera, visit)
                 if not shot.reasons and seen(visit.target, shot) is not None:
-                    counts = await visit.counts_at(shot.at)
-                    return self.judge(nominal, fitted, shot, counts)
+                    return self.judge(nominal, fitted, *await measured(visit, shot))
                 why = "; ".join(shot.reasons) or "no light on the target"
         return f"with the new parameters no photograph could be used: {why}"
 

@@ -73,6 +73,7 @@ class Visit(BroughtHome):
         self.away = False
         self._times: list[float] = []
         self._counts: list[FloatArray] = []
+        self._goals: list[FloatArray] = []
         self._there: list[bool] = []
 
     @property
@@ -193,6 +194,7 @@ class Visit(BroughtHome):
         if np.isfinite(counted) and (not self._times or counted > self._times[-1] + _LOOK):
             self._times.append(counted)
             self._counts.append(np.array([node["primary"], node["secondary"]], dtype=np.float64))
+            self._goals.append(np.array([node["primary_goal"], node["secondary_goal"]], np.float64))
             self._there.append(self.left() < ARRIVED)
 
     async def counts_at(self, instant: float, limit: float = 10.0) -> FloatArray:
@@ -221,6 +223,16 @@ class Visit(BroughtHome):
             raise RefusedError(f"{self.heliostat}: the photograph is older than all known counts")
         share = (instant - times[after - 1]) / (times[after] - times[after - 1])
         return np.asarray(counts[after - 1] + share * (counts[after] - counts[after - 1]))
+
+    def fell(self, instant: float) -> tuple[FloatArray, float]:
+        """Return how far the goals fell about an instant, steps, (2,), and within what time, s.
+
+        Between the rows before and after it that `counts_at` takes, which it has waited for.
+        """
+        times = self._heard_there()
+        goals = [row for row, there in zip(self._goals, self._there, strict=True) if there]
+        after = min(max(bisect_right(times, instant), 1), len(times) - 1)
+        return goals[after - 1] - goals[after], times[after] - times[after - 1]
 
     def _heard_there(self) -> list[float]:
         """Return the times of the rows in which both axes are at their goals."""

@@ -1,0 +1,89 @@
+"""The uncertainty of a photograph in which an axis may have taken up its play.
+
+An axis that goes down with the sun swings below its goal every few seconds, to come from below
+(`lcu.stepper`). The step counts, heard once a second or less often, miss most swings; but the goal
+falls as each begins. Where it fell between the counts before and after a photograph, the exposure
+was in the swing with a known chance, and the beam may be off by as much as the swing. Where it did
+not fall, the mirror stood at its goal.
+"""
+
+import math
+
+import numpy as np
+
+from heliotrope.geometry import FloatArray, reflect
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.machine import AxisLimits
+from heliotrope.plant.visits.visit import Visit
+
+#: Mean square over time of a motion that speeds up and slows down evenly, of its length.
+_MEAN_SQUARE = 23.0 / 60.0
+#: A goal that goes down is set ahead by this share of the backlash, as in `lcu.stepper`.
+_LEAD = 1.0 / 8.0
+#: The variance of the mixture is taken this many times: its own, with one photograph of five in a
+#: swing, would leave the deepest point 3.5 standard deviations away; this leaves it 2 away.
+_TAIL = 3.0
+#: Steps over which the beam's motion is a straight line.
+_STEPS = 10.0
+
+
+def swung(axis: AxisLimits, fall: float, span: float) -> float:
+    """Return the variance of an axis's distance from its goal at an unknown instant, steps².
+
+    Parameters
+    ----------
+    axis
+        Of the machine.
+    fall
+        Steps by which its goal fell between two reports from its goals; 0 or less: it did not.
+    span
+        Time between the reports, s.
+    """
+    if axis.backlash == 0 or not (fall > 0.0 and span > 0.0):
+        return 0.0
+    lead = 2.0 * math.ceil(_LEAD * axis.backlash)
+    deep, times = lead + axis.backlash, max(1.0, round(fall / lead))
+    lasts = _lasts(axis, deep) + _lasts(axis, axis.backlash)
+    return _MEAN_SQUARE * axis.backlash**2 * min(1.0, _TAIL * times * lasts / span)
+
+
+def _lasts(axis: AxisLimits, steps: float) -> float:
+    """Return the time of a motion from rest to rest, s."""
+    ramp = axis.rate**2 / axis.acceleration
+    if steps <= ramp:
+        return 2.0 * math.sqrt(steps / axis.acceleration)
+    return axis.rate / axis.acceleration + steps / axis.rate
+
+
+def spread_at(visit: Visit, instant: float, counts: FloatArray) -> FloatArray:
+    """Return the covariance of a beam on the visit's target by swings at an instant, m², (3, 3).
+
+    Parameters
+    ----------
+    visit
+        With the reports before and after the instant.
+    instant
+        Monotonic s.
+    counts
+        Step counts then, (2,).
+    """
+    plant, row, target = visit.plant, visit.row, visit.target
+    machine, (falls, span) = plant.beams.machines.get(visit.heliostat), visit.fell(instant)
+    covariance = np.zeros((3, 3))
+    if machine is None:
+        return covariance
+    sun = plant.sun_vector(instant - plant.now())
+    drives = Drive(plant.beams.drives.table[row])
+    armature = Armature(plant.beams.armature.table[row])
+
+    def point(at: FloatArray) -> FloatArray:
+        normal, vertex = armature.pose(np.asarray(drives.angles(at)))
+        return np.asarray(target.intersect(vertex, reflect(sun, normal)))
+
+    for i, axis in enumerate(machine.axes):
+        square = swung(axis, float(falls[i]), span)
+        if square > 0.0:
+            slope = (point(counts) - point(counts - _STEPS * np.eye(2)[i])) / _STEPS
+            covariance += square * np.outer(slope, slope)
+    return covariance if np.isfinite(covariance).all() else np.zeros((3, 3))
