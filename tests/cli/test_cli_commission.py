@@ -66,7 +66,8 @@ def test_a_drone_first_leaves_no_first_visit(
     ("option", "text"),
     [
         (["--goal-mrad", "0"], "--goal-mrad 0: give a number above 0"),
-        (["--together", "0"], "0 mirrors together"),
+        (["--together", "0"], "0 to 0 mirrors"),
+        (["--together", "1", "--first", "8"], "there are no joint visits; give --together 2"),
         (["--target", "middle"], "middle"),
         (["--drone", "3"], "3 calibration points: the model malan8 has 8 unknowns"),
         (["--picture", "c.txt"], "the name ends in '.txt'"),

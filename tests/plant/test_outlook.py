@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import cast
@@ -14,6 +14,7 @@ from benchmarks.days import Days
 
 from heliotrope.errors import InputError
 from heliotrope.field.layouts import malan_plant
+from heliotrope.field.plant import Plant
 from heliotrope.geometry import MRAD
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.controller import PlantController
@@ -21,19 +22,29 @@ from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.foresight import Foresight
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.outlook import FieldPoint, Outlook, day_of, end_of_day
-from heliotrope.plant.schedule.prospect import FieldProspect
-from heliotrope.plant.schedule.scheduler import Comparison, Scheduler, Settings
+from heliotrope.plant.schedule.choice import Assignment
+from heliotrope.plant.schedule.prospect import FieldProspect, terms_of
+from heliotrope.plant.schedule.scheduler import (
+    Comparison,
+    Finished,
+    Scheduler,
+    Visited,
+    compare,
+)
+from heliotrope.plant.schedule.settings import Settings
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import OutlookEntry
 
 PLANT = malan_plant(10)
+#: Its visits are those of one heliostat.
+ALONE = replace(PLANT, joint_visits=None)
 MORNING = datetime(2026, 6, 21, 8, 0, tzinfo=UTC)
 BOTH = ("left", "right")
 ALL = np.ones(10, dtype=np.bool_)
 
 
 def prospect(now: datetime = MORNING, able: npt.NDArray[np.bool_] = ALL) -> FieldProspect:
-    found = Scheduler(PLANT, Settings(), now=MORNING).prospect(now, able, BOTH)
+    found = Scheduler(ALONE, Settings(), now=MORNING).prospect(now, able, BOTH)
     assert found is not None
     return found
 
@@ -54,8 +65,8 @@ def at(outlook: Outlook, now: datetime) -> tuple[float, float]:
 
 def test_what_is_predicted_comes_true() -> None:
     # The real schedule and the real fit, on simulated mirrors: what is known then.
-    schedule = Scheduler(PLANT, Settings(), now=MORNING)
-    outlook, world = predicted(), Days(PLANT, schedule, MORNING)
+    schedule = Scheduler(ALONE, Settings(), now=MORNING)
+    outlook, world = predicted(), Days(ALONE, schedule, MORNING)
     assert outlook.points[0].median > 10 * MRAD
     for _ in range(2):
         world.live(timedelta(hours=1))
@@ -68,7 +79,7 @@ def test_what_is_predicted_comes_true() -> None:
 
 
 def test_the_goal_is_told_with_its_time_or_what_stands_in_its_way() -> None:
-    near = Scheduler(PLANT, Settings(goal=2 * MRAD), now=MORNING).prospect(MORNING, ALL, BOTH)
+    near = Scheduler(ALONE, Settings(goal=2 * MRAD), now=MORNING).prospect(MORNING, ALL, BOTH)
     assert near is not None
     whole = near.outlook()
     assert whole is not None
@@ -105,8 +116,8 @@ def test_nothing_is_predicted_in_the_evening_or_without_a_target() -> None:
 
 def test_visits_that_take_longer_move_the_curve() -> None:
     def curve(longer: float, calibrated: int) -> Outlook:
-        found = Comparison(20, calibrated, 1.0, 1.0, longer, ())
-        schedule = Scheduler(PLANT, Settings(), now=MORNING)
+        found = Comparison(20, calibrated, 1.0, 1.0, longer, (), (20, calibrated))
+        schedule = Scheduler(ALONE, Settings(), now=MORNING)
         schedule.compared = lambda since=None: found  # type: ignore[method-assign]
         seen = schedule.prospect(MORNING, ALL, BOTH)
         assert seen is not None
@@ -115,14 +126,71 @@ def test_visits_that_take_longer_move_the_curve() -> None:
         return made
 
     soon = MORNING + timedelta(minutes=15)
-    usual = at(predicted(), soon)[0]
-    assert at(curve(1.0, 20), soon)[0] == pytest.approx(usual)
+    usual = at(curve(1.0, 20), soon)[0]
     # Twice the time, or half of the visits without a result, is the same.
     slow = at(curve(2.0, 20), soon)[0]
     assert slow > 1.3 * usual
     assert at(curve(1.0, 10), soon)[0] == pytest.approx(slow)
     # Few visits say nothing yet.
-    assert np.isnan(Comparison(9, 9, 1.0, 1.0, 2.0, ()).pace)
+    assert np.isnan(Comparison(9, 9, 1.0, 1.0, 2.0, (), (9, 9)).pace)
+
+
+def test_joint_visits_are_those_of_the_plant_with_the_times_that_they_took() -> None:
+    joint = PLANT.joint_visits
+    assert joint is not None
+    settings = Settings(sigma=2e-4)
+    terms = terms_of(settings, joint).joint
+    assert terms is not None
+    assert (terms.most, terms.first, terms.least) == (joint.most, joint.first, joint.least)
+    assert terms.known < joint.known
+    assert terms.sigma > settings.sigma
+    assert terms_of(settings, None).joint is None
+
+    def joint_visit(begin: float, seconds: float, error: float) -> list[Finished]:
+        made = []
+        for k, name in enumerate(PLANT.names):
+            planned = Assignment(
+                name,
+                "left",
+                begin + k,
+                begin + 60.0,
+                error,
+                0.0,
+                1.0,
+                1.0,
+                overdue=False,
+                reason="",
+            )
+            ended = Visited(name, "left", begin + seconds, True, 1.0, together=True)
+            made.append(Finished(planned, ended))
+        return made
+
+    count = len(PLANT)
+    sure, new = terms.span(count, own=False), terms.span(count, own=True)
+    made = joint_visit(0.0, 1.5 * sure, 1e-3) + joint_visit(500.0, 1.5 * new, 1e-2)
+    found = compare(made)
+    assert [party.mirrors for party in found.parties] == [count, count]
+    assert np.isnan(found.pace), "nobody went alone"
+    assert terms_of(settings, joint, found.pace, found.parties).joint == terms, (
+        "few visits say nothing yet"
+    )
+    found = compare(made + joint_visit(1500.0, 1.5 * sure, 1e-3))
+    slow = terms_of(settings, joint, found.pace, found.parties).joint
+    assert slow is not None
+    assert slow.span(count, own=True) == pytest.approx(1.5 * new)
+
+
+def test_with_joint_visits_the_field_is_known_sooner() -> None:
+    soon, plant = MORNING + timedelta(minutes=15), malan_plant(60)
+
+    def median(design: Plant) -> float:
+        schedule = Scheduler(design, Settings(sigma=2e-4), now=MORNING)
+        seen = schedule.prospect(MORNING, np.ones(60, dtype=np.bool_), BOTH)
+        made = None if seen is None else seen.outlook()
+        assert made is not None
+        return at(made, soon)[0]
+
+    assert median(plant) < 0.4 * median(replace(plant, joint_visits=None))
 
 
 # --- made, kept, and followed -----------------------------------------------------------

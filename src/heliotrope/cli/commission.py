@@ -14,6 +14,7 @@ from heliotrope.cli.plan import above, check_outputs, made_so_far, span_of, targ
 if TYPE_CHECKING:
     from heliotrope.calibration.plan.commission import CommissionPlan, CommissionTerms
     from heliotrope.calibration.plan.fleets import Fleet
+    from heliotrope.calibration.plan.joint_terms import JointTerms
     from heliotrope.field.plant import Plant
 
 _MRAD = 1e-3
@@ -35,16 +36,14 @@ def commission(
         list[str] | None, typer.Option(help="Target with a camera; may be repeated. Default: all.")
     ] = None,
     together: Annotated[
-        int, typer.Option(help="Mirrors on a target at once, told apart by coded movements.")
-    ] = 1,
-    first_together: Annotated[
-        bool, typer.Option("--first-together", help="First visits may be joint visits too.")
-    ] = False,
-    likely: Annotated[
-        float, typer.Option(help="Least chance of a beam to be on the target, for a joint visit.")
-    ] = 0.9,
-    steps: Annotated[int, typer.Option(help="Photographs of a joint visit.")] = 16,
-    step: Annotated[str, typer.Option(help="Time of each, with the movement before it.")] = "3s",
+        int | None,
+        typer.Option(help="Mirrors of a later joint visit. Default: the plant file's; 1: none."),
+    ] = None,
+    first: Annotated[
+        int | None,
+        typer.Option(help="Mirrors of a joint first visit. Default: the plant file's; 0: alone."),
+    ] = None,
+    step: Annotated[str, typer.Option(help="Time of each photograph of a joint visit.")] = "2.2s",
     shots: Annotated[int, typer.Option(help="Photographs of a visit of one mirror.")] = 3,
     interval: Annotated[str, typer.Option(help="Time of each.")] = "20s",
     settle: Annotated[str, typer.Option(help="Time of a visit beside the photographs.")] = "20s",
@@ -54,7 +53,7 @@ def commission(
     ] = 0.5,
     sigma_together_mrad: Annotated[
         float, typer.Option(help="Accuracy of a joint visit in each direction, mrad.")
-    ] = 0.4,
+    ] = 0.22,
     repeat_mrad: Annotated[
         float, typer.Option(help="What a visit does not repeat, in each direction, mrad.")
     ] = 0.0,
@@ -90,12 +89,7 @@ def commission(
         interval=parse_duration(interval).total_seconds(),
         look=parse_duration(look).total_seconds(),
         sigma=_MRAD * above(sigma_mrad, "--sigma-mrad"),
-        together=together,
-        steps=steps,
-        step=parse_duration(step).total_seconds(),
-        sigma_together=_MRAD * above(sigma_together_mrad, "--sigma-together-mrad"),
-        likely=likely,
-        first_alone=not first_together,
+        joint=_joint(plant, together, first, step, sigma_together_mrad),
         repeat=_MRAD * repeat_mrad,
         clear=clear,
         every=parse_duration(every).total_seconds(),
@@ -110,6 +104,33 @@ def commission(
         plant, fleets, names, (start.timestamp(), stop.timestamp()), measured, terms, as_json
     )
     _tell(plan, plant, fleets, names, flight, (csv, page, picture), as_json)
+
+
+def _joint(
+    plant: "Plant", together: int | None, first: int | None, step: str, sigma_mrad: float
+) -> "JointTerms | None":
+    """Return the joint visits: those of the plant file, as far as no option says otherwise."""
+    from heliotrope.calibration.plan.joint_terms import JointTerms
+    from heliotrope.errors import InputError
+    from heliotrope.field.joint_visits import JointSettings
+
+    if together == 1 or (plant.joint_visits is None and together is None):
+        if first:
+            raise InputError(
+                f"--first {first}: there are no joint visits; give --together 2 or more"
+            )
+        return None
+    settings = plant.joint_visits or JointSettings()
+    most = settings.most if together is None else together
+    alike = settings.first if together is None else min(settings.first, together)
+    return replace(
+        JointTerms.of(settings, 0.0),
+        most=most,
+        least=min(settings.least, most),
+        first=alike if first is None else first,
+        step=parse_duration(step).total_seconds(),
+        sigma=_MRAD * above(sigma_mrad, "--sigma-together-mrad"),
+    )
 
 
 def _fleets(

@@ -14,6 +14,7 @@ from heliotrope.calibration.plan.commission import (
     plan_commission,
 )
 from heliotrope.calibration.plan.fleets import Fleet, fleets_of, plan_each
+from heliotrope.calibration.plan.joint_terms import JointTerms
 from heliotrope.calibration.plan.planning import (
     Aimed,
     CandidateSightings,
@@ -33,6 +34,7 @@ __all__ = [
     "CommissionPlan",
     "CommissionTerms",
     "Fleet",
+    "JointTerms",
     "SightingLimits",
     "SightingPlan",
     "Timing",

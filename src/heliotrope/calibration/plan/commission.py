@@ -1,10 +1,11 @@
 """Plans the commissioning of a field: from the errors of an installation to a goal, in days.
 
-A target takes the visits one after the other. A first visit finds the beam, and may have to search
-for it; a later visit may show several mirrors at once, told apart by coded movements. When a target
-becomes free, it takes the visit that lowers the expected squared error of the field most for each
-second. Gains are computed for all heliostats at the middle of an interval of half an hour, in which
-each is visited once at most; the gains of different heliostats do not depend on each other.
+A target takes the visits one after the other, as a running plant does: joint first visits before
+all others, then those that are due together, and alone those that a joint visit did not find.
+Within each kind, heliostats come first whose visits lower the expected squared error of the field
+most for each second. Gains are computed for all heliostats at the middle of an interval of half an
+hour, in which each is visited once at most; the gains of different heliostats do not depend on
+each other.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -12,18 +13,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import erf
 
 from heliotrope import sun as solar
 from heliotrope.calibration.plan import gain as _gain
 from heliotrope.calibration.plan.fleets import Fleet
+from heliotrope.calibration.plan.joint_terms import JointTerms
+from heliotrope.calibration.plan.on_target import chance_by_try, chance_on_target
 from heliotrope.calibration.plan.percentiles import error_percentiles
 from heliotrope.calibration.plan.planning import SightingLimits
 from heliotrope.calibration.plan.scaled_field import ScaledField, TargetView
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.optics.beam import SUN_RADIUS
 from heliotrope.sun import Site
 
 #: Most places at which a search looks for a beam.
@@ -55,17 +56,8 @@ class CommissionTerms:
         Further look for a beam that is not on the target, s.
     sigma
         Standard deviation of a photograph's beam in each direction, rad.
-    together
-        Mirrors of a joint visit, at most; 1: there are none.
-    steps, step
-        Photographs of a joint visit, and the time of each with the movement before it, s.
-    sigma_together
-        Standard deviation of the beam by all photographs of a joint visit, rad.
-    likely
-        Least chance that a beam is on the target at once, for a joint visit. One that is not there
-        is searched for by further joint photographs, of all mirrors at once.
-    first_alone
-        A mirror that was never measured has its first visit alone.
+    joint
+        Visits of several mirrors at once; None: there are none.
     repeat
         Part of the beam error that is drawn anew at each visit and in operation, standard
         deviation in each direction, rad.
@@ -85,12 +77,7 @@ class CommissionTerms:
     interval: float = 20.0
     look: float = 20.0
     sigma: float = 5e-4
-    together: int = 1
-    steps: int = 16
-    step: float = 3.0
-    sigma_together: float = 4e-4
-    likely: float = 0.9
-    first_alone: bool = True
+    joint: JointTerms | None = None
     repeat: float = 0.0
     worth: float = 0.05
     clear: float = 1.0
@@ -98,36 +85,28 @@ class CommissionTerms:
     limits: SightingLimits = field(default_factory=_default_limits)
 
     def __post_init__(self) -> None:
-        for name in ("sigma", "sigma_together", "step", "every"):
+        for name in ("sigma", "every"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise InputError(f"commission: {name} {getattr(self, name)} must be above 0")
         for name in ("goal", "settle", "interval", "look", "repeat"):
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise InputError(f"commission: {name} {getattr(self, name)} must be 0 or more")
-        for name in ("likely", "clear"):
-            if not 0.0 < getattr(self, name) <= 1.0:
-                raise InputError(f"commission: {name} {getattr(self, name)}: give 0 to 1, not 0")
+        if not 0.0 < self.clear <= 1.0:
+            raise InputError(f"commission: clear {self.clear}: give 0 to 1, not 0")
         if not 0.0 <= self.worth < 1.0:
             raise InputError(f"commission: worth {self.worth}: give a share from 0 to below 1")
-        if min(self.shots, self.together, self.steps) < 1:
-            raise InputError(
-                f"commission: {self.shots} photographs of a mirror, {self.together} mirrors "
-                f"together, {self.steps} photographs of a joint visit; give 1 or more of each"
-            )
+        if self.shots < 1:
+            raise InputError(f"commission: {self.shots} photographs of a mirror; give 1 or more")
 
     @property
     def alone(self) -> float:
         """Time of a visit of one mirror without driving and searching, s."""
         return self.settle + self.shots * self.interval
 
-    @property
-    def joint(self) -> float:
-        """Time of a joint visit without driving, s."""
-        return self.settle + self.steps * self.step
-
     def accuracy(self, together: bool) -> float:
-        """Standard deviation of a visit in each direction, rad."""
-        seen = self.sigma_together if together else self.sigma / np.sqrt(self.shots)
+        """Standard deviation in each direction of a visit alone, or of a joint stack, rad."""
+        one = self.sigma / np.sqrt(self.shots)
+        seen = self.joint.sigma if together and self.joint is not None else one
         return float(np.hypot(seen, self.repeat))
 
     @property
@@ -150,8 +129,12 @@ class Visit:
         Their numbers through all fleets, (n,).
     joint
         Whether they are told apart by coded movements.
+    own
+        Whether each has a code of its own, and a second stack verifies them.
     first
-        Whether they were never measured before.
+        Whether some were never measured before.
+    missed
+        Which beams are expected to miss the target in a joint first visit, (n,).
     after
         Expected beam error over the year afterwards, rad RMS, (n,).
     """
@@ -161,7 +144,9 @@ class Visit:
     target: int
     heliostats: Rows
     joint: bool
+    own: bool
     first: bool
+    missed: Mask
     after: FloatArray
 
 
@@ -247,6 +232,7 @@ def plan_commission(
     *,
     size: npt.ArrayLike = 3.0,
     measured: npt.ArrayLike = False,
+    missed: npt.ArrayLike = 0,
     held: npt.ArrayLike = False,
     terms: CommissionTerms | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -265,6 +251,8 @@ def plan_commission(
         Larger side of the mirrors, m, () or (N,).
     measured
         Heliostats that were measured before, as by a drone, () or (N,).
+    missed
+        Joint first visits that the beam of each heliostat has missed before, () or (N,).
     held
         Heliostats that cannot be visited, () or (N,); they count in the field's errors.
     terms
@@ -287,6 +275,7 @@ def plan_commission(
     given = terms or CommissionTerms()
     days, cells = _cells(site, start, stop, given)
     work = _Commissioning(fleets, targets, given, np.asarray(size, dtype=np.float64), measured)
+    work.missed += np.asarray(missed, dtype=np.int64)
     work.visited = work.counted & ~np.asarray(held, dtype=np.bool_)
     work.note(cells[0][0])
     for done, (begin, end) in enumerate(cells):
@@ -334,37 +323,40 @@ def _cells(
 
 
 @dataclass
-class _Choices:
-    """Visits that a target can take during an interval, the best first.
+class _Queue:
+    """Heliostats in the order of their value; those that have been taken are passed."""
 
-    ``alone`` and ``joint`` are heliostats in the order of their value; a pointer passes those
-    that have been taken.
+    rows: Rows
+
+    def first(self, free: Mask, most: int) -> Rows:
+        """Return the best that are free, at most so many."""
+        reach = max(4 * most, 256)
+        while True:
+            found = self.rows[:reach][free[self.rows[:reach]]]
+            if len(found) >= most or reach >= len(self.rows):
+                return found[:most]
+            # Most at the front have been taken.
+            self.rows = self.rows[free[self.rows]]
+            reach *= 4
+
+
+@dataclass
+class _Choices:
+    """Visits that a target can take during an interval.
+
+    ``alone`` may go alone, and ``lost`` of them were never measured; ``new`` go to a joint first
+    visit, and ``known`` to a later one.
     """
 
     view: TargetView
-    gain: FloatArray
+    slant: FloatArray
+    spread: FloatArray
+    seen: FloatArray
     looks: FloatArray
-    alone: Rows
-    joint: Rows
-    value: FloatArray
-    at: int = 0
-
-    def next_alone(self, free: Mask) -> int:
-        """Best heliostat for a visit alone; -1 if there is none."""
-        while self.at < len(self.alone) and not free[self.alone[self.at]]:
-            self.at += 1
-        return int(self.alone[self.at]) if self.at < len(self.alone) else -1
-
-    def next_joint(self, free: Mask, most: int) -> Rows:
-        """Best heliostats for a joint visit."""
-        reach = 4 * most
-        while True:
-            found = self.joint[:reach][free[self.joint[:reach]]]
-            if len(found) >= most or reach >= len(self.joint):
-                return found[:most]
-            # Most at the front have been taken.
-            self.joint = self.joint[free[self.joint]]
-            reach *= 4
+    alone: _Queue
+    lost: _Queue
+    new: _Queue
+    known: _Queue
 
 
 class _Commissioning:
@@ -390,6 +382,11 @@ class _Commissioning:
         self.times: list[float] = []
         self.curve: list[tuple[float, ...]] = []
         self.seconds = dict.fromkeys(("photographs", "search", "travel", "idle"), 0.0)
+        #: Joint first visits that each beam has missed, and the part of a miss that is owed.
+        self.missed, self._owed = np.zeros(count, dtype=np.int64), 0.0
+        self._last_joint: Mask = np.zeros(len(targets), dtype=np.bool_)
+        #: End of the last interval, and what each target had left of it, s.
+        self._until, self._left = -np.inf, np.zeros(len(targets))
 
     def note(self, now: float) -> None:
         """Add a point to the curve."""
@@ -402,107 +399,126 @@ class _Commissioning:
     def fill(self, begin: float, end: float, sun: FloatArray) -> None:
         """Give the time of all targets in an interval to visits."""
         choices = [self._choices(sun, target) for target in self.targets]
-        clock = np.full(len(choices), begin)
-        stop = begin + self.terms.clear * (end - begin)
+        # What the interval before left over, too short for a visit, is used now.
+        carried = begin - self._left if begin == self._until else np.full(len(choices), begin)
+        clock, stop = carried.copy(), begin + self.terms.clear * (end - begin)
         free: Mask = np.array(self.visited)
         opened: Mask = np.ones(len(choices), dtype=np.bool_)
         while opened.any():
             j = int(np.argmin(np.where(opened, clock, np.inf)))
             now = float(clock[j])
-            rows, joint = self._best(choices[j], free)
+            rows, joint = self._best(j, choices[j], free)
             span = self._span(choices[j], rows, joint) if rows.size else {}
             until = now + sum(span.values())
             if not rows.size or until > stop:
                 opened[j] = False
-                self.seconds["idle"] += max(0.0, stop - now)
+                self._left[j] = max(0.0, stop - now)
+                self.seconds["idle"] += self._left[j] - (begin - carried[j])
                 continue
             free[rows] = False
             for name, value in span.items():
                 self.seconds[name] += value
-            self._visit(choices[j].view, now, until, j, rows, joint)
+            self._last_joint[j] = joint
+            self._visit(choices[j], now, until, j, rows, joint)
             clock[j] = until
+        self._until = end
 
     def _choices(self, sun: FloatArray, target: Target) -> _Choices:
         terms, known, form = self.terms, self.field.covariance, self.field.form
-        view = self.field.view(sun, target)
+        view, square = self.field.view(sun, target), self.field.squares()
         spread = np.einsum("nip,npq,niq->n", view.slope, known, view.slope) * self.sigma**2
         seen = chance_on_target(target, self.position, self.size, spread)
-        square = self.field.squares()
+        if terms.joint is not None and terms.joint.tries > 1:
+            found = chance_by_try(target, self.position, self.size, spread, terms.joint.tries)
+            row = np.arange(len(self.missed))
+            at_once = found[np.minimum(self.missed, terms.joint.tries - 1), row]
+        else:
+            at_once = seen
+        able = view.able & self.counted
 
         def gains(joint: bool) -> FloatArray:
             slope = view.slope * (self.sigma / terms.accuracy(joint))[:, None, None]
             found = _gain.variance_gain(known, slope, form)
-            good = view.able & self.counted & (found > terms.worth * square)
-            return np.where(good, found, 0.0)
+            return np.where(able & (found > terms.worth * square), found, 0.0)
 
-        gain, travel = gains(joint=False), np.where(view.able, view.seconds, 0.0)
+        travel = np.where(view.able, view.seconds, 0.0)
         looks = np.minimum(1.0 / np.maximum(seen, 1e-9), LOOKS)
-        value = gain / (terms.alone + terms.look * (looks - 1.0) + 2.0 * travel)
-        alone = np.argsort(-value, kind="stable")[: int(np.sum(value > 0.0))]
-        joint, both = np.empty(0, dtype=np.intp), np.zeros_like(gain)
-        if terms.together > 1:
-            able = (seen >= terms.likely) & (self.measured | (not terms.first_alone))
-            both = np.where(able, gains(joint=True), 0.0)
-            joint = np.argsort(-both / looks, kind="stable")[: int(np.sum(both > 0.0))]
-        return _Choices(view, both, looks, alone, joint, value)
+        value = gains(joint=False) / (terms.alone + terms.look * (looks - 1.0) + 2.0 * travel)
+        nobody = np.zeros_like(value)
+        new = late = nobody
+        if terms.joint is not None:
+            both, vague = gains(joint=True), square > terms.joint.known**2
+            to_first = (~self.measured | vague) & (self.missed < terms.joint.tries)
+            new = both * at_once * to_first if terms.joint.first else nobody
+            late = np.where(self.measured & ~vague, both, 0.0)
+        slant = np.linalg.norm(target.center - self.position, axis=1)
+        lost = np.where(self.measured, 0.0, value)
+        queues = (_Queue(_descending(one)) for one in (value, lost, new, late))
+        return _Choices(view, slant, spread, at_once, looks, *queues)
 
-    def _best(self, choices: _Choices, free: Mask) -> tuple[Rows, bool]:
-        """Return the heliostats of the next visit, and whether it is a joint one."""
-        one = choices.next_alone(free)
-        many = choices.next_joint(free, self.terms.together)
-        if many.size:
-            span = sum(self._span(choices, many, joint=True).values())
-            if one < 0 or choices.gain[many].sum() / span >= choices.value[one]:
-                return many, True
-        return np.array([one] if one >= 0 else [], dtype=np.intp), False
+    def _best(self, j: int, choices: _Choices, free: Mask) -> tuple[Rows, bool]:
+        """Return the heliostats of the next visit to a target, and whether it is a joint one."""
+        alone, terms = choices.alone.first(free, 1), self.terms.joint
+        if terms is None:
+            return alone, False
+        if terms.first and len(many := choices.new.first(free, terms.first)) >= terms.least:
+            share = -(-int(free[choices.new.rows].sum()) // len(self.targets))
+            many = many[: max(terms.least, share)]
+            slant, spread = choices.slant[many], choices.spread[many]
+            light = terms.fitting(self.targets[j], self.size[many], slant, spread)
+            if light >= terms.least:
+                return many[:light], True
+        # Those that have to go alone at first get every second visit.
+        if self._last_joint[j] and (lost := choices.lost.first(free, 1)).size:
+            return lost, False
+        many = choices.known.first(free, terms.most)
+        return (many, True) if len(many) >= terms.least else (alone, False)
 
     def _span(self, choices: _Choices, rows: Rows, joint: bool) -> dict[str, float]:
-        """Return the time of a visit by use, s; joint mirrors drive and search at once."""
-        more = float(choices.looks[rows].max()) - 1.0
-        return {
-            "photographs": self.terms.joint if joint else self.terms.alone,
-            "search": more * (self.terms.joint if joint else self.terms.look),
-            "travel": 2.0 * float(choices.view.seconds[rows].max()),
-        }
+        """Return the time of a visit by use, s; joint mirrors drive at once, and do not search."""
+        travel = 2.0 * float(choices.view.seconds[rows].max())
+        if not joint or self.terms.joint is None:
+            search = self.terms.look * (float(choices.looks[rows].max()) - 1.0)
+            return {"photographs": self.terms.alone, "search": search, "travel": travel}
+        own = self._own(rows)
+        took = self.terms.joint.span(len(rows), own=own)
+        return {"photographs": took, "travel": travel * (2.0 if own else 1.0)}
+
+    def _own(self, rows: Rows) -> bool:
+        """Return whether each mirror of a joint visit has a code of its own."""
+        joint = self.terms.joint
+        vague = joint is not None and (self.field.squares(rows) > joint.known**2).any()
+        return bool(vague or not self.measured[rows].all())
 
     def _visit(
-        self, view: TargetView, begin: float, end: float, j: int, rows: Rows, joint: bool
+        self, choices: _Choices, begin: float, end: float, j: int, rows: Rows, joint: bool
     ) -> None:
-        scale = (self.sigma[rows] / self.terms.accuracy(joint))[:, None, None]
-        known = _gain.updated(self.field.covariance[rows], view.slope[rows] * scale)
+        first = bool((~self.measured[rows]).any())
+        missed, stacks = np.zeros(len(rows), dtype=np.bool_), 1.0
+        own = joint and self._own(rows)
+        if own:
+            # The stack that verifies new parameters is a sighting, too.
+            missed, stacks = self._misses(choices.seen[rows]), 2.0
+        scale = np.sqrt(stacks) * self.sigma[rows] / self.terms.accuracy(joint)
+        scale = np.where(missed, 0.0, scale)[:, None, None]
+        known = _gain.updated(self.field.covariance[rows], choices.view.slope[rows] * scale)
         self.field.covariance[rows] = known
         square = np.einsum("npq,nqp->n", self.field.form[rows], known)
         after = np.sqrt(np.maximum(square, 0.0) + self.terms.floor**2)
-        first = bool(not self.measured[rows].any())
-        self.measured[rows] = True
-        self.visits.append(Visit(begin, end, j, rows, joint, first, after))
+        self.missed[rows] += missed
+        self.measured[rows] |= ~missed
+        self.visits.append(Visit(begin, end, j, rows, joint, own, first, missed, after))
+
+    def _misses(self, seen: FloatArray) -> Mask:
+        """Return which beams miss: as many as their chances say, spread evenly, (n,)."""
+        due = self._owed + np.cumsum(1.0 - seen)
+        self._owed = float(due[-1]) % 1.0
+        return np.asarray(np.diff(np.floor(due), prepend=0.0) > 0.0)
 
 
-def chance_on_target(
-    target: Target, position: FloatArray, size: FloatArray, spread: FloatArray
-) -> FloatArray:
-    """Return the chance that a beam is wholly on a target at the first look, (N,).
-
-    Parameters
-    ----------
-    target
-        The target; the beam is sent to its centre.
-    position, size
-        Feet of the heliostats (N, 3) and the larger sides of their mirrors (N,), m.
-    spread
-        Expected squared beam error of both directions together, rad², (N,).
-    """
-    way = target.center - position
-    distance = np.linalg.norm(way, axis=1)
-    facing = np.abs(way @ target.normal) / distance
-    # The beam's own radius: half a mirror, and the sun's disc.
-    radius = 0.5 * size + SUN_RADIUS * distance
-    half = 0.5 * np.array([target.width, target.height])
-    room = np.maximum(half - radius[:, None], 0.1 * half)
-    sigma = np.sqrt(0.5 * np.maximum(spread, 1e-18)) * distance
-    across = sigma / np.maximum(facing, 0.1)
-    root = np.sqrt(2.0)
-    return np.asarray(erf(room[:, 0] / (root * across)) * erf(room[:, 1] / (root * sigma)))
+def _descending(value: FloatArray) -> Rows:
+    """Return the rows of positive values, the largest first."""
+    return np.asarray(np.argsort(-value, kind="stable")[: int(np.sum(value > 0.0))])
 
 
 def mirrors_of(visits: Iterable[Visit]) -> int:

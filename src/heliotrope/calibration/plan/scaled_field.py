@@ -84,9 +84,9 @@ class ScaledField:
     def __len__(self) -> int:
         return len(self.covariance)
 
-    def squares(self) -> FloatArray:
-        """Return the expected squared beam error of each heliostat, rad², (N,)."""
-        return np.asarray(np.einsum("npq,nqp->n", self.form, self.covariance))
+    def squares(self, rows: npt.NDArray[np.intp] | slice = slice(None)) -> FloatArray:
+        """Return the expected squared beam error of heliostats (all), rad², (K,)."""
+        return np.asarray(np.einsum("npq,nqp->n", self.form[rows], self.covariance[rows]))
 
     def part(self, k: int, rows: slice, sun: FloatArray, target: Target) -> TargetView:
         """Return heliostats ``rows`` of fleet ``k`` aimed at a target."""

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.learn.drift import DAY
-from heliotrope.calibration.plan.commission import chance_on_target
+from heliotrope.calibration.plan.on_target import chance_on_target
 from heliotrope.calibration.plan.planning import SightingLimits
 from heliotrope.field.camera import Camera
 from heliotrope.field.plant import Plant

@@ -70,6 +70,8 @@ class PlantSchedule:
         self._draft: list[Planned] = []
         self._coming: Iterator[Assignment | None] | None = None
         self._made = -np.inf
+        #: Heliostats that go to a target, by target.
+        self._sent: dict[str, list[str]] = {}
         plant.beliefs.subscribe(scheduler.learn)
         plant.beliefs.subscribe_drift(scheduler.drift)
 
@@ -91,7 +93,12 @@ class PlantSchedule:
             (target,),
             weather=self.weather,
         )
-        return None if assignment is None else _planned(assignment)
+        if not beside:
+            self._sent[target] = []
+        if assignment is None:
+            return None
+        self._sent[target].append(assignment.heliostat)
+        return _planned(assignment)
 
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[Planned]:
         """Return the coming visits; a new plan grows at each call while the old one is shown."""
@@ -116,9 +123,12 @@ class PlantSchedule:
 
     def done(self, entry: CalibrationEntry) -> None:
         """Take the result of a visit."""
-        good, missed = entry.good, entry.measured
+        good, missed, sent = entry.good, entry.measured, self._sent.get(entry.target, [])
+        together = len(sent) > 1 and entry.heliostat in sent
         self.scheduler.done(
-            Visited(entry.heliostat, entry.target, entry.at, good, missed, entry.text)
+            Visited(
+                entry.heliostat, entry.target, entry.at, good, missed, entry.text, together=together
+            )
         )
 
     def _states(self, ready: npt.NDArray[np.bool_]) -> _Ready:

@@ -4,6 +4,7 @@ The prediction is a plan as of `calibration.plan.plan_commission`, with the visi
 their times, the accuracy of a photograph, the least gain, and the goal.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
@@ -17,9 +18,11 @@ from heliotrope.calibration.plan import (
     plan_commission,
 )
 from heliotrope.calibration.plan.commission import SHARES
+from heliotrope.calibration.plan.joint_terms import JointTerms
 from heliotrope.calibration.plan.percentiles import error_percentiles
 from heliotrope.calibration.plan.scaled_field import ScaledField
 from heliotrope.errors import InputError
+from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.plant.operations.outlook import FieldPoint, Outlook, end_of_day
@@ -30,19 +33,49 @@ from heliotrope.sun import Site
 _SHORT, _LONG = 120.0, 600.0
 #: A visit takes at most this many times as long as the schedule expects, or the inverse.
 _MOST_PACE = 4.0
+#: Joint visits from which their true times count.
+_PARTIES = 3
 
 
-def terms_of(settings: Settings, pace: float) -> CommissionTerms:
+@dataclass(frozen=True)
+class Party:
+    """A joint visit that has ended.
+
+    Attributes
+    ----------
+    mirrors
+        How many were sent.
+    worst
+        Largest beam error over the year that was expected of them, rad RMS (2-D).
+    seconds
+        Its time.
+    """
+
+    mirrors: int
+    worst: float
+    seconds: float
+
+
+def terms_of(
+    settings: Settings,
+    joint: JointSettings | None,
+    pace: float = np.nan,
+    parties: Sequence[Party] = (),
+) -> CommissionTerms:
     """Return the terms of a plan whose visits are those of a schedule.
 
     Parameters
     ----------
     settings
         Of the schedule.
+    joint
+        Of the joint visits; None: there are none.
     pace
-        Time of a visit that gives parameters, as a share of the expected time of a visit.
+        Time of a visit alone that gives parameters, as a share of the expected time; NaN: unknown.
+    parties
+        Joint visits: once there are some, their times take the place of the expected ones.
     """
-    share = float(np.clip(pace, 1.0 / _MOST_PACE, _MOST_PACE)) if np.isfinite(pace) else 1.0
+    share = _share(pace)
     # Without a search, a beam that misses costs a whole visit.
     look = settings.visit if settings.look is None else settings.look
     return CommissionTerms(
@@ -54,7 +87,22 @@ def terms_of(settings: Settings, pace: float) -> CommissionTerms:
         sigma=settings.sigma,
         worth=settings.worth,
         limits=settings.limits,
+        joint=None if joint is None else _joint_terms(settings, joint, parties),
     )
+
+
+def _joint_terms(settings: Settings, joint: JointSettings, made: Sequence[Party]) -> JointTerms:
+    """Return the joint visits; after some of them, with their true times."""
+    terms = JointTerms.of(joint, settings.sigma)
+    if len(made) < _PARTIES:
+        return terms
+    expected = sum(terms.span(one.mirrors, own=one.worst > terms.known) for one in made)
+    share = _share(sum(one.seconds for one in made) / expected)
+    return replace(terms, step=share * terms.step, beside=share * terms.beside)
+
+
+def _share(pace: float) -> float:
+    return float(np.clip(pace, 1.0 / _MOST_PACE, _MOST_PACE)) if np.isfinite(pace) else 1.0
 
 
 @dataclass(frozen=True)
@@ -117,7 +165,11 @@ class FieldProspect:
 
     def _interval(self) -> float:
         """Return the time in which all are visited: a plan visits each once in an interval."""
-        all_once = len(self.held) * self.terms.alone / len(self.targets)
+        joint, count = self.terms.joint, len(self.held)
+        each = self.terms.alone
+        if joint is not None:
+            each = joint.span(joint.most, own=False) / joint.most
+        all_once = count * each / len(self.targets)
         return float(np.clip(all_once, _SHORT, _LONG))
 
     def _informed(self) -> list[Fleet]:

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from itertools import islice
+from itertools import groupby, islice
 from typing import Protocol
 
 import numpy as np
@@ -28,7 +28,7 @@ from heliotrope.geometry import FloatArray, as_vectors
 from heliotrope.lcu import states as lcu_states
 from heliotrope.plant.schedule.choice import Assignment, Judge, Mask
 from heliotrope.plant.schedule.knowledge import FieldKnowledge
-from heliotrope.plant.schedule.prospect import FieldProspect, terms_of
+from heliotrope.plant.schedule.prospect import FieldProspect, Party, terms_of
 from heliotrope.plant.schedule.settings import Settings, Weather
 
 #: A beam this many times as far off as expected says that its heliostat has changed.
@@ -60,6 +60,8 @@ class Visited:
         NaN if none could be used.
     text
         The same for people.
+    together
+        Whether it was on the target together with others.
     """
 
     heliostat: str
@@ -68,6 +70,7 @@ class Visited:
     calibrated: bool
     measured: float = float("nan")
     text: str = ""
+    together: bool = False
 
 
 @dataclass(frozen=True)
@@ -95,9 +98,13 @@ class Comparison:
         Beam error found at the photographs, and expected there, rad RMS (2-D), over visits with
         both; NaN if there are none.
     longer
-        Mean time of a visit, as a share of the expected time; NaN without visits.
+        Mean time of a visit alone, as a share of the expected time; NaN without visits.
     surprises
         Heliostats found more than `SURPRISE` times as far off as expected.
+    alone
+        Number of visits of one heliostat, and number of those that brought a new calibration.
+    parties
+        Joint visits.
     """
 
     visits: int
@@ -106,6 +113,8 @@ class Comparison:
     predicted: float
     longer: float
     surprises: tuple[str, ...]
+    alone: tuple[int, int]
+    parties: tuple[Party, ...] = ()
 
     @property
     def ratio(self) -> float:
@@ -114,13 +123,12 @@ class Comparison:
 
     @property
     def pace(self) -> float:
-        """Mean time for each new calibration, as a share of the expected time of a visit.
+        """Mean time for each calibration alone, as a share of the expected time of a visit.
 
         NaN before there are `ENOUGH` visits.
         """
-        if self.visits < ENOUGH:
-            return float("nan")
-        return self.longer * self.visits / max(self.calibrated, 1)
+        visits, calibrated = self.alone
+        return self.longer * visits / max(calibrated, 1) if visits >= ENOUGH else float("nan")
 
     @property
     def text(self) -> str:
@@ -146,9 +154,10 @@ def compare(finished: Iterable[Finished]) -> Comparison:
     def rms(values: list[float]) -> float:
         return float(np.sqrt(np.mean(np.square(values)))) if values else nan
 
+    alone = [f for f in made if not f.visited.together]
     spans = [
         (f.visited.ended - f.planned.at) / (f.planned.until - f.planned.at)
-        for f in made
+        for f in alone
         if f.planned.until > f.planned.at
     ]
     return Comparison(
@@ -158,7 +167,18 @@ def compare(finished: Iterable[Finished]) -> Comparison:
         predicted=rms([f.planned.predicted for f in both]),
         longer=float(np.mean(spans)) if spans else nan,
         surprises=tuple(f.planned.heliostat for f in both if f.surprise),
+        alone=(len(alone), sum(f.visited.calibrated for f in alone)),
+        parties=tuple(_parties(f for f in made if f.visited.together)),
     )
+
+
+def _parties(made: Iterable[Finished]) -> Iterator[Party]:
+    """Yield the joint visits: those of one target that end at once."""
+    for _, group in groupby(made, key=lambda f: (f.visited.target, round(f.visited.ended))):
+        visits = list(group)
+        begin = min(f.planned.at for f in visits)
+        worst = max(f.planned.before for f in visits)
+        yield Party(len(visits), worst, visits[0].visited.ended - begin)
 
 
 class States(Protocol):
@@ -418,6 +438,7 @@ class Scheduler:
             return None
         now = _unix(now_utc)
         fleets, rows = self._known.fleets(now)
+        made = self.compared()
         return FieldProspect(
             now,
             self.design.site,
@@ -426,7 +447,7 @@ class Scheduler:
             self._known.size[rows].max(axis=1),
             self._learnt[rows] > 0,
             ~np.asarray(able, dtype=np.bool_)[rows],
-            terms_of(self.settings, self.compared().pace),
+            terms_of(self.settings, self.design.joint_visits, made.pace, made.parties),
         )
 
     def plan(
