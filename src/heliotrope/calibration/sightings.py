@@ -204,6 +204,11 @@ def sightings(
         covariance is not symmetric and positive semidefinite; the text names the row.
     """
     table = np.atleast_2d(_numbers(counts, "counts"))
+    if not table.shape[-1]:
+        raise InputError(
+            f"sightings: counts of shape {np.shape(counts)} are of no drive; give them as (M, 2), "
+            "or as (0, 2) for no sightings"
+        )
     batch = table.shape[:-1]
     table = table.reshape(-1, table.shape[-1])
     rows = len(table)

@@ -467,7 +467,7 @@ def check_site(site: object) -> None:
     if not isinstance(site, Site):
         raise InputError(
             f"site: {kind_of(site)} is not a Site; give Site(latitude_deg, longitude_deg, height), "
-            "in degrees and metres"
+            "in degrees and metres, or Site.from_pvlib(location)"
         )
 
 
