@@ -279,14 +279,16 @@ def write_paint(
     from heliotrope.field.formats import paint
 
     given = _given(plant, learned, time, "write_paint")
+    groups = {name: given.find(name)[0] for name in learned.heliostats}
+    for name, group in groups.items():
+        paint.written(group, name)
     place = Path(folder)
     try:
         (place / "properties").mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{place}: cannot be made ({error.strerror}); give a folder") from None
     left: dict[str, tuple[str, ...]] = {}
-    for name in learned.heliostats:
-        group, _ = given.find(name)
+    for name, group in groups.items():
         file = place / "properties" / f"{name}.json"
         left[name] = paint.write_heliostat(group, name, plant.site.origin, file)
     lines = [f"{name}: {', '.join(lost)}" for name, lost in left.items() if lost]

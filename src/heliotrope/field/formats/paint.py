@@ -462,7 +462,8 @@ def written(heliostats: Heliostats, name: str) -> Mechanism:
     """
     if heliostats.mechanism.kind != "two_jacks":
         raise InputError(
-            f"heliostat {name}: kind {heliostats.mechanism.kind}; PAINT holds only two_jacks"
+            f"heliostat {name}: kind {heliostats.mechanism.kind}; PAINT holds only two_jacks; "
+            "write_plant writes every kind"
         )
     return heliostats.calibrated[heliostats.index(name)]
 
