@@ -100,6 +100,30 @@ def _answering(page: Any, fields: dict[str, Any]) -> None:
     page.route("**/api/v1/calibration", answer)
 
 
+def test_a_joint_visit_shows_its_first_heliostats_and_all_on_a_click(
+    enter: Callable[..., Any],
+) -> None:
+    names = [f"P{k:04d}A" for k in range(1, 61)]
+    visit = {"heliostat": names[0], "others": names[1:], "target": "left", "stage": "photograph 7"}
+    page = enter("viewer", viewport={"width": 800, "height": 900})
+    _answering(page, {"running": [visit | {"since": 1.75e9}], "asked": names[:4]})
+    page.click(".hx-tabs >> text=Calibration")
+    line = page.locator(".hx-list li", has_text="on left: photograph 7")
+    line.wait_for()
+    shown = " ".join(line.inner_text().split())
+    assert shown.startswith("P0001A, P0002A, P0003A and 57 more on left: photograph 7"), shown
+    assert page.locator(".hx-several summary").get_attribute("title") == ", ".join(names)
+    # Four names need no summary.
+    assert "asked for next: P0001A, P0002A, P0003A, P0004A" in page.inner_text(".hx-list")
+    line.locator("summary").click()
+    line.get_by_text("P0060A").wait_for()
+    # The list is drawn anew, and stays open.
+    page.evaluate("heliotrope.store.emit('theme')")
+    line.get_by_text("P0060A").wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 800
+    page.unroute_all(behavior="wait")
+
+
 def test_the_curve_is_in_the_answer_of_the_api_and_in_the_store(
     field: LiveConsole, enter: Callable[..., Any]
 ) -> None:

@@ -214,20 +214,32 @@ function learning(box) {
   return refreshed(shown, { every: 5 });
 }
 
+// The first names of many, all of them on a click; a list that is drawn anew stays as it was.
+const FEW = 3;
+function several(names, key, shown) {
+  if (names.length <= FEW + 1) return h("b", {}, names.join(", "));
+  const rest = names.slice(FEW);
+  const box = h("details", { className: "hx-several", open: shown.has(key) },
+    h("summary", { title: names.join(", ") }, h("b", {}, names.slice(0, FEW).join(", ")), ` and ${count(rest.length)} more`), rest.join(", "));
+  box.ontoggle = () => (box.open ? shown.add(key) : shown.delete(key));
+  return box;
+}
+
 export function calibration(box) {
   const body = h("div"), lines = h("canvas", { className: "hx-chart" }), ahead = h("canvas", { className: "hx-chart" }), air = h("div"), nights = h("div");
   box.append(body, air, nights);
+  const shown = new Set();
   let view = null;
   const draw = () => {
     if (!view) return;
     const truth = view.quality.some((p) => p.truth_median !== null);
-    const running = view.running.map((r) => h("li", {}, h("b", {}, r.heliostat), r.others.length ? ` and ${r.others.length} more (${r.others.join(", ")})` : "", ` on ${r.target}: ${r.stage}`, h("em", {}, ` since ${clock(r.since)}`)));
+    const running = view.running.map((r) => h("li", {}, several([r.heliostat, ...r.others], r.target, shown), ` on ${r.target}: ${r.stage}`, h("em", {}, ` since ${clock(r.since)}`)));
     const key = (text, colour, dashed) => h("span", {}, h("i", { className: dashed ? "dashed" : "", style: `color:${colour}` }), text);
     body.replaceChildren(
       h("div", { className: "hx-row" }, h("b", { className: view.on ? "good" : "warn" }, view.on ? "Running" : `Off: ${view.reason}`),
         canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("PUT", "calibration", { on: !view.on }), "calibration") }, view.on ? "Switch off" : "Switch on") : ""),
       facts([["Calibrated", count(view.done)], ["Waiting", count(view.waiting)], ["Failed", count(view.failed)]]),
-      h("ul", { className: "hx-list" }, running.length ? running : h("li", {}, "no measurement in progress"), view.asked.length ? h("li", {}, `asked for next: ${view.asked.join(", ")}`) : ""),
+      h("ul", { className: "hx-list" }, running.length ? running : h("li", {}, "no measurement in progress"), view.asked.length ? h("li", {}, "asked for next: ", several(view.asked, "", shown)) : ""),
       h("h3", {}, "Error of the calibrated heliostats (mrad)"), lines,
       h("p", { className: "hx-keys" }, key("predicted, median", colourOf("APPROACHING")), key("90th percentile", colourOf("APPROACHING"), true),
         truth ? [key("true (twin), median", colourOf("SEARCHING")), key("90th percentile", colourOf("SEARCHING"), true)] : ""),
