@@ -26,7 +26,7 @@ from heliotrope.calibration.plan.commission import (
 )
 from heliotrope.calibration.plan.fleets import Fleet, fleets_of
 from heliotrope.calibration.plan.joint_terms import JointTerms
-from heliotrope.calibration.plan.on_target import search_places
+from heliotrope.calibration.plan.on_target import reach_of, search_places
 from heliotrope.calibration.plan.percentiles import error_percentiles
 from heliotrope.calibration.plan.planning import aim_at
 from heliotrope.calibration.sightings import Sightings, camera_target, drone, join, sightings
@@ -38,7 +38,6 @@ from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, as_float, reflect, tangent_axes
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
-from heliotrope.optics.beam import SUN_RADIUS
 from heliotrope.plant.schedule import settings_for
 from heliotrope.plant.schedule.prospect import terms_of
 from heliotrope.twin.live import CYCLE
@@ -136,7 +135,7 @@ class Commissioned:
     def _on_target(
         self, visit: Visit, rows: npt.NDArray[np.intp], seen: Sightings
     ) -> npt.NDArray[np.bool_]:
-        """Return which beams a first look finds: those wholly on the target, (n,).
+        """Return which beams a first look finds: those with their centres on the target, (n,).
 
         A beam is moved with its aim, which is beside the middle if earlier looks have missed it.
         """
@@ -144,10 +143,7 @@ class Commissioned:
         place = np.searchsorted(rows, seen.heliostat)
         tries = 1 if self.terms.joint is None else self.terms.joint.tries
         moved = search_places(target, tries)[np.minimum(self.missed[seen.heliostat], tries - 1)]
-        slant = np.linalg.norm(target.center - self.nominal.position[seen.heliostat], axis=1)
-        half = 0.5 * min(target.width, target.height)
-        room = np.maximum(half - 0.5 * _SIZE - SUN_RADIUS * slant, 0.1 * half)[:, None]
-        found = np.abs(target.plane_coordinates(seen.destination) + moved) <= room
+        found = np.abs(target.plane_coordinates(seen.destination) + moved) <= reach_of(target)
         on[place] = found.all(axis=1) | self.measured[seen.heliostat]
         return on
 

@@ -188,6 +188,37 @@ def test_new_mirrors_have_codes_of_their_own_and_do_not_dazzle() -> None:
     joint(scene, installed=ROUGH, cycle=CYCLE)
 
 
+def test_a_beam_beside_the_target_is_looked_for_in_the_next_visit() -> None:
+    async def scene(here: Scene) -> None:
+        plant, target = here.live.plant, here.live.design.targets[0]
+        lost, *good = here.names
+        # Right of the target, at whatever place of it the mirror aims.
+        displace(here, lost, 12.0, "never")
+        results = await here.run()
+        assert results[lost].verdict is Verdict.FAINT, results[lost]
+        assert {results[name].outcome for name in good} == {_CALIBRATED}, results
+        assert here.cycle.searching(lost)
+        assert not any(here.cycle.searching(name) for name in good)
+        nominal = plant.beliefs.nominal
+        model = {lost: first_model(CYCLE, nominal(lost)).parameters}
+        places = []
+        for missed in range(10):
+            layout, wrong = newcomers(plant, target, [lost], JointSettings(), model, {lost: missed})
+            assert wrong == {}
+            places.append(target.plane_coordinates(layout.aims)[0])
+        away = np.array(places[1:9]) - places[0]
+        # Around the target, each direction once; the last place stays.
+        assert np.abs(away).max(axis=1) == pytest.approx(0.8 * target.width)
+        assert len({tuple(np.sign(np.round(one))) for one in away}) == 8
+        np.testing.assert_allclose(places[9], places[8])
+        here.stages.clear()
+        results = await here.run(lost)
+        # It is seen now; that an installation lets a mirror miss by so much is not believed.
+        assert results[lost].verdict is not Verdict.FAINT, results[lost]
+
+    joint(scene, installed=ROUGH, cycle=CYCLE)
+
+
 def test_automatic_control_begins_with_them() -> None:
     async def main(clock: VirtualClock) -> None:
         options = LiveOptions(rendered=False, threads=0, together=True)

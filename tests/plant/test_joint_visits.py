@@ -286,6 +286,7 @@ def parties(
     cycle = SimpleNamespace(
         settings=JointSettings(most=5, least=2, first=together),
         having_place=lambda names, target: names[:3],
+        searching=lambda name: False,
     )
     made = Parties(plant, book, cycle, told.append)  # type: ignore[arg-type]
     return made, told, np.ones(6, dtype=np.bool_)
@@ -328,6 +329,21 @@ def test_parties_of_new_heliostats_come_first() -> None:
     # One new heliostat is no party: those that go alone are next, then those that are known.
     assert asyncio.run(made.chosen("left", ready, follow)) == ()
     assert asyncio.run(made.chosen("left", ready, follow)) == ("E", "F")
+
+
+def test_a_beam_that_is_looked_for_does_not_go_alone() -> None:
+    made, _, ready = parties(1e-3, first=4)
+    made._book.error[:4] = np.nan
+    made.cycle.searching = lambda name: name == "A"  # type: ignore[method-assign]
+    for name in "AB":
+        faint = CycleResult(name, CalibrationOutcome.NOT_PROVEN, "x", verdict=Verdict.FAINT)
+        made.concluded(faint, joint=True)
+        assert made.again(faint) is (name == "A")
+    assert not made.again(CycleResult("A", _CALIBRATED, "calibrated", new=2))
+    cloud = CycleResult("C", CalibrationOutcome.NOT_PROVEN, "x", verdict=Verdict.CLOUD)
+    made.concluded(cloud, joint=True)
+    # A cloud is no mirror's fault, either.
+    assert made.alone(ready).tolist() == [False, True, False, False, False, False]
 
 
 def test_two_targets_share_the_new_heliostats() -> None:

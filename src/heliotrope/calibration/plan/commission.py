@@ -428,12 +428,11 @@ class _Commissioning:
         view, square = self.field.view(sun, target), self.field.squares()
         spread = np.einsum("nip,npq,niq->n", view.slope, known, view.slope) * self.sigma**2
         seen = chance_on_target(target, self.position, self.size, spread)
-        if terms.joint is not None and terms.joint.tries > 1:
-            found = chance_by_try(target, self.position, self.size, spread, terms.joint.tries)
+        at_once = seen
+        if terms.joint is not None:
+            found = chance_by_try(target, self.position, spread, terms.joint.tries)
             row = np.arange(len(self.missed))
             at_once = found[np.minimum(self.missed, terms.joint.tries - 1), row]
-        else:
-            at_once = seen
         able = view.able & self.counted
 
         def gains(joint: bool) -> FloatArray:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from heliotrope.calibration.plan.on_target import LOOKS
 from heliotrope.errors import InputError
 from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.target import Target
@@ -62,7 +63,7 @@ class JointTerms:
     least: int = 4
     first: int = 63
     known: float = _SURE * 4e-3
-    tries: int = 1
+    tries: int = LOOKS
     step: float = 2.2
     beside: float = 25.0
     sigma: float = 2.2e-4

@@ -8,7 +8,11 @@ from heliotrope.geometry import FloatArray
 from heliotrope.optics.beam import SUN_RADIUS
 
 #: Distance between neighbouring aims of a search, as a share of the target's shorter side.
-PITCH = 0.5
+PITCH = 0.8
+#: Joint first visits in which a beam is looked for, in the middle and around it.
+LOOKS = 9
+#: A stack finds a beam whose centre is this far inside the target, m.
+_INSIDE = 0.5
 
 
 def chance_on_target(
@@ -25,20 +29,26 @@ def chance_on_target(
     spread
         Expected squared beam error of both directions together, rad², (N,).
     """
-    room, sigma = _room(target, position, size, spread)
+    sigma = _deviation(target, position, spread)
+    distance = np.linalg.norm(target.center - position, axis=1)
+    # The beam's own radius: half a mirror, and the sun's disc.
+    radius = 0.5 * size + SUN_RADIUS * distance
+    half = 0.5 * np.array([target.width, target.height])
+    room = np.maximum(half - radius[:, None], 0.1 * half)
     chance = erf(room / (np.sqrt(2.0) * sigma))
     return np.asarray(chance[:, 0] * chance[:, 1])
 
 
 def chance_by_try(
-    target: Target, position: FloatArray, size: FloatArray, spread: FloatArray, tries: int
+    target: Target, position: FloatArray, spread: FloatArray, tries: int
 ) -> FloatArray:
-    """Return the chance that a beam which earlier tries have missed is on a target, (K, N).
+    """Return the chance that a stack finds a beam which earlier ones have missed, (K, N).
 
     The aim of each try is that of `search_places`; the other parameters are those of
-    `chance_on_target`.
+    `chance_on_target`. A beam is found whose centre is on the target.
     """
-    room, sigma = _room(target, position, size, spread)
+    sigma = _deviation(target, position, spread)
+    room = np.broadcast_to(reach_of(target), sigma.shape)
     places = search_places(target, tries)
     # The edges of all windows cut the plane into cells, each of which one try is the first to see.
     middles, chances = zip(
@@ -67,7 +77,7 @@ def _cut(places: FloatArray, room: FloatArray, sigma: FloatArray) -> tuple[Float
 def search_places(target: Target, count: int) -> FloatArray:
     """Return where a beam is sent that earlier looks have missed, right and up, m, (K, 2).
 
-    The middle first, then around it, half a target apart.
+    The middle first, then around it.
     """
     reach = int(np.ceil(np.sqrt(count)))
     line = np.arange(-reach, reach + 1)
@@ -76,16 +86,15 @@ def search_places(target: Target, count: int) -> FloatArray:
     return np.asarray(PITCH * min(target.width, target.height) * grid[near])
 
 
-def _room(
-    target: Target, position: FloatArray, size: FloatArray, spread: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return how far a beam may be off the middle, and the deviation of its place, m, (N, 2)."""
+def reach_of(target: Target) -> FloatArray:
+    """Return how far off the middle a stack finds a beam, right and up, m, (2,)."""
+    return np.asarray(0.5 * np.array([target.width, target.height]) - _INSIDE)
+
+
+def _deviation(target: Target, position: FloatArray, spread: FloatArray) -> FloatArray:
+    """Return the standard deviation of the place of a beam, right and up, m, (N, 2)."""
     way = target.center - position
     distance = np.linalg.norm(way, axis=1)
     facing = np.abs(way @ target.normal) / distance
-    # The beam's own radius: half a mirror, and the sun's disc.
-    radius = 0.5 * size + SUN_RADIUS * distance
-    half = 0.5 * np.array([target.width, target.height])
-    room = np.maximum(half - radius[:, None], 0.1 * half)
     sigma = np.sqrt(0.5 * np.maximum(spread, 1e-18)) * distance
-    return room, np.stack([sigma / np.maximum(facing, 0.1), sigma], axis=1)
+    return np.stack([sigma / np.maximum(facing, 0.1), sigma], axis=1)

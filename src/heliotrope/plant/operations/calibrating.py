@@ -349,8 +349,10 @@ class Calibrating:
         if self._parties is not None and not (lit and result.verdict is Verdict.CLOUD):
             self._parties.concluded(result, joint=joint)
         self._book.conclude(entry)
-        # The schedule plans visits to targets: one in production that brings nothing is no failure.
-        if good or not lit:
+        # The schedule plans visits to targets: one in production that brings nothing is no failure,
+        # and a beam that is looked for in several joint visits has not failed yet.
+        looked = joint and self._parties is not None and self._parties.again(result)
+        if good or not (lit or looked):
             self._scheduler.done(entry)
         self._log.event("calibration", entry.heliostat, f"at {target}: {entry.text}")
         self._keeping.keep(entry, begun, sigma)

@@ -161,12 +161,17 @@ class Parties:
         """Note that a joint visit to a target begins."""
         self._last.add(target)
 
+    def again(self, result: CycleResult) -> bool:
+        """Return whether a result is no failure: its beam is looked for in another joint visit."""
+        return result.verdict is not None and self.cycle.searching(result.heliostat)
+
     def concluded(self, result: CycleResult, *, joint: bool) -> None:
         """Note the result of a visit: what it proves, or disproves, of a heliostat."""
         name, kind = result.heliostat, alarms.BEAM_DISPROVED
         # Nothing says where the beam of a mirror without a calibration ought to be.
         known = np.isfinite(self._book.calibrated_at[self._plant.field.place(name)])
-        if result.verdict is not None or result.outcome is CalibrationOutcome.NOT_VERIFIED:
+        unproven = result.verdict not in (None, Verdict.CLOUD) and not self.again(result)
+        if unproven or result.outcome is CalibrationOutcome.NOT_VERIFIED:
             self._alone.add(name)
         elif result.new and not joint:
             self._alone.discard(name)

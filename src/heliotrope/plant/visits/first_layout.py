@@ -2,7 +2,8 @@
 
 Such a beam misses by metres, so that places cannot be kept apart: each mirror has a code of its
 own, and moves widely to the right and left, which needs half as many photographs as movements along
-both axes. Mirrors that may miss by more aim nearer to the middle. The target must not become too
+both axes. Mirrors that may miss by more aim nearer to the middle; one that was missed before aims
+beside the target, so that its beam comes onto it. The target must not become too
 bright wherever the beams truly are: the expected light and twice its standard deviation count.
 """
 
@@ -11,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration.plan.on_target import LOOKS, search_places
 from heliotrope.calibration.uncertainty import expected_error, precision
 from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.target import Target
@@ -34,6 +36,7 @@ def newcomers(
     heliostats: Sequence[str],
     settings: JointSettings,
     model: Mapping[str, tuple[str, ...]],
+    missed: Mapping[str, int] | None = None,
 ) -> tuple[Layout, dict[str, str]]:
     """Return the layout of a joint first visit, and why some heliostats have no place in it.
 
@@ -47,6 +50,8 @@ def newcomers(
         See `JointSettings`.
     model
         Names of the parameters whose priors say how far each beam may miss, by heliostat.
+    missed
+        Joint first visits in which a beam was not found, by heliostat.
     """
     wrong: dict[str, str] = {}
     sent: dict[str, SentBeam] = {}
@@ -69,7 +74,9 @@ def newcomers(
             f"the light on {target.name} might exceed {settings.brightest:g} suns"
         )
     code = np.arange(len(sent), dtype=np.intp)
-    places = _places(target, sent)
+    looks = search_places(target, LOOKS)
+    count = [min((missed or {}).get(name, 0), LOOKS - 1) for name in sent]
+    places = _places(target, sent) + looks[count]
     return coded(target, sent, places, code, settings.first_movement, along=_RIGHT), wrong
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from heliotrope.calibration.plan.on_target import LOOKS
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.calibration.uncertainty import expected_error
 from heliotrope.errors import HeliotropeError
@@ -42,6 +43,8 @@ from heliotrope.plant.visits.visit import Visit
 
 #: Sightings that a first fit needs: all photographs of a stack agree, and a second one verifies it.
 _FIRST = 1
+#: Verdicts on a new mirror whose beam may be beside the target.
+_NOT_FOUND = (Verdict.FAINT, Verdict.ELSEWHERE)
 #: Verdicts that are no mirror's fault: a verification that ends so is made again, once.
 _AGAIN = (Verdict.JOINED, Verdict.CLOUD)
 
@@ -97,6 +100,12 @@ class JointCycle:
     ) -> None:
         self._plant, self._camera, self._cycle = plant, camera, cycle
         self.settings = settings or JointSettings()
+        #: Joint first visits in which the beam of a heliostat was not found.
+        self._missed: dict[str, int] = {}
+
+    def searching(self, heliostat: str) -> bool:
+        """Return whether a beam that was not found is looked for again in a joint first visit."""
+        return 0 < self._missed.get(heliostat, 0) < LOOKS
 
     async def run(
         self,
@@ -147,6 +156,8 @@ class JointCycle:
             empty = await self._camera.light(place)
             proven, lost = await self._stack(joint, layout, empty, tell)
             results |= lost
+            if first:
+                self._note(results)
             learn = self._learn_first if first else self._learn
             results |= await learn(joint, proven, empty, tell)
             await self._back(visits, before)
@@ -167,7 +178,13 @@ class JointCycle:
             return arranged(self._plant, target, names, self.settings)
         nominal, cycle = self._plant.beliefs.nominal, self._cycle.settings
         model = {name: first_model(cycle, nominal(name)).parameters for name in names}
-        return newcomers(self._plant, target, names, self.settings, model)
+        return newcomers(self._plant, target, names, self.settings, model, self._missed)
+
+    def _note(self, lost: Mapping[str, CycleResult]) -> None:
+        """Note which beams of new heliostats a first stack has not found."""
+        for name, result in lost.items():
+            if result.verdict in _NOT_FOUND and self._plant.beliefs.record(name) is None:
+                self._missed[name] = self._missed.get(name, 0) + 1
 
     # -- photographs -----------------------------------------------------------------------
 
