@@ -18,7 +18,7 @@ import pytest
 from heliotrope import sun
 from heliotrope.calibration.fit import fit
 from heliotrope.calibration.flights import Flight
-from heliotrope.calibration.record import CalibrationOutcome
+from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.calibration.sightings import drone
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.example import example_plant
@@ -140,11 +140,20 @@ def state_of(bench: Bench) -> int:
 
 def test_two_visits_make_one_fit_and_the_second_changes_nothing_more(tmp_path: Path) -> None:
     results: list[CycleResult] = []
+    taken: list[HeliostatCalibration] = []
 
     async def scene(bench: Bench, whole: CalibrationCycle, eye: Eye, token: int) -> None:
+        known: list[object] = []
+        bench.plant.beliefs.subscribe(taken.append)
+        eye.during = lambda: known.append(bench.plant.beliefs.record(NAME))
         results.append(await whole.run(ENGINEER, token, NAME, "target"))
         assert state_of(bench) == HOME
         assert eye.count == 3
+        # The third photograph confirms a fit that has not seen it, and is learnt from after that.
+        assert known == [None, None, None]
+        record = bench.plant.beliefs.record(NAME)
+        assert record is not None
+        assert (record.version, len(record.sightings)) == (2, 3)
         results.append(await whole.run(ENGINEER, token, NAME, "target"))
         # Only a first calibration and a large change are confirmed by one photograph more.
         assert eye.count == 5
@@ -152,16 +161,20 @@ def test_two_visits_make_one_fit_and_the_second_changes_nothing_more(tmp_path: P
         assert bench.cluster_of(NAME).stored[NAME] == new
 
     bench = cycle(tmp_path, scene, azimuth_bias=3e-3, elevation_bias=-2e-3)
-    assert [(r.known, r.new) for r in results] == [(2, 2), (4, 2)]
+    assert [(r.known, r.new) for r in results] == [(3, 3), (5, 2)]
     assert all(r.outcome is CalibrationOutcome.CALIBRATED for r in results)
+    first = f"calibrated: beam error {1e3 * results[0].before:.2f} to "
+    assert results[0].text.startswith(first), results[0].text
+    assert results[0].text.endswith("over 3 sightings")
     records = [r.record for r in results]
-    assert [r and r.version for r in records] == [1, 2]
+    assert [r and r.version for r in records] == [2, 3]
     assert bench.plant.beliefs.record(NAME) is records[1]
     assert results[0].after < 1e-4 < 3e-3 < results[0].before
     # It was locked each time; the drives were not known there, and needed no second writing.
-    assert set(records[0].pushed) == set(items_of(prototype_machine(bench)))
-    assert len(bench.cluster_of(NAME).commands("LOCK")) == 2
-    assert "drive_primary" not in records[1].pushed
+    assert [record.version for record in taken] == [1, 2, 3]
+    assert set(taken[0].pushed) == set(items_of(prototype_machine(bench)))
+    assert len(bench.cluster_of(NAME).commands("LOCK")) == 3
+    assert "drive_primary" not in taken[2].pushed
     assert bench.cluster_of(NAME).commands("AIM")[0].values == (0.0, 0.0, 13.0)
 
 
@@ -196,9 +209,9 @@ def test_a_visit_fits_the_rows_of_a_flight_with_its_photographs(tmp_path: Path) 
 
     cycle(tmp_path, scene, **error)
     (result,) = results
-    assert (result.outcome, result.known, result.new) == (CalibrationOutcome.CALIBRATED, 6, 2)
+    assert (result.outcome, result.known, result.new) == (CalibrationOutcome.CALIBRATED, 7, 3)
     assert result.record is not None
-    assert result.record.sightings.tolist()[2:] == [7, 8, 9, 10]
+    assert result.record.sightings.tolist()[3:] == [7, 8, 9, 10]
     found = result.record.parameters
     sigma = dict(zip(result.record.names, result.record.sigma, strict=True))
     assert sigma["azimuth_bias"] < 1e-3
@@ -268,6 +281,32 @@ def test_what_has_not_earned_it_is_not_pushed(
     assert result.record is None
     assert len(result.rejected) == (2 if reasons else 0)
     assert not bench.cluster_of(NAME).of(Parameters)
+
+
+def test_a_calibration_stays_if_its_verification_cannot_be_learnt_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results: list[CycleResult] = []
+    pushes: list[str] = []
+    push = CalibrationCycle._push
+
+    async def once(self: CalibrationCycle, visit: Visit, mechanism: Any, why: str) -> Any:
+        pushes.append(why)
+        if len(pushes) == 2:
+            raise RefusedError(f"{NAME}: it waits for its turn to go to stow")
+        return await push(self, visit, mechanism, why)
+
+    monkeypatch.setattr(CalibrationCycle, "_push", once)
+
+    async def scene(bench: Bench, whole: CalibrationCycle, eye: Eye, token: int) -> None:
+        results.append(await whole.run(ENGINEER, token, NAME, "target"))
+
+    bench = cycle(tmp_path, scene, azimuth_bias=3e-3, elevation_bias=-2e-3)
+    (result,) = results
+    assert pushes == ["fit of 2 sightings", "fit of 3 sightings"]
+    assert (result.outcome, result.known, result.new) == (CalibrationOutcome.CALIBRATED, 2, 2)
+    assert bench.plant.beliefs.record(NAME) is result.record
+    assert bench.plant.wanted.items[NAME] == items_of(bench.plant.beliefs.present(NAME)[0])
 
 
 def sent_to_the_receiver(bench: Bench, token: int) -> None:

@@ -8,7 +8,7 @@ Nothing is pushed after too few sightings, a fit that did not converge, values f
 installation can be, or a fit that misses by more than before: the heliostat then keeps what it has.
 A first calibration, a large change, and one by photographs that the present calibration did not
 expect are confirmed by one more photograph before they are taken; if it contradicts them, the old
-parameters are pushed back.
+parameters are pushed back. The photograph that has confirmed them is learnt from after that.
 """
 
 import asyncio
@@ -93,6 +93,20 @@ class CycleResult:
     after: float = float("nan")
     record: HeliostatCalibration | None = None
     verdict: Verdict | None = None
+
+    def then(self, again: "CycleResult") -> "CycleResult":
+        """Return the result of a visit whose verification was learnt from, too: ``again``."""
+        new, known = self.new + again.new, max(self.known, again.known)
+        if again.record is None:
+            return replace(self, known=known, new=new)
+        return replace(
+            again,
+            text=_calibrated(self.before, again.after, again.known),
+            rejected=self.rejected,
+            new=new,
+            measured=self.measured,
+            before=self.before,
+        )
 
 
 @dataclass(frozen=True)
@@ -279,17 +293,24 @@ class CalibrationCycle:
             It tracks a receiver, and leaves it if its parameters change. A change that a photograph
             must confirm is left to a visit to a target; None: it is at standby.
         """
-        result = await self._learn(
-            visit,
-            taken,
-            tell or _nobody,
-            confirming or self.verification.problem,
-            self.settings.least if least is None else least,
-            production,
-        )
+        fewest = self.settings.least if least is None else least
+        confirm, say = confirming or self.verification.problem, tell or _nobody
+        result = await self._learn(visit, taken, say, confirm, fewest, production)
+        proof = self.verification.confirmed(visit.heliostat)
+        if proof is not None and result.outcome.calibrated:
+            say("learning from the verification")
+            result = result.then(await self._again(visit, proof, say, fewest))
         if taken.used and self._missed(visit.heliostat, taken) <= PLACED:
             self._plant.doubts.confirm(visit.heliostat, boots)
         return result
+
+    async def _again(self, visit: Visit, proof: Photographs, tell: Tell, least: int) -> CycleResult:
+        """Learn from a photograph that has confirmed a fit; what was taken stays as it is."""
+        confirm = self.verification.problem
+        try:
+            return await self._learn(visit, proof, tell, confirm, least, None)
+        except RefusedError as error:
+            return CycleResult(visit.heliostat, CalibrationOutcome.REFUSED, str(error))
 
     async def _learn(
         self,
@@ -346,13 +367,12 @@ class CalibrationCycle:
             )
         beliefs.note(name, surface, here)
         record = None if found.problem else self._take(visit, found, pushed)
-        better = f"beam error {1e3 * found.before:.2f} to {1e3 * found.after:.2f} mrad RMS"
         return CycleResult(
             name,
             found.outcome,
             f"unchanged: {found.problem}"
             if found.problem
-            else f"calibrated: {better} over {count} sightings",
+            else _calibrated(found.before, found.after, count),
             rejected,
             count,
             len(here),
@@ -452,6 +472,11 @@ class CalibrationCycle:
         await visit.command("UNLOCK")
         await visit.command("IDLE")
         return missing
+
+
+def _calibrated(before: float, after: float, count: int) -> str:
+    better = f"beam error {1e3 * before:.2f} to {1e3 * after:.2f} mrad RMS"
+    return f"calibrated: {better} over {count} sightings"
 
 
 def _nobody(stage: str) -> None:

@@ -13,7 +13,7 @@ parameters predict; it is their second sighting.
 import asyncio
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -322,7 +322,7 @@ class JointCycle:
                 gathering.leave(name)
             if name in seen and results[name].outcome.calibrated:
                 again = await self._learnt(visit, seen[name], least=_FIRST)
-                results[name] = _both(results[name], again)
+                results[name] = results[name].then(again)
 
         async with asyncio.TaskGroup() as group:
             for name in proven:
@@ -460,14 +460,6 @@ def _error(waiting: Waiting, sun: FloatArray, target: Target) -> float:
         waiting.mechanism, tuple(fitted.names), fitted.covariance[0], sun, target.center
     )
     return float(found.rms[0])
-
-
-def _both(first: CycleResult, again: CycleResult) -> CycleResult:
-    """Return the result of a first calibration that was fitted again with its verification."""
-    new = first.new + again.new
-    if again.record is None:
-        return replace(first, known=max(first.known, again.known), new=new)
-    return replace(again, new=new, measured=first.measured, before=first.before)
 
 
 def _refused(name: str, text: str) -> CycleResult:

@@ -2,7 +2,8 @@
 
 A fit explains whatever the photographs show, a false light as well as the beam. So the heliostat
 goes back to the target with its new parameters, to a place away from all earlier photographs, and
-its beam must be where they predict it.
+its beam must be where they predict it. The photograph judges a fit that has not seen it; one that
+has confirmed its fit is then a sighting like any other.
 """
 
 import asyncio
@@ -22,6 +23,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.visits.photographs import (
     CORNERS,
+    Photographs,
     Shot,
     TargetCamera,
     Tell,
@@ -113,6 +115,11 @@ class Verification:
         self._camera, self._settings, self._centring = camera, settings, centring
         self._sighting = sighting
         self._alone: dict[str, asyncio.Lock] = {}
+        self._confirmed: dict[str, Photographs] = {}
+
+    def confirmed(self, heliostat: str) -> Photographs | None:
+        """Return the photograph that confirmed the last fit of a heliostat, once; None: none."""
+        return self._confirmed.pop(heliostat, None)
 
     def judge(self, nominal: Mechanism, fitted: FieldFit, shot: Shot, counts: FloatArray) -> str:
         """Return why a shot with its step counts does not confirm a fit, "" if it does."""
@@ -148,6 +155,7 @@ class Verification:
     async def _photographed(
         self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
     ) -> str:
+        self._confirmed.pop(visit.heliostat, None)
         point = apart(visit.target, [shot.point for shot in used], room_of(visit, self._centring))
         if why := visit.plant.misled(visit.heliostat, point):
             return f"the new parameters have no free way to their photograph: {why}"
@@ -157,7 +165,11 @@ class Verification:
             for _ in range(self._settings.shots):
                 shot = await photographed(self._camera, visit)
                 if not shot.reasons and seen(visit.target, shot) is not None:
-                    return self.judge(nominal, fitted, *await measured(visit, shot))
+                    made = await measured(visit, shot)
+                    if problem := self.judge(nominal, fitted, *made):
+                        return problem
+                    self._confirmed[visit.heliostat] = Photographs([made])
+                    return ""
                 why = "; ".join(shot.reasons) or "no light on the target"
         return f"with the new parameters no photograph could be used: {why}"
 
