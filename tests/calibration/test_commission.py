@@ -110,6 +110,16 @@ def test_the_time_of_targets_is_accounted_for(joint: CommissionPlan) -> None:
     assert used == pytest.approx(whole - joint.seconds["idle"], rel=1e-9)
 
 
+def test_visits_stand_in_the_interval_in_which_they_count(joint: CommissionPlan) -> None:
+    """Sixty mirrors leave time in every interval, which is not carried on to the next."""
+    ends = np.array([visit.end for visit in joint.visits])
+    for begin, end, before, after in zip(
+        joint.time, joint.time[1:], joint.rms, joint.rms[1:], strict=False
+    ):
+        if after < before:
+            assert ((ends > begin) & (ends <= end + 1e-6)).any()
+
+
 def test_the_curve_falls_and_begins_at_the_installation(joint: CommissionPlan) -> None:
     assert joint.rms[0] == pytest.approx(15e-3, rel=1e-6)
     assert (np.diff(joint.percentiles, axis=0) <= 1e-9).all()

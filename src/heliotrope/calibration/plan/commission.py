@@ -412,8 +412,9 @@ class _Commissioning:
             until = now + sum(span.values())
             if not rows.size or until > stop:
                 opened[j] = False
-                self._left[j] = max(0.0, stop - now)
-                self.seconds["idle"] += self._left[j] - (begin - carried[j])
+                # Where nobody is left to be visited, nothing is carried on.
+                self._left[j] = max(0.0, stop - now) if rows.size else 0.0
+                self.seconds["idle"] += max(0.0, stop - now) - (begin - carried[j])
                 continue
             free[rows] = False
             for name, value in span.items():
