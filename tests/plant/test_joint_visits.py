@@ -6,6 +6,7 @@ test's cameras, from where the mirrors truly stand.
 
 import asyncio
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,7 +21,8 @@ from heliotrope.imaging.coded import Verdict
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.operations.parties import Parties
-from heliotrope.plant.operations.views import Planned
+from heliotrope.plant.operations.pictures import Pictures
+from heliotrope.plant.operations.views import PictureRow, Planned
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits import (
     CycleResult,
@@ -206,7 +208,9 @@ def test_settings_that_cannot_be_are_refused(wrong: dict[str, float], said: str)
         JointSettings(**wrong)  # type: ignore[arg-type]
 
 
-def test_automatic_control_sends_those_that_are_known_together() -> None:
+def test_automatic_control_sends_those_that_are_known_together(tmp_path: Path) -> None:
+    pictures = Pictures(tmp_path)
+
     async def scene(here: Scene) -> None:
         plant, operations = here.live.plant, here.live.operations
         names = here.names
@@ -236,8 +240,19 @@ def test_automatic_control_sends_those_that_are_known_together() -> None:
         assert seen["right"] >= set(names[3:]), "what a person asked for"
         assert "joint visit: 3 of 3 heliostats proven together" in told
         assert all(plant.beliefs.count(name) for name in names)
+        # The photographs are kept once, and each of the heliostats has them with its own result.
+        kept: dict[str, list[PictureRow]] = {}
+        for name in names[3:]:
+            pictures.find(name, 100, lambda rows, name=name: kept.setdefault(name, rows))
+        stacks = [
+            [row.identity for row in rows if row.target == "right" and row.used]
+            for rows in kept.values()
+        ]
+        assert stacks[0] == stacks[1] == stacks[2]
+        assert len(stacks[0]) >= 8
+        assert {row.heliostat for row in kept[names[3]]} == {names[3]}
 
-    joint(scene)
+    joint(scene, pictures=pictures)
 
 
 def test_a_plant_file_without_joint_visits_refuses_them() -> None:

@@ -17,6 +17,7 @@ from heliotrope.geometry import bisector, reflect
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits import (
     CalibrationCycle,
@@ -57,6 +58,7 @@ def joint(
     settings: PlantSettings | None = None,
     installed: float | None = None,
     cycle: CycleSettings = CYCLE,
+    pictures: Pictures | None = None,
 ) -> None:
     """Play a scene in virtual time.
 
@@ -75,7 +77,7 @@ def joint(
             cycle=cycle,
             plant=settings or PlantSettings(),
         )
-        live = LivePlant(design, clock, options)
+        live = LivePlant(design, clock, options, pictures=pictures)
         plant = live.plant
         async with live.running():
             try:

@@ -134,7 +134,7 @@ class PlantAssembly:
             unhidden = Unhidden(self.plant, cameras.beside)
             cycle = CalibrationCycle(self.plant, eye, chosen.cycle, Centring(), unhidden)
             if design.joint_visits is not None:
-                joint = JointCycle(self.plant, cameras, cycle, design.joint_visits)
+                joint = JointCycle(self.plant, eye, cycle, design.joint_visits)
             if design.receiver_visits is not None:
                 receiver = ReceiverCycle(self.plant, cameras, cycle, design.receiver_visits)
         self.schedule = None if cycle is None else self._schedule(cycle)

@@ -273,6 +273,8 @@ class Calibrating:
             self._running[place] = Running(names[0], place, stage, begun, names[1:])
 
         tell("on the way")
+        if self._pictures is not None:
+            self._pictures.begin_together(place)
         truth = [self._truth.now(field.place(name)) for name in names]
         sigma = [float(self._book.error[field.place(name)]) for name in names]
         outcome, said = CalibrationOutcome.REFUSED, ""
@@ -286,8 +288,12 @@ class Calibrating:
             self._running.pop(place, None)
         if said:
             results = tuple(CycleResult(name, outcome, said) for name in names)
-        for result, true, expected in zip(results, truth, sigma, strict=True):
+        entries = [
             self._conclude(place, result, true, begun, expected, joint=True)
+            for result, true, expected in zip(results, truth, sigma, strict=True)
+        ]
+        if self._pictures is not None:
+            self._pictures.conclude_together(place, entries)
         proven = sum(result.new > 0 for result in results)
         text = f"{proven} of {len(names)} heliostats proven together"
         what = "receiver visit" if place == self.receiver else "joint visit"
@@ -326,7 +332,7 @@ class Calibrating:
         sigma: float,
         *,
         joint: bool = False,
-    ) -> None:
+    ) -> CalibrationEntry:
         row, good = self._plant.field.place(result.heliostat), result.outcome.calibrated
         record = result.record
         entry = CalibrationEntry(
@@ -358,3 +364,4 @@ class Calibrating:
         self._keeping.keep(entry, begun, sigma)
         if self._pictures is not None:
             self._pictures.conclude(entry)
+        return entry

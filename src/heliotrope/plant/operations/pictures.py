@@ -2,28 +2,38 @@
 
 The pictures lie in a folder as JPEG, one row each in `pictures.sqlite` beside them. They are
 thinned by age, and the folder never grows beyond its limit by more than one visit: the oldest go
-first. A disk that fails costs pictures, never a calibration.
+first. A disk that fails costs pictures, never a calibration. The photographs of a joint visit are
+kept once, and found by each of its heliostats.
 """
 
 import contextlib
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+import numpy as np
+
 from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.field.target import Target
 from heliotrope.files.disk import AtOnce, Disk, DiskBusyError
+from heliotrope.imaging.targets.view import FaceView
 from heliotrope.plant.operations.views import CalibrationEntry, CameraView, PictureRow
-from heliotrope.plant.visits.photographs import Shot, TargetCamera
+from heliotrope.plant.visits.photographs import Shot
+from heliotrope.plant.visits.stacks import StackCamera, TargetLight
 
 #: Photographs of one visit that are kept at most: of a long search the last ones.
 _MOST = 24
+#: The same of a joint visit: of a long stack, or several, the last ones.
+_TOGETHER = 32
 #: Time between two looks for pictures that are too old, s.
 _THIN_EVERY = 600.0
 _DAY = 86_400.0
 T = TypeVar("T")
+#: A heliostat of a joint visit, whether its beam was proven, its outcome, and that for people.
+_Member = tuple[str, bool, str, str]
 _TABLE = """
 CREATE TABLE IF NOT EXISTS picture (
     identity INTEGER PRIMARY KEY AUTOINCREMENT, heliostat TEXT NOT NULL, target TEXT NOT NULL,
@@ -31,6 +41,10 @@ CREATE TABLE IF NOT EXISTS picture (
     text TEXT NOT NULL, size INTEGER NOT NULL);
 CREATE INDEX IF NOT EXISTS picture_of ON picture (heliostat, at);
 CREATE INDEX IF NOT EXISTS picture_at ON picture (at);
+CREATE TABLE IF NOT EXISTS party (
+    identity INTEGER NOT NULL, heliostat TEXT NOT NULL, used INTEGER NOT NULL,
+    outcome TEXT NOT NULL, text TEXT NOT NULL, PRIMARY KEY (identity, heliostat));
+CREATE INDEX IF NOT EXISTS party_of ON party (heliostat);
 """
 #: Pictures of a heliostat's day but its first one that was used, or else its first.
 _SPARE = """
@@ -38,6 +52,15 @@ SELECT identity FROM (
     SELECT identity, ROW_NUMBER() OVER (
         PARTITION BY heliostat, CAST(at / 86400 AS INTEGER) ORDER BY used DESC, at) AS place
     FROM picture WHERE at < ?) WHERE place > 1
+"""
+#: Those of a heliostat's own visits, and of joint ones.
+_FOUND = """
+SELECT identity, heliostat, target, at, used, reading, outcome, text FROM picture
+WHERE heliostat = :name
+UNION ALL
+SELECT identity, party.heliostat, target, at, party.used, reading, party.outcome, party.text
+FROM party JOIN picture USING (identity) WHERE party.heliostat = :name
+ORDER BY at DESC LIMIT :most
 """
 
 
@@ -48,7 +71,8 @@ class PictureSettings:
     Attributes
     ----------
     whole
-        Age up to which every picture is kept, days; after it one a day of each heliostat.
+        Age up to which every picture is kept, days; after it one a day of each heliostat, and of
+        the joint visits to each target.
     last
         Age at which the last ones go, days.
     most
@@ -103,6 +127,7 @@ class Pictures:
         self._folder, self._settings = folder, settings or PictureSettings()
         self._disk = disk or AtOnce()
         self._taken: dict[str, list[_Taken]] = {}
+        self._stacks: dict[str, deque[CameraView]] = {}
         self._thinned = float("-inf")
         self.problem = ""
 
@@ -128,23 +153,58 @@ class Pictures:
         if taken:
             self._put(taken, entry.heliostat, entry.outcome.name.lower(), entry.text, entry.at)
 
+    def begin_together(self, target: str) -> None:
+        """Begin a joint visit to a target."""
+        self._stacks.pop(target, None)
+
+    def take_together(self, view: CameraView) -> None:
+        """Take a photograph of a joint visit."""
+        self._stacks.setdefault(view.target, deque(maxlen=_TOGETHER)).append(view)
+
+    def conclude_together(self, target: str, entries: Sequence[CalibrationEntry]) -> None:
+        """Keep the photographs of a joint visit once, with the result of each heliostat."""
+        stack = self._stacks.pop(target, None)
+        if not stack or not entries:
+            return
+        proven = sum(entry.new > 0 for entry in entries)
+        text = f"{proven} of {len(entries)} heliostats proven together"
+        party = [
+            (entry.heliostat, entry.new > 0, entry.outcome.name.lower(), entry.text)
+            for entry in entries
+        ]
+        reasons = () if proven else (text,)
+        taken = [_Taken(view, Shot(np.full(3, np.nan), view.at, 0.0, reasons)) for view in stack]
+        self._put(taken, f"together on {target}", "joint visit", text, entries[-1].at, party)
+
     def keep(self, view: CameraView, shot: Shot, who: str) -> None:
         """Keep a photograph that a person has asked for, under no heliostat."""
         self._put([_Taken(view, shot)], "", "asked for", f"asked for by {who}", view.at)
 
     def _put(
-        self, taken: list[_Taken], heliostat: str, outcome: str, text: str, now: float
+        self,
+        taken: list[_Taken],
+        heliostat: str,
+        outcome: str,
+        text: str,
+        now: float,
+        party: Sequence[_Member] = (),
     ) -> None:
         def done(error: Exception | None) -> None:
             self.problem = "" if error is None else str(error)
 
         try:
-            self._disk.do(lambda: self._write(taken, heliostat, outcome, text, now), done)
+            self._disk.do(lambda: self._write(taken, heliostat, outcome, text, now, party), done)
         except DiskBusyError as error:
             done(error)
 
     def _write(
-        self, taken: list[_Taken], heliostat: str, outcome: str, text: str, now: float
+        self,
+        taken: list[_Taken],
+        heliostat: str,
+        outcome: str,
+        text: str,
+        now: float,
+        party: Sequence[_Member],
     ) -> None:
         with self._table() as table:
             for one in taken:
@@ -162,7 +222,12 @@ class Pictures:
                         len(one.view.jpeg),
                     ),
                 )
-                self._path(int(row.lastrowid or 0)).write_bytes(one.view.jpeg)
+                identity = int(row.lastrowid or 0)
+                table.executemany(
+                    "INSERT INTO party VALUES (?, ?, ?, ?, ?)",
+                    [(identity, *member) for member in party],
+                )
+                self._path(identity).write_bytes(one.view.jpeg)
             self._thin(table, now)
 
     def _thin(self, table: sqlite3.Connection, now: float) -> None:
@@ -187,6 +252,7 @@ class Pictures:
         for identity in gone:
             self._path(identity).unlink(missing_ok=True)
             table.execute("DELETE FROM picture WHERE identity = ?", (identity,))
+            table.execute("DELETE FROM party WHERE identity = ?", (identity,))
 
     # -- finding ---------------------------------------------------------------------------
 
@@ -197,11 +263,7 @@ class Pictures:
 
         def work() -> list[PictureRow]:
             with self._table() as table:
-                rows = table.execute(
-                    "SELECT identity, heliostat, target, at, used, reading, outcome, text "
-                    "FROM picture WHERE heliostat = ? ORDER BY at DESC LIMIT ?",
-                    (heliostat, limit),
-                ).fetchall()
+                rows = table.execute(_FOUND, {"name": heliostat, "most": limit}).fetchall()
             return [
                 PictureRow(i, name, target, at, bool(used), tuple(said.splitlines()), outcome, text)
                 for i, name, target, at, used, said, outcome, text in rows
@@ -273,8 +335,21 @@ class KeptCamera:
             self._pictures.take(heliostat, view, shot)
         return shot
 
+    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
+        """Return the light on a target in a photograph of a joint visit."""
+        before = self._camera.view(target.name).version
+        seen = await self._camera.light(target, view)
+        taken = self._camera.view(target.name)
+        if taken.version != before:
+            self._pictures.take_together(taken)
+        return seen
 
-class ViewedCamera(TargetCamera, Protocol):
+    async def beside(self, work: Callable[[], T]) -> T:
+        """Return the result of a computation that must not hold up the loop."""
+        return await self._camera.beside(work)
+
+
+class ViewedCamera(StackCamera, Protocol):
     """A camera of targets that shows the last photograph of each."""
 
     def view(self, target: str) -> CameraView:
