@@ -331,6 +331,47 @@ def test_from_standby_a_defocus_turns_away_from_the_aim_and_not_onto_it(kind: st
     assert "UNREACHABLE" not in flags(bench)
 
 
+@pytest.mark.parametrize("moment", ["at standby", "on the way up"])
+@pytest.mark.parametrize("cause", ["DEFOCUS", "the cluster is gone"])
+def test_whatever_its_aim_a_mirror_goes_back_down_the_way(moment: str, cause: str) -> None:
+    """Simulated run 980292: an aim on a target lay where turning off it led onto the receiver."""
+    bench = standing_by() if moment == "at standby" else brought_to("STOWED")
+    if moment != "at standby":
+        assert bench.order("APPROACH") == DONE
+        while bench.controller.motion._place < len(bench.controller.motion.way()) - 1:
+            bench.run(0.1)
+    drives, begin = bench.machine.drives, np.array(bench.made)
+    # An aim off which the usual angles turn up, away from the way.
+    normal, vertex = bench.machine.armature.pose(drives.angles(begin) - [0.05, 0.025])
+    sun = bench.sun(bench.gps_ms() / 1000)
+    bench.controller.motion.aim = tuple(vertex + 100.0 * (2.0 * (normal @ sun) * normal - sun))
+    if cause == "DEFOCUS":
+        assert bench.order("DEFOCUS") == DONE
+    bench.sends_sun = bench.sends_time = cause == "DEFOCUS"
+    while bench.state != "DEFOCUSED":
+        begin = np.array(bench.made)
+        bench.run(0.1)
+    bench.run(20)
+    assert bench.state == "DEFOCUSED"
+    foot = np.array([*STANDBY[:2], bench.machine.position[2]])
+    line = [foot + part * (np.array(STANDBY) - foot) for part in np.linspace(0.0, 1.0, 101)]
+    beside = [bench.miss(point) for point in line]
+    assert min(beside) < 0.5
+    assert np.argmin(beside) < 90
+    turned = np.abs(drives.angles(np.array(bench.made)) - drives.angles(begin))
+    assert (turned > [0.095, 0.045]).any()
+    if moment != "at standby":
+        return
+    # It stows from there along the way, and does not come up again.
+    bench.sends_sun = bench.sends_time = True
+    bench.run(3)
+    off = bench.miss(STANDBY)
+    assert bench.order("STOW") == DONE
+    for _ in range(10):
+        bench.run(0.5)
+        assert bench.miss(STANDBY) > off - 0.5
+
+
 @pytest.mark.parametrize("kind", ["LOCK", "JOG"])
 @pytest.mark.parametrize("cause", ["DEFOCUS", "the cluster is gone"])
 def test_a_mirror_that_is_held_beside_its_aim_does_not_turn_onto_it(kind: str, cause: str) -> None:

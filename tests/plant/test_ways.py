@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from heliotrope.plant.aims import BeamCheck, _disc
 from heliotrope.plant.assigned import rest_on
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.leaving import turned_away, way_out
+from heliotrope.plant.leaving import defocused, turned_away, way_out
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.ways import Ways
 from heliotrope.safety import Act
@@ -388,6 +388,34 @@ def test_a_defocus_turns_the_other_way_before_a_stop() -> None:
     # From an aim it does not turn nearer to standby: from below, and from beside it.
     standby = np.array([0.6, 0.52])
     assert np.allclose(turned_away(at, machine, drives, None, standby), [0.4, 0.6])
+
+
+def test_from_standby_and_an_approach_no_defocus_lights_the_receiver_whatever_the_aim() -> None:
+    """In 249 of 1,216 cases it did, where the aim was on the right target: run 980292."""
+    design = malan_plant(320)
+    check = BeamCheck(design, design.names)
+    machines = {name: design.machine(name) for name in design.names}
+    ways, rows = Ways(check, machines), np.arange(3, 320, 32)
+    standbys = np.array([machines[design.names[row]].standby for row in rows], dtype=np.float64)
+    points, length = ways.points(rows, standbys)
+    late = 0.5 * (points[np.arange(len(rows)), length - 2] + standbys)
+    right = np.array([45.0, 0.0, 36.0])
+    held = 0
+    for hour in (9, 12, 15):
+        moment = datetime(2026, 3, 21, hour, tzinfo=UTC)
+        sun = vector(moment - timedelta(hours=design.site.longitude_deg / 15.0), design.site)
+        for state, places in ((states.IDLE, standbys), (states.APPROACHING, late)):
+            begin = np.round(check.poses(rows, places, sun, ways.stow[rows]).best_counts)
+            for how in (state, states.LOCKED):
+                ends = np.empty_like(begin)
+                for i, row in enumerate(rows):
+                    machine, point = machines[design.names[row]], standbys[i]
+                    end = defocused(check, machine, int(row), begin[i], sun, how, right, point)
+                    ends[i] = Drive(check.drives.table[row]).counts(end)
+                lit = check.crossing(rows, ways.motion(rows, begin, ends), sun, "now")
+                held += len(lit) if how == states.LOCKED else 0
+                assert how == states.LOCKED or not lit
+    assert held > 0  # turned off the aim, as a held mirror is
 
 
 @pytest.mark.parametrize("field", [False, True])

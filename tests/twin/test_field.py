@@ -207,6 +207,26 @@ def test_an_approach_called_off_at_once_ends_as_on_the_boards() -> None:
     assert (both.field.axes["count"] == MACHINE.stow).all()
 
 
+def test_a_defocus_from_standby_and_from_an_approach_goes_down_the_way_as_on_the_boards() -> None:
+    both = Both()
+    both.run(2)
+    both.order("APPROACH", rows=(0, 1))
+    both.run(30)
+    both.order("APPROACH", rows=(2,))
+    while both.field._place[2] < 3:
+        both.run(0.5)
+    assert [states.STATES[s] for s in both.field.state] == ["IDLE", "IDLE", "APPROACHING"]
+    both.order("DEFOCUS")
+    both.run(12)
+    both.order("STOW", rows=(0,))
+    both.order("IDLE", rows=(1,))
+    both.run(8)
+    both.run(10, sun=False)
+    both.run(50, sun=False)
+    assert both.states() == {"STOWED"}
+    assert both.angles_apart() < 1e-9
+
+
 def test_gears_faults_locks_and_supplies_are_those_of_the_boards() -> None:
     wind = Wind(speed=7.0, towards=1.0, seed=3)
     both = Both(play=35.0, wind=wind)

@@ -256,37 +256,52 @@ class Motion:
         """Return an angle turned away by the defocus; the other way where a stop is near."""
         offset = self._offset[i]
         low, high = self._stops[i]
-        if low <= angle + offset <= high:
-            return angle + offset
-        if low <= angle - offset <= high:
-            return angle - offset
+        for away in (angle + offset, angle - offset):
+            if low <= away <= high:
+                return away
         return low if angle - low > high - angle else high
 
-    def _turn(self) -> tuple[float, float]:
-        """Return by how much a defocus turns.
+    def _turn(self) -> "Pose | None":
+        """Choose by how much a defocus turns; return the pose in which one from standby ends.
 
-        From standby, and on the way there, it turns off the aim, since the usual sense may lead
-        the beam onto the receiver. From an aim, an axis that the usual sense would bring nearer to
-        standby, which is beside the receiver, turns the other way. A mirror that is held, wherever
-        a person has left it, turns off the aim too, if it knows where the sun is.
+        From standby it goes down the safe way, and on the way up back as it has come, until an axis
+        has turned by its angle or the ground is reached. No other place is known to be off the
+        receiver: the aim may be on a target. From an aim, an axis that the usual sense would bring
+        nearer to standby, which is beside the receiver, turns the other way. A mirror that is held,
+        wherever a person has left it, turns off the aim. Without a recent sun, by the angles.
         """
-        one, two = self.config.defocus
-        tracks = self.kind in (TRACK, SEARCH)
+        one, two = self._offset = self.config.defocus
+        if not self.known or self.sun.since_ms > RECENT_MS:
+            return None
+        near, unreachable, kind, found = self._near, self.unreachable, self.kind, None
+        way = self.way()[:-1] if kind == STANDBY else []
+        if kind == APPROACH:
+            way = self._path[: max(0, self._place)]
+        for point in way[::-1]:
+            pose = self.pose(point, 0)
+            if pose is None:
+                break
+            first, second = abs(near[0] - pose.angles[0]), abs(near[1] - pose.angles[1])
+            if max(first, second) > FAR:
+                break
+            found, self._target, self._offset = pose, point, (0.0, 0.0)
+            if first >= one or second >= two or point[2] <= way[0][2]:
+                break
+        tracks = kind in (TRACK, SEARCH)
         other = self.config.standby if tracks else self.aim
-        if other is None or not self.known or self.sun.since_ms > RECENT_MS:
-            return one, two
-        unreachable = self.unreachable
-        pose = self.pose(other, 0)
+        pose = None if other is None or found is not None else self.pose(other, 0)
         self.unreachable = unreachable
-        if pose is None:
-            return one, two
-        first, second = [self._near[i] - pose.angles[i] for i in (0, 1)]
-        if not tracks:
-            return math.copysign(one, first), math.copysign(two, second)
-        return (
-            one if abs(first + one) >= abs(first) else -one,
-            two if abs(second + two) >= abs(second) else -two,
-        )
+        if pose is not None:
+            first, second = near[0] - pose.angles[0], near[1] - pose.angles[1]
+            if not tracks:
+                one, two = math.copysign(one, first), math.copysign(two, second)
+            else:
+                if abs(first + one) < abs(first):
+                    one = -one
+                if abs(second + two) < abs(second):
+                    two = -two
+            self._offset = one, two
+        return found
 
     # Actions of the state table.
 
@@ -316,8 +331,8 @@ class Motion:
             self.declare((first.low + first.high) // 2, (second.low + second.high) // 2, False)
             self.blind, self._turns = 0, sense
             self.kind = HOLD
-        self._base, self._offset = self.kind, self._turn()
-        self.kind = DEFOCUS
+        found = self._turn()
+        self._base, self.kind = self.kind, DEFOCUS
         self._knot_ms = self._renew_ms = 0
         angles = [0.0, 0.0]
         for i in (0, 1):
@@ -327,7 +342,7 @@ class Motion:
             away = self._away(i, here)
             # The other way is twice as far: past the place where the first turn began.
             angles[i] = away if sense > 0 else 3.0 * here - 2.0 * away
-        self._go_angles(angles, BOTH)
+        self._go_angles(angles if found is None else found.angles, BOTH)
 
     def stow(self) -> None:
         """Return by the way of the approach, as far as the sun allows, and go to stow."""
@@ -338,12 +353,14 @@ class Motion:
             self._path = self._path[: max(0, self._place)][::-1]
         elif self.ready and self.config.standby is not None:
             way = self.way()[::-1]
-            on_aim = self.kind in (TRACK, SEARCH) and self.aim is not None
-            if on_aim and self.aim is not None:
+            if self.kind in (TRACK, SEARCH) and self.aim is not None:
                 way = self._pieces([self.aim] + way)[1:]
             elif self.kind == DEFOCUS:
                 # Beside the receiver: down from there, not across it.
-                way = [point for point in way if point[2] < self.config.standby[2]]
+                top = self.config.standby[2]
+                if self._target is not None:
+                    top = min(top, self._target[2])
+                way = [point for point in way if point[2] < top]
             self._path = way
         else:
             self._path = []
@@ -535,8 +552,12 @@ class Motion:
             self._renew_ms = RENEW_MS
             if kind in (STANDBY, TRACK, SEARCH) and self._target is not None:
                 return "" if self._follow(self._target) else "UNREACHABLE"
-            follows = kind == DEFOCUS and self._target is not None and self.following()
-            if follows and self._target is not None and not self._follow(self._target):
+            if (
+                kind == DEFOCUS
+                and self._target is not None
+                and self.following()
+                and not self._follow(self._target)
+            ):
                 # It stands now, and the beam of a standing mirror moves with the sun.
                 self._base = HOLD
         return ""

@@ -18,7 +18,7 @@ from heliotrope.mechanism.tracking import TrackingStatus
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import Points
 from heliotrope.plant.field_state import FieldState
-from heliotrope.plant.leaving import turns_from, way_out
+from heliotrope.plant.leaving import way_out
 from heliotrope.plant.parameters import Tables
 from heliotrope.plant.refusals import BEAM_REFUSED, RefusedError
 from heliotrope.plant.unsent import TURNS, UnsentBeams
@@ -370,8 +370,8 @@ class BeamWatch:
             return Act.STOW
         machine = self._machines.get(name)
         points, counts, sun = self.points, self._field.posed[row], self._sun(0.0)
-        aim, standby = turns_from(int(node["state"]), points.aims[row], points.standbys[row])
-        return way_out(self._check, machine, row, counts, sun, aim, standby)
+        state, aim, standby = int(node["state"]), points.aims[row], points.standbys[row]
+        return way_out(self._check, machine, row, counts, sun, state, aim, standby)
 
     def _look(self, now: float) -> None:
         field = self._field

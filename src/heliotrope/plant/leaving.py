@@ -10,15 +10,19 @@ import numpy as np
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.lcu import states
 from heliotrope.lcu.config import Config
+from heliotrope.lcu.motion import FAR
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.plant.aims import BeamCheck
+from heliotrope.plant.ways import motion_of
 from heliotrope.safety import Act
 
 #: States from which a mirror does not turn nearer to its standby point, wherever it stands.
 _AT_AIM = (states.TRACKING, states.SEARCHING)
 #: Turn of the axes between two poses that are looked at, rad.
 _PIECE = 0.02
+#: A mirror in IDLE stands by if its axes are this near to the angles of standby, rad.
+_STANDS_BY = 0.02
 
 
 def way_out(
@@ -27,6 +31,7 @@ def way_out(
     row: int,
     counts: FloatArray,
     sun: FloatArray,
+    state: int = states.LOCKED,
     aim: FloatArray | None = None,
     standby: FloatArray | None = None,
 ) -> Act:
@@ -42,10 +47,13 @@ def way_out(
         Row of the heliostat, and where its axes stand, steps, (2,).
     sun
         Unit vector to the sun, (3,).
+    state
+        Of the heliostat; see `lcu.states`.
     aim
-        Aim of a heliostat that does not track, m, (3,), from which it turns away.
+        Its aim, m, (3,), from which it turns away where it neither tracks nor stands by.
     standby
-        Standby point of a heliostat that tracks, m, (3,), which it does not turn nearer to.
+        Its standby point, m, (3,): where it tracks, it does not turn nearer to that; from there and
+        on the way there it goes back down the way.
     """
     if machine is None:
         return Act.DEFOCUS
@@ -55,7 +63,9 @@ def way_out(
     corner = end.copy()
     corner[machine.azimuth_axis] = begin[machine.azimuth_axis]
     ways = {
-        Act.DEFOCUS: np.stack([begin, defocused(check, machine, row, counts, sun, aim, standby)]),
+        Act.DEFOCUS: np.stack(
+            [begin, defocused(check, machine, row, counts, sun, state, aim, standby)]
+        ),
         Act.STOW: np.stack([begin, corner, end]),
     }
     costs = {act: _cost(check, row, path, sun) for act, path in ways.items()}
@@ -68,20 +78,52 @@ def defocused(
     row: int,
     counts: FloatArray,
     sun: FloatArray,
+    state: int = states.LOCKED,
     aim: FloatArray | None = None,
     standby: FloatArray | None = None,
 ) -> FloatArray:
     """Return the angles (2,) where DEFOCUS ends; parameters as of `way_out`."""
     drives = Drive(check.drives.table[row])
     begin = as_float(drives.angles(counts))
-    aimed, stood = (_angles(check, row, point, counts, sun) for point in (aim, standby))
-    return turned_away(begin, machine, drives, aimed, stood)
+    stood = _angles(check, row, standby, counts, sun)
+    if state in _AT_AIM:
+        return turned_away(begin, machine, drives, None, stood)
+    if machine is not None and standby is not None and stood is not None:
+        end = _down(check, machine, row, counts, sun, state, standby)
+        if end is not None:
+            return end
+    return turned_away(begin, machine, drives, _angles(check, row, aim, counts, sun))
 
 
-def turns_from(state: int, aim: FloatArray, standby: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return aim and standby point as DEFOCUS goes by them in a state, NaN where it does not."""
-    nowhere = np.full(3, np.nan)
-    return (nowhere, standby) if state in _AT_AIM else (aim, nowhere)
+def _down(
+    check: BeamCheck,
+    machine: Machine,
+    row: int,
+    counts: FloatArray,
+    sun: FloatArray,
+    state: int,
+    standby: FloatArray,
+) -> FloatArray | None:
+    """Return the angles (2,) down the way in which DEFOCUS ends: `lcu.motion`; None elsewhere."""
+    if state not in (states.IDLE, states.APPROACHING):
+        return None
+    points = np.array(motion_of(check, row, machine.way, standby).way())
+    begin = as_float(Drive(check.drives.table[row]).angles(counts))
+    rows = np.full(len(points), row)
+    found = check.poses(rows, points, sun, np.tile(counts, (len(points), 1)))
+    turns = np.abs(as_float(found.best_angles) - begin)
+    near = np.nan_to_num(turns.max(axis=-1), nan=np.inf)
+    place = int(near.argmin())
+    if state == states.IDLE and (place < len(points) - 1 or near[place] > _STANDS_BY):
+        return None  # a person has moved it elsewhere
+    end = None
+    for i in reversed(range(place)):
+        if not near[i] <= FAR:
+            break
+        end = as_float(found.best_angles[i])
+        if (turns[i] >= machine.defocus).any() or points[i, 2] <= points[0, 2]:
+            break
+    return end
 
 
 def _angles(
@@ -103,9 +145,9 @@ def turned_away(
 ) -> FloatArray:
     """Return the angles (2,) of the defocus from some angles, as a local controller chooses them.
 
-    From standby, on the way there, and where it is held, it turns away from the angles of the aim
-    (``aimed``). From an aim, an axis that the usual sense would bring nearer to the angles of
-    ``standby`` turns the other way. So does one that is near a stop, as in `lcu.motion`.
+    Where it is held, it turns away from the angles of the aim (``aimed``). From an aim, an axis
+    that the usual sense would bring nearer to the angles of ``standby`` turns the other way. So
+    does one that is near a stop, as in `lcu.motion`.
     """
     offsets = as_float(Config().defocus if machine is None else machine.defocus)
     if aimed is not None and np.isfinite(aimed).all():

@@ -18,7 +18,7 @@ from heliotrope.mechanism.machine import Machine
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import Points
 from heliotrope.plant.field_state import FieldState, Mask
-from heliotrope.plant.leaving import defocused, turns_from
+from heliotrope.plant.leaving import defocused
 from heliotrope.safety import Act
 
 #: A heliostat that stands still is looked at once in this many looks.
@@ -102,7 +102,7 @@ class UnsentBeams:
         if again or self._field.rows["state"][row] in _TURNED:
             return Act.STOW
         rows, sun, state = np.array([row]), self._sun(0.0), int(self._field.rows["state"][row])
-        aim, standby = turns_from(state, self._points.aims[row], self._points.standbys[row])
+        aim, standby = self._points.aims[row], self._points.standbys[row]
         machine, counts = self._machines.get(name), self._field.counts(rows)[0]
-        end = defocused(self._check, machine, row, counts, sun, aim, standby)
+        end = defocused(self._check, machine, row, counts, sun, state, aim, standby)
         return Act.STOW if self._check.lights(rows, end[None], sun)[0] else Act.DEFOCUS

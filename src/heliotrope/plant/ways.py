@@ -93,11 +93,7 @@ class Ways:
 
     def _found(self, row: int, standby: FloatArray) -> list[tuple[float, float, float]]:
         """Return the points that a local controller with these settings finds."""
-        config, (east, north, up) = Config(), standby.tolist()
-        config.pointing = Pointing(tuple(self._check.armature.table[row].tolist()))
-        config.location = tuple(self._check.position[row].tolist())
-        config.standby, config.path = (east, north, up), list(self._given[row])
-        return Motion(config, SunLease(config.lease_ms), lambda: None).way()
+        return motion_of(self._check, row, self._given[row], standby).way()
 
     def turns(self, rows: Rows, begin: FloatArray, end: FloatArray) -> FloatArray:
         """Return the angles (K, 3, 2) from counts (K, 2) to others, one axis after the other.
@@ -193,6 +189,20 @@ class Ways:
                 left = left[[check.names[row] not in wrong for row in rows[left]]]
                 found |= wrong
         return found
+
+
+def motion_of(
+    check: BeamCheck,
+    row: int,
+    given: tuple[tuple[float, float, float], ...],
+    standby: FloatArray,
+) -> Motion:
+    """Return the motion of a local controller with a given way to a standby point (3,), m."""
+    config, (east, north, up) = Config(), standby.tolist()
+    config.pointing = Pointing(tuple(check.armature.table[row].tolist()))
+    config.location = tuple(check.position[row].tolist())
+    config.standby, config.path = (east, north, up), list(given)
+    return Motion(config, SunLease(config.lease_ms), lambda: None)
 
 
 def _time(way: FloatArray, rate: FloatArray, ramp: FloatArray) -> FloatArray:

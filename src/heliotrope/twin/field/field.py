@@ -267,12 +267,39 @@ class Field:
         home = self.at_stow(rows)
         self._hold(rows[home])
         rows = rows[~home]
-        self._sense(rows)
+        points, down = self._down(rows)
+        lower = np.isfinite(down[:, 0])
+        self._sense(rows[~lower])
+        self._senses[rows[lower]] = 0.0
+        self._target[rows[lower]] = points[lower]
         self._base[rows] = self.kind[rows]
         self.kind[rows] = DEFOCUS
         self._knot[rows] = self._renew[rows] = 0
         angles = self._away(rows, self._angles_at(self.axes["count"][rows], rows))
+        angles[lower] = down[lower]
         self._go(rows, angles, np.full(len(rows), kernels.BOTH))
+
+    def _down(self, rows: Rows) -> tuple[FloatArray, FloatArray]:
+        """Return points (M, 3) and angles (M, 2) down the safe way, or NaN: `Motion._turn`."""
+        points, angles = np.full((len(rows), 3), np.nan), np.full((len(rows), 2), np.nan)
+        stands = self.kind[rows] == STANDBY
+        place = np.where(stands, self._way_length[rows] - 1, self._place[rows])
+        knows = self.now_ms - self._sunned[rows] < RECENT_MS
+        left = np.flatnonzero(knows & (stands | (self.kind[rows] == APPROACH)))
+        begin = self._angles_at(self.axes["count"][rows], rows)
+        ground = np.where(stands, self._way[rows, 0, 2], self._path[rows, 0, 2])
+        while len(left := left[place[left] > 0]):
+            place[left] -= 1
+            chosen, at = rows[left], place[left]
+            up = self._path[chosen, np.minimum(at, self._path.shape[1] - 1)]
+            tried = np.where(stands[left, None], self._way[chosen, at % self._way.shape[1]], up)
+            found, good = self._pose(chosen, tried, 0)
+            turn = np.abs(found - begin[left])
+            good &= turn.max(axis=1) <= FAR
+            points[left[good]], angles[left[good]] = tried[good], found[good]
+            more = (turn < self._defocus[chosen]).all(axis=1) & (tried[:, 2] > ground[left])
+            left = left[good & more]
+        return points, angles
 
     def _sense(self, rows: Rows) -> None:
         """Choose in which sense heliostats turn away: `Motion._turn`."""
@@ -328,7 +355,8 @@ class Field:
             long, length = pieces(corners, self.journals.origin[i][None])
             return np.asarray(long[0, 1 : length[0]])
         if self.kind[i] == DEFOCUS:
-            return np.asarray(way[way[:, 2] < self.journals.standby[i, 2]])
+            top = min(self.journals.standby[i, 2], self._target[i, 2])
+            return np.asarray(way[way[:, 2] < top])
         return np.asarray(way)
 
     def _set_path(self, i: np.intp, points: FloatArray) -> None:
