@@ -201,3 +201,17 @@ def test_repeated_lines_are_counted() -> None:
     for number in range(1000):
         repeated.filter(line(number=number))
     assert len(repeated._seen) <= 500
+
+
+def test_time_that_the_server_lost_is_nobodys_fault(
+    console: LiveConsole, listener: Listener
+) -> None:
+    listener.limits = Limits(header=1.5)
+    with ExitStack() as stack:
+        line = opened(console, stack, b"GET /api/v1/health HTTP/1.1\r\n")
+        time.sleep(0.5)
+        console.console_call(lambda: time.sleep(3.0))
+        host = console.address.removeprefix("http://").rstrip("/")
+        line.sendall(f"Host: {host}\r\n\r\n".encode())
+        line.settimeout(60.0)
+        assert line.recv(4096).startswith(b"HTTP/1.1 200")

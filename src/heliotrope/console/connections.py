@@ -211,8 +211,9 @@ class Listener:
             resume()
             try:
                 while True:
+                    begun = self._now()
                     await asyncio.sleep(_LOOK)
-                    self.look()
+                    self.look(max(0.0, self._now() - begun - 2.0 * _LOOK))
             finally:
                 loop.remove_reader(line)
 
@@ -293,12 +294,21 @@ class Listener:
         self._known.pop(key, None)
         one.abort()
 
-    def look(self) -> None:
-        """Close connections that are late, and forget those that are gone."""
+    def look(self, stalled: float = 0.0) -> None:
+        """Close connections that are late, and forget those that are gone.
+
+        Parameters
+        ----------
+        stalled
+            Time that the loop has just lost, s. Nothing was read meanwhile, so no caller is the
+            later for it.
+        """
         self._sorted = -1.0
         self._sort()
         now = self._now()
         for kept in (self._known, self._strangers):
+            for one in kept.values():
+                one.since = min(now, one.since + stalled)
             for key in [key for key, one in kept.items() if one.late(self.limits, now)]:
                 kept.pop(key).abort()
 
