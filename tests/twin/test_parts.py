@@ -15,7 +15,7 @@ from heliotrope.errors import FormatError, InputError
 from heliotrope.lcu import ticks, wire
 from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of, run_virtual
 from heliotrope.links.link import LinkClosedError, SendOutcome
-from heliotrope.links.messages import Emergency, encode
+from heliotrope.links.messages import Emergency, Lease, encode
 from heliotrope.plant.audit import AuditError, Record
 from heliotrope.safety import Alarm, Severity
 from heliotrope.sun import vector
@@ -31,6 +31,7 @@ from heliotrope.twin.invariants.runs import RunAccount
 from heliotrope.twin.invariants.sensors import LIMITS as SENSORS
 from heliotrope.twin.invariants.sensors import SensorObserver
 from heliotrope.twin.records import RecordsDisk
+from heliotrope.twin.world.operator import ENGINEER
 from heliotrope.twin.world.pod import PlantEar
 from heliotrope.twin.world.scene import USUAL, scene_of
 from heliotrope.twin.world.simulation import SETTINGS, RunPlan, Simulation
@@ -286,6 +287,23 @@ def test_a_record_of_a_command_that_was_given_up_belongs_to_nothing_and_says_so(
         else:
             with pytest.raises(InvariantError, match="record x-1 belongs to nothing"):
                 observer.look(plant, 4.0)  # type: ignore[arg-type]
+
+
+def test_a_lease_of_automatic_control_may_leave_after_a_person_has_the_authority() -> None:
+    """Simulated run 990686: it took the authority and gave way before it leased with it."""
+
+    def leased(token: int, told: int) -> None:
+        observer = PlantObserver(0.0, RecordsDisk(), SETTINGS, [], automatic=True)
+        observer.gave_way(1.0, told)
+        observer.granted(ENGINEER, 8, 1.0, seized=False)
+        for now in (1.0, 1.2):
+            observer.posted(4, Lease(token, 5.0, 60.0, "one"), now)
+
+    leased(8, 7)
+    leased(7, 7)
+    for token, told in ((6, 7), (7, 0)):
+        with pytest.raises(InvariantError, match="given the authority, which engineer had"):
+            leased(token, told)
 
 
 def test_a_slow_disk_works_in_order_and_loses_what_waits() -> None:

@@ -131,11 +131,13 @@ class PlantObserver:
 
     def _end(self, now: float) -> None:
         if self._holder is not None:
-            token = self._holder[1]
-            self.old[token] = now
-            for each in self._clusters:
-                each.orders.void(token, now + VOID_WITHIN)
+            self._void(self._holder[1], now)
         self._holder = None
+
+    def _void(self, token: int, now: float) -> None:
+        self.old[token] = now
+        for each in self._clusters:
+            each.orders.void(token, now + VOID_WITHIN)
 
     def granted(self, person: Person, token: int, now: float, *, seized: bool) -> None:
         """Judge a grant of the authority."""
@@ -163,10 +165,15 @@ class PlantObserver:
         self._noted(person.name, "AUTHORITY", now)
         self._end(now)
 
-    def gave_way(self, now: float) -> None:
-        """Note that automatic control gives its authority to a person."""
+    def gave_way(self, now: float, token: int = 0) -> None:
+        """Note that automatic control gives its authority to a person.
+
+        ``token``: what it had, 0 if none. Its first lease with that may leave only after this.
+        """
         if self._by_itself():
             self._end(now)
+        if token != 0:
+            self._void(token, now)
 
     def _by_itself(self) -> bool:
         return self._holder is not None and self._holder[0] == AUTOMATIC

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from heliotrope.links.clock import Clock
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.operations import Operations
+from heliotrope.plant.operations.automatic import AUTOMATIC
 from heliotrope.safety import Act
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.day import DayObserver
@@ -120,7 +121,9 @@ class Shift:
 
     async def _duty(self, operations: Operations) -> None:
         """Take the authority for a while, and command; automatic control gives way."""
-        self._observer.gave_way(self._clock.monotonic())
+        grant = operations.plant.authority.grant
+        its = grant.token if grant is not None and grant.holder == AUTOMATIC else 0
+        self._observer.gave_way(self._clock.monotonic(), its)
         self._day.on_duty(self._clock.monotonic())
         token = operations.take_authority(ENGINEER).token
         self._observer.granted(ENGINEER, token, self._clock.monotonic(), seized=False)
