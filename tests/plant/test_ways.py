@@ -285,6 +285,28 @@ def test_a_beam_in_a_volume_is_seen_in_every_state(state: int, tmp_path: Path) -
     assert sent[-1].name == "STOW"
 
 
+@pytest.mark.parametrize("whom", ["itself", "the field"])
+def test_a_mirror_that_has_turned_into_a_volume_is_stowed_although_it_was_just_sent_off(
+    whom: str, tmp_path: Path
+) -> None:
+    """Simulated run 990504: it had turned while the plant was frozen; then DEFOCUS was ordered."""
+
+    async def scene(bench: Bench) -> None:
+        inside = counts(bench.plant, "P5A", (0.0, -12.0, 8.0))
+        outside = counts(bench.plant, "P5B", EAST)
+        reports(bench, "P5A", states.DEFOCUSED, inside, inside)
+        reports(bench, "P5B", states.DEFOCUSED, outside, outside)
+        if whom == "itself":
+            bench.plant.defocus(OPERATOR.name, ("P5A", "P5B"))
+        else:
+            bench.plant.raise_emergency(OPERATOR.name, Act.DEFOCUS)
+        await bench.wait(6.0)
+        assert alarmed(bench.plant) == {"P5A"}
+
+    sent = play(tmp_path, scene).cluster_of("P5A").of(Emergency)
+    assert [m.heliostats for m in sent if m.name == "STOW"] == [("P5A",)]
+
+
 @pytest.mark.parametrize("state", [states.DEFOCUSED, states.LOCKED, states.FAULT])
 def test_a_way_off_that_would_end_in_a_volume_is_seen_before_it_ends(
     state: int, tmp_path: Path

@@ -363,15 +363,22 @@ class BeamWatch:
         if name not in self._seen:
             lit = name in self.unsent.seen
             return self.unsent.way_out(name, again=again) if lit else Act.DEFOCUS
-        node = self._field.rows[row]
-        ends = self._field.goals(np.array([row]))[0]
-        stands = not (np.abs(ends - self._field.posed[row]) > _MOVES).any()
-        if node["state"] == states.STOWING or (again and stands):
+        state = int(self._field.rows["state"][row])
+        if state == states.STOWING or (again and self._stands(row)) or self.turned(name):
             return Act.STOW
         machine = self._machines.get(name)
         points, counts, sun = self.points, self._field.posed[row], self._sun(0.0)
-        state, aim, standby = int(node["state"]), points.aims[row], points.standbys[row]
+        aim, standby = points.aims[row], points.standbys[row]
         return way_out(self._check, machine, row, counts, sun, state, aim, standby)
+
+    def turned(self, name: str) -> bool:
+        """Return whether DEFOCUS has turned a heliostat already, so that it turns nothing more."""
+        row = self._field.place(name)
+        return bool(self._field.rows["state"][row] == states.DEFOCUSED and self._stands(row))
+
+    def _stands(self, row: int) -> bool:
+        ends = self._field.goals(np.array([row]))[0]
+        return not (np.abs(ends - self._field.posed[row]) > _MOVES).any()
 
     def _look(self, now: float) -> None:
         field = self._field

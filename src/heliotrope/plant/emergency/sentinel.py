@@ -134,7 +134,8 @@ class Sentinel:
     def _obey_heliostats(self, now: float) -> None:
         """Send heliostats off, and send them again until their rows release.
 
-        A heliostat that has just been sent off has the time to show it.
+        A heliostat that has just been sent off has the time to show it, unless DEFOCUS has turned
+        it already: its beam stays where it may not be until it is stowed.
         """
         self._sent_off = {n: at for n, at in self._sent_off.items() if now - at < OFF_SHOWS}
         wanted = {**self.table.off(), **self._identities.off(now)}
@@ -144,7 +145,7 @@ class Sentinel:
         for name, (act, text) in wanted.items():
             tries, due = self._tries.get(name, (0, -math.inf))
             whole = order is not None and now - order.at < OFF_SHOWS
-            if name in self._sent_off or now < due or whole:
+            if now < due or ((whole or name in self._sent_off) and not self._ways.turned(name)):
                 continue
             self._tries[name] = tries + 1, now + min(OFF_SHOWS * 2**tries, LONGEST_PAUSE)
             best = self._ways.way_out(name, again=tries > 0)
