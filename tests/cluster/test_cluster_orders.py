@@ -225,7 +225,7 @@ def test_a_search_is_done_only_if_it_was_begun(lost: int) -> None:
         assert await final(field, "search") is Stage.DONE
         assert field.boards[0].state == "SEARCHING"
         # The other refuses it, and stays in IDLE, which is where a search ends.
-        field.boards[1].node.controller._may_track = lambda: messages.REFUSED_STATE
+        field.boards[1].node.controller._may_go = lambda up: messages.REFUSED_STATE
         field.bus.lose("SEARCH", lost)
         await field.order("other", "SEARCH", 2e-3, 3e-2, heliostats=("A2",))
         assert await final(field, "other", "A2") is Stage.FAILED

@@ -21,7 +21,7 @@ from heliotrope.lcu.messages import (
     REFUSED_STATE,
     REFUSED_SWITCH,
 )
-from heliotrope.lcu.motion import HOLD, MOVE
+from heliotrope.lcu.motion import DEFOCUS, HOLD, MOVE
 from heliotrope.lcu.sender import Sender
 from support.lcu_machines import (
     ADDRESS,
@@ -331,12 +331,14 @@ def test_from_standby_a_defocus_turns_away_from_the_aim_and_not_onto_it(kind: st
     assert "UNREACHABLE" not in flags(bench)
 
 
-@pytest.mark.parametrize("moment", ["at standby", "on the way up"])
+@pytest.mark.parametrize("moment", ["at standby", "locked at standby", "on the way up"])
 @pytest.mark.parametrize("cause", ["DEFOCUS", "the cluster is gone"])
 def test_whatever_its_aim_a_mirror_goes_back_down_the_way(moment: str, cause: str) -> None:
     """Simulated run 980292: an aim on a target lay where turning off it led onto the receiver."""
-    bench = standing_by() if moment == "at standby" else brought_to("STOWED")
-    if moment != "at standby":
+    bench = standing_by() if "at standby" in moment else brought_to("STOWED")
+    if "locked" in moment:
+        assert bench.order("LOCK") == DONE
+    if moment == "on the way up":
         assert bench.order("APPROACH") == DONE
         while bench.controller.motion._place < len(bench.controller.motion.way()) - 1:
             bench.run(0.1)
@@ -348,11 +350,11 @@ def test_whatever_its_aim_a_mirror_goes_back_down_the_way(moment: str, cause: st
     if cause == "DEFOCUS":
         assert bench.order("DEFOCUS") == DONE
     bench.sends_sun = bench.sends_time = cause == "DEFOCUS"
-    while bench.state != "DEFOCUSED":
+    while bench.controller.motion.kind != DEFOCUS:
         begin = np.array(bench.made)
         bench.run(0.1)
     bench.run(20)
-    assert bench.state == "DEFOCUSED"
+    assert bench.state == ("LOCKED" if "locked" in moment else "DEFOCUSED")
     foot = np.array([*STANDBY[:2], bench.machine.position[2]])
     line = [foot + part * (np.array(STANDBY) - foot) for part in np.linspace(0.0, 1.0, 101)]
     beside = [bench.miss(point) for point in line]
@@ -372,15 +374,16 @@ def test_whatever_its_aim_a_mirror_goes_back_down_the_way(moment: str, cause: st
         assert bench.miss(STANDBY) > off - 0.5
 
 
-@pytest.mark.parametrize("kind", ["LOCK", "JOG"])
+@pytest.mark.parametrize("locked", [False, True])
 @pytest.mark.parametrize("cause", ["DEFOCUS", "the cluster is gone"])
-def test_a_mirror_that_is_held_beside_its_aim_does_not_turn_onto_it(kind: str, cause: str) -> None:
+def test_a_mirror_that_is_held_beside_its_aim_does_not_turn_onto_it(
+    cause: str, locked: bool
+) -> None:
     bench = standing_by()
-    if kind == "LOCK":
+    assert bench.order("JOG", 0, 400) == DONE
+    bench.run(5)
+    if locked:
         assert bench.order("LOCK") == DONE
-    else:
-        assert bench.order("JOG", 0, 400) == DONE
-        bench.run(5)
     turned, aim = usual_turn(bench)
     assert bench.order("AIM", *aim) == DONE
     if cause == "DEFOCUS":

@@ -426,18 +426,18 @@ def test_from_standby_and_an_approach_no_defocus_lights_the_receiver_whatever_th
     for hour in (9, 12, 15):
         moment = datetime(2026, 3, 21, hour, tzinfo=UTC)
         sun = vector(moment - timedelta(hours=design.site.longitude_deg / 15.0), design.site)
-        for state, places in ((states.IDLE, standbys), (states.APPROACHING, late)):
+        for state, places in ((states.LOCKED, standbys), (states.APPROACHING, late)):
             begin = np.round(check.poses(rows, places, sun, ways.stow[rows]).best_counts)
-            for how in (state, states.LOCKED):
+            for how in (state, states.FAULT):
                 ends = np.empty_like(begin)
                 for i, row in enumerate(rows):
                     machine, point = machines[design.names[row]], standbys[i]
                     end = defocused(check, machine, int(row), begin[i], sun, how, right, point)
                     ends[i] = Drive(check.drives.table[row]).counts(end)
                 lit = check.crossing(rows, ways.motion(rows, begin, ends), sun, "now")
-                held += len(lit) if how == states.LOCKED else 0
-                assert how == states.LOCKED or not lit
-    assert held > 0  # turned off the aim, as a held mirror is
+                held += len(lit) if how == states.FAULT else 0
+                assert how == states.FAULT or not lit
+    assert held > 0  # turned off the aim
 
 
 @pytest.mark.parametrize("field", [False, True])

@@ -521,12 +521,10 @@ class Controller:
         if motion.kind == DIAGNOSE and name not in ("LOCK", "IDLE"):
             return messages.BUSY
         result = messages.DONE
-        if name in ("TRACK", "REFOCUS", "SEARCH"):
-            result = self._may_track()
+        if name in ("APPROACH", "TRACK", "REFOCUS", "SEARCH"):
+            result = self._may_go(name == "APPROACH")
             if name == "SEARCH" and not motion.prepare_search(values[0], values[1]):
                 return messages.BAD_VALUE
-        elif name == "APPROACH":
-            result = self._may_approach()
         elif name in ("JOG", "GOTO", "DIAGNOSE"):
             result = self._may_move(name, values)
         if result == messages.DONE:
@@ -551,20 +549,15 @@ class Controller:
             self.fault = NO_FAULT
         return messages.DONE
 
-    def _may_track(self) -> int:
-        """Whether the mirror may go straight from its position to its aim."""
+    def _may_go(self, up: bool) -> int:
+        """Whether the mirror may leave stow (``up``), or go straight from standby to its aim."""
         motion = self.motion
-        if not (motion.ready and motion.known and self.sun.fresh() and self.fault == NO_FAULT):
+        if not (
+            (up or motion.ready) and motion.known and self.sun.fresh() and self.fault == NO_FAULT
+        ):
             return messages.REFUSED_STATE
-        if motion.aim is None or not motion.reaches([motion.aim]):
-            return messages.BAD_VALUE
-        return messages.DONE
-
-    def _may_approach(self) -> int:
-        motion = self.motion
-        if not (motion.known and self.sun.fresh() and self.fault == NO_FAULT):
-            return messages.REFUSED_STATE
-        if self.config.standby is None or not motion.reaches(motion.way()):
+        end = self.config.standby if up else motion.aim
+        if end is None or not motion.reaches(motion.way() if up else [end]):
             return messages.BAD_VALUE
         return messages.DONE
 

@@ -264,19 +264,21 @@ class Motion:
     def _turn(self) -> "Pose | None":
         """Choose by how much a defocus turns; return the pose in which one from standby ends.
 
-        From standby it goes down the safe way, and on the way up back as it has come, until an axis
-        has turned by its angle or the ground is reached. No other place is known to be off the
-        receiver: the aim may be on a target. From an aim, an axis that the usual sense would bring
-        nearer to standby, which is beside the receiver, turns the other way. A mirror that is held,
-        wherever a person has left it, turns off the aim. Without a recent sun, by the angles.
+        From standby, held there too, it goes down the safe way, and on the way up back as it has
+        come, until an axis has turned by its angle or the ground is reached. No other place is
+        known to be off the receiver: the aim may be on a target. From an aim, an axis that the
+        usual sense would bring nearer to standby, which is beside the receiver, turns the other
+        way. A mirror that is held elsewhere, where a person has left it, turns off the aim. Without
+        a recent sun, by the angles.
         """
         one, two = self._offset = self.config.defocus
         if not self.known or self.sun.since_ms > RECENT_MS:
             return None
         near, unreachable, kind, found = self._near, self.unreachable, self.kind, None
-        way = self.way()[:-1] if kind == STANDBY else []
-        if kind == APPROACH:
-            way = self._path[: max(0, self._place)]
+        way = self._path[: max(0, self._place)] if kind == APPROACH else []
+        at_standby = self.ready and self._target is self.config.standby
+        if kind == STANDBY or (kind == HOLD and at_standby):
+            way = self.way()[:-1]
         for point in way[::-1]:
             pose = self.pose(point, 0)
             if pose is None:
@@ -427,7 +429,7 @@ class Motion:
 
     def move(self) -> None:
         """Go to the prepared step counts."""
-        self.kind = MOVE
+        self.kind, self._target = MOVE, None  # one that is held there does not stand at standby
         if self.stepper is not None:
             self.stepper.go(self._home[0], self._home[1], BOTH)
 

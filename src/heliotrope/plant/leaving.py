@@ -21,7 +21,7 @@ from heliotrope.safety import Act
 _AT_AIM = (states.TRACKING, states.SEARCHING)
 #: Turn of the axes between two poses that are looked at, rad.
 _PIECE = 0.02
-#: A mirror in IDLE stands by if its axes are this near to the angles of standby, rad.
+#: One in IDLE or LOCKED stands by if its axes are this near to the angles of standby, rad.
 _STANDS_BY = 0.02
 
 
@@ -31,7 +31,7 @@ def way_out(
     row: int,
     counts: FloatArray,
     sun: FloatArray,
-    state: int = states.LOCKED,
+    state: int = states.FAULT,
     aim: FloatArray | None = None,
     standby: FloatArray | None = None,
 ) -> Act:
@@ -78,7 +78,7 @@ def defocused(
     row: int,
     counts: FloatArray,
     sun: FloatArray,
-    state: int = states.LOCKED,
+    state: int = states.FAULT,
     aim: FloatArray | None = None,
     standby: FloatArray | None = None,
 ) -> FloatArray:
@@ -105,7 +105,7 @@ def _down(
     standby: FloatArray,
 ) -> FloatArray | None:
     """Return the angles (2,) down the way in which DEFOCUS ends: `lcu.motion`; None elsewhere."""
-    if state not in (states.IDLE, states.APPROACHING):
+    if state not in (states.IDLE, states.LOCKED, states.APPROACHING):
         return None
     points = np.array(motion_of(check, row, machine.way, standby).way())
     begin = as_float(Drive(check.drives.table[row]).angles(counts))
@@ -114,7 +114,7 @@ def _down(
     turns = np.abs(as_float(found.best_angles) - begin)
     near = np.nan_to_num(turns.max(axis=-1), nan=np.inf)
     place = int(near.argmin())
-    if state == states.IDLE and (place < len(points) - 1 or near[place] > _STANDS_BY):
+    if state != states.APPROACHING and (place < len(points) - 1 or near[place] > _STANDS_BY):
         return None  # a person has moved it elsewhere
     end = None
     for i in reversed(range(place)):

@@ -282,7 +282,9 @@ class Field:
     def _down(self, rows: Rows) -> tuple[FloatArray, FloatArray]:
         """Return points (M, 3) and angles (M, 2) down the safe way, or NaN: `Motion._turn`."""
         points, angles = np.full((len(rows), 3), np.nan), np.full((len(rows), 2), np.nan)
-        stands = self.kind[rows] == STANDBY
+        there = (self._target[rows] == self.journals.standby[rows]).all(axis=1)
+        held = self._ready[rows] & (self.kind[rows] == HOLD) & there
+        stands = held | (self.kind[rows] == STANDBY)
         place = np.where(stands, self._way_length[rows] - 1, self._place[rows])
         knows = self.now_ms - self._sunned[rows] < RECENT_MS
         left = np.flatnonzero(knows & (stands | (self.kind[rows] == APPROACH)))
