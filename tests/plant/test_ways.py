@@ -302,6 +302,11 @@ def test_a_mirror_that_has_turned_into_a_volume_is_stowed_although_it_was_just_s
             bench.plant.raise_emergency(OPERATOR.name, Act.DEFOCUS)
         await bench.wait(6.0)
         assert alarmed(bench.plant) == {"P5A"}
+        # P5B stands too, where it does no harm: another row that sends it off waits as ever.
+        for name, where in (("P5A", inside), ("P5B", outside)):
+            reports(bench, name, states.DEFOCUSED, where, where)
+        await bench.wait(4.0)
+        assert [name for name in ("P5A", "P5B") if bench.plant._ways.turned(name)] == ["P5A"]
 
     sent = play(tmp_path, scene).cluster_of("P5A").of(Emergency)
     assert [m.heliostats for m in sent if m.name == "STOW"] == [("P5A",)]

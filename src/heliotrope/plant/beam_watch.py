@@ -372,7 +372,9 @@ class BeamWatch:
         return way_out(self._check, machine, row, counts, sun, state, aim, standby)
 
     def turned(self, name: str) -> bool:
-        """Return whether DEFOCUS has turned a heliostat already, so that it turns nothing more."""
+        """Return whether a beam stands where it may not be, and DEFOCUS turns it no further."""
+        if name not in self._seen and name not in self.unsent.seen:
+            return False
         row = self._field.place(name)
         return bool(self._field.rows["state"][row] == states.DEFOCUSED and self._stands(row))
 
