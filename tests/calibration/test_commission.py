@@ -25,11 +25,14 @@ from heliotrope.calibration.plan.on_target import (
     search_places,
 )
 from heliotrope.calibration.plan.percentiles import error_percentiles
+from heliotrope.calibration.plan.receiver_terms import ReceiverTerms
 from heliotrope.errors import InputError
 from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
+from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.geometry import FloatArray
+from heliotrope.imaging.coded import photographs_for
 
 DAY, HALF = 86400.0, 43200.0
 JOINT = JointTerms(most=6, first=8, sigma=4e-4)
@@ -82,18 +85,23 @@ def test_what_every_mirror_has_stays_when_everything_is_known() -> None:
     np.testing.assert_allclose(found, 2e-4)
 
 
-def test_no_target_and_no_heliostat_is_taken_twice(plant: Plant, joint: CommissionPlan) -> None:
-    assert {v.target for v in joint.visits} == {0, 1}
-    assert max(len(v.heliostats) for v in joint.visits if v.own) == JOINT.first
-    assert max(len(v.heliostats) for v in joint.visits if not v.own) == JOINT.most
-    spans = [(v.begin, v.end, ("target", v.target)) for v in joint.visits]
-    spans += [(v.begin, v.end, ("mirror", i)) for v in joint.visits for i in v.heliostats.tolist()]
+def _nothing_twice(plan: CommissionPlan) -> None:
+    """No place and no heliostat has two visits at one time."""
+    spans = [(v.begin, v.end, ("place", v.target)) for v in plan.visits]
+    spans += [(v.begin, v.end, ("mirror", i)) for v in plan.visits for i in v.heliostats.tolist()]
     by_place: dict[tuple[str, int], list[tuple[float, float]]] = {}
     for begin, end, place in spans:
         by_place.setdefault(place, []).append((begin, end))
     for rows in by_place.values():
         rows.sort()
         assert all(b[0] >= a[1] - 1e-6 for a, b in pairwise(rows))
+
+
+def test_no_target_and_no_heliostat_is_taken_twice(plant: Plant, joint: CommissionPlan) -> None:
+    assert {v.target for v in joint.visits} == {0, 1}
+    assert max(len(v.heliostats) for v in joint.visits if v.own) == JOINT.first
+    assert max(len(v.heliostats) for v in joint.visits if not v.own) == JOINT.most
+    _nothing_twice(joint)
     for visit in joint.visits:
         assert len(set(visit.heliostats.tolist())) == len(visit.heliostats)
         together = JOINT.span(len(visit.heliostats), own=visit.own)
@@ -305,3 +313,124 @@ def test_a_span_without_sun_or_targets_is_refused(plant: Plant, fleet: Fleet) ->
         _plan(plant, fleet, TOGETHER, 400.0 * DAY)
     with pytest.raises(InputError, match="at least one target"):
         plan_commission([fleet], plant.site, (), START, START + DAY)
+
+
+# --- mirrors in production ------------------------------------------------------------------
+
+
+def _receiver(plant: Plant, known: float = 4e-3) -> ReceiverTerms:
+    settings = ReceiverSettings("eye", "receiver", known=known, every=3600.0)
+    return ReceiverTerms(settings, plant.receiver("receiver").face)
+
+
+@pytest.fixture(scope="module")
+def produced(plant: Plant, fleet: Fleet) -> CommissionPlan:
+    # Intervals so short that visits begin in what the interval before has left over.
+    terms = replace(TOGETHER, every=300.0, receiver=_receiver(plant))
+    return _plan(plant, fleet, terms, HALF)
+
+
+def test_with_receiver_visits_the_curve_falls_faster(
+    plant: Plant, fleet: Fleet, produced: CommissionPlan
+) -> None:
+    without = _plan(plant, fleet, replace(TOGETHER, every=300.0), HALF)
+    assert {v.target for v in without.visits} == {0, 1}
+    assert {v.target for v in produced.visits} == {0, 1, 2}
+    assert (produced.percentiles[-1] < 0.9 * without.percentiles[-1]).all()
+    # The time of the targets is theirs alone.
+    used = sum(v.end - v.begin for v in produced.visits if v.target < 2)
+    whole = 2.0 * sum(end - begin for begin, end in produced.days)
+    assert used == pytest.approx(whole - produced.seconds["idle"], rel=1e-9)
+
+
+def test_a_mirror_in_a_receiver_visit_is_nowhere_else(
+    plant: Plant, produced: CommissionPlan
+) -> None:
+    _nothing_twice(produced)
+    terms = _receiver(plant)
+    last: dict[int, float] = {}
+    for visit in (v for v in produced.visits if v.target == 2):
+        count = len(visit.heliostats)
+        assert visit.joint
+        assert (visit.own, visit.first, int(visit.missed.sum())) == (False, False, 0)
+        assert terms.settings.least <= count <= terms.party(60)
+        # Nothing drives, and no more mirrors shine than there are.
+        assert visit.end - visit.begin >= terms.span(count, 60) - 1e-6
+        for i in visit.heliostats.tolist():
+            assert visit.begin - last.get(i, -np.inf) >= terms.settings.every
+            last[i] = visit.end
+
+
+def test_only_mirrors_that_are_known_go_to_the_receiver(
+    plant: Plant, fleet: Fleet, produced: CommissionPlan
+) -> None:
+    before = set[int]()
+    for visit in sorted(produced.visits, key=lambda v: v.end):
+        mirrors = set(visit.heliostats.tolist())
+        assert visit.target < 2 or mirrors <= before
+        before |= mirrors
+    # Twenty are known to half a milliradian, twenty to 15, and twenty were never measured.
+    row = np.arange(60)
+    better = np.where((row < 20) | (row >= 40), 900.0, 1.0)[:, None, None]
+    known = replace(fleet, information=better * fleet.information)
+    begin = START + 8.0 * 3600.0
+    made = plan_commission(
+        [known],
+        plant.site,
+        plant.targets,
+        begin,
+        begin + 900.0,
+        measured=row < 40,
+        terms=CommissionTerms(goal=1e-5, receiver=_receiver(plant)),
+    )
+    (there,) = [v.heliostats for v in made.visits if v.target == 2]
+    assert len(there) >= 8
+    assert (there < 20).all()
+
+
+def test_receiver_visits_take_the_photographs_and_the_time_of_the_simulated_plant(
+    plant: Plant,
+) -> None:
+    terms = _receiver(plant)
+    counts = range(1, 128)
+    assert [terms.photographs(n) for n in counts] == [photographs_for(n) for n in counts]
+    # Measured: 254 s for the stack of 50, then 9.5 minutes until 47 had new parameters.
+    assert terms.span(50, 150) == pytest.approx(254.0 + 570.0, rel=0.1)
+    # In a large field many are away at a time.
+    assert terms.span(50, 10_000) < 300.0
+    assert (terms.party(150), terms.party(10_000)) == (50, 50)
+    assert 8 < terms.party(60) < 30
+    # Automatic control stays below the largest error, and part of that is drawn anew.
+    assert terms.known == pytest.approx(3e-3)
+    known = replace(terms, settings=replace(terms.settings, visit=2.5e-3)).known
+    assert known == pytest.approx(np.sqrt(16.0 - 12.5) * 1e-3)
+    with pytest.raises(InputError, match=r"sigma 0\.0 must be above 0"):
+        replace(terms, sigma=0.0)
+
+
+def test_only_beams_that_stay_on_the_receiver_are_moved(plant: Plant) -> None:
+    terms = _receiver(plant)
+    face, feet = terms.face, np.array(plant.position[:1])
+    edge = 0.5 * face.width * face.axes[0]
+    aims = face.center + np.array([0.0, 0.9, 0.999])[:, None] * edge
+    assert terms.shining(np.repeat(feet, 3, axis=0), aims).tolist() == [True, True, False]
+    behind = 2.0 * face.center - feet
+    assert not terms.shining(behind, face.center[None]).any()
+
+
+def test_the_receiver_stands_in_tables_by_its_name(
+    plant: Plant, produced: CommissionPlan, tmp_path: Path
+) -> None:
+    targets = [t.name for t in plant.targets]
+    there = mirrors_of(v for v in produced.visits if v.target == 2)
+    rows = commission_report.visit_rows(produced, plant.names, targets)
+    hours = commission_report.hour_rows(produced, targets)
+    document = commission_report.document(produced, plant.names, targets)
+    assert sum(row["target"] == "receiver" for row in rows) == there
+    assert sum(row["mirrors"] for row in hours if row["target"] == "receiver") == there
+    listed = [v for v in document["visits"] if v["target"] == document["receiver"] == "receiver"]
+    assert sum(len(v["heliostats"]) for v in listed) == there
+    commission_report.write_page(tmp_path / "page.html", produced, plant.name, targets)
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "<td>receiver</td>" in page
+    assert "On receiver, up to 50 mirrors" in page

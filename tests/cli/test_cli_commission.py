@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from heliotrope.cli import main
 from heliotrope.field.formats.plant_file import write_plant
 from heliotrope.field.layouts import malan_plant
+from heliotrope.field.receiver_visits import ReceiverSettings
 
 SPAN = ("--from", "2026-09-01T22:00Z", "--days", "0.5", "--every", "1h")
 
@@ -60,6 +62,20 @@ def test_a_drone_first_leaves_no_first_visit(
     assert without["visits"][0]["first"]
     assert not any(visit["first"] for visit in flown["visits"])
     assert {visit["target"] for visit in without["visits"]} == {"left"}
+
+
+def test_the_receiver_is_one_more_place_where_the_plant_file_says_so(
+    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    visits = ReceiverSettings("camera-left", "receiver", least=4, power=0.01)
+    file, table = tmp_path / "plant.toml", tmp_path / "visits.csv"
+    write_plant(replace(malan_plant(24), receiver_visits=visits), file)
+    given = [str(file), "--from", "2026-09-01T22:00Z", "--days", "0.5", "--together", "4"]
+    out = _call([*given, "--csv", str(table)], capsys, monkeypatch)
+    assert any(line.split()[1:2] == ["receiver"] for line in out.splitlines())
+    with table.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert {row["target"] for row in rows} == {"left", "receiver", "right"}
 
 
 @pytest.mark.parametrize(

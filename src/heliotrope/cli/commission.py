@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from heliotrope.calibration.plan.commission import CommissionPlan, CommissionTerms
     from heliotrope.calibration.plan.fleets import Fleet
     from heliotrope.calibration.plan.joint_terms import JointTerms
+    from heliotrope.calibration.plan.receiver_terms import ReceiverTerms
     from heliotrope.field.plant import Plant
 
 _MRAD = 1e-3
@@ -52,7 +53,7 @@ def commission(
         float, typer.Option(help="Accuracy of a photograph in each direction, mrad.")
     ] = 0.5,
     sigma_together_mrad: Annotated[
-        float, typer.Option(help="Accuracy of a joint visit in each direction, mrad.")
+        float, typer.Option(help="Accuracy of visits of several in each direction, mrad.")
     ] = 0.22,
     repeat_mrad: Annotated[
         float, typer.Option(help="What a visit does not repeat, in each direction, mrad.")
@@ -74,7 +75,7 @@ def commission(
     page: Annotated[Path | None, typer.Option(help="HTML file for the report.")] = None,
     picture: Annotated[Path | None, typer.Option(help="File .png, .svg or .pdf.")] = None,
 ) -> None:
-    """Plan the days that bring a new field to its goal: which mirrors, when, on which target."""
+    """Plan the days that bring a new field to its goal: which mirrors, when, and where."""
     from heliotrope.calibration.plan.commission import CommissionTerms
     from heliotrope.calibration.plan.report import check_picture
 
@@ -90,6 +91,7 @@ def commission(
         look=parse_duration(look).total_seconds(),
         sigma=_MRAD * above(sigma_mrad, "--sigma-mrad"),
         joint=_joint(plant, together, first, step, sigma_together_mrad),
+        receiver=_receiver(plant, sigma_together_mrad),
         repeat=_MRAD * repeat_mrad,
         clear=clear,
         every=parse_duration(every).total_seconds(),
@@ -131,6 +133,14 @@ def _joint(
         step=parse_duration(step).total_seconds(),
         sigma=_MRAD * above(sigma_mrad, "--sigma-together-mrad"),
     )
+
+
+def _receiver(plant: "Plant", sigma_mrad: float) -> "ReceiverTerms | None":
+    """Return the receiver visits of the plant file."""
+    from heliotrope.calibration.plan.receiver_terms import ReceiverTerms
+
+    terms = ReceiverTerms.of(plant, 0.0)
+    return None if terms is None else replace(terms, sigma=_MRAD * sigma_mrad)
 
 
 def _fleets(

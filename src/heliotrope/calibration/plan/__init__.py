@@ -26,6 +26,7 @@ from heliotrope.calibration.plan.planning import (
     sighting_jacobian,
     time_grid,
 )
+from heliotrope.calibration.plan.receiver_terms import ReceiverTerms
 
 __all__ = [
     "Aimed",
@@ -35,6 +36,7 @@ __all__ = [
     "CommissionTerms",
     "Fleet",
     "JointTerms",
+    "ReceiverTerms",
     "SightingLimits",
     "SightingPlan",
     "Timing",

@@ -5,7 +5,8 @@ all others, then those that are due together, and alone those that a joint visit
 Within each kind, heliostats come first whose visits lower the expected squared error of the field
 most for each second. Gains are computed for all heliostats at the middle of an interval of half an
 hour, in which each is visited once at most; the gains of different heliostats do not depend on
-each other.
+each other. Where a plant measures mirrors on its receiver, that is one more place, for mirrors that
+are known well enough; they stay at their aims.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -21,6 +22,7 @@ from heliotrope.calibration.plan.joint_terms import JointTerms
 from heliotrope.calibration.plan.on_target import chance_by_try, chance_on_target
 from heliotrope.calibration.plan.percentiles import error_percentiles
 from heliotrope.calibration.plan.planning import SightingLimits
+from heliotrope.calibration.plan.receiver_terms import ReceiverTerms
 from heliotrope.calibration.plan.scaled_field import ScaledField, TargetView
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target
@@ -58,6 +60,8 @@ class CommissionTerms:
         Standard deviation of a photograph's beam in each direction, rad.
     joint
         Visits of several mirrors at once; None: there are none.
+    receiver
+        Visits of mirrors in production; None: there are none.
     repeat
         Part of the beam error that is drawn anew at each visit and in operation, standard
         deviation in each direction, rad.
@@ -78,6 +82,7 @@ class CommissionTerms:
     look: float = 20.0
     sigma: float = 5e-4
     joint: JointTerms | None = None
+    receiver: ReceiverTerms | None = None
     repeat: float = 0.0
     worth: float = 0.05
     clear: float = 1.0
@@ -103,10 +108,16 @@ class CommissionTerms:
         """Time of a visit of one mirror without driving and searching, s."""
         return self.settle + self.shots * self.interval
 
-    def accuracy(self, together: bool) -> float:
-        """Standard deviation in each direction of a visit alone, or of a joint stack, rad."""
-        one = self.sigma / np.sqrt(self.shots)
-        seen = self.joint.sigma if together and self.joint is not None else one
+    def accuracy(self, together: bool, *, produces: bool = False) -> float:
+        """Standard deviation in each direction of a visit, rad.
+
+        Parameters
+        ----------
+        together, produces
+            Whether it is a joint stack, and one of mirrors in production.
+        """
+        terms = self.receiver if produces else self.joint if together else None
+        seen = self.sigma / np.sqrt(self.shots) if terms is None else terms.sigma
         return float(np.hypot(seen, self.repeat))
 
     @property
@@ -117,14 +128,14 @@ class CommissionTerms:
 
 @dataclass(frozen=True)
 class Visit:
-    """Mirrors on a target.
+    """Mirrors on a target, or in production on the receiver.
 
     Attributes
     ----------
     begin, end
         POSIX s; mirrors leave their aim at the beginning and are back at it at the end.
     target
-        Number of the target.
+        Number of the target; the receiver has the one after the last.
     heliostats
         Their numbers through all fleets, (n,).
     joint
@@ -384,9 +395,16 @@ class _Commissioning:
         self.seconds = dict.fromkeys(("photographs", "search", "travel", "idle"), 0.0)
         #: Joint first visits that each beam has missed, and the part of a miss that is owed.
         self.missed, self._owed = np.zeros(count, dtype=np.int64), 0.0
-        self._last_joint: Mask = np.zeros(len(targets), dtype=np.bool_)
-        #: End of the last interval, and what each target had left of it, s.
-        self._until, self._left = -np.inf, np.zeros(len(targets))
+        self._last_joint: Mask = np.zeros(len(targets) + 1, dtype=np.bool_)
+        places = len(targets) + (terms.receiver is not None)
+        #: End of the last interval, and what each place had left of it, s.
+        self._until, self._left = -np.inf, np.zeros(places)
+        #: When each mirror's last visit ended, and the last one on the receiver.
+        self._home, self._shone = np.full((2, count), -np.inf)
+        self._shines: Mask = np.zeros(count, dtype=np.bool_)
+        if terms.receiver is not None:
+            aim = np.concatenate([f.aim for f in fleets])
+            self._shines = self.counted & terms.receiver.shining(self.position, aim)
 
     def note(self, now: float) -> None:
         """Add a point to the curve."""
@@ -397,57 +415,61 @@ class _Commissioning:
         self.curve.append((float(middle), float(high), float(rms)))
 
     def fill(self, begin: float, end: float, sun: FloatArray) -> None:
-        """Give the time of all targets in an interval to visits."""
-        choices = [self._choices(sun, target) for target in self.targets]
+        """Give the time of all targets, and of the receiver, in an interval to visits."""
         # What the interval before left over, too short for a visit, is used now.
-        carried = begin - self._left if begin == self._until else np.full(len(choices), begin)
+        left = self._left if begin == self._until else np.zeros_like(self._left)
+        carried = begin - left
+        choices = [self._choices(sun, target) for target in self.targets]
+        if (terms := self.terms.receiver) is not None:
+            choices.append(self._in_production(sun, terms, float(carried[-1])))
         clock, stop = carried.copy(), begin + self.terms.clear * (end - begin)
         free: Mask = np.array(self.visited)
         opened: Mask = np.ones(len(choices), dtype=np.bool_)
         while opened.any():
             j = int(np.argmin(np.where(opened, clock, np.inf)))
             now = float(clock[j])
-            rows, joint = self._best(j, choices[j], free)
-            span = self._span(choices[j], rows, joint) if rows.size else {}
+            # In that time, some are still on their way back from another place.
+            home = free if now >= begin else free & (self._home <= now)
+            rows, joint = self._best(j, choices[j], home)
+            span = self._span(j, choices[j], rows, joint) if rows.size else {}
             until = now + sum(span.values())
             if not rows.size or until > stop:
                 opened[j] = False
                 # Where nobody is left to be visited, nothing is carried on.
                 self._left[j] = max(0.0, stop - now) if rows.size else 0.0
-                self.seconds["idle"] += max(0.0, stop - now) - (begin - carried[j])
+                self._use(j, {"idle": max(0.0, stop - now) - (begin - carried[j])})
                 continue
             free[rows] = False
-            for name, value in span.items():
-                self.seconds[name] += value
+            self._use(j, span)
             self._last_joint[j] = joint
             self._visit(choices[j], now, until, j, rows, joint)
             clock[j] = until
         self._until = end
 
+    def _use(self, j: int, span: dict[str, float]) -> None:
+        """Account for the time of a target; that of the receiver is none of it."""
+        if j < len(self.targets):
+            for name, value in span.items():
+                self.seconds[name] += value
+
     def _choices(self, sun: FloatArray, target: Target) -> _Choices:
-        terms, known, form = self.terms, self.field.covariance, self.field.form
-        view, square = self.field.view(sun, target), self.field.squares()
-        spread = np.einsum("nip,npq,niq->n", view.slope, known, view.slope) * self.sigma**2
+        terms, square = self.terms, self.field.squares()
+        view, spread = self._seen_on(target, sun)
         seen = chance_on_target(target, self.position, self.size, spread)
         at_once = seen
         if terms.joint is not None:
             found = chance_by_try(target, self.position, spread, terms.joint.tries)
             row = np.arange(len(self.missed))
             at_once = found[np.minimum(self.missed, terms.joint.tries - 1), row]
-        able = view.able & self.counted
-
-        def gains(joint: bool) -> FloatArray:
-            slope = view.slope * (self.sigma / terms.accuracy(joint))[:, None, None]
-            found = _gain.variance_gain(known, slope, form)
-            return np.where(able & (found > terms.worth * square), found, 0.0)
-
         travel = np.where(view.able, view.seconds, 0.0)
         looks = np.minimum(1.0 / np.maximum(seen, 1e-9), LOOKS)
-        value = gains(joint=False) / (terms.alone + terms.look * (looks - 1.0) + 2.0 * travel)
+        span = terms.alone + terms.look * (looks - 1.0) + 2.0 * travel
+        value = self._gains(view, terms.accuracy(together=False)) / span
         nobody = np.zeros_like(value)
         new = late = nobody
         if terms.joint is not None:
-            both, vague = gains(joint=True), square > terms.joint.known**2
+            both = self._gains(view, terms.accuracy(together=True))
+            vague = square > terms.joint.known**2
             to_first = (~self.measured | vague) & (self.missed < terms.joint.tries)
             new = both * at_once * to_first if terms.joint.first else nobody
             late = np.where(self.measured & ~vague, both, 0.0)
@@ -456,8 +478,41 @@ class _Commissioning:
         queues = (_Queue(_descending(one)) for one in (value, lost, new, late))
         return _Choices(view, slant, spread, at_once, looks, *queues)
 
+    def _seen_on(self, target: Target, sun: FloatArray) -> tuple[TargetView, FloatArray]:
+        """Return what a target shows, and the expected squared errors of beams there, rad²."""
+        view, known = self.field.view(sun, target), self.field.covariance
+        spread = np.einsum("nip,npq,niq->n", view.slope, known, view.slope) * self.sigma**2
+        return view, spread
+
+    def _gains(self, view: TargetView, accuracy: float) -> FloatArray:
+        """Return the fall of each expected squared error, 0 where it is not worth it, rad²."""
+        slope = view.slope * (self.sigma / accuracy)[:, None, None]
+        found = _gain.variance_gain(self.field.covariance, slope, self.field.form)
+        worthy = view.able & self.counted & (found > self.terms.worth * self.field.squares())
+        return np.where(worthy, found, 0.0)
+
+    def _in_production(self, sun: FloatArray, terms: ReceiverTerms, now: float) -> _Choices:
+        """Return the visits on the receiver: those of mirrors that are known well enough."""
+        view, spread = self._seen_on(terms.face, sun)
+        ready = self._shines & self.measured & (spread <= terms.known**2)
+        ready &= now - self._shone >= terms.settings.every
+        gains = self._gains(view, self.terms.accuracy(together=True, produces=True))
+        slant = np.linalg.norm(terms.face.center - self.position, axis=1)
+        certain, nobody = np.ones(len(slant)), np.zeros(0, dtype=np.intp)
+        known = _descending(np.where(ready, gains, 0.0))
+        queues = (_Queue(rows) for rows in (nobody, nobody, nobody, known))
+        return _Choices(view, slant, spread, certain, certain, *queues)
+
+    @property
+    def _lit(self) -> int:
+        """Number of mirrors in production."""
+        return int((self._shines & self.visited & self.measured).sum())
+
     def _best(self, j: int, choices: _Choices, free: Mask) -> tuple[Rows, bool]:
-        """Return the heliostats of the next visit to a target, and whether it is a joint one."""
+        """Return the heliostats of the next visit to a place, and whether it is a joint one."""
+        if j == len(self.targets) and (shining := self.terms.receiver) is not None:
+            many = choices.known.first(free, shining.party(self._lit))
+            return (many if len(many) >= shining.settings.least else many[:0]), True
         alone, terms = choices.alone.first(free, 1), self.terms.joint
         if terms is None:
             return alone, False
@@ -474,8 +529,13 @@ class _Commissioning:
         many = choices.known.first(free, terms.most)
         return (many, True) if len(many) >= terms.least else (alone, False)
 
-    def _span(self, choices: _Choices, rows: Rows, joint: bool) -> dict[str, float]:
-        """Return the time of a visit by use, s; joint mirrors drive at once, and do not search."""
+    def _span(self, j: int, choices: _Choices, rows: Rows, joint: bool) -> dict[str, float]:
+        """Return the time of a visit by use, s; joint mirrors drive at once, and do not search.
+
+        On the receiver they do not drive either.
+        """
+        if j == len(self.targets) and (shining := self.terms.receiver) is not None:
+            return {"photographs": shining.span(len(rows), self._lit)}
         travel = 2.0 * float(choices.view.seconds[rows].max())
         if not joint or self.terms.joint is None:
             search = self.terms.look * (float(choices.looks[rows].max()) - 1.0)
@@ -495,11 +555,12 @@ class _Commissioning:
     ) -> None:
         first = bool((~self.measured[rows]).any())
         missed, stacks = np.zeros(len(rows), dtype=np.bool_), 1.0
-        own = joint and self._own(rows)
+        produces = j == len(self.targets)
+        own = joint and not produces and self._own(rows)
         if own:
             # The stack that verifies new parameters is a sighting, too.
             missed, stacks = self._misses(choices.seen[rows]), 2.0
-        scale = np.sqrt(stacks) * self.sigma[rows] / self.terms.accuracy(joint)
+        scale = np.sqrt(stacks) * self.sigma[rows] / self.terms.accuracy(joint, produces=produces)
         scale = np.where(missed, 0.0, scale)[:, None, None]
         known = _gain.updated(self.field.covariance[rows], choices.view.slope[rows] * scale)
         self.field.covariance[rows] = known
@@ -507,6 +568,9 @@ class _Commissioning:
         after = np.sqrt(np.maximum(square, 0.0) + self.terms.floor**2)
         self.missed[rows] += missed
         self.measured[rows] |= ~missed
+        self._home[rows] = end
+        if produces:
+            self._shone[rows] = end
         self.visits.append(Visit(begin, end, j, rows, joint, own, first, missed, after))
 
     def _misses(self, seen: FloatArray) -> Mask:

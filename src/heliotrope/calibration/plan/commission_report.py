@@ -20,8 +20,8 @@ _HOUR = 3600.0
 
 
 def hour_rows(plan: CommissionPlan, targets: Sequence[str]) -> list[dict[str, Any]]:
-    """Return one record for each hour and target, with the field's prediction at its end."""
-    found = []
+    """Return one record for each hour and place, with the field's prediction at its end."""
+    found, places = [], _places(plan, targets)
     order = sorted(plan.visits, key=lambda visit: (visit.begin // _HOUR, visit.target))
     for (hour, target), group in groupby(order, key=lambda v: (v.begin // _HOUR, v.target)):
         visits = list(group)
@@ -31,7 +31,7 @@ def hour_rows(plan: CommissionPlan, targets: Sequence[str]) -> list[dict[str, An
         found.append(
             {
                 "hour": iso(hour * _HOUR),
-                "target": targets[target],
+                "target": places[target],
                 "visits": len(visits),
                 "mirrors": mirrors_of(visits),
                 "first": first,
@@ -41,6 +41,12 @@ def hour_rows(plan: CommissionPlan, targets: Sequence[str]) -> list[dict[str, An
             }
         )
     return found
+
+
+def _places(plan: CommissionPlan, targets: Sequence[str]) -> list[str]:
+    """Return the names of the targets, and of the receiver if there are visits to it."""
+    receiver = plan.terms.receiver
+    return [*targets] if receiver is None else [*targets, receiver.face.name]
 
 
 def at(plan: CommissionPlan, time: float) -> tuple[float, float]:
@@ -56,12 +62,13 @@ def visit_rows(
     plan: CommissionPlan, heliostats: Sequence[str], targets: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Return one record for each mirror of each visit, in order of time."""
+    places = _places(plan, targets)
     return [
         {
             "visit": number + 1,
             "begin": iso(visit.begin),
             "end": iso(visit.end),
-            "target": targets[visit.target],
+            "target": places[visit.target],
             "heliostat": heliostats[i],
             "together": len(visit.heliostats),
             "first": visit.first,
@@ -84,8 +91,10 @@ def document(
     plan: CommissionPlan, heliostats: Sequence[str], targets: Sequence[str]
 ) -> dict[str, Any]:
     """Return the whole plan for JSON."""
+    places = _places(plan, targets)
     return {
         "targets": list(targets),
+        "receiver": None if plan.terms.receiver is None else places[-1],
         "goal_mrad": 1e3 * plan.terms.goal,
         "reached": None if plan.reached is None else iso(plan.reached),
         "limit": plan.limit,
@@ -99,7 +108,7 @@ def document(
             {
                 "begin": iso(v.begin),
                 "end": iso(v.end),
-                "target": targets[v.target],
+                "target": places[v.target],
                 "heliostats": [heliostats[i] for i in v.heliostats.tolist()],
                 "joint": v.joint,
                 "first": v.first,
@@ -151,7 +160,7 @@ def curve_picture(plan: CommissionPlan) -> "Figure":
             right.plot(every / 24.0, mirrors, ".", color=colour, label=f"{label} visits")
         right.legend(frameon=False, fontsize=8)
     right.set_xlabel("days")
-    right.set_ylabel("mirrors measured in an hour, all targets")
+    right.set_ylabel("mirrors measured in an hour")
     for ax in (left, right):
         ax.grid(alpha=0.3, which="both")
     return figure

@@ -20,6 +20,7 @@ from heliotrope.calibration.plan import (
 from heliotrope.calibration.plan.commission import SHARES
 from heliotrope.calibration.plan.joint_terms import JointTerms
 from heliotrope.calibration.plan.percentiles import error_percentiles
+from heliotrope.calibration.plan.receiver_terms import ReceiverTerms
 from heliotrope.calibration.plan.scaled_field import ScaledField
 from heliotrope.errors import InputError
 from heliotrope.field.joint_visits import JointSettings
@@ -61,6 +62,7 @@ def terms_of(
     joint: JointSettings | None,
     pace: float = np.nan,
     parties: Sequence[Party] = (),
+    receiver: ReceiverTerms | None = None,
 ) -> CommissionTerms:
     """Return the terms of a plan whose visits are those of a schedule.
 
@@ -74,6 +76,8 @@ def terms_of(
         Time of a visit alone that gives parameters, as a share of the expected time; NaN: unknown.
     parties
         Joint visits: once there are some, their times take the place of the expected ones.
+    receiver
+        Of the receiver visits; None: there are none.
     """
     share = _share(pace)
     # Without a search, a beam that misses costs a whole visit.
@@ -88,6 +92,7 @@ def terms_of(
         worth=settings.worth,
         limits=settings.limits,
         joint=None if joint is None else _joint_terms(settings, joint, parties),
+        receiver=receiver,
     )
 
 

@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from heliotrope import sun as solar
 from heliotrope.calibration.learn.drift import DAY
+from heliotrope.calibration.plan.receiver_terms import ReceiverTerms
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.errors import InputError, TimeError, UnknownNameError
 from heliotrope.field.plant import Plant
@@ -447,7 +448,13 @@ class Scheduler:
             self._known.size[rows].max(axis=1),
             self._learnt[rows] > 0,
             ~np.asarray(able, dtype=np.bool_)[rows],
-            terms_of(self.settings, self.design.joint_visits, made.pace, made.parties),
+            terms_of(
+                self.settings,
+                self.design.joint_visits,
+                made.pace,
+                made.parties,
+                ReceiverTerms.of(self.design, self.settings.sigma),
+            ),
         )
 
     def plan(
