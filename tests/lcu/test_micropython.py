@@ -190,7 +190,9 @@ def tree(folder: Path, given: dict[str, Any], compiler: str | None) -> None:
 
 
 def compile_with(compiler: str, path: Path, into: Path) -> int:
-    done = subprocess.run([compiler, "-o", into, path], capture_output=True, text=True, check=False)
+    # Machine code holds the name of its source, which as a path takes memory on the board.
+    command = [compiler, "-s", path.name, "-o", into, path]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return into.stat().st_size
 
