@@ -310,7 +310,8 @@ def _row(case: _Case, plant: Plant, fleet: Fleet, quick: bool) -> Row:
         START + DAYS * 86400.0,
         size=_SIZE,
         measured=case.flown,
-        terms=case.terms,
+        # The plant goes on measuring when its goal is reached.
+        terms=replace(case.terms, goal=0.0),
     )
     planned = time.perf_counter() - begin
     looks = come_true(plan, mirrors, 1 if quick else 3)
@@ -345,10 +346,12 @@ def _pair(values: FloatArray) -> str:
 
 
 def _sun_hours(plan: CommissionPlan) -> float | None:
-    """Hours of sun until the goal."""
-    if plan.reached is None:
+    """Hours of sun until the predicted 90th percentile is that of the goal."""
+    good = np.flatnonzero(plan.percentiles[:, 1] <= GOAL)
+    if not len(good):
         return None
-    used = sum(max(0.0, min(end, plan.reached) - begin) for begin, end in plan.days)
+    reached = float(plan.time[good[0]])
+    used = sum(max(0.0, min(end, reached) - begin) for begin, end in plan.days)
     return round(used / 3600.0, 1)
 
 

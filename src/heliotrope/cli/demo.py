@@ -13,7 +13,7 @@ from heliotrope.warm import compiling
 #: The day of the demonstration; mirrors are measured during the week before it.
 DAY = date(2026, 9, 2)
 #: Heliostats with pictures of their own in the report, enough to see what a report shows.
-SECTIONS = 4
+SECTIONS = 2
 #: The usual parameters of this kind of mechanism, and the survey.
 MODEL = (
     "tilt_north", "tilt_east", "azimuth_bias", "elevation_bias", "non_orthogonality",
