@@ -1,6 +1,5 @@
 """Neighbours that hide a part of a mirror from its calibration in a running plant."""
 
-import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -15,14 +14,13 @@ from heliotrope.calibration.sightings import camera_target
 from heliotrope.field.example import roughly_installed
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import reflect
-from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant import assembly
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.visits import CalibrationCycle, JointCycle, Shot, Unhidden
 from heliotrope.plant.visits.neighbours import Standing
 from support.live import LiveOptions, LivePlant
-from support.visit_scene import CYCLE, ENGINEER, VisitScene, believe, in_command
+from support.visit_scene import CYCLE, ENGINEER, VisitScene, believe, in_command, raised
 
 T = TypeVar("T")
 
@@ -69,11 +67,7 @@ def early(scene: Callable[[LivePlant, int], Awaitable[None]]) -> None:
         async with live.running():
             plant = live.plant
             try:
-                until = clock.monotonic() + 600.0
-                while not plant.field.among((states.TRACKING,), plant.now()).all():
-                    assert clock.monotonic() < until
-                    await asyncio.sleep(1.0)
-                await live.operations.automatic.halt()
+                await raised(live)
                 believe(live, 3e-4)
                 token = plant.take_authority(ENGINEER).token
                 await in_command(VisitScene(live, token), lambda: scene(live, token))

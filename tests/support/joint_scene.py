@@ -4,7 +4,6 @@ Mirrors drive, clusters poll and the plant commands as in operation; only the li
 test's cameras, from where the mirrors truly stand.
 """
 
-import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +13,6 @@ import numpy as np
 from heliotrope.field.example import roughly_installed
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import bisector, reflect
-from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.pictures import Pictures
@@ -28,7 +26,7 @@ from heliotrope.plant.visits import (
     Unhidden,
 )
 from support.live import LiveOptions, LivePlant
-from support.visit_scene import CYCLE, ENGINEER, START, VisitScene, believe, in_command
+from support.visit_scene import CYCLE, ENGINEER, START, VisitScene, believe, in_command, raised
 
 
 @dataclass(kw_only=True)
@@ -81,11 +79,7 @@ def joint(
         plant = live.plant
         async with live.running():
             try:
-                until = clock.monotonic() + 600.0
-                while not plant.field.among((states.TRACKING,), plant.now()).all():
-                    assert clock.monotonic() < until
-                    await asyncio.sleep(1.0)
-                await live.operations.automatic.halt()
+                await raised(live)
                 if installed is None:
                     believe(live, 3e-4)
                 unhidden = Unhidden(plant, live.cameras.beside)

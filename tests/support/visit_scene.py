@@ -53,6 +53,15 @@ def believe(live: LivePlant, sigma: float) -> None:
         live.plant.beliefs.take(record)
 
 
+async def raised(live: LivePlant, limit: float = 600.0) -> None:
+    """Let automatic control raise the field; return when all track, and it has halted."""
+    until = live.clock.monotonic() + limit
+    while not live.plant.field.among((states.TRACKING,), live.plant.now()).all():
+        assert live.clock.monotonic() < until, live.plant.field.counted()
+        await asyncio.sleep(1.0)
+    await live.operations.automatic.halt()
+
+
 async def in_command(made: VisitScene, play: Callable[[], Awaitable[None]]) -> None:
     """Play a scene while the engineer keeps the command authority, as long as it is theirs."""
 
