@@ -92,6 +92,25 @@ def test_a_refusal_names_the_holder_of_the_authority_and_the_role_that_lacks() -
             asked(*each)
 
 
+def test_a_command_refused_for_another_reason_may_renew_the_authority() -> None:
+    """Simulated run 996043: the plant renews it before it looks whether the motion is free."""
+
+    def given(reason: str, at: float) -> None:
+        observer = PlantObserver(0.0, RecordsDisk(), SETTINGS, [])
+        observer.granted(ANN, 7, 1.0, seized=False)
+        observer.refused(ANN, 7, "AIM", reason, 0.95 + SETTINGS.authority)
+        ticket: Any = SimpleNamespace(identity="x")
+        observer.accepted(ANN, 7, ticket, "AIM", at)
+
+    busy = str(refusals.NOT_NOW.error(what="AIM", reason="a frozen cluster"))
+    lost = str(refusals.NO_AUTHORITY.error(person="Ann"))
+    with pytest.raises(InvariantError, match="accepted without its record"):
+        given(busy, 0.9 + 2.0 * SETTINGS.authority)
+    for reason, at in ((busy, 1.0 + 2.0 * SETTINGS.authority), (lost, SETTINGS.authority + 1.0)):
+        with pytest.raises(InvariantError, match="accepted without the authority"):
+            given(reason, at)
+
+
 @pytest.fixture
 def refused() -> Callable[..., None]:
     """Refuse a command to a heliostat that has been quiet, with sure counts, since given times."""

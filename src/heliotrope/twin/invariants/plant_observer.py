@@ -90,6 +90,8 @@ class PlantObserver:
         self._clusters, self._automatic = clusters, automatic
         self._accounts = {a.name: a for each in clusters for a in each.accounts}
         self._holder: tuple[Person, int, float] | None = None
+        #: When a command that was refused for other reasons may have renewed the authority.
+        self._perhaps = float("-inf")
         self._accepted: Counter[tuple[str, str]] = Counter()
         self._recorded: Counter[tuple[str, str]] = Counter()
         self._looked = 0  # records already counted
@@ -125,14 +127,16 @@ class PlantObserver:
     def _live(self, now: float) -> tuple[Person, int, float] | None:
         """Return the holder of the authority; an authority that nobody renews is over."""
         holder = self._holder
-        if holder is not None and now - holder[2] >= self._settings.authority:
-            self._end(holder[2] + self._settings.authority)
+        if holder is not None:
+            over = max(holder[2], self._perhaps) + self._settings.authority
+            if now >= over:
+                self._end(over)
         return self._holder
 
     def _end(self, now: float) -> None:
         if self._holder is not None:
             self._void(self._holder[1], now)
-        self._holder = None
+        self._holder, self._perhaps = None, float("-inf")
 
     def _void(self, token: int, now: float) -> None:
         self.old[token] = now
@@ -224,7 +228,11 @@ class PlantObserver:
         self._count(now)
 
     def refused(self, person: Person, token: int, what: str, reason: str, now: float) -> None:
-        """Judge the reason of a refusal, where it names the command authority or the role."""
+        """Judge the reason of a refusal, where it names the command authority or the role.
+
+        A command that its holder may give is refused for other reasons after it has renewed the
+        authority, or before.
+        """
         holder = self._live(now)
         # An authority that nobody has renewed for a while may be over a moment earlier or later.
         sure = holder is not None and now - holder[2] < self._settings.authority - _AT_ONCE
@@ -232,11 +240,14 @@ class PlantObserver:
         if ROLE_REASON in reason:
             least = Role.OPERATOR if what in OPERATOR_COMMANDS else Role.ENGINEER
             self.check(16, person.role < least, now, f"{saw}{least.title} is enough")
-        elif sure and holder is not None and NOBODY_REASON in reason:
-            self.check(16, False, now, f"{saw}{holder[0].name} has it")
-        elif sure and holder is not None and OTHER_REASON in reason:
-            right = holder[:2] != (person, token) and f"{holder[0].name} has it" in reason
-            self.check(16, right, now, f"{saw}{holder[0].name} has it")
+        elif NOBODY_REASON in reason:
+            self.check(16, not sure, now, f"{saw}{holder[0].name if holder else 'nobody'} has it")
+        elif OTHER_REASON in reason:
+            if sure and holder is not None:
+                right = holder[:2] != (person, token) and f"{holder[0].name} has it" in reason
+                self.check(16, right, now, f"{saw}{holder[0].name} has it")
+        elif holder is not None and holder[:2] == (person, token):
+            self._perhaps = now
 
     def _kept_record(self, identity: str, who: str, what: str, now: float) -> None:
         record = self._disk.records.get(identity)
