@@ -38,8 +38,8 @@ from heliotrope.plant.visits.neighbours import Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.receiver_layout import caught, production
 from heliotrope.plant.visits.settings import Centring, CycleSettings
-from heliotrope.twin.cameras import mirrors_near
 from heliotrope.twin.live import World, WorldOptions
+from heliotrope.twin.true_mirrors import mirrors_near
 
 START = datetime(2026, 10, 21, 7, tzinfo=UTC)
 ENGINEER = Person("benchmark", Role.ENGINEER)

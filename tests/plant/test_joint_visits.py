@@ -8,6 +8,7 @@ import asyncio
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from heliotrope.plant.visits import (
     CycleResult,
 )
 from heliotrope.plant.visits.joint_layout import arranged
+from heliotrope.plant.visits.stacks import Exposed
 from support.joint_scene import Scene, joint, spoil
 from support.live import LiveOptions, LivePlant
 from support.visit_scene import BIASES, ENGINEER, START, believe
@@ -116,6 +118,30 @@ def test_movements_on_a_target_wait_for_no_turn_to_join_the_receiver() -> None:
         assert 8 * 2.0 <= end - begin + 1e-6 < 8 * 4.0
 
     joint(scene, settings=PlantSettings(join_rate=0.5, join_burst=2))
+
+
+def test_a_photograph_that_cannot_be_read_ends_the_visit_soon() -> None:
+    """Photographs are read while the beams move on, two of them at most."""
+
+    async def scene(here: Scene) -> None:
+        camera = here.live.cameras
+        real, count = camera.expose, iter(range(100))
+
+        async def exposed(*given: Any) -> Exposed:
+            seen = await real(*given)
+            if next(count) != 2:
+                return seen
+            bad = asyncio.get_running_loop().create_future()
+            bad.set_exception(InputError("target left: no mark is found"))
+            return replace(seen, light=bad)
+
+        camera.expose = exposed  # type: ignore[method-assign]
+        with pytest.raises(InputError, match="no mark is found"):
+            await here.run()
+        assert next(count) == 4
+        assert set(here.states().values()) == {"IDLE"}
+
+    joint(scene)
 
 
 def test_an_emergency_a_lost_authority_or_a_blind_camera_ends_it_cleanly() -> None:

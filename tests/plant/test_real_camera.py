@@ -33,7 +33,9 @@ from heliotrope.imaging.targets.view import posed_view
 from heliotrope.links.clock import SystemClock
 from heliotrope.plant.cameras import RealCameras, source_of
 from heliotrope.safety import Alarm
-from heliotrope.twin.cameras import FieldSnapshot, Optics, RenderedCamera, TrueMirror
+from heliotrope.twin.cameras import FieldSnapshot, RenderedCamera
+from heliotrope.twin.drawing import Optics
+from heliotrope.twin.true_mirrors import TrueMirror
 
 SUN = normalize(np.array([0.2, -0.7, 0.7]), "sun")
 OFF = 0.4

@@ -25,7 +25,7 @@ from heliotrope.plant.assembly import AssemblySettings, PlantAssembly
 from heliotrope.plant.audit import JsonLines
 from heliotrope.plant.cameras import RealCameras
 from heliotrope.plant.operations.automatic import AutomaticSettings
-from heliotrope.twin.cameras import PEAK
+from heliotrope.twin.drawing import PEAK
 from heliotrope.twin.live import World
 
 #: Heliostats that must have learnt, and the time for it, s.

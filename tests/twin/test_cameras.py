@@ -1,33 +1,33 @@
 """Cameras of the twin: true centroids with noise, and photographs drawn and read."""
 
+import asyncio
+import multiprocessing
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.errors import FetchError, InputError, UnknownNameError
 from heliotrope.geometry import FloatArray, bisector, normalize
 from heliotrope.imaging.synthetic.rendering import Thrown, example_camera, example_target
 from heliotrope.imaging.synthetic.scenes import Scene
-from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.clock import SystemClock, VirtualClock, run_virtual
 from heliotrope.optics.mirror_image import gaussian_beam
 from heliotrope.plant.visits import CalibrationCycle, CycleSettings, Shot
 from heliotrope.twin.boards.outfit import RECEIVER
-from heliotrope.twin.cameras import (
-    ExactCamera,
-    FieldSnapshot,
-    RenderedCamera,
-    TrueMirror,
-    mirrors_of,
-)
+from heliotrope.twin.cameras import ExactCamera, FieldSnapshot, RenderedCamera
+from heliotrope.twin.drawing import Drawer, Exposure, Optics
+from heliotrope.twin.true_mirrors import TrueMirror, mirrors_of
 from support.whole_plant import ENGINEER, WholePlant
 
 MRAD = 1e-3
 TARGET = example_target(6.0, name="white")
 SCENE = Scene(example_camera(TARGET, 120.0, (1000, 750)), (TARGET,))
 SUN = normalize(np.array([0.2, 0.4, 0.9]))
+START = datetime(2026, 6, 21, 10, tzinfo=UTC)
 
 
 def mirror(name: str, right: float = 0.0, up: float = 0.0, east: float = 5.0) -> TrueMirror:
@@ -154,6 +154,55 @@ def test_what_a_rendered_camera_refuses() -> None:
             RenderedCamera(sight(clock), [replace(SCENE, beams=(beam,))])
 
     run_virtual(main)
+
+
+def test_photographs_are_drawn_in_a_process_that_begins_again_when_it_dies() -> None:
+    shown = Exposure(SCENE, (mirror("A", 0.5, -0.4),), SUN, Optics(), 3, "photo 1", START)
+    drawer = Drawer()
+    try:
+        frame = drawer.draw(shown)
+        assert np.array_equal(frame.pixels, shown.draw().pixels)
+        assert (frame.name, frame.time) == ("photo 1", START)
+        (process,) = multiprocessing.active_children()
+        process.kill()
+        process.join()
+        with pytest.raises(FetchError, match="photo 1: the process that draws photographs has"):
+            drawer.draw(shown)
+        assert np.array_equal(drawer.draw(shown).pixels, frame.pixels)
+        (again,) = multiprocessing.active_children()
+        with pytest.raises(InputError, match="facet"):
+            drawer.draw(replace(shown, optics=Optics(facets=(0, 1))))
+    finally:
+        drawer.close()
+    assert not again.is_alive()
+
+
+def test_a_joint_photograph_is_read_after_it_is_taken() -> None:
+    """The beams may move on while it is drawn and read: it shows where they were."""
+
+    async def main() -> None:
+        clock = SystemClock()
+        there = [mirror("A", 0.6, -0.5)]
+        camera = RenderedCamera(
+            FieldSnapshot(clock, lambda: tuple(there), lambda: SUN, latency=0.0),
+            [SCENE],
+            threads=1,
+        )
+        camera.start(lambda alarm: None)
+        try:
+            exposed = await camera.expose(TARGET)
+            assert not exposed.light.done()
+            there[:] = [mirror("A", -0.9, 0.4)]
+            light = await exposed.light
+        finally:
+            camera.close()
+        assert light.at == exposed.at
+        rows, columns = np.unravel_index(np.argmax(light.values), light.values.shape)
+        x, y = light.first + light.step * np.array([columns, -rows])
+        assert abs(x - 0.6) < 0.5
+        assert abs(y + 0.5) < 0.5
+
+    asyncio.run(main())
 
 
 def test_a_calibration_cycle_with_rendered_photographs(tmp_path: Path) -> None:

@@ -28,18 +28,13 @@ from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.safety import FluxProof
 from heliotrope.store.keeper import Keeper
-from heliotrope.twin.cameras import (
-    ExactCamera,
-    FieldSnapshot,
-    RenderedCamera,
-    TrueMirror,
-    mirrors_near,
-)
+from heliotrope.twin.cameras import ExactCamera, FieldSnapshot, RenderedCamera
 from heliotrope.twin.field import Field, FieldBus
 from heliotrope.twin.live import CYCLE, PacedLoop, WorldOptions, near_pair
 from heliotrope.twin.live.live import machines_of
 from heliotrope.twin.live.loop import LATE
 from heliotrope.twin.sensors import light_share
+from heliotrope.twin.true_mirrors import TrueMirror, mirrors_near
 from support.live import LiveOptions, LivePlant
 
 MRAD = 1e-3

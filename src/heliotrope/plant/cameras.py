@@ -34,7 +34,7 @@ from heliotrope.links.clock import Clock
 from heliotrope.plant.camera_views import SEVERAL, Views, light_of, picture_of, shot_of
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.photographs import Shot
-from heliotrope.plant.visits.stacks import TargetLight
+from heliotrope.plant.visits.stacks import Exposed, TargetLight
 from heliotrope.safety import Alarm, alarms
 
 T = TypeVar("T")
@@ -292,15 +292,13 @@ class RealCameras:
             shot = replace(shot, reasons=(*shot.reasons, text))
         return shot
 
-    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
-        """Return the light on a target; see `plant.visits.stacks.StackCamera`.
+    async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
+        """Photograph a target; see `plant.visits.stacks.StackCamera`.
 
         Raises
         ------
         FetchError
             No frame comes, or its time is not known well enough.
-        InputError
-            The target is not found in it.
         """
         eye = self._eye(target.name)
         frame = await self._frame(eye, target.name)
@@ -319,7 +317,19 @@ class RealCameras:
             self._views.show(target.name, taken, frame, SEVERAL)
             return light_of(frame, target, eye.targets, eye.camera, settings, view, at)
 
-        return await loop.run_in_executor(self._pool, work)
+        return Exposed(at, loop.run_in_executor(self._pool, work))
+
+    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
+        """Return the light on a target; see `plant.visits.stacks.StackCamera`.
+
+        Raises
+        ------
+        FetchError
+            No frame comes, or its time is not known well enough.
+        InputError
+            The target is not found in it.
+        """
+        return await (await self.expose(target, view)).light
 
     async def beside(self, work: Callable[[], T]) -> T:
         """Return the result of a computation made in a thread."""

@@ -26,7 +26,7 @@ from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.sensors import Readings
 from heliotrope.plant.visits.photographs import Shot
-from heliotrope.plant.visits.stacks import TargetLight
+from heliotrope.plant.visits.stacks import Exposed, TargetLight
 from heliotrope.safety import Alarm
 from heliotrope.store.records import Records
 
@@ -64,6 +64,16 @@ class Cameras(Protocol):
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
         """Return what a new photograph shows of a heliostat's beam on the target."""
+        ...
+
+    async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
+        """Photograph the target; return when it is taken, before it is read; see `StackCamera`.
+
+        Raises
+        ------
+        FetchError, InputError
+            No photograph.
+        """
         ...
 
     async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -19,90 +20,27 @@ import numpy.typing as npt
 from heliotrope.errors import FetchError, InputError, UnknownNameError
 from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
-from heliotrope.geometry import FloatArray, reflect
+from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.photograph import Photograph, PhotographSettings, read_photograph
-from heliotrope.imaging.synthetic.rendering import render
-from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
+from heliotrope.imaging.synthetic.scenes import Scene, Thrown
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.links.clock import Clock, sleep_until
-from heliotrope.optics import Neighbours, centroid_shift, equal_facets, reflected_beam
 from heliotrope.plant.camera_views import SEVERAL, Views, light_of, picture_of, shot_of
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.joint_layout import moments_on
 from heliotrope.plant.visits.photographs import Shot
-from heliotrope.plant.visits.stacks import TargetLight
+from heliotrope.plant.visits.stacks import Exposed, TargetLight
 from heliotrope.safety import Alarm
-from heliotrope.twin.boards.board import Board
+from heliotrope.twin.drawing import Drawer, Exposure, Optics, thrown
+from heliotrope.twin.true_mirrors import NEAR, TrueMirror, within
 
-#: Light further from the centre of a target than this many of its half diagonals is left out.
-NEAR = 2.0
-#: Cosine of the incidence below which the light of a mirror is not worth drawing.
-GRAZING = 0.05
-#: Least share of a mirror that is left by its neighbours for a beam to be drawn.
-LEAST = 0.01
-#: Brightest reading after exposure, as a share of full scale.
-PEAK = 0.7
 #: Share of a mirror's size in its exact beam.
 _FLAT = 0.7
 #: Pictures of exact beams: pixels across, brightness of the paint and of a sun, and its noise.
 _ACROSS, _PAINT, _SUN, _GRAIN = 96, 0.05, 0.1, 0.0005
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class TrueMirror:
-    """True position and size of one mirror.
-
-    Attributes
-    ----------
-    heliostat
-        Name.
-    vertex
-        ENU, m, (3,).
-    normal
-        Unit normal, (3,).
-    width, height
-        m.
-    neighbours
-        Mirrors that may shade or block it; None: none does.
-    """
-
-    heliostat: str
-    vertex: FloatArray
-    normal: FloatArray
-    width: float = 3.0
-    height: float = 2.0
-    neighbours: Neighbours | None = None
-
-    def lit(self, target: Target, sun: FloatArray) -> tuple[FloatArray, float]:
-        """Return where its centroid is on the plane of a target, ENU, m, (3,), and its lit share.
-
-        NaN and 0 if neighbours hide all of it. Its facets are canted at the target's distance.
-        """
-        point = self.on(target, sun)
-        if self.neighbours is None or not np.isfinite(point).all():
-            return point, 1.0
-        slant = float(np.linalg.norm(point - self.vertex))
-        facets = equal_facets(self.width, self.height, (1, 1), slant)
-        found = centroid_shift(
-            target,
-            self.vertex,
-            sun,
-            self.normal,
-            facets,
-            self.neighbours,
-            facet_focal=slant,
-            elements=24,
-        )
-        return point + found.shift @ target.axes, 1.0 - found.hidden
-
-    def on(self, target: Target, sun: FloatArray) -> FloatArray:
-        """Return where its ray meets the plane of a target, ENU, m, (3,); NaN if it does not."""
-        if not float(self.normal @ sun) > GRAZING:
-            return np.full(3, np.nan)
-        return target.intersect(self.vertex, reflect(sun, self.normal))
 
 
 @dataclass(frozen=True)
@@ -130,67 +68,6 @@ class FieldSnapshot:
         """Wait for the middle of an exposure; return its time, monotonic s."""
         await sleep_until(self.clock, self.clock.monotonic() + self.latency)
         return self.clock.monotonic()
-
-
-def mirrors_of(
-    boards: Mapping[str, Board], width: float = 3.0, height: float = 2.0
-) -> Callable[[], Sequence[TrueMirror]]:
-    """Return a function that gives the mirrors of boards, by name, all of one size in m."""
-
-    def mirrors() -> Sequence[TrueMirror]:
-        return [TrueMirror(name, *board.mirror(), width, height) for name, board in boards.items()]
-
-    return mirrors
-
-
-def mirrors_near(
-    target: Target,
-    sun: FloatArray,
-    stand: tuple[FloatArray, FloatArray],
-    names: tuple[str, ...],
-    sizes: FloatArray,
-    reach: float = NEAR,
-    beside: npt.NDArray[np.intp] | None = None,
-) -> list[TrueMirror]:
-    """Return the mirrors whose rays meet the plane of a target near its centre.
-
-    Parameters
-    ----------
-    target
-        Its corners and normal count.
-    sun
-        Unit vector to the sun, (3,).
-    stand
-        Unit normals and vertices of N mirrors, (N, 3) each.
-    names
-        Heliostats, N.
-    sizes
-        Width and height of the mirrors, m, (N, 2).
-    reach
-        Largest distance from the centre, in half diagonals of the target.
-    beside
-        Rows of the neighbours of each mirror, (N, J); None: they hide nothing.
-    """
-    middle = np.asarray(target.corners).mean(axis=0)
-    limit = reach * 0.5 * float(np.hypot(target.width, target.height))
-    facing, vertex = stand
-    cosine = facing @ sun
-    rays = 2.0 * cosine[:, None] * facing - sun
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along = ((middle - vertex) @ target.normal) / (rays @ target.normal)
-    away = np.linalg.norm(vertex + along[:, None] * rays - middle, axis=-1)
-    hits = np.flatnonzero((cosine > GRAZING) & (along > 0.0) & (away <= limit)).tolist()
-    found = []
-    for i in hits:
-        size = float(sizes[i, 0]), float(sizes[i, 1])
-        hiding = None
-        if beside is not None and beside.shape[1]:
-            near = beside[i]
-            others = Neighbours(vertex[near], facing[near], *sizes[near].T)
-            hides = others.before(vertex[i], facing[i], size, sun, rays[i])
-            hiding = others.of(hides) if hides.any() else None
-        found.append(TrueMirror(names[i], vertex[i], facing[i], *size, hiding))
-    return found
 
 
 class ExactCamera:
@@ -274,13 +151,18 @@ class ExactCamera:
         true = places.get(heliostat, np.full(3, np.nan))
         point = true + (self._root @ self._chance.standard_normal(2)) @ target.axes
         reasons = []
-        if not _within(target, true):
+        if not within(target, true):
             reasons.append("no beam on the target")
-        others = [n for n, p in places.items() if n != heliostat and _within(target, p)]
+        others = [n for n, p in places.items() if n != heliostat and within(target, p)]
         if others:
             reasons.append(f"several beams: {', '.join(others)} too")
         self._keep(target, point, (heliostat, *reasons))
         return Shot(point, at, target.axes.T @ self._plane @ target.axes, tuple(reasons))
+
+    async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
+        """Photograph a target; see `light`."""
+        seen = await self.light(target, view)
+        return Exposed.read(seen)
 
     async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
         """Return the light on a target: each beam a Gaussian at its true place, with noise."""
@@ -295,7 +177,7 @@ class ExactCamera:
         points = np.stack(np.meshgrid(x, y), axis=-1)
         for mirror in self._sight.mirrors():
             place, share = mirror.lit(target, sun)
-            if not _within(target, place, NEAR):
+            if not within(target, place, NEAR):
                 continue
             size = mirror.width, mirror.height
             shape = moments_on(target, mirror.vertex, mirror.normal, *size, flat=_FLAT)
@@ -323,33 +205,11 @@ class ExactCamera:
         self._views[target.name] = CameraView(target.name, version, at, b"", lines, centroid)
 
 
-@dataclass(frozen=True)
-class Optics:
-    """Quality of the mirrors and strength of the light.
-
-    Attributes
-    ----------
-    slope_error
-        Standard deviation of the mirrors' normals per axis, rad.
-    dni
-        W/m².
-    reflectivity
-        Share, 0 to 1.
-    facets
-        Columns and rows, canted at the slant range.
-    """
-
-    slope_error: float = 1e-3
-    dni: float = 850.0
-    reflectivity: float = 0.9
-    facets: tuple[int, int] = (2, 2)
-
-
 class RenderedCamera:
     """Draws photographs and reads them.
 
-    A photograph takes a second of a processor. With ``threads`` it is drawn, read and annotated
-    beside the event loop; without, at once, as virtual time needs it.
+    A photograph takes a second of a processor. With ``threads`` it is drawn in a process of its own
+    and read in a thread, beside the event loop; without, at once, as virtual time needs it.
 
     Parameters
     ----------
@@ -364,7 +224,7 @@ class RenderedCamera:
     seed
         Seed of the sensor's noise.
     threads
-        Photographs that are worked on at a time; 0: in the event loop itself.
+        Photographs that are read at a time; 0: drawn and read in the event loop itself.
 
     Attributes
     ----------
@@ -400,6 +260,7 @@ class RenderedCamera:
         self._optics, self._settings = optics or Optics(), settings or PhotographSettings()
         self._chance = np.random.default_rng(seed)
         self._pool = ThreadPoolExecutor(threads, "camera") if threads else None
+        self._drawer = Drawer() if threads else None
         self._views, self._empty = Views(), dict[str, Frame]()
         #: Frames, and cameras and targets as they are known; the scenes have the true ones.
         self._frames = dict[str, Frame]()
@@ -408,12 +269,17 @@ class RenderedCamera:
         self.last: Frame | None = None
 
     def start(self, on_alarm: Callable[[Alarm], None]) -> None:
-        """Do nothing: a simulated camera never falls silent."""
+        """Begin the process that draws; a simulated camera never falls silent."""
+        del on_alarm
+        if self._drawer is not None:
+            self._drawer.start()
 
     def close(self) -> None:
-        """End the threads."""
+        """End threads and process."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
+        if self._drawer is not None:
+            self._drawer.close()
 
     def sees(self, target: str) -> bool:
         """Return whether there is a scene of the target."""
@@ -484,13 +350,11 @@ class RenderedCamera:
         seen, at = await self._take(target.name)
         return shot_of(seen, target.name, at)
 
-    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
-        """Return the light on a target; see `plant.visits.stacks.StackCamera`.
+    async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
+        """Photograph a target; see `plant.visits.stacks.StackCamera`.
 
         Raises
         ------
-        InputError
-            The target is not found in the photograph.
         UnknownNameError
             There is no scene of the target.
         """
@@ -504,9 +368,24 @@ class RenderedCamera:
             self._views.show(name, utc.timestamp(), frame, SEVERAL)
             return light_of(frame, known, (known,), camera, settings, view, at), frame
 
-        seen, frame = await self._worked(work)
-        self.last = self._frames[name] = frame
-        return seen
+        async def read() -> TargetLight:
+            seen, frame = await self._worked(work)
+            self.last = self._frames[name] = frame
+            return seen
+
+        return Exposed(at, asyncio.create_task(read()))
+
+    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
+        """Return the light on a target; see `plant.visits.stacks.StackCamera`.
+
+        Raises
+        ------
+        InputError
+            The target is not found in the photograph.
+        UnknownNameError
+            There is no scene of the target.
+        """
+        return await (await self.expose(target, view)).light
 
     async def beside(self, work: Callable[[], T]) -> T:
         """Return the result of a computation, made in a thread if there are any."""
@@ -514,7 +393,7 @@ class RenderedCamera:
 
     def beams(self, target: Target) -> tuple[Thrown, ...]:
         """Return the beams on a target, and those beside it that a frame would show, now."""
-        return _thrown(target, self._sight.mirrors(), self._sight.sun(), self._optics)
+        return thrown(target, self._sight.mirrors(), self._sight.sun(), self._optics)
 
     def _known_of(self, name: str) -> tuple[Camera, Target]:
         if name not in self._scenes:
@@ -525,18 +404,18 @@ class RenderedCamera:
         """Expose a frame: return what draws it, and when it was exposed, UTC and monotonic s."""
         at = await self._sight.exposure()
         scene, utc = self._scenes[name], self._sight.clock.utc()
-        mirrors, sun = self._sight.mirrors(), self._sight.sun()
-        seed = int(self._chance.integers(1 << 32))
         self.taken += 1
-        title = f"{scene.camera.name} {self.taken}"
-
-        def draw() -> Frame:
-            beams = _thrown(scene.targets[0], mirrors, sun, self._optics)
-            # Automatic exposure: the brightest of paint and beams sets it.
-            lit = exposed(replace(scene, beams=beams), PEAK)
-            return render(lit, seed, name=title, time=utc).frame
-
-        return draw, utc, at
+        shown = Exposure(
+            scene,
+            tuple(self._sight.mirrors()),
+            self._sight.sun(),
+            self._optics,
+            int(self._chance.integers(1 << 32)),
+            f"{scene.camera.name} {self.taken}",
+            utc,
+        )
+        drawer = self._drawer
+        return (shown.draw if drawer is None else partial(drawer.draw, shown)), utc, at
 
     async def _worked(self, work: Callable[[], T]) -> T:
         """Return the result of work on a photograph."""
@@ -564,47 +443,3 @@ class RenderedCamera:
         self.last = self._frames[name] = seen.frame
         self._views.keep(name, utc.timestamp(), seen, jpeg)
         return seen, at
-
-
-def _thrown(
-    target: Target, mirrors: Sequence[TrueMirror], sun: FloatArray, optics: Optics
-) -> tuple[Thrown, ...]:
-    """Return the beams of mirrors on a target, and near enough beside it."""
-    thrown = []
-    for mirror in mirrors:
-        place, share = mirror.lit(target, sun)
-        if not (_within(target, place, NEAR) and share >= LEAST):
-            continue
-        # Facets are canted at the distance of the target, wherever the mirror looks.
-        slant = float(np.linalg.norm(target.center - mirror.vertex))
-        beam = reflected_beam(
-            target,
-            mirror.vertex,
-            sun,
-            mirror.width,
-            mirror.height,
-            normal=mirror.normal,
-            facets=optics.facets,
-            focal=slant,
-            slope_error=optics.slope_error,
-            reflectivity=optics.reflectivity,
-            dni=optics.dni,
-            neighbours=mirror.neighbours,
-        )
-        thrown.append(Thrown(target.name, beam))
-    return tuple(thrown)
-
-
-def _within(target: Target, point: FloatArray, share: float = 0.0) -> bool:
-    """Return whether a point is on a target, or within a share of its half diagonal."""
-    if not np.isfinite(point).all():
-        return False
-    away = np.abs(target.plane_coordinates(point) - target.plane_coordinates(_middle(target)))
-    half = 0.5 * np.array([target.width, target.height])
-    if share > 0.0:
-        return bool(np.linalg.norm(away) <= share * np.linalg.norm(half))
-    return bool((away <= half).all())
-
-
-def _middle(target: Target) -> FloatArray:
-    return np.asarray(target.corners.mean(axis=0))

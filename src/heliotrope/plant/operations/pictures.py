@@ -6,6 +6,7 @@ first. A disk that fails costs pictures, never a calibration. The photographs of
 kept once, and found by each of its heliostats.
 """
 
+import asyncio
 import contextlib
 import sqlite3
 from collections import deque
@@ -22,7 +23,7 @@ from heliotrope.files.disk import AtOnce, Disk, DiskBusyError
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.plant.operations.views import CalibrationEntry, CameraView, PictureRow
 from heliotrope.plant.visits.photographs import Shot
-from heliotrope.plant.visits.stacks import StackCamera, TargetLight
+from heliotrope.plant.visits.stacks import Exposed, StackCamera, TargetLight
 
 #: Photographs of one visit that are kept at most: of a long search the last ones.
 _MOST = 24
@@ -325,6 +326,8 @@ class KeptCamera:
 
     def __init__(self, camera: "ViewedCamera", pictures: Pictures) -> None:
         self._camera, self._pictures = camera, pictures
+        #: Versions of the photographs of joint visits that were kept last, by target.
+        self._kept = dict[str, int]()
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
         """Return what a new photograph shows of a heliostat's beam."""
@@ -335,14 +338,24 @@ class KeptCamera:
             self._pictures.take(heliostat, view, shot)
         return shot
 
+    async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
+        """Take a photograph of a joint visit, which is kept once it is read."""
+        before = self._camera.view(target.name).version
+        exposed = await self._camera.expose(target, view)
+
+        async def kept() -> TargetLight:
+            seen = await exposed.light
+            taken = self._camera.view(target.name)
+            if taken.version not in (before, self._kept.get(target.name)):
+                self._kept[target.name] = taken.version
+                self._pictures.take_together(taken)
+            return seen
+
+        return Exposed(exposed.at, asyncio.create_task(kept()))
+
     async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
         """Return the light on a target in a photograph of a joint visit."""
-        before = self._camera.view(target.name).version
-        seen = await self._camera.light(target, view)
-        taken = self._camera.view(target.name)
-        if taken.version != before:
-            self._pictures.take_together(taken)
-        return seen
+        return await (await self.expose(target, view)).light
 
     async def beside(self, work: Callable[[], T]) -> T:
         """Return the result of a computation that must not hold up the loop."""

@@ -11,8 +11,9 @@ parameters predict; it is their second sighting.
 """
 
 import asyncio
+import contextlib
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,12 +38,14 @@ from heliotrope.plant.visits.joint_visit import JointVisit
 from heliotrope.plant.visits.neighbours import Standing
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.stack_counts import counts_at_rest
-from heliotrope.plant.visits.stacks import StackCamera, TargetLight, noting, stack_of
+from heliotrope.plant.visits.stacks import Exposed, StackCamera, TargetLight, noting, stack_of
 from heliotrope.plant.visits.verification import Confirming
 from heliotrope.plant.visits.visit import Visit
 
 #: Sightings that a first fit needs: all photographs of a stack agree, and a second one verifies it.
 _FIRST = 1
+#: Photographs that may wait to be read while the next is taken.
+_UNREAD = 2
 #: Verdicts on a new mirror whose beam may be beside the target.
 _NOT_FOUND = (Verdict.FAINT, Verdict.ELSEWHERE)
 #: Verdicts that are no mirror's fault: a verification that ends so is made again, once.
@@ -57,6 +60,7 @@ class _Taken:
     ----------
     pictures
         The last photographs, each with its number; those of one whole turn of the codes at the end.
+        They are read while the beams move on.
     still
         From when to when all stood at the aims of a photograph, and its number.
     count
@@ -65,10 +69,30 @@ class _Taken:
         How the field stood in the middle of them.
     """
 
-    pictures: deque[tuple[int, TargetLight]]
+    pictures: deque[tuple[int, Exposed]]
     still: list[tuple[float, float, int]] = field(default_factory=list)
     count: int = 0
     standing: Standing | None = None
+
+    @classmethod
+    @contextlib.contextmanager
+    def of(cls, layout: Layout) -> "Iterator[_Taken]":
+        """Give a place for the photographs of a layout; those unread at the end are forgotten."""
+        taken = cls(deque(maxlen=len(layout.moves)))
+        try:
+            yield taken
+        finally:
+            taken.forget()
+
+    async def read(self) -> list[tuple[int, TargetLight]]:
+        """Return the light in the last photographs, each with its number."""
+        return [(number, await one.light) for number, one in self.pictures]
+
+    def forget(self) -> None:
+        """Forget the photographs, read or not."""
+        for _, one in self.pictures:
+            one.light.cancel()
+        self.pictures.clear()
 
 
 class JointCycle:
@@ -197,24 +221,24 @@ class JointCycle:
         -------
             The sighting of each proven beam, and the results of the others, by heliostat.
         """
-        async with joint:
-            tell(f"{len(joint.names)} on the way")
-            await joint.go(layout.start(), self._cycle.settings.arrival)
-            taken = await self._photograph(joint, layout, empty, tell)
-            tell(f"{len(joint.names)} on the way back")
-        lost = {name: _refused(name, text) for name, text in joint.lost.items()}
-        proven, others = await self._separated(joint, layout, empty, taken, tell)
+        with _Taken.of(layout) as taken:
+            async with joint:
+                tell(f"{len(joint.names)} on the way")
+                await joint.go(layout.start(), self._cycle.settings.arrival)
+                await self._photograph(joint, layout, empty, taken, tell)
+                tell(f"{len(joint.names)} on the way back")
+            lost = {name: _refused(name, text) for name, text in joint.lost.items()}
+            proven, others = await self._separated(joint, layout, empty, taken, tell)
         return proven, lost | others
 
     async def _photograph(
-        self, joint: JointVisit, layout: Layout, empty: TargetLight, tell: Tell
-    ) -> _Taken:
+        self, joint: JointVisit, layout: Layout, empty: TargetLight, taken: _Taken, tell: Tell
+    ) -> None:
         """Take the stack. When a heliostat drops out, a whole turn of the codes begins anew."""
         needed = len(layout.moves)
-        taken = _Taken(deque(maxlen=needed))
         while len(taken.pictures) < needed:
             if await joint.leave():
-                taken.pictures.clear()
+                taken.forget()
             if not joint.visits:
                 why = next(iter(joint.lost.values()), "")
                 raise RefusedError(f"joint visit to {layout.target.name}: nobody is left; {why}")
@@ -228,7 +252,7 @@ class JointCycle:
             await joint.aim(layout.points(number))
             begin = self._plant.now()
             await self._settled(joint, begin + self.settings.settle)
-            picture = await self._light(joint, layout, empty)
+            picture = await self._exposed(joint, layout, empty, taken)
             joint.drop(joint.missing(states.TRACKING))
             taken.count += 1
             if len(taken.pictures) == needed // 2:
@@ -236,23 +260,33 @@ class JointCycle:
             taken.still.append((begin + 0.5 * self.settings.settle, picture.at, number))
             taken.pictures.append((number, picture))
             if joint.astray:
-                taken.pictures.clear()
-        return taken
+                taken.forget()
 
     async def _settled(self, joint: JointVisit, until: float) -> None:
         while self._plant.now() < until:
             await joint.look()
 
-    async def _light(self, joint: JointVisit, layout: Layout, empty: TargetLight) -> TargetLight:
-        """Photograph the target, and go on noting step counts meanwhile."""
-        return await noting(joint.look, self._camera.light(layout.target, empty.view))
+    async def _exposed(
+        self, joint: JointVisit, layout: Layout, empty: TargetLight, taken: _Taken
+    ) -> Exposed:
+        """Photograph the target, and go on noting step counts meanwhile.
+
+        Few photographs wait to be read, so that one which cannot be read ends the visit soon.
+        """
+
+        async def exposed() -> Exposed:
+            if len(taken.pictures) >= _UNREAD:
+                await asyncio.shield(taken.pictures[-_UNREAD][1].light)
+            return await self._camera.expose(layout.target, empty.view)
+
+        return await noting(joint.look, exposed())
 
     async def _separated(
         self, joint: JointVisit, layout: Layout, empty: TargetLight, taken: _Taken, tell: Tell
     ) -> tuple[dict[str, Photographs], dict[str, CycleResult]]:
         """Take a stack apart into sightings of proven beams, and results of the others."""
         chosen = [layout.names.index(name) for name in joint.names]
-        pictures = list(taken.pictures)
+        pictures = await taken.read()
         moves = layout.moves[[number for number, _ in pictures]][:, chosen]
         beams = [layout.beams[i] for i in chosen]
         tell("taking the beams apart")

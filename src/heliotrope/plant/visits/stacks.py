@@ -88,8 +88,35 @@ def stack_of(pictures: Sequence[TargetLight], empty: TargetLight) -> Stack:
     )
 
 
+@dataclass(frozen=True)
+class Exposed:
+    """A photograph that has been taken, and is read while the beams move on.
+
+    Attributes
+    ----------
+    at
+        Middle of the exposure, s of the plant's monotonic clock.
+    light
+        Gives the light on the target, or raises why there is none.
+    """
+
+    at: float
+    light: "asyncio.Future[TargetLight]"
+
+    @classmethod
+    def read(cls, light: TargetLight) -> "Exposed":
+        """Return a photograph that is read already."""
+        done: asyncio.Future[TargetLight] = asyncio.get_running_loop().create_future()
+        done.set_result(light)
+        return cls(light.at, done)
+
+
 class StackCamera(TargetCamera, Protocol):
     """A camera that gives the light on targets, and a place for computations."""
+
+    async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
+        """Photograph a target as `light` does; return as soon as the photograph is taken."""
+        ...
 
     async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
         """Photograph a target; with the view of an earlier photograph it is not searched for."""

@@ -44,19 +44,14 @@ from heliotrope.plant.ports import Ports
 from heliotrope.plant.settings import clusters_of
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import Records
-from heliotrope.twin.cameras import (
-    ExactCamera,
-    FieldSnapshot,
-    Optics,
-    RenderedCamera,
-    TrueMirror,
-    mirrors_near,
-)
+from heliotrope.twin.cameras import ExactCamera, FieldSnapshot, RenderedCamera
+from heliotrope.twin.drawing import Optics
 from heliotrope.twin.field.field import Field
 from heliotrope.twin.field.field_bus import FieldBus
 from heliotrope.twin.live.boards import BoardField, key_of
 from heliotrope.twin.live.near_link import NearLink, near_pair
 from heliotrope.twin.sensors import FluxSensor
+from heliotrope.twin.true_mirrors import TrueMirror, mirrors_near
 
 #: Tick of the field, and period at which the true sun is computed, s.
 _TICK, _SUN_EVERY = 0.05, 5.0
@@ -96,7 +91,7 @@ class WorldOptions:
 
     seed: int = 0
     rendered: bool = True
-    threads: int = 1
+    threads: int = 2
     installed: Callable[[Mechanism], Mechanism] | None = None
     boards: bool = False
     centroid: float = 1e-5

@@ -35,7 +35,7 @@ from heliotrope.twin.boards.outfit import (
     Outfit,
     outfits,
 )
-from heliotrope.twin.cameras import FieldSnapshot, mirrors_of
+from heliotrope.twin.cameras import FieldSnapshot
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
@@ -44,6 +44,7 @@ from heliotrope.twin.invariants.quiet import QuietObserver
 from heliotrope.twin.invariants.sensors import SensorObserver
 from heliotrope.twin.invariants.visits import VisitObserver
 from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
+from heliotrope.twin.true_mirrors import mirrors_of
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.damage import Damage
 from heliotrope.twin.world.design import design_of, wanted_of

@@ -1,0 +1,203 @@
+"""Photographs of a simulated field, drawn in a process beside the plant.
+
+A photograph of a hundred beams takes a second of a processor. Drawn in the process of the plant and
+its field it would wait for their event loop, and they for it.
+"""
+
+import multiprocessing
+import signal
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+
+import numpy as np
+
+from heliotrope.errors import FetchError, HeliotropeError, InputError
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.synthetic.rendering import render
+from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
+from heliotrope.optics import reflected_beam
+from heliotrope.twin.true_mirrors import NEAR, TrueMirror, within
+
+#: Least share of a mirror that is left by its neighbours for a beam to be drawn, and the elements
+#: along a side of the mirror by which it is found.
+LEAST, _COARSE = 0.05, 6
+#: Brightest reading after exposure, as a share of full scale.
+PEAK = 0.7
+#: Time in which the process ends, s.
+_ENDS = 5.0
+
+
+@dataclass(frozen=True)
+class Optics:
+    """Quality of the mirrors and strength of the light.
+
+    Attributes
+    ----------
+    slope_error
+        Standard deviation of the mirrors' normals per axis, rad.
+    dni
+        W/m².
+    reflectivity
+        Share, 0 to 1.
+    facets
+        Columns and rows, canted at the slant range.
+    """
+
+    slope_error: float = 1e-3
+    dni: float = 850.0
+    reflectivity: float = 0.9
+    facets: tuple[int, int] = (2, 2)
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """All that a photograph shows.
+
+    Attributes
+    ----------
+    scene
+        One target, without beams.
+    mirrors, sun
+        True mirrors whose light may be on it, and the unit vector to the sun, (3,).
+    optics
+        Mirrors and light.
+    seed
+        Seed of the sensor's noise.
+    title, time
+        Name and time of the frame.
+    """
+
+    scene: Scene
+    mirrors: tuple[TrueMirror, ...]
+    sun: FloatArray
+    optics: Optics
+    seed: int
+    title: str
+    time: datetime
+
+    def draw(self) -> Frame:
+        """Return the frame; the brightest of paint and beams sets the exposure."""
+        beams = thrown(self.scene.targets[0], self.mirrors, self.sun, self.optics)
+        lit = exposed(replace(self.scene, beams=beams), PEAK)
+        return render(lit, self.seed, name=self.title, time=self.time).frame
+
+
+class Drawer:
+    """A process that draws photographs; it may be asked by several threads.
+
+    It begins with the first photograph, or by `start`, and anew after one in which it died.
+    """
+
+    def __init__(self) -> None:
+        self._mine = threading.Lock()
+        self._process: SpawnProcess | None = None
+        self._line: Connection | None = None
+
+    def start(self) -> None:
+        """Begin the process, which takes some seconds until its first photograph."""
+        with self._mine:
+            self._begun()
+
+    def draw(self, exposure: Exposure) -> Frame:
+        """Return the frame of an exposure.
+
+        Raises
+        ------
+        FetchError
+            The process has died.
+        InputError
+            As drawing raises it.
+        """
+        with self._mine:
+            line = self._begun()
+            try:
+                line.send(exposure)
+                found = line.recv()
+            except (EOFError, OSError) as error:
+                self._end()
+                raise FetchError(
+                    f"{exposure.title}: the process that draws photographs has ended; "
+                    "the next photograph begins another"
+                ) from error
+        if isinstance(found, str):
+            raise InputError(found)
+        assert isinstance(found, Frame)
+        return found
+
+    def close(self) -> None:
+        """End the process, when it has drawn what it was asked for."""
+        with self._mine:
+            self._end()
+
+    def _begun(self) -> Connection:
+        if self._line is None:
+            context = multiprocessing.get_context("spawn")
+            self._line, far = context.Pipe()
+            self._process = context.Process(target=_drawing, args=(far,), daemon=True)
+            self._process.start()
+            # The process alone holds its end now, so that its death is seen, and ours by it.
+            far.close()
+        return self._line
+
+    def _end(self) -> None:
+        line, process = self._line, self._process
+        self._line = self._process = None
+        if line is None or process is None:
+            return
+        line.close()
+        process.join(_ENDS)
+        if process.is_alive():
+            process.kill()
+
+
+def _drawing(line: Connection) -> None:
+    """Draw what comes over a line until it is closed."""
+    # Ctrl-C in the plant's terminal is the plant's.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    while True:
+        try:
+            exposure: Exposure = line.recv()
+        except (EOFError, OSError):
+            return
+        found: Frame | str
+        try:
+            found = exposure.draw()
+        except HeliotropeError as error:
+            found = str(error)
+        line.send(found)
+
+
+def thrown(
+    target: Target, mirrors: Sequence[TrueMirror], sun: FloatArray, optics: Optics
+) -> tuple[Thrown, ...]:
+    """Return the beams of mirrors on a target, and near enough beside it."""
+    found = []
+    for mirror in mirrors:
+        if not within(target, mirror.on(target, sun), NEAR):
+            continue
+        if mirror.lit(target, sun, _COARSE)[1] < LEAST:
+            continue
+        # Facets are canted at the distance of the target, wherever the mirror looks.
+        slant = float(np.linalg.norm(target.center - mirror.vertex))
+        beam = reflected_beam(
+            target,
+            mirror.vertex,
+            sun,
+            mirror.width,
+            mirror.height,
+            normal=mirror.normal,
+            facets=optics.facets,
+            focal=slant,
+            slope_error=optics.slope_error,
+            reflectivity=optics.reflectivity,
+            dni=optics.dni,
+            neighbours=mirror.neighbours,
+        )
+        found.append(Thrown(target.name, beam))
+    return tuple(found)

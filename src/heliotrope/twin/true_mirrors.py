@@ -1,0 +1,152 @@
+"""True mirrors of a simulated field, as its cameras see them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray, reflect
+from heliotrope.optics import Neighbours, centroid_shift, equal_facets
+from heliotrope.twin.boards.board import Board
+
+#: Light further from the centre of a target than this many of its half diagonals is left out.
+NEAR = 2.0
+#: Cosine of the incidence below which the light of a mirror is not worth drawing.
+GRAZING = 0.05
+#: Elements along a side of a mirror by which its hidden part is found.
+_ELEMENTS = 24
+
+
+@dataclass(frozen=True)
+class TrueMirror:
+    """True position and size of one mirror.
+
+    Attributes
+    ----------
+    heliostat
+        Name.
+    vertex
+        ENU, m, (3,).
+    normal
+        Unit normal, (3,).
+    width, height
+        m.
+    neighbours
+        Mirrors that may shade or block it; None: none does.
+    """
+
+    heliostat: str
+    vertex: FloatArray
+    normal: FloatArray
+    width: float = 3.0
+    height: float = 2.0
+    neighbours: Neighbours | None = None
+
+    def lit(
+        self, target: Target, sun: FloatArray, elements: int = _ELEMENTS
+    ) -> tuple[FloatArray, float]:
+        """Return where its centroid is on the plane of a target, ENU, m, (3,), and its lit share.
+
+        NaN and 0 if neighbours hide all of it. Its facets are canted at the target's distance, and
+        the mirror is divided into the square of a number of elements.
+        """
+        point = self.on(target, sun)
+        if self.neighbours is None or not np.isfinite(point).all():
+            return point, 1.0
+        slant = float(np.linalg.norm(point - self.vertex))
+        facets = equal_facets(self.width, self.height, (1, 1), slant)
+        found = centroid_shift(
+            target,
+            self.vertex,
+            sun,
+            self.normal,
+            facets,
+            self.neighbours,
+            facet_focal=slant,
+            elements=elements,
+        )
+        return point + found.shift @ target.axes, 1.0 - found.hidden
+
+    def on(self, target: Target, sun: FloatArray) -> FloatArray:
+        """Return where its ray meets the plane of a target, ENU, m, (3,); NaN if it does not."""
+        if not float(self.normal @ sun) > GRAZING:
+            return np.full(3, np.nan)
+        return target.intersect(self.vertex, reflect(sun, self.normal))
+
+
+def mirrors_of(
+    boards: Mapping[str, Board], width: float = 3.0, height: float = 2.0
+) -> Callable[[], Sequence[TrueMirror]]:
+    """Return a function that gives the mirrors of boards, by name, all of one size in m."""
+
+    def mirrors() -> Sequence[TrueMirror]:
+        return [TrueMirror(name, *board.mirror(), width, height) for name, board in boards.items()]
+
+    return mirrors
+
+
+def mirrors_near(
+    target: Target,
+    sun: FloatArray,
+    stand: tuple[FloatArray, FloatArray],
+    names: tuple[str, ...],
+    sizes: FloatArray,
+    reach: float = NEAR,
+    beside: npt.NDArray[np.intp] | None = None,
+) -> list[TrueMirror]:
+    """Return the mirrors whose rays meet the plane of a target near its centre.
+
+    Parameters
+    ----------
+    target
+        Its corners and normal count.
+    sun
+        Unit vector to the sun, (3,).
+    stand
+        Unit normals and vertices of N mirrors, (N, 3) each.
+    names
+        Heliostats, N.
+    sizes
+        Width and height of the mirrors, m, (N, 2).
+    reach
+        Largest distance from the centre, in half diagonals of the target.
+    beside
+        Rows of the neighbours of each mirror, (N, J); None: they hide nothing.
+    """
+    middle = np.asarray(target.corners).mean(axis=0)
+    limit = reach * 0.5 * float(np.hypot(target.width, target.height))
+    facing, vertex = stand
+    cosine = facing @ sun
+    rays = 2.0 * cosine[:, None] * facing - sun
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = ((middle - vertex) @ target.normal) / (rays @ target.normal)
+    away = np.linalg.norm(vertex + along[:, None] * rays - middle, axis=-1)
+    hits = np.flatnonzero((cosine > GRAZING) & (along > 0.0) & (away <= limit)).tolist()
+    found = []
+    for i in hits:
+        size = float(sizes[i, 0]), float(sizes[i, 1])
+        hiding = None
+        if beside is not None and beside.shape[1]:
+            near = beside[i]
+            others = Neighbours(vertex[near], facing[near], *sizes[near].T)
+            hides = others.before(vertex[i], facing[i], size, sun, rays[i])
+            hiding = others.of(hides) if hides.any() else None
+        found.append(TrueMirror(names[i], vertex[i], facing[i], *size, hiding))
+    return found
+
+
+def within(target: Target, point: FloatArray, share: float = 0.0) -> bool:
+    """Return whether a point is on a target, or within a share of its half diagonal."""
+    if not np.isfinite(point).all():
+        return False
+    away = np.abs(target.plane_coordinates(point) - target.plane_coordinates(_middle(target)))
+    half = 0.5 * np.array([target.width, target.height])
+    if share > 0.0:
+        return bool(np.linalg.norm(away) <= share * np.linalg.norm(half))
+    return bool((away <= half).all())
+
+
+def _middle(target: Target) -> FloatArray:
+    return np.asarray(target.corners.mean(axis=0))
