@@ -162,6 +162,37 @@ def test_a_lost_answer_is_asked_for_again_and_nothing_acts_twice() -> None:
     run(main, "IDLE", bus=interrupted)
 
 
+def test_the_haste_of_an_emergency_ends_with_it() -> None:
+    """While one waits nothing is repeated; afterwards a lost answer is asked for at once again."""
+
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        await field.emergency("off", "DEFOCUS", "A2")
+        assert await final(field, "off", "A2") is Stage.DONE
+        field.bus.lose("JOG", 2)
+        await field.order("jog", "JOG", 0.0, 500.0, heliostats=("A1",))
+        await field.until(lambda: Stage.ACKNOWLEDGED in field.plant.stages("jog", "A1"), 0.9)
+        assert len(field.bus.lost) == 2
+
+    run(main, "IDLE", bus=interrupted)
+
+
+def test_who_answers_everything_but_an_emergency_is_asked_for_it_once_a_second() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        field.bus.lose("DEFOCUS", 1000)
+        await field.emergency("off", "DEFOCUS", "A2")
+        await asyncio.sleep(4.0)
+        before = len(field.bus.lost)
+        assert before >= 5, "three times at once, and each second"
+        await asyncio.sleep(10.0)
+        assert 9 <= len(field.bus.lost) - before <= 11
+        field.bus.left = 0
+        await field.until(lambda: Stage.ACKNOWLEDGED in field.plant.stages("off", "A2"), 2.0)
+
+    run(main, "TRACKING", bus=interrupted)
+
+
 @pytest.mark.parametrize("lost", [0, 1, 2])
 @pytest.mark.parametrize("steps", [500.0, -30.0, 3.0])
 def test_a_jog_is_done_only_if_the_counts_go_elsewhere(lost: int, steps: float) -> None:

@@ -167,6 +167,18 @@ def test_the_near_field_is_left_to_newton() -> None:
     assert met > 500
 
 
+def test_with_the_normal_along_the_primary_axis_its_angle_is_zero() -> None:
+    """Any angle would do there, but it must be an angle: sine and cosine are of length one."""
+    numbers = (0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0, *[0.0] * 9, 1.0, 0.0)
+    for module in (pointing, single_pointing()):
+        own = module.Pointing(numbers if module is pointing else f32(numbers))
+        own.solve(f32((0.0, 0.0, 1.0)), f32((0.0, 0.0, 80.0)), FREE, HOME)
+        for pose in own.found:
+            assert pose.status == pointing.OK
+            assert pose.angles == [0.0, pytest.approx(math.pi / 2)]
+            assert pose.residual < 1e-6
+
+
 def test_no_mirror_serves_opposite_directions() -> None:
     table = every_kind()["azimuth_elevation"].armature.table
     own = pointing.Pointing(tuple(map(float, table)))

@@ -317,6 +317,10 @@ def test_what_a_plant_shows() -> None:
         assert (one.state, one.cluster, one.on, len(one.drives)) == ("STOWED", "C1", "", 2)
         assert one.parameters["tilt_north"].sigma == pytest.approx(10 * MRAD)
         assert one.truth_error == pytest.approx(float(plant.errors()[1]), rel=0.05)
+        node = shown.plant.field.rows[1:2]
+        node["supply_mv"], node["temperature_degc"], node["boots"] = 23_850, -7, 3
+        one = shown.heliostat(shown.names[1])
+        assert (one.supply, one.temperature, one.boots) == (pytest.approx(23.85), -7.0, 3)
         light = shown.sun()
         assert light.elevation == pytest.approx(math.asin(light.direction[2]), abs=1e-6)
         assert shown.receiver_flux().power == 0.0

@@ -30,6 +30,7 @@ from heliotrope.plant import joining
 from heliotrope.plant.aims import BeamCheck, _disc
 from heliotrope.plant.assigned import rest_on
 from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.beam_watch import BeamWatch
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.leaving import defocused, turned_away, way_out
 from heliotrope.plant.operations.automatic import AutomaticSettings
@@ -605,6 +606,81 @@ def test_a_way_is_the_one_that_the_motors_go() -> None:
         took = float(ways.lasts(row, begin[None] * 1.0, end[None], turns=turns)[0])
         assert abs(took - 0.05 * ticks) < 0.3 + 0.02 * took
     assert worst < 1.5e-3
+
+
+def test_a_path_without_ramps_is_that_of_two_axes_at_their_rates() -> None:
+    """The corner is where the axis with less to do arrives."""
+    rng = np.random.default_rng(6)
+    design = gated(6)
+    name, row = design.names[0], np.array([0])
+    limits = (AxisLimits(-200_000, 200_000, 8000, 16_000, 40), AxisLimits(0, 99_000, 3000, 9000, 0))
+    machine = replace(design.machine(name), axes=limits, stow=(0, 90_000))
+    check = BeamCheck(design, design.names)
+    ways, drives = Ways(check, {name: machine}), Drive(check.drives.table[0])
+    rates = np.array([8000.0, 3000.0])
+    for _ in range(20):
+        begin = rng.uniform((-100_000.0, 20_000.0), (100_000.0, 80_000.0)).round()
+        end = (begin + rng.uniform(200.0, 20_000.0, 2) * rng.choice((-1.0, 1.0), 2)).round()
+        path = ways.motion(row, begin[None], end[None], ramps=False)[0]
+        # A goal below is reached from below: the axis goes past it first.
+        goal = end - np.where(end < begin, (40.0, 0.0), 0.0)
+        lasts = float((np.abs(goal - begin) / rates).max())
+        for time in np.linspace(0.0, lasts, 23):
+            made = np.minimum(rates * time, np.abs(goal - begin))
+            at = drives.angles(begin + np.sign(goal - begin) * made)
+            assert _apart(at, path) < 2e-5
+        np.testing.assert_allclose(path[-1], drives.angles(end), atol=1e-9)
+
+
+def test_each_leg_of_an_approach_is_proven_in_the_sun_of_its_moment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In a sun that goes ten times as fast, a proof in that of the start would be far off."""
+    design = gated(6)
+    machine = design.machine(design.names[0])
+    check, rows = BeamCheck(design, design.names), np.arange(3)
+    ways = Ways(check, dict.fromkeys(design.names, machine))
+    stow, standby = (np.tile(np.array(x, dtype=float), (3, 1)) for x in _rest(machine))
+    asked: list[tuple[Any, ...]] = []
+    poses = check.poses
+
+    def noted(*values: Any) -> Any:
+        asked.append(values)
+        return poses(*values)
+
+    def sun(ahead: float) -> FloatArray:
+        return vector(NOON.timestamp() + 10.0 * ahead, design.site)
+
+    monkeypatch.setattr(check, "poses", noted)
+    assert not ways.approach(rows, stow, standby, sun)
+    time, at = np.zeros(3), stow
+    for leg, (_, _, light, begin) in enumerate(asked):
+        if leg:
+            time = time + ways.lasts(rows, at, begin, turns=leg == 1)
+        at = begin
+        exact = np.array([sun(float(each)) for each in time])
+        assert np.linalg.norm(light - exact, axis=-1).max() < 2e-3
+    assert time.min() > 20.0
+
+
+@pytest.mark.parametrize("azimuth", [0, 1])
+def test_an_approach_leaves_stow_as_long_as_its_other_axis_stands_there(azimuth: int) -> None:
+    design = gated(6)
+    machine = replace(design.machine(design.names[0]), azimuth_axis=azimuth)
+    check, rows = BeamCheck(design, design.names), np.arange(4)
+    known: Any = design.names  # what is asked of the field is its size alone
+    stow = np.array(machine.stow, dtype=float)
+    begin = np.tile(stow, (4, 1))
+    begin[1, azimuth] += 5000.0  # on its way: the azimuth has moved
+    begin[2, 1 - azimuth] -= 5000.0  # and now the other axis has
+    end = begin + 40_000.0
+    state = np.array([states.APPROACHING] * 3 + [states.STOWING])
+    watch = BeamWatch(check, known, known, known, dict.fromkeys(design.names, machine))
+    assert list(watch._leaves_stow(rows, state, begin, end)) == [True, True, False, False]
+    # Where the place of stow is not known, a long way tells it.
+    watch = BeamWatch(check, known, known, known, {})
+    near = np.where(np.arange(4)[:, None] == 2, begin + 10.0, begin + 900_000.0)
+    assert list(watch._leaves_stow(rows, state, begin, near)) == [True, True, False, False]
 
 
 def _apart(point: FloatArray, path: FloatArray) -> float:
