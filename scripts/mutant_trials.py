@@ -50,6 +50,15 @@ HELIOSTATS = 3
 #: Tests of one mutant together, at most, s; those left over are not run. What an interpreter of
 #: its own may take before the first, s.
 MOST_TESTS, START = 10.0, 10.0
+#: Tests in other folders than the packages' own that feel what those leave: records that are kept,
+#: corners, zeros and predictions asked for over the console, and whole plants of the twin. Tests
+#: with browsers or programs of their own feel nothing here.
+BESIDE = (
+    "console/test_admission.py", "console/test_connections.py", "console/test_marking.py",
+    "console/test_outlook_page.py", "console/test_parameters.py", "console/test_zero.py",
+    "store/test_kept_alarms.py", "store/test_kept_audit.py",
+    "twin/test_live.py", "twin/test_parts.py",
+)  # fmt: skip
 #: Tests that run the code in another interpreter, where no mutant is.
 ELSEWHERE = ("--ignore-glob=*micropython*",)
 #: Time of the processor after which a test or a run hangs: this and so much more than it takes
@@ -61,8 +70,8 @@ OPTIONS = ("-q", "-s", "-m", "not slow", "-p", "no:cacheprovider", "-p", "no:ter
 
 
 def folders() -> list[str]:
-    """Return the folders of the unit tests."""
-    return [str(ROOT / "tests" / package) for package in operators.PACKAGES]
+    """Return the folders and files of the unit tests."""
+    return [str(ROOT / "tests" / each) for each in (*operators.PACKAGES, *BESIDE)]
 
 
 def _file(test: str) -> str:
@@ -586,6 +595,8 @@ def try_all(
     """Try mutants; see `Bench`."""
     bench = Bench(sample, todo, kept, processes, end, keep)
     os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+    # Tests that compute as they are imported would start threads, which a fork does not have.
+    os.environ["HELIOTROPE_THREADS"] = "1"
     pytest.main([*OPTIONS, *ELSEWHERE, *folders()], plugins=[bench])
 
 

@@ -43,6 +43,10 @@ def mutants(scripts: Any) -> Any:
     return scripts.mutant_operators
 
 
+def test_the_tests_of_mutants_are_where_they_are_looked_for(scripts: Any) -> None:
+    assert all(Path(each).exists() for each in scripts.mutant_trials.folders())
+
+
 def test_each_change_is_made_once_and_alone(mutants: Any) -> None:
     found = mutants.mutants_of("a.py", SOURCE)
     words = sorted(each.change for each in found)

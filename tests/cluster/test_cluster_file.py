@@ -123,6 +123,7 @@ def test_what_is_wrong_in_the_file_is_named(folder: Path, old: str, new: str, te
         ('plant = "00', 'plant = 5 # "00', "plant: a key of 0 characters"),
         ('plant = "00', 'plaint = "00', "'plaint' is not known"),
         ("[heliostats]\n", "", "'AA1' is not known"),
+        ("[heliostats]\n", "password = 3\n[heliostats]\n", "password must be a text, and"),
         ("[heliostats]\n", "heliostats = 3\n[password]\n", "password must be a text, and"),
     ],
 )

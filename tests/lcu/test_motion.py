@@ -1,9 +1,12 @@
 """Motion of the two axes: the goals between the poses that are computed."""
 
 import numpy as np
+import pytest
 
 from heliotrope.geometry import angle_between
-from support.lcu_machines import Bench, tracking
+from heliotrope.lcu.journal import Journal
+from heliotrope.lcu.messages import DONE
+from support.lcu_machines import Bench, Flash, items_of_heliostat, standing_by, tracking
 
 #: A step of either axis, rad.
 STEP = 3.3e-6
@@ -51,3 +54,48 @@ def test_beside_the_keyhole_the_goals_do_not_take_a_short_cut() -> None:
     motion.aim = beside_the_keyhole(bench)
     motion.track()
     assert worst_goal(bench, 4.0) < 2 * STEP + 0.2 * 0.5 * 7.3e-5
+
+
+def lacking(*names: str, known: bool) -> Bench:
+    """A bench whose heliostat stood where it had tracked when its board lost settings."""
+    before = tracking()
+    flash, items = Flash(), items_of_heliostat(before.machine)
+    for name in names:
+        del items[name]
+    journal = Journal(flash)
+    journal.load()
+    journal.store(items)
+    if known:
+        journal.zero(*before.made)
+    return Bench(flash)
+
+
+@pytest.mark.parametrize("name", ["stow", "armature"])
+def test_a_board_that_lacks_settings_turns_away_as_far_as_those_allow(name: str) -> None:
+    bench = lacking(name, known=True)
+    begin = list(bench.made)
+    bench.run(20)
+    assert bench.state == "UNCONFIGURED"
+    assert np.abs(np.subtract(bench.made, begin)) == pytest.approx([30558, 15279], rel=2e-3)
+
+
+def test_a_board_that_lacks_settings_and_its_counts_does_not_move_by_itself() -> None:
+    bench = lacking("stow", known=False)
+    begin = list(bench.made)
+    bench.run(20)
+    assert bench.made == begin
+
+
+def test_stow_stops_a_motion_by_hand_before_its_end() -> None:
+    bench = standing_by()
+    first, second = bench.made
+    assert bench.order("GOTO", first + 200_000, second) == DONE
+    bench.run(3)
+    at = furthest = bench.made[0]
+    assert bench.order("STOW") == DONE
+    for _ in range(100):
+        bench.run(0.1)
+        furthest = max(furthest, bench.made[0])
+    assert furthest - at <= 8000**2 / (2 * 16_000) + 0.3 * 8000, "half a second, and the lead"
+    bench.run(240, until="STOWED")
+    assert bench.state == "STOWED"

@@ -80,6 +80,8 @@ def test_pauses_double_to_their_limit_and_begin_anew() -> None:
         ({"period": 1.0, "deadline": 1.5}, "must be at least twice the period"),
         ({"first_pause": 3.0}, "not above the longest"),
         ({"capacity": 0}, "capacity 0"),
+        ({"largest": 0}, "largest message 0 bytes"),
+        ({"horizon": 0.0}, "horizon 0.0 s"),
         ({"horizon": 9000.0}, "horizon 9000.0 s"),
     ],
 )
@@ -88,6 +90,11 @@ def test_settings_that_contradict_each_other_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=text):
         LinkSettings(**values)  # type: ignore[arg-type]
+
+
+def test_the_smallest_and_the_largest_settings_are_taken() -> None:
+    for values in ({"capacity": 1, "largest": 1}, {"horizon": 4000.0}, {"deadline": 1.0}):
+        LinkSettings(period=0.5, **values)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
