@@ -152,7 +152,7 @@ def test_those_of_a_joint_visit_are_kept_once_with_the_result_of_each(tmp_path: 
     # A visit of its own stands among them, in the order of time.
     visit(again, "A", NOW + 20.5)
     assert [row.at for row in listed(again, "A", 20)][19:] == [NOW + 20.5]
-    # A visit without photographs, as on a receiver, keeps nothing.
+    # A visit without photographs keeps nothing.
     again.conclude_together("right", [entry("A", NOW + 90.0)])
     assert len(listed(again, "A")) == 33
 

@@ -8,6 +8,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,7 +29,9 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.production import ProductionVisits
+from heliotrope.plant.operations.views import PictureRow
 from heliotrope.plant.visits import CalibrationCycle, Centring, CycleResult, Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle, judged
 from support.live import LiveOptions, LivePlant
@@ -74,6 +77,7 @@ def production(
     *,
     rendered: bool = False,
     least: int = 8,
+    pictures: Pictures | None = None,
 ) -> None:
     """Play a scene in virtual time: the beams stand about the middle of the receiver."""
 
@@ -85,7 +89,7 @@ def production(
             work=AutomaticSettings(wanted=True, calibrate=False),
             cycle=CYCLE,
         )
-        live = LivePlant(design_of(count, least=least), clock, options)
+        live = LivePlant(design_of(count, least=least), clock, options, pictures=pictures)
         plant = live.plant
         async with live.running():
             try:
@@ -310,7 +314,9 @@ def test_a_movement_is_refused_that_leaves_the_receiver_or_its_neighbourhood() -
     production(scene, 2)
 
 
-def test_automatic_control_measures_those_that_track_the_receiver() -> None:
+def test_automatic_control_measures_those_that_track_the_receiver(tmp_path: Path) -> None:
+    pictures = Pictures(tmp_path)
+
     async def scene(here: Scene) -> None:
         plant, operations, names = here.live.plant, here.live.operations, here.names
         plant.release_authority(ENGINEER, here.token)
@@ -337,8 +343,18 @@ def test_automatic_control_measures_those_that_track_the_receiver() -> None:
         await here.until(lambda: len(told()) > 1, 1200.0)
         assert all(plant.beliefs.count(name) for name in names)
         operations.automatic.switch(on=False)
+        # The last photographs are kept once; each of the heliostats finds them with its own result.
+        kept: list[list[PictureRow]] = []
+        for name in names[2:5]:
+            pictures.find(name, 100, kept.append)  # type: ignore[arg-type]
+        one, *others = ([row for row in rows if row.target == "receiver"] for rows in kept)
+        assert len(one) >= 8
+        assert {(row.heliostat, row.outcome, row.used) for row in one} == {
+            (names[2], "calibrated", True)
+        }
+        assert all({r.identity for r in rows} >= {r.identity for r in one} for rows in others)
 
-    production(scene, least=1)
+    production(scene, least=1, pictures=pictures)
 
 
 class Rows(SimpleNamespace):

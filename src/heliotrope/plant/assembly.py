@@ -136,7 +136,7 @@ class PlantAssembly:
             if design.joint_visits is not None:
                 joint = JointCycle(self.plant, eye, cycle, design.joint_visits)
             if design.receiver_visits is not None:
-                receiver = ReceiverCycle(self.plant, cameras, cycle, design.receiver_visits)
+                receiver = ReceiverCycle(self.plant, eye, cycle, design.receiver_visits)
         self.schedule = None if cycle is None else self._schedule(cycle)
         self.operations = Operations(
             self.plant,
