@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from heliotrope.calibration.record import CalibrationOutcome
-from heliotrope.errors import InputError
+from heliotrope.errors import FetchError, InputError
 from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import bisector, reflect
@@ -25,6 +25,8 @@ from support.visit_scene import START, believe
 CYCLE = CycleSettings(least=3, sigma=2e-4)
 #: Scale of the errors of a quick installation.
 ROUGH = 0.5
+#: Light on a target that three of six beams exceed, suns.
+DIM = 2.6
 _CALIBRATED, _NOT_VERIFIED = CalibrationOutcome.CALIBRATED, CalibrationOutcome.NOT_VERIFIED
 
 
@@ -83,6 +85,51 @@ def test_new_mirrors_are_calibrated_and_verified_together() -> None:
         assert first[0] == "photograph 1 of 8, 6 beams"
         assert second[0] == "verification: photograph 1 of 8, 5 beams"
         assert here.lit() == [stuck]
+
+    joint(scene, installed=ROUGH, cycle=CYCLE)
+
+
+def test_those_that_would_dazzle_are_verified_by_further_stacks() -> None:
+    async def scene(here: Scene) -> None:
+        def during(stage: str) -> None:
+            if stage.startswith("learning"):
+                here.cycle.settings = replace(here.cycle.settings, brightest=DIM)
+
+        here.during = during
+        results = await here.run()
+        verified = [stage for stage in here.stages if "photograph 1 of" in stage][1:]
+        beams = [int(stage.split()[-2]) for stage in verified]
+        assert len(beams) > 1
+        assert sum(beams) == len(here.names), "each once"
+        assert {r.outcome for r in results.values()} == {_CALIBRATED}, results
+        assert all(r.new == 2 for r in results.values()), "seen, and verified"
+
+    joint(scene, installed=ROUGH, cycle=CYCLE)
+
+
+def test_a_stack_that_cannot_be_taken_leaves_the_confirmed_of_the_one_before() -> None:
+    async def scene(here: Scene) -> None:
+        real, second = here.live.cameras.light, []
+
+        def during(stage: str) -> None:
+            if stage.startswith("learning"):
+                here.cycle.settings = replace(here.cycle.settings, brightest=DIM)
+            if stage.startswith("verification: photograph 1 "):
+                second.append(stage)
+
+        async def blind(*given: object) -> object:
+            if len(second) > 1:
+                raise FetchError("camera left: no frame for 15 s")
+            return await real(*given)  # type: ignore[arg-type]
+
+        here.during = during
+        here.live.cameras.light = blind  # type: ignore[method-assign, assignment]
+        results = await here.run()
+        good = [name for name, r in results.items() if r.outcome is _CALIBRATED]
+        assert len(good) == int(second[0].split()[-2]) < len(here.names)
+        for name in set(here.names) - set(good):
+            assert "no frame" in results[name].text
+            assert here.live.plant.beliefs.record(name) is None
 
     joint(scene, installed=ROUGH, cycle=CYCLE)
 

@@ -364,29 +364,37 @@ class JointCycle:
             waiting = await gathering.all()
             try:
                 if waiting:
-                    gathering.settle(await self._confirmed(joint, waiting, empty, seen, tell))
+                    await self._confirm(joint, gathering, waiting, empty, seen, tell)
             except HeliotropeError as error:
                 gathering.fail(error)
         return results
 
-    async def _confirmed(
+    async def _confirm(
         self,
         joint: JointVisit,
+        gathering: Gathering,
         waiting: Mapping[str, Waiting],
         empty: TargetLight,
         seen: dict[str, Photographs],
         tell: Tell,
-    ) -> dict[str, str]:
-        """Verify new parameters together; return why each is not confirmed, "" if it is.
+    ) -> None:
+        """Verify new parameters together; the sightings of the confirmed go to ``seen``.
 
-        The sightings of those that are confirmed go to ``seen``. Those that other light hid come
-        once more, each with a code of its own.
+        Those that would make the target too bright have further stacks. Those that other light hid
+        come once more, each with a code of its own. Each stack settles its own, whatever becomes
+        of the next.
         """
-        problems, again = await self._verified(joint, waiting, tuple(waiting), empty, seen, tell)
-        if again:
-            more = await self._verified(joint, waiting, again, empty, seen, tell, own=True)
-            problems |= more[0]
-        return problems
+        waits, own = tuple(waiting), False
+        while waits:
+            hidden: list[str] = []
+            while waits:
+                problems, again, waits = await self._verified(
+                    joint, waiting, waits, empty, seen, tell, own=own
+                )
+                hidden += () if own else again
+                left = {name: why for name, why in problems.items() if name not in hidden}
+                gathering.settle(left)
+            waits, own = tuple(hidden), True
 
     async def _verified(
         self,
@@ -397,13 +405,21 @@ class JointCycle:
         seen: dict[str, Photographs],
         tell: Tell,
         *,
-        own: bool = False,
-    ) -> tuple[dict[str, str], list[str]]:
-        """Take one stack of a verification; return problems, and who may come once more."""
+        own: bool,
+    ) -> tuple[dict[str, str], list[str], tuple[str, ...]]:
+        """Take one stack of a verification.
+
+        Returns
+        -------
+            Why each is not confirmed, "" if it is; those that may come once more; and those that
+            wait for another stack.
+        """
         plant, target = self._plant, joint.target
         sun = plant.sun_vector()
         errors = {name: _error(waiting[name], sun, target) for name in names}
-        layout, problems = verifying(plant, target, errors, self.settings, own=own)
+        layout, problems, waits = verifying(plant, target, errors, self.settings, own=own)
+        if not layout.names:
+            return problems, [], waits
         again = JointVisit(plant, joint.person, joint.token, layout.names, target)
         again.drop(
             {
@@ -424,7 +440,8 @@ class JointCycle:
             problems[name] = problem
             if not problem:
                 seen[name] = photographs
-        return problems, [name for name, one in others.items() if one.verdict in _AGAIN]
+        hidden = [name for name, one in others.items() if one.verdict in _AGAIN]
+        return problems, hidden, waits
 
     async def _learnt(
         self,

@@ -165,7 +165,9 @@ def arranged(
     for name in list(known)[settings.most :]:
         wrong[name] = f"{settings.most} heliostats are on {target.name} already"
         del known[name]
-    places = _darkened(target, known, settings, wrong)
+    places, dazzling = _darkened(target, known, settings)
+    too_bright = f"the light on {target.name} would exceed {settings.brightest:g} suns"
+    wrong |= dict.fromkeys(dazzling, too_bright)
     code = _shared(known, places, along=None)
     return coded(target, known, places, code, settings.movement), wrong
 
@@ -177,8 +179,11 @@ def verifying(
     settings: JointSettings,
     *,
     own: bool = False,
-) -> tuple[Layout, dict[str, str]]:
-    """Return the layout of a joint verification, and why some heliostats have no place in it.
+) -> tuple[Layout, dict[str, str], tuple[str, ...]]:
+    """Return the layout of a joint verification.
+
+    With it, why some heliostats have no place on the target, and those that would make it too
+    bright: they can be verified by another stack.
 
     Parameters
     ----------
@@ -197,25 +202,23 @@ def verifying(
             wrong[name] = found
         else:
             known[name] = found
-    places = _darkened(target, known, settings, wrong)
+    places, dazzling = _darkened(target, known, settings)
     code = np.arange(len(known)) if own else _shared(known, places, along=_UP)
-    return coded(target, known, places, code, settings.movement, along=_UP), wrong
+    return coded(target, known, places, code, settings.movement, along=_UP), wrong, dazzling
 
 
 def _darkened(
-    target: Target,
-    known: dict[str, SentBeam],
-    settings: JointSettings,
-    wrong: dict[str, str],
-) -> FloatArray:
-    """Return places; those that make the target too bright go from the known to the wrong ones."""
+    target: Target, known: dict[str, SentBeam], settings: JointSettings
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return places, and the beams that make the target too bright; these are known no more."""
+    dazzling: list[str] = []
     while known:
         places = _places(target, known)
         if not (over := _too_bright(known, places, settings.brightest)):
-            return places
-        wrong[over] = f"the light on {target.name} would exceed {settings.brightest:g} suns"
+            return places, tuple(dazzling)
+        dazzling.append(over)
         del known[over]
-    return np.zeros((0, 2))
+    return np.zeros((0, 2)), tuple(dazzling)
 
 
 def _known(
