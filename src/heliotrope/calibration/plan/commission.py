@@ -453,7 +453,7 @@ class _Commissioning:
                 self.seconds[name] += value
 
     def _choices(self, sun: FloatArray, target: Target) -> _Choices:
-        terms, square = self.terms, self.field.squares()
+        terms = self.terms
         view, spread = self._seen_on(target, sun)
         seen = chance_on_target(target, self.position, self.size, spread)
         at_once = seen
@@ -469,7 +469,7 @@ class _Commissioning:
         new = late = nobody
         if terms.joint is not None:
             both = self._gains(view, terms.accuracy(together=True))
-            vague = square > terms.joint.known**2
+            vague = spread > terms.joint.known**2
             to_first = (~self.measured | vague) & (self.missed < terms.joint.tries)
             new = both * at_once * to_first if terms.joint.first else nobody
             late = np.where(self.measured & ~vague, both, 0.0)
@@ -540,14 +540,14 @@ class _Commissioning:
         if not joint or self.terms.joint is None:
             search = self.terms.look * (float(choices.looks[rows].max()) - 1.0)
             return {"photographs": self.terms.alone, "search": search, "travel": travel}
-        own = self._own(rows)
+        own = self._own(choices, rows)
         took = self.terms.joint.span(len(rows), own=own)
         return {"photographs": took, "travel": travel * (2.0 if own else 1.0)}
 
-    def _own(self, rows: Rows) -> bool:
+    def _own(self, choices: _Choices, rows: Rows) -> bool:
         """Return whether each mirror of a joint visit has a code of its own."""
         joint = self.terms.joint
-        vague = joint is not None and (self.field.squares(rows) > joint.known**2).any()
+        vague = joint is not None and (choices.spread[rows] > joint.known**2).any()
         return bool(vague or not self.measured[rows].all())
 
     def _visit(
@@ -556,7 +556,7 @@ class _Commissioning:
         first = bool((~self.measured[rows]).any())
         missed, stacks = np.zeros(len(rows), dtype=np.bool_), 1.0
         produces = j == len(self.targets)
-        own = joint and not produces and self._own(rows)
+        own = joint and not produces and self._own(choices, rows)
         if own:
             # The stack that verifies new parameters is a sighting, too.
             missed, stacks = self._misses(choices.seen[rows]), 2.0

@@ -26,7 +26,7 @@ _SHARING, _VERIFYING = 5.2, 3.6
 #: Numbers of codes.
 _CODES = (3, 7, 15, 31, 63, 127)
 #: Share of the largest expected error that automatic control allows in a later visit.
-_SURE = 0.75
+_SURE = 0.95
 #: Share of the light that a mirror sends, and slope error of its surface, rad.
 _REFLECTED, _SLOPE = 0.8, 1e-3
 #: A beam keeps this many of its standard deviations from the border, and those of its place.
@@ -46,7 +46,7 @@ class JointTerms:
     first
         Mirrors of a first visit, at most; 0: each has its first visit alone.
     known
-        Expected beam error above which a mirror goes with the new ones, rad RMS.
+        Expected beam error on the target above which a mirror goes with the new ones, rad RMS.
     tries
         Joint first visits that a beam may miss before its mirror goes alone.
     step
@@ -62,7 +62,7 @@ class JointTerms:
     most: int = 49
     least: int = 4
     first: int = 63
-    known: float = _SURE * 4e-3
+    known: float = 3.7e-3
     tries: int = LOOKS
     step: float = 2.2
     beside: float = 25.0
@@ -99,7 +99,9 @@ class JointTerms:
             most=settings.most,
             least=settings.least,
             first=settings.first,
-            known=_SURE * settings.known,
+            known=float(
+                np.sqrt(max(1e-9, (_SURE * settings.known) ** 2 - 2.0 * settings.visit**2))
+            ),
             step=settings.settle + _PHOTOGRAPH,
             sigma=float(np.hypot(sigma, _CENTROID)),
             brightest=settings.brightest,

@@ -1,6 +1,7 @@
 """The calibration of every heliostat, for people: predicted and measured errors over time."""
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,7 @@ from heliotrope.calibration.record import (
     covariances_at,
 )
 from heliotrope.calibration.uncertainty import expected_error, precision
+from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.plant.controller import PlantController
@@ -90,9 +92,29 @@ class CalibrationBook:
         self._predict(list(self._plant.beliefs))
 
     def _predict(self, records: list[HeliostatCalibration]) -> None:
-        light = self._plant.sun_vector()
+        rows, error = self._expected(records, None)
+        self.error[rows] = 0.5 * error
+
+    def error_on(self, target: Target, rows: npt.NDArray[np.intp]) -> FloatArray:
+        """Return the expected errors of n beams on a target now, rad RMS (2-D), (n,).
+
+        NaN for rows of the field without a calibration, and while it is dark.
+        """
+        known = [self._plant.beliefs.record(self._plant.field.names[row]) for row in rows]
+        found = dict(zip(*self._expected([r for r in known if r], target.center), strict=True))
+        return np.array([found.get(row, np.nan) for row in rows])
+
+    def _expected(
+        self, records: Sequence[HeliostatCalibration], aim: FloatArray | None
+    ) -> tuple[npt.NDArray[np.intp], FloatArray]:
+        """Return rows of the field and beam errors there, rad RMS (2-D); none while it is dark.
+
+        Each goes to a point (3,), or to its aim in operation.
+        """
+        light, found = self._plant.sun_vector(), [np.zeros(0)]
+        where = [np.zeros(0, dtype=np.intp)]
         if not light[2] > 0.0:
-            return
+            return where[0], found[0]
         now = self._plant.clock.utc().timestamp()
         # Heliostats of one group with the same parameters are computed together.
         parts: dict[tuple[int, tuple[str, ...]], list[HeliostatCalibration]] = {}
@@ -107,8 +129,10 @@ class CalibrationBook:
             covariance = covariances_at(members, now)
             parameters = dict(zip(names, values.T, strict=True))
             mechanism = group.mechanism[places].with_parameters(parameters)
-            found = expected_error(mechanism, names, covariance, light, self._aims(rows))
-            self.error[rows] = 0.5 * found.rms
+            points = self._aims(rows) if aim is None else np.broadcast_to(aim, (len(rows), 3))
+            where.append(rows)
+            found.append(expected_error(mechanism, names, covariance, light, points).rms)
+        return np.concatenate(where), np.concatenate(found)
 
     def _aims(self, rows: npt.NDArray[np.intp]) -> FloatArray:
         names = [self._plant.field.names[row] for row in rows]

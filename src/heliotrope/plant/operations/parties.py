@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.record import CalibrationOutcome
+from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.lcu import states
 from heliotrope.plant.controller import PlantController
@@ -20,10 +21,13 @@ Mask = npt.NDArray[np.bool_]
 #: Returns the next of the ready heliostats (N,) for a target; with True others go there with it.
 Next = Callable[[str, Mask, bool], Planned | None]
 
-#: Share of the largest expected error that a heliostat may have which automatic control sends.
-_SURE = 0.75
+#: Share of the largest expected error that a heliostat may have which automatic control sends: the
+#: sun moves on until the visit begins.
+_SURE = 0.95
 #: Longest wait of a target for a joint first visit while the field is raised, s.
 _PATIENCE = 60.0
+#: Heliostats that are judged at a time, some 10 ms.
+_PART = 500
 #: Verdicts that say that something is wrong with a mirror or with what is believed of it.
 _WRONG = (Verdict.STUCK, Verdict.EXCHANGED, Verdict.ELSEWHERE)
 
@@ -94,12 +98,12 @@ class Parties:
         While others wait for their first calibration, every second visit to a target is a joint
         one at most.
         """
-        settings = self.cycle.settings
-        alone = self.alone(ready)
+        settings, able = self.cycle.settings, ready & ~self.alone(ready)
         first = ready & ~np.isfinite(self._book.calibrated_at)
-        # Few sightings on one target leave much open elsewhere: these keep a code of their own.
-        vague = ready & (2.0 * self._book.error > _SURE * settings.known)
-        new = (first | vague) & ~alone
+        error = await self._error_on(target, able & ~first)
+        limit = _SURE * settings.known
+        # Those that are known too badly on this target keep a code of their own, as new ones do.
+        new = able & (first | (error > limit))
         if settings.first and int(new.sum()) >= settings.least:
             # The targets share those that are left.
             share = -(-int(new.sum()) // len(self._plant.design.targets))
@@ -112,14 +116,26 @@ class Parties:
         if first.any() and target in self._last:
             self._last.discard(target)
             return ()
-        # The book has errors of the normal at the receiver; a beam is off by twice as much, and on
-        # the target a little more. One that has no place in the visit would count as failed.
-        known = ready & (2.0 * self._book.error <= _SURE * settings.known)
-        known &= ~alone
+        # One that has no place in the visit would count as failed.
+        known = able & (error <= limit)
         if int(known.sum()) < settings.least:
             return ()
         names = await self._several(target, known, following, settings.most)
         return names if len(names) >= settings.least else ()
+
+    async def _error_on(self, target: str, heliostats: Mask) -> FloatArray:
+        """Return the expected errors of beams on a target, as a joint visit judges them, rad, (N,).
+
+        What counts is the error where the visit is: sightings on one target leave more open on the
+        receiver.
+        """
+        again, place = 2.0 * self.cycle.settings.visit**2, self._plant.design.target(target)
+        found, rows = np.full(len(heliostats), np.nan), np.flatnonzero(heliostats)
+        for k in range(0, len(rows), _PART):
+            part = rows[k : k + _PART]
+            found[part] = np.sqrt(self._book.error_on(place, part) ** 2 + again)
+            await asyncio.sleep(0.0)
+        return found
 
     async def _several(
         self, target: str, ready: Mask, following: Next, most: int

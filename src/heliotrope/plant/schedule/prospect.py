@@ -47,7 +47,7 @@ class Party:
     mirrors
         How many were sent.
     worst
-        Largest beam error over the year that was expected of them, rad RMS (2-D).
+        Largest beam error that was expected of them on the target, rad RMS (2-D).
     seconds
         Its time.
     """

@@ -178,7 +178,7 @@ def _parties(made: Iterable[Finished]) -> Iterator[Party]:
     for _, group in groupby(made, key=lambda f: (f.visited.target, round(f.visited.ended))):
         visits = list(group)
         begin = min(f.planned.at for f in visits)
-        worst = max(f.planned.before for f in visits)
+        worst = max(f.planned.predicted for f in visits)
         yield Party(len(visits), worst, visits[0].visited.ended - begin)
 
 
