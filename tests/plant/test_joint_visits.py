@@ -37,12 +37,36 @@ from support.visit_scene import BIASES, ENGINEER, START, believe
 _CALIBRATED = CalibrationOutcome.CALIBRATED
 
 
+def rows_in_the_loop(here: Scene) -> list[int]:
+    """Return a list that grows by the rows of each solution that is computed in the loop."""
+    camera, beams = here.live.cameras, here.live.plant.beams
+    poses, beside = beams.poses, camera.beside
+    held, away = list[int](), list[None]()
+
+    async def noted(work: Any) -> Any:
+        away.append(None)
+        try:
+            return await beside(work)
+        finally:
+            away.pop()
+
+    def counted(rows: Any, *given: Any) -> Any:
+        if not away:
+            held.append(len(rows))
+        return poses(rows, *given)
+
+    camera.beside, beams.poses = noted, counted  # type: ignore[method-assign, assignment]
+    return held
+
+
 def test_mirrors_on_one_target_are_calibrated_together() -> None:
     async def scene(here: Scene) -> None:
         plant = here.live.plant
         before, aims = here.live.errors(), plant.aims.copy()
+        held = rows_in_the_loop(here)
         results = await here.run()
         assert {r.outcome for r in results.values()} == {_CALIBRATED}, results
+        assert 0 < max(held) <= len(here.names), "a stack's rows are computed beside the loop"
         assert all(r.verdict is None and r.new == 1 for r in results.values())
         await asyncio.sleep(30.0)
         after = here.live.errors()

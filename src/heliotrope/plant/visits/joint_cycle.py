@@ -306,7 +306,8 @@ class JointCycle:
                 (begin, end, layout.aims[i] + layout.moves[number, i] @ layout.target.axes)
                 for begin, end, number in taken.still
             ]
-            counts = counts_at_rest(joint.visits[name], layout.aims[i], still, _middle(pictures))
+            rest = counts_at_rest(joint.visits[name], layout.aims[i], still, _middle(pictures))
+            counts = await self._camera.beside(rest)
             if isinstance(counts, str):
                 text = f"unchanged: {counts}"
                 results[name] = CycleResult(name, CalibrationOutcome.NOT_PROVEN, text)

@@ -276,7 +276,8 @@ class ReceiverCycle:
             (begin, end, layout.aims[i] + layout.moves[number, i] @ self.face.axes)
             for begin, end, number in taken.still
         ]
-        counts = counts_at_rest(joint.visits[name], layout.aims[i], still, taken.middle)
+        rest = counts_at_rest(joint.visits[name], layout.aims[i], still, taken.middle)
+        counts = await self._camera.beside(rest)
         if isinstance(counts, str):
             return CycleResult(name, CalibrationOutcome.NOT_PROVEN, f"unchanged: {counts}")
         axes = self.face.axes

@@ -1,6 +1,6 @@
 """Step counts of a heliostat during a stack of photographs, each at a place beside one aim."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -15,8 +15,11 @@ _LEAST_ROWS = 3
 
 def counts_at_rest(
     visit: Visit, base: FloatArray, still: Iterable[tuple[float, float, FloatArray]], middle: float
-) -> FloatArray | str:
-    """Return the step counts of a heliostat at its aim without movement, (2,), or why not.
+) -> Callable[[], FloatArray | str]:
+    """Return what tells the step counts of a heliostat at its aim without movement.
+
+    It returns them, (2,), or why they are not known. It computes for some milliseconds, from what
+    is known now, and may be called in any thread.
 
     The local controller reports counts while it stands still for a photograph. They differ from
     those that the aim of the photograph asks for by what its tracking lags; the median of
@@ -41,18 +44,22 @@ def counts_at_rest(
             rows.append(int(r))
             aims.append(aim)
     if len(rows) < _LEAST_ROWS:
-        return f"its step counts were heard {len(rows)} times at its aims; {_LEAST_ROWS} needed"
-    now = plant.now()
+        few = f"its step counts were heard {len(rows)} times at its aims; {_LEAST_ROWS} needed"
+        return lambda: few
     when = [*times[rows], middle]
-    suns = np.stack([plant.sun_vector(float(at) - now) for at in when])
     heard = np.concatenate([counts[rows], counts[rows[-1:]]])
     which = np.full(len(when), visit.row, dtype=np.intp)
-    ordered = plant.beams.poses(which, np.array([*aims, base]), suns, heard).best_counts
-    rest = plant.beams.poses(which, np.tile(base, (len(when), 1)), suns, heard).best_counts
-    off = counts[rows] - ordered[:-1]
-    # Medians: a drive with play overshoots for a moment when it turns back.
-    lag = np.median(off, axis=0)
-    loose = float(np.median(np.abs(off - lag).max(axis=-1)))
-    if not loose <= _FOLLOWS * float(np.median(np.abs((ordered - rest)[:-1]).max(axis=-1))):
-        return "its step counts do not follow the movements of its aim"
-    return np.asarray(rest[-1] + lag)
+
+    def work() -> FloatArray | str:
+        suns = np.stack([plant.sun_vector(float(at) - plant.now()) for at in when])
+        ordered = plant.beams.poses(which, np.array([*aims, base]), suns, heard).best_counts
+        rest = plant.beams.poses(which, np.tile(base, (len(when), 1)), suns, heard).best_counts
+        off = heard[:-1] - ordered[:-1]
+        # Medians: a drive with play overshoots for a moment when it turns back.
+        lag = np.median(off, axis=0)
+        loose = float(np.median(np.abs(off - lag).max(axis=-1)))
+        if not loose <= _FOLLOWS * float(np.median(np.abs((ordered - rest)[:-1]).max(axis=-1))):
+            return "its step counts do not follow the movements of its aim"
+        return np.asarray(rest[-1] + lag)
+
+    return work
