@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pytest
 from benchmarks.days import Days
 
+from heliotrope.calibration.plan.receiver_terms import ReceiverTerms
 from heliotrope.errors import InputError
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
@@ -24,7 +25,7 @@ from heliotrope.plant.operations.foresight import Foresight
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.outlook import FieldPoint, Outlook, day_of, end_of_day
 from heliotrope.plant.schedule.choice import Assignment
-from heliotrope.plant.schedule.prospect import FieldProspect, terms_of
+from heliotrope.plant.schedule.prospect import FieldProspect, Shining, terms_of
 from heliotrope.plant.schedule.scheduler import (
     Comparison,
     Finished,
@@ -211,6 +212,27 @@ def test_receiver_visits_of_the_plant_are_predicted() -> None:
         return at(near, MORNING + timedelta(hours=4))[0]
 
     assert at_noon(replace(plant, receiver_visits=visits)) < 0.9 * at_noon(plant)
+
+
+def test_receiver_visits_take_the_times_that_they_took() -> None:
+    plant = replace(PLANT, receiver_visits=ReceiverSettings("camera-left", "receiver"))
+    schedule = Scheduler(plant, Settings(sigma=2e-4), now=MORNING)
+
+    def seen() -> ReceiverTerms:
+        made = schedule.prospect(MORNING, ALL, BOTH)
+        assert made is not None
+        assert made.terms.receiver is not None
+        return made.terms.receiver
+
+    usual = seen().span(10, 60)
+    for k in range(3):
+        assert seen().pace == 1.0, f"{k} visits say nothing yet"
+        schedule.shining.append(Shining(10, 60, 1.5 * usual))
+    assert seen().span(10, 60) == pytest.approx(1.5 * usual)
+    assert seen().span(30, 60) > 1.5 * usual
+    # One visit that took for ever does not end all others.
+    schedule.shining.append(Shining(10, 60, 1e5))
+    assert seen().pace == 4.0
 
 
 # --- made, kept, and followed -----------------------------------------------------------

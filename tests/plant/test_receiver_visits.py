@@ -343,6 +343,12 @@ def test_automatic_control_measures_those_that_track_the_receiver(tmp_path: Path
         await here.until(lambda: len(told()) > 1, 1200.0)
         assert all(plant.beliefs.count(name) for name in names)
         operations.automatic.switch(on=False)
+        # The prediction hears how long they took.
+        schedule = here.live.assembly.schedule
+        assert schedule is not None
+        first = schedule.scheduler.shining[0]
+        assert (first.mirrors, first.lit) == (3, len(names))
+        assert 20.0 < first.seconds < 300.0
         # The last photographs are kept once; each of the heliostats finds them with its own result.
         kept: list[list[PictureRow]] = []
         for name in names[2:5]:

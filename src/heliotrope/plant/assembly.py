@@ -318,3 +318,6 @@ class _WhereAwake:
 
     def done(self, entry: CalibrationEntry) -> None:
         self._schedule.done(entry)
+
+    def shone(self, mirrors: int, lit: int, seconds: float) -> None:
+        self._schedule.shone(mirrors, lit, seconds)

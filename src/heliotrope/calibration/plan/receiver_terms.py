@@ -43,15 +43,19 @@ class ReceiverTerms:
     sigma
         Standard deviation of a beam in each direction by all photographs of a stack, rad; measured
         in the simulated plant: 0.32 mrad RMS in both directions together.
+    pace
+        Time of a visit as a share of that of the simulated plant.
     """
 
     settings: ReceiverSettings
     face: Target
     sigma: float = 2.2e-4
+    pace: float = 1.0
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.sigma < np.inf:
-            raise InputError(f"receiver visits: sigma {self.sigma} must be above 0")
+        for name in ("sigma", "pace"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise InputError(f"receiver visits: {name} {getattr(self, name)} must be above 0")
 
     @classmethod
     def of(cls, plant: Plant, sigma: float) -> "ReceiverTerms | None":
@@ -97,7 +101,7 @@ class ReceiverTerms:
         settings = self.settings
         step = settings.settle + settings.exposures * _PHOTOGRAPH
         turns = -(-mirrors // max(1, int(settings.power * lit)))
-        return _BESIDE + step * self.photographs(mirrors) + _AWAY * turns
+        return self.pace * (_BESIDE + step * self.photographs(mirrors) + _AWAY * turns)
 
     def shining(self, position: FloatArray, aim: FloatArray) -> npt.NDArray[np.bool_]:
         """Return which mirrors would stay on the receiver with every movement, (N,).

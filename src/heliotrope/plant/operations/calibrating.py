@@ -49,6 +49,10 @@ class Scheduling(Foreseeing, Protocol):
         """Take the result of a visit."""
         ...
 
+    def shone(self, mirrors: int, lit: int, seconds: float) -> None:
+        """Take the time of a receiver visit, in which some of the mirrors lit there took part."""
+        ...
+
 
 class TrueErrors:
     """True tracking errors, known to a twin only, computed every five seconds.
@@ -253,9 +257,15 @@ class Calibrating:
         names, cycle = self._production.chosen(ready & ~self._pressing()), self._production.cycle
         if not names:
             return ()
+        begun, lit = self._now(), self._production.lit
         results = await self._together(
             names, self.receiver, lambda tell: cycle.run(person, token, names, tell)
         )
+        # One that is broken off, or came to nothing, does not tell how long a visit takes.
+        if any(result.new > 0 for result in results):
+            out = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)
+            moved = sum(result.outcome not in out for result in results)
+            self._scheduler.shone(moved, lit, self._now() - begun)
         for name in self._production.concluded(results):
             self.ask(name, "")
         return names

@@ -64,14 +64,22 @@ class ProductionVisits:
         left = [tuple(n for n in names if n not in heliostats) for names in self._asked]
         self._asked = [names for names in left if names]
 
+    @property
+    def lit(self) -> int:
+        """Number of heliostats that track the receiver."""
+        return int(self._shining().sum())
+
+    def _shining(self) -> Mask:
+        tracking = self._plant.field.among((states.TRACKING,), self._plant.now())
+        return np.asarray(tracking & self.cycle.face.holds(self._plant.aims))
+
     def chosen(self, ready: Mask) -> tuple[str, ...]:
         """Return the ready heliostats (N,) that are measured next; () if there are too few.
 
         Those that persons asked for come first, then those whose errors may be largest.
         """
         field, settings, now = self._plant.field, self.cycle.settings, self._plant.now()
-        lit = ready & field.among((states.TRACKING,), now)
-        lit &= self.cycle.face.holds(self._plant.aims)
+        lit = ready & self._shining()
         for i, names in enumerate(self._asked):
             if lit[[field.place(name) for name in names]].all():
                 del self._asked[i]

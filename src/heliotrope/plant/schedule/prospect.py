@@ -34,7 +34,7 @@ from heliotrope.sun import Site
 _SHORT, _LONG = 120.0, 600.0
 #: A visit takes at most this many times as long as the schedule expects, or the inverse.
 _MOST_PACE = 4.0
-#: Joint visits from which their true times count.
+#: Joint visits, and receiver visits, from which their true times count.
 _PARTIES = 3
 
 
@@ -57,12 +57,30 @@ class Party:
     seconds: float
 
 
+@dataclass(frozen=True)
+class Shining:
+    """A receiver visit that has ended.
+
+    Attributes
+    ----------
+    mirrors, lit
+        How many took part, and how many shone on the receiver.
+    seconds
+        Its time.
+    """
+
+    mirrors: int
+    lit: int
+    seconds: float
+
+
 def terms_of(
     settings: Settings,
     joint: JointSettings | None,
     pace: float = np.nan,
     parties: Sequence[Party] = (),
     receiver: ReceiverTerms | None = None,
+    shining: Sequence[Shining] = (),
 ) -> CommissionTerms:
     """Return the terms of a plan whose visits are those of a schedule.
 
@@ -78,6 +96,8 @@ def terms_of(
         Joint visits: once there are some, their times take the place of the expected ones.
     receiver
         Of the receiver visits; None: there are none.
+    shining
+        Receiver visits: their times count as those of joint visits do.
     """
     share = _share(pace)
     # Without a search, a beam that misses costs a whole visit.
@@ -92,7 +112,7 @@ def terms_of(
         worth=settings.worth,
         limits=settings.limits,
         joint=None if joint is None else _joint_terms(settings, joint, parties),
-        receiver=receiver,
+        receiver=None if receiver is None else _receiver_terms(receiver, shining),
     )
 
 
@@ -104,6 +124,14 @@ def _joint_terms(settings: Settings, joint: JointSettings, made: Sequence[Party]
     expected = sum(terms.span(one.mirrors, own=one.worst > terms.known) for one in made)
     share = _share(sum(one.seconds for one in made) / expected)
     return replace(terms, step=share * terms.step, beside=share * terms.beside)
+
+
+def _receiver_terms(terms: ReceiverTerms, made: Sequence[Shining]) -> ReceiverTerms:
+    """Return the receiver visits; after some of them, with their true times."""
+    if len(made) < _PARTIES:
+        return terms
+    expected = sum(terms.span(one.mirrors, one.lit) for one in made)
+    return replace(terms, pace=_share(sum(one.seconds for one in made) / expected))
 
 
 def _share(pace: float) -> float:

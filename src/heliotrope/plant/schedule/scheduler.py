@@ -29,7 +29,7 @@ from heliotrope.geometry import FloatArray, as_vectors
 from heliotrope.lcu import states as lcu_states
 from heliotrope.plant.schedule.choice import Assignment, Judge, Mask
 from heliotrope.plant.schedule.knowledge import FieldKnowledge
-from heliotrope.plant.schedule.prospect import FieldProspect, Party, terms_of
+from heliotrope.plant.schedule.prospect import FieldProspect, Party, Shining, terms_of
 from heliotrope.plant.schedule.settings import Settings, Weather
 
 #: A beam this many times as far off as expected says that its heliostat has changed.
@@ -38,6 +38,8 @@ SURPRISE = 3.0
 READY = (lcu_states.IDLE, lcu_states.TRACKING)
 #: Visits from which their true pace counts in a prediction.
 ENOUGH = 10
+#: Receiver visits to remember, some days of them.
+_SHINING = 100
 #: Finished visits to remember.
 REMEMBERED = 20_000
 #: Step of a plan while there is nothing to do, s.
@@ -220,6 +222,8 @@ class Scheduler:
         Assignments under way, by heliostat.
     finished
         The last visits, each with its assignment.
+    shining
+        The last receiver visits; they are not chosen here.
 
     Raises
     ------
@@ -247,6 +251,7 @@ class Scheduler:
         self.reason = ""
         self.running: dict[str, Assignment] = {}
         self.finished: deque[Finished] = deque(maxlen=REMEMBERED)
+        self.shining: deque[Shining] = deque(maxlen=_SHINING)
         begin, year = _unix(now), now.astimezone(UTC).year
         self._known = FieldKnowledge(design, self.settings, self.names, begin, year)
         self._judge = Judge(design, self.settings, self._known, self.names)
@@ -454,6 +459,7 @@ class Scheduler:
                 made.pace,
                 made.parties,
                 ReceiverTerms.of(self.design, self.settings.sigma),
+                tuple(self.shining),
             ),
         )
 

@@ -71,6 +71,9 @@ class _Rounds:
     def done(self, entry: CalibrationEntry) -> None:
         """Nothing to do: the next is next."""
 
+    def shone(self, mirrors: int, lit: int, seconds: float) -> None:
+        """Nothing to do: it predicts nothing."""
+
 
 class Work:
     """Automatic control of a run, made anew whenever the plant's program starts.
