@@ -13,6 +13,7 @@ import gc
 import hashlib
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -20,7 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import CodeType, FunctionType
@@ -406,11 +407,14 @@ class Bench:
         )
         function = probes.function_of(chain)
         felt, executed = self._reach.felt[mutant.key], self._reach.executed[mutant.key]
-        if not function and not probes.words(chain):
+        words = [] if function else probes.words(chain)
+        naming = self._naming([word for word in words if word.isupper()])
+        felt, executed = felt | naming, executed | naming
+        if not function and not words:
             felt = executed = self._own(mutant) | set(self._kills)
         inside = function and function not in self._at_import and self._patches(plain, new)
         if kind == "unit":
-            names, spare = self._shortest(mutant, felt & set(self._items))
+            names, spare = self._shortest(mutant, felt & set(self._items), naming)
         else:
             names = sorted(felt & set(self._kills), key=self._worth, reverse=True)
             spare = 10.0 * len(names)
@@ -431,26 +435,40 @@ class Bench:
         start = f"tests/{Path(mutant.file).parts[0]}/"
         return {name for name in self._items if name.startswith(start)}
 
-    def _shortest(self, mutant: Mutant, tests: set[str]) -> tuple[list[str], float]:
+    def _naming(self, words: Sequence[str]) -> set[str]:
+        """Return the tests of files that name a constant: they may read it without a function."""
+        if not words:
+            return set()
+        wanted = re.compile(rf"\b({'|'.join(map(re.escape, words))})\b")
+        files = {_file(name) for name in self._items}
+        good = {f for f in files if wanted.search((ROOT / f).read_text(encoding="utf-8"))}
+        return {name for name in self._items if _file(name) in good}
+
+    def _shortest(
+        self, mutant: Mutant, tests: set[str], first: Collection[str] = ()
+    ) -> tuple[list[str], float]:
         """Return tests, the shortest first, and the time that they take.
 
-        Those of a file with the module's name come before all others.
-        Of a test with parameters one comes first, and the others after all tests had their turn:
-        they mostly find the same.
+        Those of a file with the module's name, and those given as first, come before all others.
+        Of another test with parameters one comes first, and the others after all tests had their
+        turn: they mostly find the same.
         """
         seconds = self._reach.seconds
         own = f"tests/{Path(mutant.file).parts[0]}/"
         noun = Path(mutant.file).stem.strip("_")
 
+        def near(name: str) -> bool:
+            return noun in _file(name) or name in first
+
         def worth(name: str) -> float:
             far = 1.0 if own in name else 2.0
-            return seconds.get(name, 1.0) * (0.1 if noun in _file(name) else far)
+            return seconds.get(name, 1.0) * (0.1 if near(name) else far)
 
         order = sorted(tests - self._flaky, key=worth)
         turns = Counter[str]()
         turn = {}
         for name in order:
-            turn[name] = min(2, turns[name.split("[")[0]])
+            turn[name] = 0 if near(name) else min(2, turns[name.split("[")[0]])
             turns[name.split("[")[0]] += 1
         order.sort(key=lambda name: turn[name])
         chosen: list[str] = []

@@ -241,6 +241,24 @@ def test_a_new_mutant_is_measured_with_all_tests_and_a_known_one_with_new_tests(
     assert (reach.seconds, reach.executed) == ({}, {old.key: set(), new.key: set()})
 
 
+def test_tests_that_read_a_constant_themselves_come_first(scripts: Any, tmp_path: Path) -> None:
+    trials = scripts.mutant_trials
+    bench = trials.Bench([], [], tmp_path / "reach.json", 1, 0.0, print)
+    table, other = "tests/links/test_leap_seconds.py::test_a", "tests/lcu/test_wire.py::test_b"
+    bench._items = {table: None, other: None}
+    assert bench._naming(["LEAP_SECONDS"]) == {table}
+    assert bench._naming([]) == set()
+    bench._reach.seconds.update({table: 3.0, other: 1.0})
+    mutant = scripts.mutant_operators.Mutant("links/clock.py", 1, 2, "x")
+    assert bench._shortest(mutant, {table, other}, {table})[0] == [table, other]
+    assert bench._shortest(mutant, {table, other})[0] == [other, table]
+    # Of the module's own file all parameters have their turn before the tests of others.
+    own = [f"tests/lcu/test_wire.py::test_c[{n}]" for n in (1, 2)]
+    mutant = scripts.mutant_operators.Mutant("lcu/wire.py", 1, 2, "x")
+    found = bench._shortest(mutant, {table, *own})[0]
+    assert (sorted(found[:2]), found[2:]) == (own, [table])
+
+
 @pytest.mark.parametrize("most", [-1e9, 1e9])
 def test_tests_that_are_left_out_when_the_time_is_up_find_nothing(
     tmp_path: Path, most: float

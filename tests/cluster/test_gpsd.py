@@ -62,6 +62,7 @@ def gpsd() -> Iterator[GpsdProcess]:
 @pytest.mark.parametrize("size", [1, 7, 4096])
 def test_reports_are_read_however_they_are_cut(size: int) -> None:
     reader = GpsdReader()
+    assert reader.error == ""
     data = VERSION + SKY + tpv(START)
     found = [reader.feed(data[k : k + size]) for k in range(0, len(data), size)]
     assert sum(found) == 1

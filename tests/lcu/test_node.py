@@ -94,6 +94,11 @@ def test_stored_items_are_told_but_for_the_key_and_what_is_none(item: int) -> No
         assert bench.answers == [(0x0A, (item, data))]
 
 
+def test_slots_of_questions_in_the_same_instant_differ() -> None:
+    own = Bench().node
+    assert len({own._draw(5000) for _ in range(100)}) > node.HERE_SLOTS // 2
+
+
 def test_slots_are_drawn_evenly_and_by_each_for_itself() -> None:
     nodes = [
         node.Node(Flash(), Bench().motors, lambda data: None, 0, serial=serial)

@@ -111,14 +111,21 @@ def test_drawn_photographs_name_a_stuck_mirror_and_an_exchanged_pair() -> None:
 def test_one_that_is_stowed_meanwhile_drops_out_and_the_others_go_on() -> None:
     async def scene(here: Scene) -> None:
         gone, plant = here.names[4], here.live.plant
+        sent: list[str] = []
+        defocus = plant.defocus
 
         def during(stage: str) -> None:
             if stage.startswith("photograph 3 "):
                 here.during = lambda _: None
                 plant.stow("Vera", (gone,))
 
-        here.during = during
+        def noted(who: str, names: tuple[str, ...]) -> object:
+            sent.extend(names)
+            return defocus(who, names)
+
+        here.during, plant.defocus = during, noted  # type: ignore[assignment, method-assign]
         results = await here.run()
+        assert gone not in sent, "what is on its way to stow is off the target"
         assert results[gone].outcome is CalibrationOutcome.REFUSED
         assert "STOWING" in results[gone].text
         good = [r for name, r in results.items() if name != gone]

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -35,6 +36,7 @@ from heliotrope.plant.audit import STOPPED, AuditError, JsonLines, Record, read
 from heliotrope.plant.authority import Authority, Person, RefusedError, Role
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoiningJob, JoinQueue
+from heliotrope.plant.links_file import PlantLinks
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.views import CalibrationEntry
@@ -334,7 +336,9 @@ def test_rows_are_put_by_their_names_and_strangers_left_out() -> None:
     assert problems == ["cluster K: it reports C, which is not its own; correct its configuration"]
     assert field.of("A", 10.0).state == "TRACKING"
     assert field.of("B", 10.0).state == "IDLE"
-    assert not field.of("C", 10.0).live
+    gone = field.of("C", 10.0)
+    assert (gone.live, gone.state, gone.fault, gone.flags) == (False, "", "", ())
+    assert (gone.counts, gone.goals) == ((0, 0), (0, 0))
     # A row of exactly the limit is live, one by one as in the whole field.
     last = 10.0 + field.limit
     for now in (last, np.nextafter(last, np.inf)):
@@ -432,3 +436,13 @@ def test_standby_points_given_by_a_person_are_an_event() -> None:
     olga = Person("Olga", Role.OPERATOR)
     assert Operations.standby(operations, olga, 1, {}) is given  # type: ignore[arg-type]
     assert told == [("command", "Olga", "STANDBY A, B")]
+
+
+def test_a_refused_link_is_told_with_its_count() -> None:
+    papers: Any = None
+    assert PlantLinks(papers).facts() == {}
+    server: Any = SimpleNamespace(refused=0, last_refusal="")
+    links = PlantLinks(papers, server=server)
+    assert links.facts() == {}
+    server.refused, server.last_refusal = 3, "no certificate"
+    assert links.facts() == {"refused link": "no certificate (3 so far)"}

@@ -18,6 +18,7 @@ from heliotrope.field.target import Receiver
 from heliotrope.field.volumes import Box, Sphere
 from heliotrope.geometry import FloatArray, reflect
 from heliotrope.lcu import names, states
+from heliotrope.lcu.diagnosis import NUDGE
 from heliotrope.lcu.stepper import BOTH, PRIMARY_FIRST, Axis, Stepper
 from heliotrope.links.clock import VirtualClock, gps_seconds, run_virtual
 from heliotrope.links.messages import Emergency
@@ -661,6 +662,24 @@ def test_each_leg_of_an_approach_is_proven_in_the_sun_of_its_moment(
         exact = np.array([sun(float(each)) for each in time])
         assert np.linalg.norm(light - exact, axis=-1).max() < 2e-3
     assert time.min() > 20.0
+
+
+def test_a_diagnosis_passes_a_nudge_of_each_axis_both_ways() -> None:
+    design = gated(6)
+    check, rows = BeamCheck(design, design.names), np.array([1, 3])
+    counts = np.array([[1000.0, 60_000.0], [-2000.0, 40_000.0]])
+
+    class Standing(tuple[str, ...]):
+        def counts(self, of: object) -> FloatArray:
+            assert of is rows
+            return counts
+
+    field: Any = Standing(design.names)
+    watch = BeamWatch(check, field, field, field, {})
+    path = watch._by_counts("DIAGNOSE", (), rows)
+    begin = Drive(check.drives.table[rows]).angles(counts)
+    nudges = [(0, 0), (1, 0), (-1, 0), (0, 0), (0, 1), (0, -1)]
+    np.testing.assert_allclose(path, begin[:, None] + NUDGE * np.array(nudges), atol=1e-12)
 
 
 @pytest.mark.parametrize("azimuth", [0, 1])
