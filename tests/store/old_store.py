@@ -1,7 +1,8 @@
 """One record of each kind, and the rows that hold them as a store keeps them.
 
 ``data/written_0002.json`` has the rows that `fill` left in a store before its columns had types of
-their own, when each record was turned into a row by hand.
+their own, when each record was turned into a row by hand; those of ``parameter_sighting`` are of
+revision 0009.
 """
 
 import json

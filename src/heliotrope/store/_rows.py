@@ -5,7 +5,7 @@ Names say which field belongs to which column, and the types of the columns conv
 sightings, and the sightings behind a calibration.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from functools import cache
 from typing import Any, TypeVar, cast
@@ -138,34 +138,75 @@ def kept_sightings(rows: Sequence[SqlRow[Any]]) -> KeptSightings:
 # -- calibrations ------------------------------------------------------------------------
 
 
-def used_rows(record: HeliostatCalibration) -> list[Row]:
-    """Return the rows of the table ``parameter_sighting``: sightings used, then those left out."""
+def behind_rows(
+    record: HeliostatCalibration, standing: Mapping[int, bool]
+) -> tuple[list[Row], list[int]]:
+    """Return what a version changes in the table ``parameter_sighting``.
+
+    Parameters
+    ----------
+    record
+        The new version.
+    standing
+        Whether each sighting behind the version before was used, by number.
+
+    Returns
+    -------
+        The new rows, and the numbers whose rows end.
+    """
     nothing = np.full((len(record.left_out), 4), np.nan)
     misses = np.concatenate([record.residual_before, record.residual_after], axis=1)
-    whole = np.concatenate([misses, nothing]).tolist()
+    whole = np.concatenate([misses, nothing])
     numbers = (*record.sightings.tolist(), *record.left_out.tolist())
-    return [
+    wanted = {number: place < len(misses) for place, number in enumerate(numbers)}
+    made = [
         {
             "heliostat": record.heliostat,
-            "version": record.version,
-            "place": place,
             "sighting": number,
-            "used": place < len(record.sightings),
-            **dict(zip(_MISSES, whole[place], strict=True)),
+            "version": record.version,
+            "used": wanted[number],
+            **dict(zip(_MISSES, whole[place].tolist(), strict=True)),
         }
         for place, number in enumerate(numbers)
+        if standing.get(number) is not wanted[number]
     ]
+    return made, [number for number, used in standing.items() if wanted.get(number) is not used]
 
 
-def calibration(row: RowMapping, behind: Sequence[RowMapping] = ()) -> HeliostatCalibration:
-    """Return a calibration from its row and the rows of the sightings behind it."""
-    used = [u for u in behind if u["used"]]
-    misses = np.array([[u[name] for name in _MISSES] for u in used]).reshape(-1, 4)
-    return record_of(
-        HeliostatCalibration,
-        row,
-        sightings=np.array([u["sighting"] for u in used], np.int64),
-        left_out=np.array([u["sighting"] for u in behind if not u["used"]], np.int64),
-        residual_before=misses[:, :2],
-        residual_after=misses[:, 2:],
-    )
+class Behind:
+    """The sightings behind the versions of one heliostat.
+
+    Parameters
+    ----------
+    found
+        Its rows of the table ``parameter_sighting``, in the order of the numbers.
+    """
+
+    def __init__(self, found: Sequence[RowMapping]) -> None:
+        def column(name: str, dtype: npt.DTypeLike) -> Any:
+            return np.array([row[name] for row in found], dtype=dtype)
+
+        self._number, self._used = column("sighting", np.int64), column("used", np.bool_)
+        self._from = column("version", np.int64)
+        last = np.iinfo(np.int64).max
+        ends = [last if row["until"] is None else row["until"] for row in found]
+        self._until = np.array(ends, np.int64)
+        self._misses = np.array([[row[name] for name in _MISSES] for row in found]).reshape(-1, 4)
+
+    def of(self, version: int) -> dict[str, Any]:
+        """Return the fields of a version; what a sighting missed by where it is new, else NaN."""
+        stands = (self._from <= version) & (version < self._until)
+        used = np.flatnonzero(stands & self._used)
+        new = (self._from[used] == version)[:, None]
+        misses = np.where(new, self._misses[used], np.nan)
+        return {
+            "sightings": self._number[used],
+            "left_out": self._number[stands & ~self._used],
+            "residual_before": misses[:, :2],
+            "residual_after": misses[:, 2:],
+        }
+
+
+def calibration(row: RowMapping, behind: Behind) -> HeliostatCalibration:
+    """Return a calibration from its row and the sightings behind it."""
+    return record_of(HeliostatCalibration, row, **behind.of(row["version"]))

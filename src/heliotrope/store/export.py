@@ -1,8 +1,9 @@
 """Every step of the calibrations as CSV: sightings, their beam errors, and the parameters learnt.
 
 One folder for each heliostat, as Malan kept them to find faults: ``sightings.csv`` (which
-`calibration.sighting_table` reads), ``residuals.csv`` (of every version, before and after),
-``versions.csv``, ``parameters.csv`` and ``covariance.csv``; and ``heliostats.csv`` beside them.
+`calibration.sighting_table` reads), ``residuals.csv``
+(of each version's new sightings, before and after), ``versions.csv``, ``parameters.csv`` and
+``covariance.csv``; and ``heliostats.csv`` beside them.
 """
 
 import csv
@@ -151,7 +152,10 @@ def _residuals(
     row_of = {int(number): row for row, number in enumerate(seen.identities)}
     for version in history:
         before, after = version.residual_before, version.residual_after
-        for i, sighting in enumerate(version.sightings):
+        # What a sighting missed by is kept for the version that begins to use it.
+        known = np.isfinite(before).any(axis=1) | np.isfinite(after).any(axis=1)
+        for i in np.flatnonzero(known):
+            sighting = version.sightings[i]
             row = row_of.get(int(sighting))
             place = ("", "") if row is None else (row + 1, seen.sightings.time[row])
             yield (

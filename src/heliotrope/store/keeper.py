@@ -191,11 +191,10 @@ class Keeper:
                     f"{last}, the last one recorded; give it a higher version"
                 )
             row = rows.row_of(tables.parameter_version, record)
-            used = rows.used_rows(record)
 
             def work(connection: Connection) -> None:
                 rows.insert(connection, tables.parameter_version, [row])
-                rows.insert(connection, tables.parameter_sighting, used)
+                _change_behind(connection, record)
 
             self.writer.put(work)
             self._versions[record.heliostat] = record.version
@@ -248,7 +247,7 @@ class Keeper:
         }
 
     def calibration_history(self, heliostat: str) -> list[HeliostatCalibration]:
-        """Return all versions of one heliostat, the oldest first, with their residuals."""
+        """Return all versions of one heliostat, the oldest first; see `Records`."""
         with self.database.reading() as connection:
             return calibration_history(connection, heliostat)
 
@@ -463,17 +462,26 @@ class Keeper:
 
 
 def calibration_history(connection: Connection, heliostat: str) -> list[HeliostatCalibration]:
-    """Return all versions of one heliostat, the oldest first, with their residuals."""
+    """Return all versions of one heliostat, the oldest first; see `Records`."""
     versions, used = tables.parameter_version, tables.parameter_sighting
-    query = select(used).where(used.c.heliostat == heliostat).order_by(used.c.place)
-    by_version: dict[int, list[Any]] = {}
-    for row in connection.execute(query).mappings():
-        by_version.setdefault(row["version"], []).append(row)
+    query = select(used).where(used.c.heliostat == heliostat).order_by(used.c.sighting)
+    behind = rows.Behind(connection.execute(query).mappings().all())
     query = select(versions).where(versions.c.heliostat == heliostat).order_by(versions.c.version)
-    return [
-        rows.calibration(row, by_version.get(row["version"], ()))
-        for row in connection.execute(query).mappings().all()
-    ]
+    return [rows.calibration(row, behind) for row in connection.execute(query).mappings().all()]
+
+
+def _change_behind(connection: Connection, record: HeliostatCalibration) -> None:
+    """Record the sightings behind a version: those that the one before does not rest on alike."""
+    used = tables.parameter_sighting.c
+    mine = and_(used.heliostat == record.heliostat, used.until.is_(None))
+    found = connection.execute(select(used.sighting, used.used).where(mine))
+    made, gone = rows.behind_rows(record, {number: bool(use) for number, use in found})
+    for k in range(0, len(gone), _MANY):
+        ended = and_(mine, used.sighting.in_(gone[k : k + _MANY]))
+        connection.execute(
+            update(tables.parameter_sighting).where(ended).values(until=record.version)
+        )
+    rows.insert(connection, tables.parameter_sighting, made)
 
 
 def _make_folder(folder: Path) -> None:

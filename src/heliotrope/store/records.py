@@ -462,7 +462,11 @@ class Records(Protocol):
         ...
 
     def calibration_history(self, heliostat: str) -> list[HeliostatCalibration]:
-        """Return all versions of one heliostat, the oldest first, with their residuals."""
+        """Return all versions of one heliostat, the oldest first.
+
+        The sightings behind each are in the order of their numbers. What a sighting missed by is
+        kept for the version that begins to use it; it is NaN in those that go on.
+        """
         ...
 
     def visits(self, limit: int = 100, heliostat: str = "") -> list[VisitEntry]:

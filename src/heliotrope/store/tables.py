@@ -233,14 +233,17 @@ parameter_version = Table(
     Column("provenance", Name(Provenance), nullable=False),
 )
 
-#: The sightings behind a version: those used in the fit with their residuals, and those left out.
+#: The sightings behind versions. A row stands from a version until before another (NULL: to the
+#: last one); it says whether they use the sighting, and what it missed by in the first of them.
 parameter_sighting = Table(
     "parameter_sighting",
     metadata,
     _text("heliostat", key=True),
+    Column(
+        "sighting", Number, ForeignKey(sighting.c.number), primary_key=True, autoincrement=False
+    ),
     Column("version", Integer, primary_key=True, autoincrement=False),
-    Column("place", Integer, primary_key=True, autoincrement=False),
-    Column("sighting", Number, ForeignKey(sighting.c.number), nullable=False),
+    Column("until", Integer),
     *(_figure_of(f"{when}_{way}") for when in ("before", "after") for way in ("right", "above")),
     Column("used", Boolean, nullable=False),
     ForeignKeyConstraint(
