@@ -69,7 +69,7 @@ def _value(row: Condition, value: float) -> str:
 
 def _action(row: Condition) -> str:
     then = "" if math.isinf(row.then_stow) else f", STOW after {row.then_stow:g} s"
-    return f"{row.act.name} {row.scope.name.lower()}{then}"
+    return f"{row.ordered(row.act)} {row.scope.name.lower()}{then}"
 
 
 def _release(row: Condition) -> str:

@@ -117,6 +117,8 @@ class Condition:
         Longest time from the fault to the finished action, s.
     then_stow
         Time from the trip to STOW in place of ``act``, s; infinite for never.
+    or_stow
+        Whether the plant may order STOW at once where DEFOCUS would not take the beam away.
     delay
         Time that the value must be beyond ``trips``, s.
     clear_for
@@ -146,6 +148,7 @@ class Condition:
     severity: Severity
     budget: float
     then_stow: float = math.inf
+    or_stow: bool = False
     delay: float = 0.0
     clear_for: float = 2.0
     stale_after: float = 5.0
@@ -228,6 +231,10 @@ class Condition:
         """The trip in words, as " (limit 3 s)"; "" for a row of yes or no, or of a count."""
         return "" if self.unit in ("yes/no", "count") else f" (limit {self.shown(self.trips)})"
 
+    def ordered(self, act: Act) -> str:
+        """Return an act by name, as the plant may order it."""
+        return "DEFOCUS or STOW" if self.or_stow and act is Act.DEFOCUS else act.name
+
     @property
     def consequence(self) -> str:
         """The automatic action: a sentence."""
@@ -237,7 +244,7 @@ class Condition:
             Act.ALARM: f"Nothing moves or stops in {whole}",
             Act.REFUSE_NEW: f"New motions of {whole} are refused; running motions go on",
             Act.HOLD: f"HOLD: {whole} stops where it is",
-            Act.DEFOCUS: f"DEFOCUS of {whole}",
+            Act.DEFOCUS: f"{self.ordered(Act.DEFOCUS)} of {whole}",
             Act.STOW: f"STOW of {whole}",
         }[self.act]
         if math.isfinite(self.then_stow):

@@ -286,7 +286,8 @@ def _mirrors() -> tuple[Condition, ...]:
             "keep_out_predicted", _PLANT, "keep_out_predicted", "yes/no",
             "beam in or heading for a keep-out volume",
             "its beam is in a keep-out volume or heading for one", 0.5, 0.4, _DEFOCUS, _HELIOSTAT,
-            _SERIOUS, 30.0, then_stow=_PATIENCE, release="the beam and its way are clear",
+            _SERIOUS, 30.0, then_stow=_PATIENCE, or_stow=True,
+            release="the beam and its way are clear",
             remedy="Keep people out of the volume until the alarm is over; then give it another aim"
             " point.",
         ),
@@ -294,7 +295,8 @@ def _mirrors() -> tuple[Condition, ...]:
             "beam_unsent", _PLANT, "beam_unsent", "yes/no",
             "beam on a receiver that was not sent there",
             "its beam is on a receiver, and nobody sent it there", 0.5, 0.4, _DEFOCUS, _HELIOSTAT,
-            _SERIOUS, 30.0, then_stow=10.0, delay=5.0, release="the beam is off the receiver",
+            _SERIOUS, 30.0, then_stow=10.0, or_stow=True, delay=5.0,
+            release="the beam is off the receiver",
             remedy="If it stays, inspect the heliostat; to hold it, lock it at stow.",
         ),
         Condition(

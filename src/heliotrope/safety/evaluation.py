@@ -284,7 +284,7 @@ def _action(
         text += f", for {now - since:.0f} s"
     if waits and row.role is not None:
         text += f"; the cause has gone, {row.role.title} to acknowledge"
-    text += f"; {act.name} {row.scope.name.lower()}{f' {subject}' if subject else ''}"
+    text += f"; {row.ordered(act)} {row.scope.name.lower()}{f' {subject}' if subject else ''}"
     return Action(
         act,
         row.scope,
