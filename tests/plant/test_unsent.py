@@ -146,6 +146,10 @@ def test_stow_is_ordered_where_defocus_ends_on_the_receiver(share: float, act: A
     unsent = UnsentBeams(check, field, points, lambda _: SUN, {})
     assert unsent.way_out("P5A", again=False) is act
     assert unsent.way_out("P5A", again=True) is Act.STOW
+    # It has turned since it was locked: DEFOCUS turns it no further.
+    field.turned[row] = True
+    assert unsent.way_out("P5A", again=False) is Act.STOW
+    field.turned[row] = False
     # Held beside its aim on the receiver, it turns away from that.
     points.aims[row], points.standbys[row] = ON, BESIDE
     assert unsent.way_out("P5A", again=False) is Act.DEFOCUS

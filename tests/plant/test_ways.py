@@ -250,6 +250,9 @@ def test_a_beam_in_a_volume_or_heading_for_one_is_sent_off(commanded: bool, tmp_
         await bench.wait(6.0)
         told = {a.subject for a in plant.alarms if a.condition == "keep_out_predicted"}
         assert told == {"P5A", "P5B"}
+        alarms = [a for a in plant.alarms if a.condition == "keep_out_predicted"]
+        texts = [a.text for a in alarms if a.active]
+        assert all("DEFOCUS or STOW heliostat" in text for text in texts)
         # P5A is defocused and does not go on; P5B has obeyed too, but its beam is where it was.
         reports(bench, "P5A", states.DEFOCUSED, west, west)
         await bench.wait(60.0)
@@ -312,6 +315,29 @@ def test_a_mirror_that_has_turned_into_a_volume_is_stowed_although_it_was_just_s
 
     sent = play(tmp_path, scene).cluster_of("P5A").of(Emergency)
     assert [m.heliostats for m in sent if m.name == "STOW"] == [("P5A",)]
+
+
+@pytest.mark.parametrize("state", [states.LOCKED, states.FAULT])
+def test_a_held_mirror_that_has_turned_is_stowed_at_once(state: int, tmp_path: Path) -> None:
+    """DEFOCUS turns it once; another would leave its beam where it is for 10 s."""
+
+    async def scene(bench: Bench) -> None:
+        bench.cluster_of("P5A").deaf.add("P5A")
+        inside, outside = (counts(bench.plant, "P5A", p) for p in ((0.0, -12.0, 8.0), WEST))
+        reports(bench, "P5A", state, outside, outside)
+        await bench.wait(3.0)
+        assert not bench.plant.field.turned.any()
+        reports(bench, "P5A", state, inside, inside)
+        await bench.wait(6.0)
+        assert alarmed(bench.plant) == {"P5A"}
+        # Out of that state, it turns again.
+        assert bench.plant.field.turned.sum() == 1
+        reports(bench, "P5A", states.IDLE, inside, inside)
+        await bench.wait(3.0)
+        assert not bench.plant.field.turned.any()
+
+    sent = play(tmp_path, scene).cluster_of("P5A").of(Emergency)
+    assert sent[0].name == "STOW"
 
 
 @pytest.mark.parametrize("state", [states.DEFOCUSED, states.LOCKED, states.FAULT])

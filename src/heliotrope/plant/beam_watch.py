@@ -376,7 +376,8 @@ class BeamWatch:
         if name not in self._seen and name not in self.unsent.seen:
             return False
         row = self._field.place(name)
-        return bool(self._field.rows["state"][row] == states.DEFOCUSED and self._stands(row))
+        off = self._field.rows["state"][row] == states.DEFOCUSED or self._field.turned[row]
+        return bool(off and self._stands(row))
 
     def _stands(self, row: int) -> bool:
         ends = self._field.goals(np.array([row]))[0]

@@ -22,6 +22,11 @@ from heliotrope.links.messages import NEVER, NODE, ClusterStatus
 #: Age from which a row is stale, s: three missed polls.
 STALE = 3.0
 
+#: States in which a mirror makes no motion but a turn away and the way to stow.
+_HELD = (states.LOCKED, states.FAULT)
+#: Goals that differ by more steps than this belong to another motion.
+_TURN = 200
+
 _UNKNOWN = 1 << meanings.FLAGS.index("COUNTS_UNKNOWN")
 
 Mask = npt.NDArray[np.bool_]
@@ -92,6 +97,9 @@ class FieldState:
     posed, posed_state, posed_at
         Step counts when they were last known, (N, 2), the state then, and that time, (N,): a local
         controller that has lost its counts goes on reporting numbers, which mean nothing.
+    turned
+        Whether one that is locked or in FAULT has moved since: it has turned away, and turns no
+        further, (N,). One that was locked anew would, which no status shows.
 
     Raises
     ------
@@ -121,6 +129,7 @@ class FieldState:
         self.posed_state = np.zeros(len(pairs), dtype=np.intp)
         self.posed_at = np.full(len(pairs), -np.inf)
         self.failed_at = np.full(len(pairs), -np.inf)
+        self.turned = np.zeros(len(pairs), dtype=bool)
         self.status_at = dict.fromkeys(self.clusters, -math.inf)
         self._places: dict[str, tuple[tuple[str, ...], npt.NDArray[np.intp]]] = {}
 
@@ -153,7 +162,11 @@ class FieldState:
         good = (places >= 0) & (nodes["heard_ms"] != NEVER) & (nodes["state"] < len(states.STATES))
         mine, new = places[good], nodes[good]
         self._note_failures(mine, new, at)
+        before, goals = self.rows["state"][mine], self.goals(mine)
         self.rows[mine] = new
+        stays = np.isin(before, _HELD) & (before == new["state"])
+        moved = np.abs(self.goals(mine) - goals).max(axis=-1) > _TURN
+        self.turned[mine] = stays & (self.turned[mine] | moved)
         self.heard[mine] = at - 1e-3 * new["heard_ms"].astype(np.float64)
         steps = new["steps_ms"].astype(np.float64)
         self.counted_at[mine] = np.where(steps < NEVER, at - 1e-3 * steps, -np.inf)

@@ -99,7 +99,7 @@ class UnsentBeams:
     def way_out(self, name: str, *, again: bool) -> Act:
         """Return DEFOCUS, or STOW where DEFOCUS has not helped or would end on a receiver too."""
         row = self._field.place(name)
-        if again or self._field.rows["state"][row] in _TURNED:
+        if again or self._field.rows["state"][row] in _TURNED or self._field.turned[row]:
             return Act.STOW
         rows, sun, state = np.array([row]), self._sun(0.0), int(self._field.rows["state"][row])
         aim, standby = self._points.aims[row], self._points.standbys[row]
