@@ -108,6 +108,30 @@ def test_drawn_photographs_name_a_stuck_mirror_and_an_exchanged_pair() -> None:
     joint(scene, rendered=True)
 
 
+def test_a_cloud_teaches_nothing_and_leaves_what_local_controllers_store() -> None:
+    async def scene(here: Scene) -> None:
+        plant, cameras = here.live.plant, here.live.cameras
+        stored = {name: await plant.stored(name) for name in here.names}
+        records = {name: plant.beliefs.record(name) for name in here.names}
+        real = cameras.light
+
+        async def clouded(*given: object) -> object:
+            picture = await real(*given)  # type: ignore[arg-type]
+            shade, paint = (0.1 if here.photographs() % 2 else 1.0), 0.05
+            return replace(picture, values=paint + shade * (picture.values - paint))
+
+        cameras.light = clouded  # type: ignore[method-assign, assignment]
+        results = await here.run()
+        assert {r.verdict for r in results.values()} == {Verdict.CLOUD}, results
+        assert {r.outcome for r in results.values()} == {CalibrationOutcome.NOT_PROVEN}
+        for name in here.names:
+            assert plant.beliefs.seen(name) is None
+            assert plant.beliefs.record(name) is records[name]
+            assert await plant.stored(name) == stored[name]
+
+    joint(scene)
+
+
 def test_one_that_is_stowed_meanwhile_drops_out_and_the_others_go_on() -> None:
     async def scene(here: Scene) -> None:
         gone, plant = here.names[4], here.live.plant
