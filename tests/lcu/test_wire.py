@@ -144,6 +144,15 @@ def test_hmac_is_that_of_the_library(key: bytes, data: bytes) -> None:
     assert wire.hmac_sha256(sha256, key, data) == hmac.new(key, data, "sha256").digest()
 
 
+@pytest.mark.parametrize("zero", [252, 253, 254, 255, 256, 508, 509])
+@pytest.mark.parametrize("after", [0, 1, 253, 254, 255])
+def test_stuffing_keeps_a_zero_beside_the_end_of_a_full_block(zero: int, after: int) -> None:
+    data = b"\1" * zero + b"\0" + b"\2" * after
+    stuffed = wire.stuff(data)
+    assert 0 not in stuffed
+    assert wire.unstuff(stuffed) == data
+
+
 @given(st.binary(max_size=600))
 def test_stuffing_leaves_no_zero_and_comes_back(data: bytes) -> None:
     stuffed = wire.stuff(data)

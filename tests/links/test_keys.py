@@ -132,6 +132,8 @@ def test_keys_go_from_plant_to_cluster_by_commands(
     assert Keys(cluster, HELIOSTATS).plant == (new, old)
     shown = run(capsys, monkeypatch, "keys", "list", str(plant))
     assert fingerprint(new) in shown
+    assert len(fingerprint(new)) == 8
+    assert fingerprint(new) not in new.hex()
     assert new.hex() not in shown
     run(capsys, monkeypatch, "keys", "end", str(plant))
     assert Keys(plant, CLUSTERS).members["C1"] == (new,)

@@ -139,9 +139,10 @@ def test_what_is_found_up_at_dusk_is_stowed_unless_a_person_commands(tmp_path: P
     async def scene(bench: Bench) -> None:
         for cluster in bench.clusters.values():
             cluster.set(states.STOWED)
+        logbook = Logbook(bench.clock)
         control = AutomaticControl(
             bench.plant,
-            Logbook(bench.clock),
+            logbook,
             None,
             scheduler=None,
             records=None,
@@ -153,6 +154,8 @@ def test_what_is_found_up_at_dusk_is_stowed_unless_a_person_commands(tmp_path: P
         late = bench.cluster_of(NAME)
         late.set(states.DEFOCUSED, NAME)
         await bench.until(lambda: bench.count(states.DEFOCUSED) == 0, 40.0)
+        told = [each.text for each in logbook.events(100)]
+        assert "the sun is low: 1 heliostats go to stow" in told
         control.give_way()
         token = await bench.commanded()
         late.set(states.DEFOCUSED, NAME)
