@@ -1,10 +1,12 @@
 """Parts of the twin: flash, motors, clocks, the bus and its faults, many runs."""
 
+import ast
 import asyncio
 import contextlib
 import math
 import random
 from contextvars import copy_context
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,6 +21,7 @@ from heliotrope.links.messages import Emergency, Lease, encode
 from heliotrope.plant.audit import AuditError, Record
 from heliotrope.safety import Alarm, Severity
 from heliotrope.sun import vector
+from heliotrope.twin import invariants
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.bus import BusFaults, TwinBus
 from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime, TickCounter
@@ -415,3 +418,23 @@ def test_what_a_killed_plant_still_posts_is_not_judged() -> None:
 
     run_virtual(main)
     assert posted == [1]
+
+
+def test_no_observer_takes_a_table_from_the_code_that_it_observes() -> None:
+    """An error in the table would then be an error of both, which no run finds."""
+    tiers = ("cluster", "lcu", "links", "plant", "safety")
+    pages = sorted(Path(invariants.__path__[0]).glob("*.py"))
+    seen, taken = 0, []
+    for page in pages:
+        for node in ast.walk(ast.parse(page.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ImportFrom) or (node.module or "").count(".") < 1:
+                continue
+            if (node.module or "").split(".")[1] not in tiers:
+                continue
+            for alias in node.names:
+                value = getattr(import_module(node.module or ""), alias.name)
+                seen += 1
+                if isinstance(value, (tuple, list, set, frozenset, dict)):
+                    taken.append(f"{page.name}: {node.module}.{alias.name}")
+    assert seen > 20
+    assert taken == []

@@ -13,10 +13,9 @@ from itertools import islice
 
 from heliotrope.lcu import states
 from heliotrope.links.messages import Command, Emergency, Lease, Message, Parameters
-from heliotrope.plant.authority import OPERATOR_COMMANDS, Person, Role
+from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.automatic import AUTOMATIC
-from heliotrope.plant.permission import JOINING
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.tickets import Ticket
 from heliotrope.twin.invariants.invariants import InvariantError, Observer, Violation
@@ -49,6 +48,13 @@ _OFF = (
 _OWN = ("plant", "safety table")
 #: Ends of the names under which automatic control commands.
 _UNTOLD = (AUTOMATIC.name, "out of service")
+#: Commands that an operator may give, and those that bring beams to the receiver: tables of the
+#: observer's own, so that an error in the plant's is found.
+_OPERATORS = (
+    "APPROACH", "IDLE", "TRACK", "REFOCUS", "LOCK", "UNLOCK", "AIM", "STANDBY", "LOCK_AIM",
+    "SEARCH",
+)  # fmt: skip
+_JOINING = ("TRACK", "REFOCUS", "SEARCH")
 
 
 class PlantObserver:
@@ -216,7 +222,7 @@ class PlantObserver:
         held = holder is not None and holder[:2] == (person, token)
         saw = f"{what} by {person.name} was accepted without the authority"
         self.check(4, held, now, saw)
-        enough = person.role >= (Role.OPERATOR if what in OPERATOR_COMMANDS else Role.ENGINEER)
+        enough = person.role >= (Role.OPERATOR if what in _OPERATORS else Role.ENGINEER)
         saw = f"{what} was accepted from {person.name}, role {person.role.name.lower()}"
         self.check(4, enough, now, saw)
         self.kept(now)
@@ -238,7 +244,7 @@ class PlantObserver:
         sure = holder is not None and now - holder[2] < self._settings.authority - _AT_ONCE
         saw = f"{what} was refused: {reason}; "
         if ROLE_REASON in reason:
-            least = Role.OPERATOR if what in OPERATOR_COMMANDS else Role.ENGINEER
+            least = Role.OPERATOR if what in _OPERATORS else Role.ENGINEER
             self.check(16, person.role < least, now, f"{saw}{least.title} is enough")
         elif NOBODY_REASON in reason:
             self.check(16, not sure, now, f"{saw}{holder[0].name if holder else 'nobody'} has it")
@@ -302,7 +308,7 @@ class PlantObserver:
         record = self._disk.records.get(identity)
         good = record is not None and record.what == what
         self.check(11, good, now, f"{what} {message.identity} is sent before its record is kept")
-        if isinstance(message, Command) and what in JOINING:
+        if isinstance(message, Command) and what in _JOINING:
             self._posted.append((now, len(message.heliostats) or members))
             self._bounded(self._posted, 0.0, now, f"are sent {what}")
 
