@@ -1,19 +1,36 @@
 """The plant file of a run, and what its boards should store."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.joint_visits import JointSettings
+from heliotrope.field.layout_tower import watching_camera
 from heliotrope.field.plant import Plant
+from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.target import Receiver
 from heliotrope.field.volumes import Sphere
 from heliotrope.mechanism.board_items import Wanted, items_of
 from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, Outfit, mechanisms
 from heliotrope.twin.world.scene import Scene
 
+#: Width and height of every mirror, m.
+MIRROR = 2.0
+#: Joint visits and receiver visits of a small field, in a run of some minutes.
+JOINT = JointSettings(least=3, first=8)
+_EYE = "below"
+RECEIVER_VISITS = ReceiverSettings(_EYE, "receiver", least=2, known=0.01, power=0.01, every=60.0)
 
-def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], scene: Scene) -> Plant:
+
+def design_of(
+    fits: Sequence[Outfit],
+    homes: Mapping[str, Sequence[str]],
+    scene: Scene,
+    *,
+    together: bool = False,
+) -> Plant:
     """Return a plant of some heliostats, calibrated to the truth.
 
     Parameters
@@ -24,10 +41,12 @@ def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], scene:
         Names of the heliostats of each cluster.
     scene
         Site, targets and keep-out volumes.
+    together
+        Whether several heliostats are measured at once, on targets and on the receiver.
     """
     home = {name: cluster for cluster, names in homes.items() for name in names}
     names = tuple(each.name for each in fits)
-    size = np.full(len(fits), 2.0)
+    size = np.full(len(fits), MIRROR)
     group = Heliostats(
         names,
         mechanisms(fits),
@@ -41,6 +60,7 @@ def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], scene:
     )
     balls = tuple(Sphere(f"house {i}", *ball) for i, ball in enumerate(scene.keep_outs, 1))
     groups = {"all": group}
+    eye = watching_camera(receiver.face, _EYE, 60.0, 5.0, 0.0)
     return Plant(
         "simulation",
         scene.site,
@@ -48,6 +68,9 @@ def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], scene:
         targets=scene.targets,
         receivers=(receiver,),
         keep_outs=balls,
+        cameras=(replace(eye, targets=()),) if together else (),
+        joint_visits=JOINT if together else None,
+        receiver_visits=RECEIVER_VISITS if together else None,
     )
 
 

@@ -4,18 +4,28 @@ A beam wavers by as much as the settings of a visit say, so that the covariance 
 which stands on them, is the true one, and `VisitObserver` can judge it.
 """
 
+import math
 import random
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
+from heliotrope.imaging.targets.view import FaceView
 from heliotrope.plant.visits import Shot
+from heliotrope.plant.visits.stacks import Exposed, TargetLight
 from heliotrope.twin.cameras import ExactCamera, FieldSnapshot
 
+T = TypeVar("T")
 #: What a photograph may show instead of the heliostat's beam.
 LIES = ("still", "passing", "before")
+#: What may spoil the photographs of a stack, at this share of the rate of lies, and the size of a
+#: lamp, m; photographs of a stack follow each other within this time, s.
+SPOILS, _STACKS_SPOILT, _LAMP, _GAP = ("lamp", "cloud"), 0.1, 0.3, 20.0
 #: Variance of a centroid in the plane of the target, m².
 _CENTROID = 1e-4
 #: Photographs in turn that show the same lie; the same where lights stand for minutes.
@@ -32,6 +42,17 @@ class _Lie:
     place: FloatArray
     speed: FloatArray
     since: float
+    left: int
+
+
+@dataclass(frozen=True)
+class _Spoilt:
+    """What spoils photographs of a stack: a lamp, m in the target's plane (2,), or less sun."""
+
+    kind: str
+    place: FloatArray
+    sun: float
+    lamp: float
     left: int
 
 
@@ -57,7 +78,7 @@ class LyingCamera:
     lies
         Number of photographs of each kind that lied.
     taken
-        Times of all photographs, s of the monotonic clock.
+        Times of all photographs of single beams, s of the monotonic clock.
     """
 
     def __init__(
@@ -70,8 +91,55 @@ class LyingCamera:
         self._chance = random.Random(f"camera {seed}")
         self._lie: dict[str, _Lie] = {}
         self._last: dict[str, Shot] = {}
-        self.lies = dict.fromkeys(LIES, 0)
+        self._spoilt: dict[str, _Spoilt] = {}
+        self._stacked: list[float] = []
+        self.lies = dict.fromkeys((*LIES, *SPOILS), 0)
         self.taken: list[float] = []
+
+    def away(self, at: float) -> float:
+        """Return how far a time is from that of the nearest photograph, s of the monotonic clock.
+
+        A sighting of a stack has the time of its middle, which may be between two photographs.
+        """
+        near = min((abs(at - each) for each in self.taken), default=math.inf)
+        between = any(one <= at <= two <= one + _GAP for one, two in pairwise(self._stacked))
+        return 0.0 if between else near
+
+    async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
+        """Photograph a target; see `light`."""
+        return Exposed.read(await self.light(target, view))
+
+    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
+        """Return the light on a target, now and then beside a lamp or under a cloud."""
+        true = await self._true.light(target, view)
+        self._stacked.append(true.at)
+        spoilt = self._spoilt.get(target.name)
+        if spoilt is None and self._chance.random() < self._share * _STACKS_SPOILT:
+            spoilt = self._spoiling()
+        if spoilt is None:
+            return true
+        if spoilt.left > 1:
+            self._spoilt[target.name] = replace(spoilt, left=spoilt.left - 1)
+        else:
+            self._spoilt.pop(target.name, None)
+        self.lies[spoilt.kind] += 1
+        rows, columns = true.values.shape
+        x = true.first[0] + true.step * np.arange(columns)
+        y = true.first[1] - true.step * np.arange(rows)
+        across = (x - spoilt.place[0]) ** 2 + (y[:, None] - spoilt.place[1]) ** 2
+        lamp = spoilt.lamp * np.exp(-0.5 * across / _LAMP**2)
+        return replace(true, values=(spoilt.sun * true.values + lamp).astype(np.float32))
+
+    def _spoiling(self) -> _Spoilt:
+        chance = self._chance
+        place = np.array([chance.uniform(-3.0, 3.0), chance.uniform(-3.0, 3.0)])
+        if chance.random() < 0.5:
+            return _Spoilt("lamp", place, 1.0, chance.uniform(0.05, 0.5), chance.choice(_LONG_RUNS))
+        return _Spoilt("cloud", place, chance.uniform(0.2, 0.95), 0.0, chance.choice(_RUNS))
+
+    async def beside(self, work: Callable[[], T]) -> T:
+        """Return the result of a computation."""
+        return work()
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
         """Return what a photograph shows: the heliostat's beam, or something else."""

@@ -47,7 +47,7 @@ from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
 from heliotrope.twin.true_mirrors import mirrors_of
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.damage import Damage
-from heliotrope.twin.world.design import design_of, wanted_of
+from heliotrope.twin.world.design import MIRROR, design_of, wanted_of
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.instruments import READINGS, Instruments
 from heliotrope.twin.world.operator import Operator
@@ -58,11 +58,13 @@ from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
 from heliotrope.twin.world.twice import SecondPlant
 from heliotrope.twin.world.work import Work
 from heliotrope.twin.world.worlds import (
+    PARTY,
     Habits,
     PodErrors,
     checked,
     drawn,
     knows_boards,
+    parties,
     stored_by,
     works,
 )
@@ -77,6 +79,8 @@ _PLANT = "plant"
 _WRONG = ("addresses", "clock", "site")
 #: Longest run: the sun must stay up.
 MOST_HOURS = 8.0
+#: Mean time between two interruptions by persons, s: a joint visit takes two minutes.
+SHIFT_PAUSE, PARTY_PAUSE = 90.0, 300.0
 #: With this few mirrors they join one at a time.
 SETTINGS = PlantSettings(
     join_rate=0.5, join_burst=1, stow_rate=1.0, sensors=frozenset({FLUX_READING})
@@ -135,9 +139,14 @@ class RunPlan:
             kinds.drawn(0, 1.0, 1, pause=self.pause, only=self.only)
 
     @property
+    def size(self) -> int:
+        """Number of heliostats: enough for a joint visit, where there are joint visits."""
+        return max(self.heliostats, PARTY) if parties(self.worlds) else self.heliostats
+
+    @property
     def clusters(self) -> int:
         """Number of clusters: two with every third seed."""
-        return 2 if self.seed % 3 == 2 and self.heliostats > 1 else 1
+        return 2 if self.seed % 3 == 2 and self.size > 1 else 1
 
     @property
     def drawn(self) -> tuple[Fault, ...]:
@@ -150,7 +159,7 @@ class RunPlan:
             kinds.drawn(
                 self.seed,
                 self.seconds,
-                self.heliostats,
+                self.size,
                 pause=self.pause,
                 only=self.only,
                 worlds=self.worlds,
@@ -245,12 +254,12 @@ class Simulation:
         self.plan = plan
         self.faults: Counter[str] = Counter()
         self._chance = random.Random(f"simulation {plan.seed}")
-        scene = scene_of(plan.worlds, plan.seed, plan.seconds, plan.heliostats)
+        scene = scene_of(plan.worlds, plan.seed, plan.seconds, plan.size)
         self._scene = scene
         self._loop, self._clock = loop, VirtualClock(loop.time, scene.start)
         self.begin = loop.time()
         self._suns: dict[int, FloatArray] = {}
-        fits = outfits(plan.heliostats, plan.seed, scene.places)
+        fits = outfits(plan.size, plan.seed, scene.places)
         stored = stored_by(fits, plan.worlds, plan.seed)
         self.boards = [self._board(each) for each in stored]
         self.pods = self._new_pods()
@@ -263,7 +272,8 @@ class Simulation:
         self.instruments = Instruments(self._clock, plan.seed, self._flux, self.readings)
         self._measured = "sensors" in plan.worlds
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
-        self._design, self._homes = design_of(fits, homes, scene), homes
+        together = parties(plan.worlds)
+        self._design, self._homes = design_of(fits, homes, scene, together=together), homes
         # The boards' wanted items and assigned points survive the plant's program.
         self._fits = fits
         self._wanted = wanted_of(fits) if knows_boards(plan.worlds) else Wanted()
@@ -310,11 +320,14 @@ class Simulation:
         """Return automatic control with its persons and its observer."""
         plan, clock = self.plan, self._clock
         boards = {board.outfit.name: board for board in self.boards}
-        sight = FieldSnapshot(clock, mirrors_of(boards), lambda: self.sun(clock.monotonic()))
-        work = Work(plan.seed, sight, self._exits, lights="lights" in plan.worlds)
+        mirrors = mirrors_of(boards, MIRROR, MIRROR)
+        sight = FieldSnapshot(clock, mirrors, lambda: self.sun(clock.monotonic()))
+        lights, together = "lights" in plan.worlds, parties(plan.worlds)
+        work = Work(plan.seed, sight, self._exits, lights=lights, together=together)
         day, names = DayObserver(self.begin, self.boards), tuple(boards)
+        pause = PARTY_PAUSE if together else SHIFT_PAUSE
         shift = Shift(
-            work, self.operator, self.observer, self.beams, day, names, clock, plan.seed, 90.0
+            work, self.operator, self.observer, self.beams, day, names, clock, plan.seed, pause
         )
         targets = self._scene.targets
         observer = VisitObserver(self.begin, self.boards, targets, work.away, followed=work.centred)

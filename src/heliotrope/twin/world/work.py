@@ -1,12 +1,11 @@
 """Automatic control in a run: raising, visits to targets, and the memory of both.
 
-The worlds "visits", "lights" and "day" run the whole plant, not its controller alone: `Operations`
-with automatic control and calibration visits. The store outlives the plant's program, as a disk
-does.
+The worlds "visits", "lights", "day" and "parties" run the whole plant, not its controller alone:
+`Operations` with automatic control and calibration visits. The store outlives the plant's program,
+as a disk does.
 """
 
 import contextlib
-import math
 import random
 import tempfile
 from collections.abc import Sequence
@@ -21,7 +20,10 @@ from heliotrope.plant.assembly import CYCLE
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations import AutomaticSettings, Logbook, Operations
 from heliotrope.plant.operations.views import CalibrationEntry, Planned
-from heliotrope.plant.visits import CalibrationCycle, Centring, CycleSettings
+from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
+from heliotrope.plant.schedule.scheduler import Scheduler
+from heliotrope.plant.visits import CalibrationCycle, Centring, CycleSettings, JointCycle
+from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import Alarm
 from heliotrope.store.keeper import Keeper
 from heliotrope.twin.boards.outfit import MACHINE
@@ -88,6 +90,8 @@ class Work:
         Closes the store at the end of the run.
     lights
         Whether lights stand on the targets for minutes.
+    together
+        Whether the plant chooses by its own schedule, and measures several heliostats at once.
 
     Attributes
     ----------
@@ -100,10 +104,18 @@ class Work:
     """
 
     def __init__(
-        self, seed: int, sight: FieldSnapshot, exits: contextlib.ExitStack, *, lights: bool
+        self,
+        seed: int,
+        sight: FieldSnapshot,
+        exits: contextlib.ExitStack,
+        *,
+        lights: bool,
+        together: bool,
     ) -> None:
         searches, lies = (SEARCHES_BY_LIGHTS, LIGHTS) if lights else (SEARCHES, LIES)
-        self.centred = random.Random(f"visits {seed}").random() < searches
+        # A stack of photographs tells beams apart, as a search does.
+        self.centred = together or random.Random(f"visits {seed}").random() < searches
+        self._together = together
         self.camera = LyingCamera(sight, seed, lies, VISIT.sigma, standing=lights)
         self._clock = sight.clock
         folder = exits.enter_context(tempfile.TemporaryDirectory())
@@ -115,7 +127,7 @@ class Work:
     def away(self, at: float) -> float:
         """Return how far a POSIX time, s, is from that of the nearest photograph, s."""
         zero = self._clock.utc().timestamp() - self._clock.monotonic()
-        return min((abs(at - zero - taken) for taken in self.camera.taken), default=math.inf)
+        return self.camera.away(at - zero)
 
     def opens(self) -> Logbook:
         """Return the logbook of a new program."""
@@ -127,17 +139,33 @@ class Work:
         assert self.logbook is not None
         centring = SEARCH if self.centred else None
         cycle = CalibrationCycle(plant, self.camera, VISIT, centring)
+        rounds = _Rounds(plant.field.names, self._clock)
         self.operations = Operations(
             plant,
             self.logbook,
             cycle,
-            scheduler=_Rounds(plant.field.names, self._clock),
+            scheduler=self._schedule(plant) if self._together else rounds,
             records=self._records,
             settings=SETTINGS,
+            joint=self._joint(plant, cycle),
+            receiver=self._receiver(plant, cycle),
         )
         for name in plant.field.names:
             plant.wanted.set(name, items_of(plant.beliefs.present(name)[0], MACHINE))
         return self.operations
+
+    def _schedule(self, plant: PlantController) -> PlantSchedule:
+        now, names = self._clock.utc(), plant.field.names
+        scheduler = Scheduler(plant.design, settings_for(VISIT), now=now, names=names)
+        return PlantSchedule(plant, scheduler)
+
+    def _joint(self, plant: PlantController, cycle: CalibrationCycle) -> JointCycle | None:
+        settings = plant.design.joint_visits
+        return None if settings is None else JointCycle(plant, self.camera, cycle, settings)
+
+    def _receiver(self, plant: PlantController, cycle: CalibrationCycle) -> ReceiverCycle | None:
+        settings = plant.design.receiver_visits
+        return None if settings is None else ReceiverCycle(plant, self.camera, cycle, settings)
 
     def take_alarm(self, alarm: Alarm) -> None:
         """Take an alarm of the plant."""

@@ -29,9 +29,12 @@ WORLDS = {
     "visits": "automatic control raises and calibrates the field, by photographs that may lie",
     "day": "automatic control meets the morning's or the evening's limit of the sun, at any place",
     "lights": "as visits; lights stand on the targets for minutes, and most visits search no beam",
+    "parties": "as visits, by the plant's own schedule: many at once on a target and the receiver",
 }
 #: Worlds with automatic control.
-WORKING = ("visits", "day", "lights")
+WORKING = ("visits", "day", "lights", "parties")
+#: World with joint visits and receiver visits, and the least number of its heliostats.
+PARTIES, PARTY = "parties", 6
 #: Worlds in which site, date, hour, and places are drawn.
 DRAWN = ("place", "day")
 #: Faults in a run with automatic control come this many times more seldom: a visit takes a minute.
@@ -132,6 +135,11 @@ def pause_of(worlds: Sequence[str], seed: int, pause: float) -> float:
 def works(worlds: Sequence[str]) -> bool:
     """Whether automatic control runs in a run."""
     return not set(worlds).isdisjoint(WORKING)
+
+
+def parties(worlds: Sequence[str]) -> bool:
+    """Whether several heliostats are measured at once in a run."""
+    return PARTIES in worlds
 
 
 def drawn(worlds: Sequence[str]) -> bool:
