@@ -85,13 +85,15 @@ def test_what_was_found_once_stays_mended(seed: int, seconds: float) -> None:
         (800195, 44.0, "frozen place sensors"),
         (910267, 79.0, "place visits"),
         (910519, 6.0, ""),
+        (101, 183.0, "parties"),
     ],
 )
 def test_what_any_world_found_once_stays_mended(seed: int, seconds: float, worlds: str) -> None:
     """An approach over the receiver; a scene; parameters not compared; two proofs of DEFOCUS;
     a defocus onto the receiver; an approach by the other pose; leases of one moment in any order;
     SUN of a second in which the cluster stood still; a defocus from a target onto the receiver; a
-    jump of the time before the first second.
+    jump of the time before the first second; a photograph that confirmed the step counts of a later
+    boot.
     """
     outcome = run(RunPlan(seed, seconds, 4, pause=12.0, worlds=tuple(worlds.split())))
     assert outcome.good, f"{outcome.text}; {outcome.command}"

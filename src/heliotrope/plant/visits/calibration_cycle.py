@@ -202,12 +202,11 @@ class CalibrationCycle:
         plant = self._plant
         plant.authority.check(person, token, "PARAMETERS")
         visit = Visit(plant, person, token, heliostat, plant.design.target(target))
-        tracked = visit.state == states.TRACKING
-        aim, boots = plant.aims[visit.row].copy(), int(plant.field.rows["boots"][visit.row])
+        tracked, aim = visit.state == states.TRACKING, plant.aims[visit.row].copy()
         async with visit:
             await visit.go(self.settings.arrival)
             taken = await self._photographing.take(visit, tell or _nobody)
-        result = await self.learn(visit, taken, boots, tell)
+        result = await self.learn(visit, taken, tell)
         if tracked and np.isfinite(aim).all():
             await visit.aim(aim)
             await visit.command("TRACK")
@@ -268,7 +267,6 @@ class CalibrationCycle:
         self,
         visit: Visit,
         taken: Photographs,
-        boots: int,
         tell: Tell | None = None,
         *,
         confirming: Confirming | None = None,
@@ -281,8 +279,6 @@ class CalibrationCycle:
         ----------
         visit, taken
             Its visit, and the photographs.
-        boots
-            Boots of its local controller before the photographs.
         tell
             Called with the name of each step.
         confirming
@@ -301,7 +297,7 @@ class CalibrationCycle:
             say("learning from the verification")
             result = result.then(await self._again(visit, proof, say, fewest))
         if taken.used and self._missed(visit.heliostat, taken) <= PLACED:
-            self._plant.doubts.confirm(visit.heliostat, boots)
+            self._plant.doubts.confirm(visit.heliostat, visit.boots)
         return result
 
     async def _again(self, visit: Visit, proof: Photographs, tell: Tell, least: int) -> CycleResult:

@@ -452,9 +452,9 @@ class JointCycle:
         confirming: Confirming | None = None,
         least: int | None = None,
     ) -> CycleResult:
-        name, boots = visit.heliostat, int(self._plant.field.rows["boots"][visit.row])
+        name = visit.heliostat
         try:
-            return await self._cycle.learn(visit, taken, boots, confirming=confirming, least=least)
+            return await self._cycle.learn(visit, taken, confirming=confirming, least=least)
         except RefusedError as error:
             return _refused(name, str(error))
         except HeliotropeError as error:

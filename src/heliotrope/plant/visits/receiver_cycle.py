@@ -291,7 +291,7 @@ class ReceiverCycle:
     ) -> CycleResult:
         """Learn from a proven beam; a mirror that leaves the receiver returns to its aim."""
         plant, visit = self._plant, joint.visits[name]
-        boots, aim = int(plant.field.rows["boots"][visit.row]), plant.aims[visit.row].copy()
+        aim = plant.aims[visit.row].copy()
         left = False
 
         async def leave(visit: Visit) -> None:
@@ -302,7 +302,7 @@ class ReceiverCycle:
 
         seen = Production(self.face.name, self.settings.worth, leave)
         try:
-            result = await self._cycle.learn(visit, taken, boots, production=seen)
+            result = await self._cycle.learn(visit, taken, production=seen)
             if left:
                 await visit.aim(aim)
                 await visit.command("TRACK")

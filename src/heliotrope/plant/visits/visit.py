@@ -59,6 +59,9 @@ class Visit(BroughtHome):
     ----------
     row
         Row of the heliostat in the field's table.
+    boots
+        Boots of its local controller when the visit began: what a photograph says of its step
+        counts holds for these only.
     away
         Whether the heliostat has been sent to the target.
     """
@@ -69,6 +72,7 @@ class Visit(BroughtHome):
         self.plant, self.person, self.token = plant, person, token
         self.heliostat, self.target = heliostat, target
         self.row = plant.field.place(heliostat)
+        self.boots = int(plant.field.rows["boots"][self.row])
         self._drives = Drive(plant.beams.drives.table[self.row])
         self.away = False
         self._times: list[float] = []
