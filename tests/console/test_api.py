@@ -59,6 +59,7 @@ NEEDED = {
     ("POST", "flights"): "engineer",
     ("POST", "learning"): "engineer",
     ("POST", "parameters"): "engineer",
+    ("PUT", "readings/{name}"): "engineer",
     ("POST", "clusters/{name}/frames"): "engineer",
     ("POST", "targets/{name}/marks/picture"): "engineer",
     ("POST", "targets/{name}/marks"): "engineer",

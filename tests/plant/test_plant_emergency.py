@@ -1,5 +1,6 @@
 """Emergencies of the plant: order, proof, repetition, causes, hysteresis, release."""
 
+import math
 import re
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -17,6 +18,8 @@ from heliotrope.mechanism.drives import Drive, rotary
 from heliotrope.plant.audit import read
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.emergency import carried_out
+from heliotrope.plant.operations.given_readings import GivenReadings
+from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import FLUX_READING, Act, FluxProof, adjusted, conditions
 from heliotrope.twin.wind import Wind
@@ -478,3 +481,47 @@ def test_a_safe_order_repeated_at_once_joins_the_one_under_way(tmp_path: Path) -
     bench = play(tmp_path, scene)
     sent = [heliostats for name, heliostats in orders(bench, "pod-3") if name == "STOW"]
     assert len(sent) == 6
+
+
+def test_a_given_reading_counts_from_when_it_was_made_and_goes_stale_as_any_other(
+    tmp_path: Path,
+) -> None:
+    """A calm wind that is not renewed ends in the worst case, 5 s after it was measured."""
+
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        given = GivenReadings(plant, Logbook(plant.clock))
+
+        def give(value: float, age: float = 0.0) -> None:
+            at = plant.clock.utc().timestamp() - age
+            given.take(ENGINEER, "wind_gust", value, at)
+
+        for _ in range(20):
+            give(3.0, 0.5)
+            await bench.wait(1.0)
+        assert "wind_gust_stow" not in {alarm.condition for alarm in plant.alarms}
+        for age, said in ((1.5, r"is 0\.0 s older than the last one"), (2.5, r"is 1\.0 s older")):
+            with pytest.raises(InputError, match=said):
+                give(3.0, age)
+        with pytest.raises(InputError, match=r"is 6\.0 s old, the limit is 5 s"):
+            give(3.0, 6.0)
+        with pytest.raises(InputError, match=r"is 2\.0 s ahead of the plant's clock"):
+            give(3.0, -2.0)
+        with pytest.raises(InputError, match="finite"):
+            give(math.nan)
+        with pytest.raises(UnknownNameError, match="there is no reading that programs give"):
+            given.take(ENGINEER, "receiver_flux", 0.0, 0.0)
+        # The last one was made 1.5 s ago.
+        await bench.wait(3.0)
+        assert "wind_gust_stow" not in {alarm.condition for alarm in plant.alarms}
+        await bench.wait(1.0)
+        assert "wind_gust_stow" in {alarm.condition for alarm in plant.alarms}
+        # A program whose clock was an hour ahead, as the plant's was, goes on once both are right.
+        newest, taken = given._last["wind_gust"]
+        given._last["wind_gust"] = newest + 3600.0, taken
+        with pytest.raises(InputError, match="older than the last one"):
+            give(3.0)
+        await bench.wait(1.0)
+        give(3.0)
+
+    play(tmp_path, scene, settings=PlantSettings(given=frozenset({"wind_gust"})))

@@ -726,6 +726,14 @@ def test_a_sensor_is_read_when_its_file_is_written_anew(tmp_path: Path) -> None:
     assert sensors.names <= FED
 
 
+def test_a_reading_that_programs_give_has_no_file(folder: Path) -> None:
+    path = folder / "links.toml"
+    table = "[sensors]\nwind_gust = 'api'\nwind_mean = 'wind_mean'\n[clusters]"
+    path.write_text(path.read_text().replace("[clusters]", table))
+    made = read_links(path).build(clusters_of(design()), SystemClock())
+    assert (made.given, made.sensors.names) == ({"wind_gust"}, {"wind_mean"})
+
+
 def test_a_sensor_that_no_row_needs_is_refused(folder: Path) -> None:
     links = folder / "links.toml"
     links.write_text(links.read_text().replace("[clusters]", "[sensors]\nrain = 'x'\n[clusters]"))

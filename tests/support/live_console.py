@@ -33,6 +33,7 @@ from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.interface import PlantInterface
 from heliotrope.plant.interface.console_process import Patience
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.settings import PlantSettings
 from heliotrope.store.keeper import Keeper
 from heliotrope.twin.live.loop import PacedLoop
 from support.live import LiveOptions, LivePlant
@@ -95,13 +96,17 @@ class LiveConsole:
         keep_outs: tuple[Box, ...] = (GATE,),
         marks: Path | None = None,
         work: AutomaticSettings | None = None,
+        given: frozenset[str] = frozenset(),
     ) -> None:
         self.folder, self.address = folder, ""
         self._made, self._child = (heliostats, speed), child
         self._settings = settings or ConsoleSettings(port=0, page=page)
         self._keep_outs, self._marks = keep_outs, marks
         self._options = LiveOptions(
-            rendered=rendered, boards=boards, work=work or AutomaticSettings(wanted=True)
+            rendered=rendered,
+            boards=boards,
+            work=work or AutomaticSettings(wanted=True),
+            plant=PlantSettings(given=given),
         )
         self._ready, self._over = threading.Event(), threading.Event()
         self._problem: BaseException | None = None

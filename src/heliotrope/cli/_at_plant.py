@@ -50,6 +50,7 @@ _NAMED = (
     ("GET", "commands/", "", "one_command"),
     ("POST", "clusters/", "/frames", "bus_frames"),
     ("POST", "targets/", "/photograph", "take_photograph"),
+    ("PUT", "readings/", "", "give_reading"),
 )
 
 
@@ -127,5 +128,5 @@ def _named(method: str, path: str, given: dict[str, Any]) -> tuple[str, dict[str
     for way, head, tail, call in _NAMED:
         name = path.removeprefix(head).removesuffix(tail)
         if way == method and path == f"{head}{name}{tail}" and name:
-            return call, {"name": unquote(name)}
+            return call, {**given, "name": unquote(name)}
     return "", given

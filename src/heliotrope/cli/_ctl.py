@@ -574,6 +574,20 @@ def learn(
         print(f"  in force: {one['drift']}")
 
 
+@app.command()
+def reading(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Reading of the safety table.")],
+    value: Annotated[float, typer.Argument(help="Value, made now, in the unit of its row.")],
+) -> None:
+    """Give a reading of a sensor to the safety table, where the links file says "api"."""
+    from urllib.parse import quote
+
+    with _client(context) as client:
+        order = {"value": value, "at": time.time()}
+        client.ask("PUT", f"readings/{quote(name, safe='')}", order)
+
+
 @app.command("out-of-service")
 def out_of_service(
     context: typer.Context,

@@ -226,6 +226,12 @@ async def learn(console: Here, who: Engineer, order: orders.OneGroup) -> JSONRes
     return answer(await console.plant.ask("learn", who.person, **order.model_dump()))
 
 
+@router.put("/readings/{name}", status_code=204, tags=["safety"])
+async def give_reading(console: Here, who: Engineer, name: Named, order: orders.Reading) -> None:
+    """Give a reading of the safety table, for a sensor that the plant does not read itself."""
+    await console.plant.ask("give_reading", who.person, name=name, **order.model_dump())
+
+
 @router.post("/holds", response_model=models.many(models.Lockout), tags=["commands"])
 async def hold(console: Here, who: Operator, order: orders.HoldOrder) -> JSONResponse:
     """Take heliostats out of service: they go to stow, and nobody moves them."""

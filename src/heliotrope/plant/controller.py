@@ -223,7 +223,13 @@ class PlantController:
         )
         return Sentinel(
             self.clock,
-            TableWatch(rows, readings, self.field.clusters, self.settings.sensors, self.now()),
+            TableWatch(
+                rows,
+                readings,
+                self.field.clusters,
+                self.settings.sensors | self.settings.given,
+                self.now(),
+            ),
             self.field,
             self._orders,
             self._joining,
@@ -392,15 +398,17 @@ class PlantController:
         """Commands that have not ended."""
         return self._orders.open
 
-    def put(self, name: str, value: float, subject: str = "") -> None:
-        """Take a sensor's reading, made now, for the safety table or the proof of an emergency.
+    def put(self, name: str, value: float, subject: str = "", *, made: float | None = None) -> None:
+        """Take a sensor's reading for the safety table or the proof of an emergency.
+
+        It was made at ``made`` (monotonic s); None: now.
 
         Raises
         ------
         UnknownNameError
             If it is not one of the settings' sensors.
         """
-        self._sentinel.put(name, value, self.now(), subject)
+        self._sentinel.put(name, value, self.now() if made is None else made, subject)
 
     # -- open to anybody -------------------------------------------------------------------
 

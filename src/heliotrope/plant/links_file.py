@@ -69,13 +69,16 @@ class LinksDocument(Table):
     tcp: TcpTable | None = None
     mqtt: MqttTable | None = None
     sensors: dict[str, str] = Field(
-        default_factory=dict, description="File with one number, by reading of the safety table."
+        default_factory=dict,
+        description='File with one number, or `"api"`, by reading of the safety table.',
     )
     clusters: dict[str, str] = Field(
         min_length=1, description='`"tcp"`, `"mqtt"`, or the cluster file of a local bus, by name.'
     )
 
 
+#: Says that programs give a reading, in place of the name of a file.
+GIVEN = "api"
 #: The tables, for the reference and for hints.
 TABLES: tuple[type[Table], ...] = (LinksDocument, TcpTable, MqttTable)
 
@@ -148,7 +151,9 @@ class LinksFile:
         folder = self.path.parent
         if self.document.keys:
             made.papers.renew("key file", [folder / self.document.keys], self._take_keys)
-        made.sensors = SensorFiles({n: folder / f for n, f in self.document.sensors.items()})
+        sensors = self.document.sensors
+        made.sensors = SensorFiles({n: folder / f for n, f in sensors.items() if f != GIVEN})
+        made.given = frozenset(n for n, f in sensors.items() if f == GIVEN)
         served = {n: self.keys[n] for n, how in self.document.clusters.items() if how == "tcp"}
         if served:
             self._serve(made, served, clock)
@@ -221,6 +226,8 @@ class PlantLinks:
         Server that clusters connect to; None if none does.
     sensors
         Readings of the safety table from files.
+    given
+        Readings of the safety table that programs give by the HTTP API.
     """
 
     papers: Papers
@@ -229,6 +236,7 @@ class PlantLinks:
     local: dict[str, Path] = field(default_factory=dict)
     server: TcpServer | None = None
     sensors: SensorFiles = field(default_factory=lambda: SensorFiles({}))
+    given: frozenset[str] = frozenset()
 
     def facts(self) -> dict[str, str]:
         """Return, by name, why the last connection was refused and whose new key is not used."""

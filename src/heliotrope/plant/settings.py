@@ -35,6 +35,8 @@ class PlantSettings:
         Life of the command authority without renewal, s.
     sensors
         Readings of the safety table that come from sensors, by `PlantController.put`.
+    given
+        The same that programs give by the HTTP API; see `operations.given_readings`.
     repeat
         Pause between repetitions of an emergency order to heliostats that have not acknowledged
         it, s.
@@ -60,6 +62,7 @@ class PlantSettings:
     stale: float = STALE
     authority: float = 15.0
     sensors: frozenset[str] = frozenset()
+    given: frozenset[str] = frozenset()
     repeat: float = 1.0
     largest_change: float = 5e-3
     stow_rate: float = 200.0

@@ -65,7 +65,11 @@ def run_real(design: Plant, choice: RealChoice, shown: Shown) -> None:
             design.machine(name)
     if choice.check:
         _check(
-            design, _settings(choice, shown), outside, _cameras(design, choice, shown, clock), clock
+            design,
+            _settings(choice, shown, outside),
+            outside,
+            _cameras(design, choice, shown, clock),
+            clock,
         )
         for text in _papers(outside, shown).lines():
             print(text)
@@ -86,9 +90,9 @@ def _papers(outside: "_Outside", shown: Shown) -> "Papers":
     return papers
 
 
-def _settings(choice: RealChoice, shown: Shown) -> AssemblySettings:
+def _settings(choice: RealChoice, shown: Shown, outside: "_Outside") -> AssemblySettings:
     return AssemblySettings(
-        plant=shown.plant,
+        plant=replace(shown.plant, given=outside.links.given),
         # A heliostat that a person gives to automatic control is calibrated too.
         work=AutomaticSettings(wanted=not choice.idle, foresee=FORESEE),
         machines=MachineTables.WRITTEN if choice.configure else MachineTables.UNKNOWN,
@@ -184,7 +188,7 @@ async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outsid
         ports = outside.ports(design, choice, shown, clock, keeper)
         kept = pictures(shown, folder)
         ports = replace(ports, pictures=kept, marks=shown.marks)
-        live = PlantAssembly(design, ports, _settings(choice, shown))
+        live = PlantAssembly(design, ports, _settings(choice, shown, outside))
         if live.plant.unwatched:
             print(f"no readings for: {', '.join(live.plant.unwatched)}", flush=True)
         papers = _papers(outside, shown)

@@ -257,6 +257,11 @@ _ORDERS = {
         Role.ENGINEER, orders.Nothing, lambda _, __, ___, blob: blob, Desk.take_flight, blob=True
     ),
     "learn": Call(Role.ENGINEER, orders.OneGroup, _learn),
+    "give_reading": Call(
+        Role.ENGINEER,
+        orders.NamedReading,
+        lambda d, who, a, _: d.readings.take(who, a.name, a.value, a.at),
+    ),
     "hold": Call(Role.OPERATOR, orders.HoldOrder, _hold),
     "unhold": Call(Role.OPERATOR, orders.GivenBack, _unhold),
 }

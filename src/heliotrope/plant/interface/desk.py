@@ -19,6 +19,7 @@ from heliotrope.plant.authority import Person
 from heliotrope.plant.interface import orders
 from heliotrope.plant.interface.tickets import Tickets, state_of
 from heliotrope.plant.operations import bus_frames
+from heliotrope.plant.operations.given_readings import GivenReadings
 from heliotrope.plant.operations.marking import Marking, MarksView
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.typed_parameters import ParametersView
@@ -45,10 +46,13 @@ class Desk:
     ----------
     tickets
         The last commands.
+    readings
+        Readings that programs give.
     """
 
     def __init__(self, operations: Operations) -> None:
         self.operations, self.tickets = operations, Tickets()
+        self.readings = GivenReadings(operations.plant, operations.logbook)
         #: When each holder of the authority was last present, monotonic time of the machine, s.
         self._present: dict[str, float] = {}
         #: When emergencies were ordered, by person and word, monotonic time of the machine, s.

@@ -106,6 +106,19 @@ class OneGroup(Strict):
     group: Annotated[str, Field(max_length=64)] = ""
 
 
+class Reading(Strict):
+    """A reading of the safety table in the unit of its row, and when it was made, Unix s."""
+
+    value: Number
+    at: Annotated[float, Field(ge=0.0, le=1e11, allow_inf_nan=False)]
+
+
+class NamedReading(Reading):
+    """`Reading` on the way to the plant: with its name."""
+
+    name: Name
+
+
 class ParameterOrder(Strict):
     """New error parameters of a heliostat by name, rad, m or 1, or an earlier version, and why."""
 

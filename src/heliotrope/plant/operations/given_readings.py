@@ -1,0 +1,89 @@
+"""Readings of the safety table that programs give, for sensors that the plant does not read itself.
+
+A reading counts from the moment when it was made, and goes stale from then, as one from a file
+does. Only the readings that the links file names as given are taken: an account alone cannot
+replace a sensor that the plant reads.
+"""
+
+import math
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.plant.authority import Person
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.logbook import Logbook
+
+#: Age from which a reading is refused: by then it is stale in most rows of the safety table, s.
+OLDEST = 5.0
+#: A reading may be this far ahead of the plant's clock, as two clocks never agree fully, s.
+AHEAD = 0.5
+#: A person who was silent for this long is recorded again as giving a reading, s.
+_SILENT = 10.0
+
+
+class GivenReadings:
+    """Takes readings from programs.
+
+    Parameters
+    ----------
+    plant
+        The controller; its settings name the readings.
+    logbook
+        Records who gives which reading.
+    """
+
+    def __init__(self, plant: PlantController, logbook: Logbook) -> None:
+        self._plant, self._logbook = plant, logbook
+        #: When the newest reading was made, Unix s as its program said, and taken, monotonic s.
+        self._last: dict[str, tuple[float, float]] = {}
+        #: When each person last gave each reading, monotonic s.
+        self._given: dict[tuple[str, str], float] = {}
+
+    def take(self, person: Person, name: str, value: float, at: float) -> None:
+        """Take a reading.
+
+        Parameters
+        ----------
+        person
+            Gives it.
+        name
+            Reading of the safety table.
+        value
+            In the unit of its row.
+        at
+            When it was made, Unix s.
+
+        Raises
+        ------
+        UnknownNameError
+            If programs do not give this reading at this plant.
+        InputError
+            If it is not finite, too old, from the future, or not newer than the last one.
+        """
+        names = self._plant.settings.given
+        if name not in names:
+            raise UnknownNameError("reading that programs give at this plant", name, sorted(names))
+        if not (math.isfinite(value) and math.isfinite(at)):
+            raise InputError(f"{name}: {value} at {at} is not a reading; give finite numbers")
+        age, now = self._plant.clock.utc().timestamp() - at, self._plant.now()
+        if age > OLDEST:
+            raise InputError(
+                f"{name}: the reading is {age:.1f} s old, the limit is {OLDEST:g} s; give it at "
+                "once, and compare the clocks of both machines"
+            )
+        if age < -AHEAD:
+            raise InputError(
+                f"{name}: the reading is {-age:.1f} s ahead of the plant's clock, the limit is "
+                f"{AHEAD:g} s; compare the clocks of both machines"
+            )
+        last, taken = self._last.get(name, (-math.inf, -math.inf))
+        # A copy is refused by its age afterwards; a clock that was set back must not bar for long.
+        if at <= last and now - taken <= OLDEST + AHEAD:
+            raise InputError(
+                f"{name}: the reading is {last - at:.1f} s older than the last one; give each "
+                "reading once, in order"
+            )
+        self._plant.put(name, value, made=min(now - age, now))
+        self._last[name] = at, now
+        if now - self._given.get((person.name, name), -math.inf) >= _SILENT:
+            self._logbook.event("command", person.name, f"gives {name}; the first is {value:g}")
+        self._given[person.name, name] = now
