@@ -23,6 +23,10 @@ from heliotrope.field.formats import measurements, paint
 from heliotrope.mechanism.parameters import MODELS
 
 ENOUGH = 20
+COLUMNS = (
+    "split", "contender", "heliostats", "tested", "median_of_medians_mrad",
+    "mean_of_medians_mrad", "processor_s_per_heliostat", "error_ratio", "time_ratio",
+)  # fmt: skip
 #: Heliostats of a quick run.
 FEW = 3
 
@@ -45,6 +49,16 @@ def _row(split: str, contender: str, errors: list[np.ndarray], seconds: float) -
     }
 
 
+def with_ratios(rows: list[Row]) -> list[Row]:
+    """Return the rows with error and time as multiples of Heliotrope's in the same split."""
+    measured = {"error_ratio": "median_of_medians_mrad", "time_ratio": "processor_s_per_heliostat"}
+    ours = {row["split"]: row for row in rows if row["contender"] == "Heliotrope"}
+    return [
+        row | {r: row[of] / ours[row["split"]][of] for r, of in measured.items()}  # type: ignore[operator]
+        for row in rows
+    ]
+
+
 def _ours(group: Any, seen: Sightings, training: Any, tested: Any, rows: Any) -> Any:
     start = time.process_time()
     part = seen.take(np.flatnonzero(training | tested))
@@ -57,12 +71,8 @@ def _ours(group: Any, seen: Sightings, training: Any, tested: Any, rows: Any) ->
 def run(quick: bool) -> Result:
     """Return errors and times on each split, or why there are none."""
     data = _data()
-    columns = (
-        "split", "contender", "heliostats", "tested", "median_of_medians_mrad",
-        "mean_of_medians_mrad", "processor_s_per_heliostat",
-    )  # fmt: skip
     if data is None:
-        nothing: Row = dict.fromkeys(columns)
+        nothing: Row = dict.fromkeys(COLUMNS)
         return Result([nothing | {"split": "none"}], "skipped: HELIOTROPE_DATA is not set")
     ((_, group),) = paint.read_plant(data).groups.items()
     found = measurements.read_measurements(data)
@@ -95,7 +105,7 @@ def run(quick: bool) -> Result:
         table.append(_row(kind, "ARTIST", errors, sum(r["processor_s"] for r in theirs)))
     first = table[0]
     return Result(
-        table,
+        with_ratios(table),
         f"{first['split']} split: {first['median_of_medians_mrad']:.2f} mrad, median of the "
         f"medians of {first['heliostats']} heliostats",
         {"artist": f"skipped: {skipped}" if skipped else "same sightings"},

@@ -54,7 +54,7 @@ COLUMNS = {
     },
     "splits": {
         "split", "contender", "heliostats", "tested", "median_of_medians_mrad",
-        "mean_of_medians_mrad", "processor_s_per_heliostat",
+        "mean_of_medians_mrad", "processor_s_per_heliostat", "error_ratio", "time_ratio",
     },
     "commission": {
         "case", "visits", "sightings", "never_measured", "later_mirrors_an_hour_and_target",
@@ -163,6 +163,26 @@ def test_the_chain_of_artist_is_ours(monkeypatch: pytest.MonkeyPatch) -> None:
         moved = beam_errors(nominal.with_parameters({name: 4e-3}), seen).beam
         found = artist.beam_errors(nominal, seen, tilts)
         np.testing.assert_allclose(found, moved, atol=1e-9)
+
+
+def test_ratios_are_over_heliotrope_in_the_same_split(monkeypatch: pytest.MonkeyPatch) -> None:
+    splits = _module(monkeypatch, "splits")
+    table = [
+        {
+            "split": split,
+            "contender": contender,
+            "median_of_medians_mrad": mrad,
+            "processor_s_per_heliostat": seconds,
+        }
+        for split, contender, mrad, seconds in (
+            ("azimuth", "Heliotrope", 0.5, 0.2),
+            ("azimuth", "ARTIST", 3.0, 5.0),
+            ("solstice", "Heliotrope", 1.0, 0.4),
+            ("solstice", "ARTIST", 4.0, 6.0),
+        )
+    ]
+    ratios = [(row["error_ratio"], row["time_ratio"]) for row in splits.with_ratios(table)]
+    np.testing.assert_allclose(ratios, [(1.0, 1.0), (6.0, 25.0), (1.0, 1.0), (4.0, 15.0)])
 
 
 def test_the_oracle_predicts_as_well_as_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
