@@ -46,6 +46,8 @@ RUNS: tuple[tuple[str, int, tuple[str, ...], float, float], ...] = (
     ("calibrations 74", 74, ("calm", "calibrations", "parameters"), 30.0, 180.0),
     ("sensors 75", 75, ("calm", "sensors", "disk"), 30.0, 180.0),
     ("place 76", 76, ("calm", "place", "held"), 30.0, 180.0),
+    ("parties 80", 80, ("calm", "parties"), 120.0, 300.0),
+    ("parties 104", 104, ("parties",), 12.0, 360.0),
 )
 HELIOSTATS = 3
 #: Tests of one mutant together, at most, s; those left over are not run. What an interpreter of
