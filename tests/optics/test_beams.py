@@ -100,6 +100,33 @@ def test_moved_turned_coarser_and_swept_beams() -> None:
     assert beam.swept((0.0, 0.0)) is beam
 
 
+def test_several_beams_as_one_have_their_light_at_its_places() -> None:
+    def sent(right: float, up: float, step: float = 0.04) -> Beam:
+        aim = TARGET.point(np.array([right, up]))
+        return reflected_beam(TARGET, MIRROR, SUN, 3.0, 2.0, aim=aim, step=step)
+
+    one, other = sent(0.3, -0.2), sent(-1.9, 0.7)
+    both = Beam.together([one, other])
+    assert both.power == pytest.approx(one.power + other.power, rel=1e-12)
+    middle = (one.power * one.centroid + other.power * other.centroid) / both.power
+    np.testing.assert_allclose(both.centroid, middle, atol=1e-9)
+    row, column = np.round((one.origin - both.origin)[::-1] / 0.04).astype(int)
+    rows, columns = np.round((other.origin - both.origin)[::-1] / 0.04).astype(int)
+    left = both.flux.copy()
+    left[row : row + one.flux.shape[0], column : column + one.flux.shape[1]] -= one.flux
+    left[rows : rows + other.flux.shape[0], columns : columns + other.flux.shape[1]] -= other.flux
+    assert np.abs(left).max() < 1e-9 * both.peak
+    # A grid of 4 cm shows the same beam as one of 2 cm.
+    fine = sent(0.3, -0.2, 0.02)
+    np.testing.assert_allclose(fine.centroid, one.centroid, atol=0.1 * MM)
+    np.testing.assert_allclose(fine.second_moments, one.second_moments, rtol=0.01)
+    alone = Beam.together([one])
+    assert np.array_equal(alone.flux, one.flux)
+    for bad in (fine, one.shifted((0.01, 0.0))):
+        with pytest.raises(InputError, match="fall on one grid"):
+            Beam.together([one, bad])
+
+
 def test_what_falls_on_the_target() -> None:
     """Half a symmetric beam at the border: half its energy, and the half bell's centroid."""
     sigma = 0.4

@@ -1,5 +1,6 @@
 """The flux of a heliostat's beam on a target's plane, with its exact centroid."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -31,6 +32,8 @@ SUN_SHAPES = ("pillbox", "limb", "buie")
 _REACH = 5.0
 #: Greatest number of samples along a side of a grid.
 _LARGEST = 4096
+#: Samples of several beams fall on one grid within this share of a step.
+_ALIGNED = 1e-6
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,29 @@ class Beam:
         middle = 0.5 * metres_per_pixel * (np.array(flux.shape[::-1]) - 1.0)
         beam = cls(flux[::-1].copy(), metres_per_pixel, as_float(centre) - middle)
         return beam if power is None else beam.of_power(power)
+
+    @classmethod
+    def together(cls, beams: Sequence["Beam"]) -> "Beam":
+        """Return the light of one or more beams as one, on a grid that holds all of them.
+
+        Raises
+        ------
+        InputError
+            Their samples do not fall on one grid, as those of `reflected_beam` with one step do.
+        """
+        step = beams[0].step
+        places = np.array([beam.origin for beam in beams]) / step
+        first = places.min(axis=0)
+        columns, rows = np.round(places - first).astype(int).T
+        off = np.abs(places - first - np.stack([columns, rows], axis=-1)).max()
+        if any(beam.step != step for beam in beams) or off > _ALIGNED:
+            raise InputError("beams: their samples do not fall on one grid; give them one step")
+        height = max(y + beam.flux.shape[0] for y, beam in zip(rows, beams, strict=True))
+        width = max(x + beam.flux.shape[1] for x, beam in zip(columns, beams, strict=True))
+        flux = np.zeros((height, width))
+        for x, y, beam in zip(columns, rows, beams, strict=True):
+            flux[y : y + beam.flux.shape[0], x : x + beam.flux.shape[1]] += beam.flux
+        return cls(flux, step, step * first)
 
     @cached_property
     def power(self) -> float:
@@ -454,7 +480,9 @@ def _gather(
     covariance = sigma @ sigma.T
     sun_reach = radius * np.linalg.norm(per_rad, axis=1)
     margin = sun_reach + _REACH * np.sqrt(np.diag(covariance)) + 2.0 * step
+    # Samples lie at multiples of the step, so that beams can be added.
     low, high = plane.min(axis=0) - margin, plane.max(axis=0) + margin
+    low = step * np.floor(low / step)
     needed = np.ceil((high - low) / step).astype(int) + 1
     if needed.max() > _LARGEST:
         raise InputError(

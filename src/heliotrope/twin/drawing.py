@@ -21,12 +21,14 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.synthetic.rendering import render
 from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
-from heliotrope.optics import reflected_beam
+from heliotrope.optics import Beam, reflected_beam
 from heliotrope.twin.true_mirrors import NEAR, TrueMirror, within
 
 #: Least share of a mirror that is left by its neighbours for a beam to be drawn, and the elements
 #: along a side of the mirror by which it is found.
 LEAST, _COARSE = 0.05, 6
+#: Step of the beams' grids, m; a beam is wider than ten of them.
+_STEP = 0.04
 #: Brightest reading after exposure, as a share of full scale.
 PEAK = 0.7
 #: Time in which the process ends, s.
@@ -83,8 +85,10 @@ class Exposure:
 
     def draw(self) -> Frame:
         """Return the frame; the brightest of paint and beams sets the exposure."""
-        beams = thrown(self.scene.targets[0], self.mirrors, self.sun, self.optics)
-        lit = exposed(replace(self.scene, beams=beams), PEAK)
+        target = self.scene.targets[0]
+        beams = [one.beam for one in thrown(target, self.mirrors, self.sun, self.optics)]
+        light = (Thrown(target.name, Beam.together(beams)),) if beams else ()
+        lit = exposed(replace(self.scene, beams=light), PEAK)
         return render(lit, self.seed, name=self.title, time=self.time).frame
 
 
@@ -198,6 +202,7 @@ def thrown(
             reflectivity=optics.reflectivity,
             dni=optics.dni,
             neighbours=mirror.neighbours,
+            step=_STEP,
         )
         found.append(Thrown(target.name, beam))
     return tuple(found)
