@@ -75,8 +75,8 @@ class ScriptedCluster:
         Items of each heliostat's journal.
     poses
         Completes the rows with the step counts of heliostats that track.
-    late, site
-        Error of its time, s, and the site that it reports.
+    late, site, settings
+        Error of its time, s; the site and the checksum of settings that it reports.
     """
 
     def __init__(self, name: str, names: tuple[str, ...], link: Link, clock: VirtualClock) -> None:
@@ -95,6 +95,7 @@ class ScriptedCluster:
         self.poses: Callable[[Rows], Rows] = lambda rows: rows
         self.late = 0.0
         self.site: tuple[float, ...] = ()
+        self.settings = ""
 
     def of(self, kind: type[Any]) -> list[Any]:
         """The messages of a kind."""
@@ -138,6 +139,7 @@ class ScriptedCluster:
                     0.2,
                     names=self.names if greet else (),
                     site=self.site,
+                    settings=self.settings,
                     block=rows.tobytes(),
                 )
                 await self.send(status)

@@ -49,6 +49,8 @@ class PlantLink:
         Name of the cluster.
     site
         Site for which it computes the sun.
+    settings
+        Checksum of its common settings, see `common_settings`.
     link, clock, nodes, watch, work, reports
         Parts of the cluster.
     wake
@@ -59,6 +61,7 @@ class PlantLink:
         self,
         cluster: str,
         site: Site,
+        settings: str,
         link: Link,
         clock: Clock,
         nodes: Nodes,
@@ -69,7 +72,7 @@ class PlantLink:
     ) -> None:
         self._cluster, self._link, self._clock, self._nodes = cluster, link, clock, nodes
         self._watch, self._work, self._reports, self._wake = watch, work, reports, wake
-        self._site = site.numbers
+        self._site, self._settings = site.numbers, settings
         self._names = tuple(node.name for node in nodes)
         self._opened = -1
         self._was_connected = False
@@ -153,6 +156,7 @@ class PlantLink:
                 acts=self._watch.verdict.acts,
                 names=self._names if told else (),
                 site=self._site,
+                settings=self._settings,
                 block=self._nodes.rows(now),
                 run=self._watch.runs.holder,
                 barred=self._watch.runs.barred,

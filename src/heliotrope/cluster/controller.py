@@ -38,6 +38,7 @@ from heliotrope.cluster._questions import Questions
 from heliotrope.cluster._reports import Reports
 from heliotrope.cluster._watch import Watch
 from heliotrope.cluster._work import Work
+from heliotrope.cluster.common_settings import settings_checksum
 from heliotrope.cluster.config import ClusterConfig
 from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.timekeeping import Time, TimeKeeper
@@ -133,6 +134,7 @@ class Cluster:
         self._plant = PlantLink(
             config.name,
             config.site,
+            settings_checksum(config),
             link,
             clock,
             self.nodes,

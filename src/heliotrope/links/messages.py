@@ -201,6 +201,8 @@ class ClusterStatus:
     every tenth after it, as each may be lost; otherwise it is ().
     ``utc_s`` is the cluster's own time (POSIX seconds), ``time_error_s`` the bound of its error.
     ``site`` holds `Site.numbers`, for which it computes the sun; () from an older cluster.
+    ``settings`` is the checksum of the settings that all clusters should share, eight hexadecimal
+    digits (`cluster.common_settings`); "" from an older cluster.
     ``lease_left`` in s; below 0 the plant's lease is over. ``cycle_s`` is the last poll cycle.
     ``run`` is the run of the plant that it belongs to, ``barred`` those that get no lease.
     With the names come the ``alarms`` of the cluster that are active, each as "condition subject",
@@ -223,6 +225,7 @@ class ClusterStatus:
     barred: tuple[str, ...] = ()
     alarms: tuple[str, ...] = ()
     alarms_listed: bool = False
+    settings: str = ""
 
     def nodes(self) -> "npt.NDArray[Any]":
         """Return the rows, of dtype `NODE`, read only.

@@ -47,6 +47,7 @@ from heliotrope.plant.audit import Audit
 from heliotrope.plant.authority import Authority, Grant, Person, Role
 from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.beliefs import Beliefs
+from heliotrope.plant.cluster_settings import ClusterSettings
 from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
 from heliotrope.plant.commands import Commands
 from heliotrope.plant.doubts import Doubts
@@ -178,6 +179,7 @@ class PlantController:
         self.doubts = Doubts(self.field, design, self.aims, self._tell)
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
         self._rivals, self._told_alarms = Rivals(self.name, self._tell), ToldAlarms()
+        self._cluster_settings = ClusterSettings(self._tell)
         self._orders = PlantOrders(
             clock,
             audit,
@@ -205,8 +207,7 @@ class PlantController:
         self._joiner = JoinDispatcher(
             self._joining, self._orders, self._ways, life, barred, examine
         )
-        self._named_at = dict.fromkeys(members, -math.inf)
-        self._slow_at = -math.inf
+        self._named_at, self._slow_at = dict.fromkeys(members, -math.inf), -math.inf
         self._closing = asyncio.Event()
         self._last_safe: tuple[tuple[str, Act, tuple[str, ...]], Ticket] | None = None
 
@@ -322,6 +323,7 @@ class PlantController:
         self.counters.statuses += 1
         self.counters.problems.extend(self.field.take(end.name, status, now))
         self._agreement.take(end.name, status)
+        self._cluster_settings.take(end.name, status, now)
         self._rivals.take(end.name, status)
         for alarm in self._told_alarms.compare(end.name, status):
             self._tell(alarm)

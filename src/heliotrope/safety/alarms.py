@@ -139,6 +139,18 @@ SECOND_PLANT = AlarmKind(
     "Switch one of the two plants off; if the other is off, restart this one.",
     over="the clusters belong to no other plant any more",
 )
+SETTINGS_DIFFER = AlarmKind(
+    "cluster_settings_differ",
+    _PLANT,
+    Severity.WARNING,
+    "For 5 s, limits, periods or safety thresholds of a cluster have differed from those of most "
+    "others.",
+    "cluster {subject}: its settings differ from those of {others}",
+    "It goes on with its own settings.",
+    "Compare [polling], [safety] and delta_t_s in its cluster file, and the version of its "
+    "program, with another cluster's; correct the wrong one and restart that cluster.",
+    over="cluster {subject}: its settings are no longer known to differ from those of most others",
+)
 CONSOLE = AlarmKind(
     "console",
     _PLANT,

@@ -270,7 +270,7 @@ export function clusters(box) {
       table([["Cluster", (r) => r.name], ["", (r) => h("span", { className: r.alive ? (rank(r) === 2 ? "good" : "warn") : "bad" }, r.alive ? (rank(r) === 2 ? "● healthy" : "▲ degraded") : "✕ silent")],
         ["Heliostats", (r) => `${r.live}/${r.heliostats}`, "num"], ["Heard", (r) => (r.age === null ? "never" : `${number(r.age, 1)} s`), "num"],
         ["Poll (ms)", (r) => number(r.cycle === null ? null : 1e3 * r.cycle, 0), "num"], ["Answered", (r) => (r.answered === null ? "–" : `${number(100 * r.answered, 1)} %`), "num"],
-        ["Lease (s)", (r) => number(r.lease_left, 1), "num"], ["Clock", (r) => r.time_quality], ["", (r) => [r.acts.join(", "), r.problem].filter(Boolean).join("; ")]],
+        ["Lease (s)", (r) => number(r.lease_left, 1), "num"], ["Clock", (r) => r.time_quality], ["Settings", (r) => r.settings || "not known"], ["", (r) => [r.acts.join(", "), r.problem].filter(Boolean).join("; ")]],
       rows, (r) => { const place = store.field.clusters.indexOf(r.name); store.select(store.field.cluster.flatMap((c, row) => (c === place ? [row] : [])), -1); }));
   }, { every: 3 });
 }

@@ -251,6 +251,7 @@ class Logbook:
             self.refused.get(name, 0),
             status.time_quality if status else "",
             status.time_error_s if status else nan,
+            status.settings if status else "",
             status.lease_left if status else nan,
             status.acts if status else (),
             link.problem if link is not None else "",

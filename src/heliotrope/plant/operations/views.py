@@ -225,6 +225,8 @@ class ClusterRow:
         Messages from it that could not be read.
     time_quality, time_error
         Quality of its clock, and the error bound, s.
+    settings
+        Checksum of the settings that all clusters should share; "" if unknown.
     lease_left
         Remaining lease at its last status, s; NaN if unknown.
     acts
@@ -244,6 +246,7 @@ class ClusterRow:
     refused: int
     time_quality: str
     time_error: float
+    settings: str
     lease_left: float
     acts: tuple[str, ...]
     problem: str

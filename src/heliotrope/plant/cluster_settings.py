@@ -1,0 +1,68 @@
+"""Settings that all clusters should share, compared by the checksum in each status."""
+
+from collections import Counter
+from collections.abc import Callable
+
+from heliotrope.links.messages import ClusterStatus
+from heliotrope.safety import Alarm, alarms
+
+#: An alarm waits this long, s: after a start, the first clusters heard need not be most of them.
+PATIENCE = 5.0
+
+
+class ClusterSettings:
+    """The comparison of the clusters' settings with each other.
+
+    A cluster is named if its checksum differs from those of more than half of the others; of two
+    that differ, both are. A cluster that has fallen silent counts with its last checksum; one that
+    sends none, as an older one, is not compared.
+
+    Parameters
+    ----------
+    tell
+        Called with each alarm, raised or over, and again when its text changes.
+    """
+
+    def __init__(self, tell: Callable[[Alarm], None]) -> None:
+        self._tell = tell
+        #: Checksums by cluster, and how many clusters have each.
+        self._known: dict[str, str] = {}
+        self._counts: Counter[str] = Counter()
+        #: When a cluster was first found to differ, monotonic s; alarms raised, by cluster.
+        self._since: dict[str, float] = {}
+        self._told: dict[str, Alarm] = {}
+
+    def take(self, cluster: str, status: ClusterStatus, now: float) -> None:
+        """Take a cluster's status that has arrived at a monotonic time, s."""
+        self._learn(cluster, status.settings)
+        others = self._differing(cluster)
+        if not others:
+            self._since.pop(cluster, None)
+            if self._told.pop(cluster, None) is not None:
+                self._tell(alarms.SETTINGS_DIFFER.ended(cluster))
+        elif now - self._since.setdefault(cluster, now) >= PATIENCE:
+            alarm = alarms.SETTINGS_DIFFER.raised(cluster, others=others)
+            if self._told.get(cluster) != alarm:
+                self._told[cluster] = alarm
+                self._tell(alarm)
+
+    def _learn(self, cluster: str, checksum: str) -> None:
+        before = self._known.pop(cluster, "")
+        if before != checksum:
+            self._counts.subtract([before] if before else [])
+            self._counts.update([checksum] if checksum else [])
+            self._counts = +self._counts
+        if checksum:
+            self._known[cluster] = checksum
+
+    def _differing(self, cluster: str) -> str:
+        """Return in words the others from which a cluster differs; "" if it need not be named."""
+        own, total = self._counts[self._known.get(cluster, "")], len(self._known)
+        others, differ = total - 1, total - own
+        if not own or 2 * differ <= others:
+            return ""
+        if others == 1:
+            return next(name for name in self._known if name != cluster)
+        if len(self._counts) == 2 and own == 1:
+            return f"the {others} other clusters, which agree among themselves"
+        return f"{differ} of the {others} other clusters, which do not all agree among themselves"
