@@ -1,0 +1,30 @@
+"""The page about hazards names tests that there are, and each hazard has its parts."""
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "explanation" / "hazards.md").read_text(encoding="utf-8")
+
+
+def test_each_test_that_is_named_exists() -> None:
+    files = set(re.findall(r"`(tests/[\w/]+\.py)`", PAGE))
+    assert len(files) > 20
+    assert not [name for name in sorted(files) if not (ROOT / name).is_file()]
+    known = {
+        name
+        for path in (ROOT / "tests").rglob("test_*.py")
+        for name in re.findall(r"def (test_\w+)\(", path.read_text(encoding="utf-8"))
+    }
+    named = set(re.findall(r"`(test_\w+)`", PAGE))
+    assert len(named) > 80
+    assert not named - known
+
+
+def test_each_hazard_has_a_cause_a_safeguard_a_test_and_what_remains() -> None:
+    chapters = PAGE.split("\n## ")[1:]
+    assert len(chapters) > 20
+    for chapter in chapters:
+        title = chapter.splitlines()[0]
+        for part in ("Cause", "Safeguard", "Test", "What remains"):
+            assert f"**{part}" in chapter, f"{title}: no {part}"
