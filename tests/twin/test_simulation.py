@@ -1,6 +1,7 @@
 """Deterministic simulation: no invariant broken; each planted defect found, replayed, shrunk."""
 
 import re
+import shlex
 from dataclasses import replace
 
 import pytest
@@ -19,6 +20,7 @@ from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.scene import scene_of
 from heliotrope.twin.world.simulation import RunPlan, RunResult, run, shrink
+from heliotrope.twin.world.soak import SoakResult
 from heliotrope.twin.world.tour import TOUR_LENGTH
 from heliotrope.twin.world.worlds import MIX, WORLDS, mixed
 from support.twin_defects import DEFECTS, Defect
@@ -128,6 +130,29 @@ def test_a_world_is_the_same_for_the_same_seed(world: str) -> None:
     first, second = (run(RunPlan(4, 20.0, 2, worlds=(world,))) for _ in range(2))
     assert (first.text, first.checks, first.counts) == (second.text, second.checks, second.counts)
     assert f" --world {world}" in first.command
+
+
+def test_the_command_of_a_run_names_exactly_the_worlds_that_ran(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Without `--world` a run has no worlds, as one for which `any` drew none."""
+    asked: list[RunPlan] = []
+
+    def noted(plans: list[RunPlan], **_: object) -> SoakResult:
+        asked.extend(plans)
+        return SoakResult()
+
+    monkeypatch.setattr("heliotrope.twin.world.soak.run_many", noted)
+    given = ["--seed=0", "--runs=40", "--hours=0.05", "--pause=7.3", "--world=any"]
+    CliRunner().invoke(app, ["simulate", *given], catch_exceptions=False)
+    first = list(asked)
+    assert len(first) == 40
+    assert () in {plan.worlds for plan in first}
+    for plan in first:
+        asked.clear()
+        command = RunResult(plan).command
+        CliRunner().invoke(app, shlex.split(command)[1:], catch_exceptions=False)
+        assert asked == [plan], command
 
 
 def test_each_run_of_any_draws_its_worlds_again() -> None:
