@@ -22,7 +22,7 @@ from heliotrope.twin.world.scene import scene_of
 from heliotrope.twin.world.simulation import RunPlan, RunResult, run, shrink
 from heliotrope.twin.world.soak import SoakResult
 from heliotrope.twin.world.tour import TOUR_LENGTH
-from heliotrope.twin.world.worlds import MIX, WORLDS, mixed
+from heliotrope.twin.world.worlds import MIX, RARE, WORLDS, mixed
 from support.twin_defects import DEFECTS, Defect
 
 #: Seeds that may be spent on a defect.
@@ -159,8 +159,9 @@ def test_each_run_of_any_draws_its_worlds_again() -> None:
     drawn = [mixed(seed) for seed in range(200)]
     assert drawn == [mixed(seed) for seed in range(200)]
     assert () in drawn
-    assert {name for worlds in drawn for name in worlds} == {*MIX, "lights"}
-    assert sum("lights" in worlds for worlds in drawn) < 20
+    assert {name for worlds in drawn for name in worlds} == {*MIX, *RARE}
+    for name in RARE:
+        assert sum(name in worlds for worlds in drawn) < 20
     assert not any({"twice", "lights"} <= set(worlds) for worlds in drawn)
     assert len(set(drawn)) > 15
 
