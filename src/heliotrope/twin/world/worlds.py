@@ -47,8 +47,8 @@ MIX = (
     "twice",
     "visits", "day",
 )  # fmt: skip
-#: Worlds that `mixed` adds to this share of runs each, beside those that it draws: a cluster that is
-#: wrong from the start is found within seconds, and then keeps its mirrors from all else.
+#: Worlds that `mixed` adds to this share of runs each, beside those that it draws. A cluster that
+#: is wrong from the start is found within seconds, and then keeps its mirrors from all else.
 RARE, RARE_SHARE = ("lights", "clock", "site", "addresses"), 0.04
 
 
