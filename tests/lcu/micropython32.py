@@ -14,9 +14,35 @@ from pathlib import Path
 from lcu.test_micropython import absent
 
 RELEASE, VERSION = "trixie", "1.25.0"
-PACKAGES = (
-    "micropython", "libc6", "libffi8", "libmbedcrypto16", "libmbedtls21", "libmbedx509-7",
-)  # fmt: skip
+#: Each package's file in the archive and its SHA-256, of 2026-11-24. They are taken where the lists
+#: of a mirror do not agree with its release file, as while it is being renewed.
+PACKAGES = {
+    "micropython": (
+        "main/m/micropython/micropython_1.25.0+ds-1_i386.deb",
+        "a72799821cb45442150f8a7f0757bc8e4f9a4b64abccbd837d694a20d6900bb5",
+    ),
+    "libc6": (
+        "main/g/glibc/libc6_2.41-12+deb13u4_i386.deb",
+        "67bb4b54cf4bb6a380449dfa1852cd9135659f85360caa0e41d312f4b30e573a",
+    ),
+    "libffi8": (
+        "main/libf/libffi/libffi8_3.4.8-2_i386.deb",
+        "8bafefb38c320ca27796070c881595ce04d900c3b534ac142a494daf1fe1db13",
+    ),
+    "libmbedcrypto16": (
+        "main/m/mbedtls/libmbedcrypto16_3.6.6-0.1~deb13u1_i386.deb",
+        "aa4698ed436eebf77e3dc9f5c514073bd554109d857d887db5a367dde9a5c377",
+    ),
+    "libmbedtls21": (
+        "main/m/mbedtls/libmbedtls21_3.6.6-0.1~deb13u1_i386.deb",
+        "eb1b20154ce9008aca1d036698ffc12019020a54985d2c5ae3dc1c1c39c9e995",
+    ),
+    "libmbedx509-7": (
+        "main/m/mbedtls/libmbedx509-7_3.6.6-0.1~deb13u1_i386.deb",
+        "fe6ba192c9227d30a4cd05a3bdeccdf9ff30d55b27d8ff488126c16dcf727cce",
+    ),
+}
+HELPER = "/usr/lib/apt/apt-helper"
 KEYRING = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
 LIBRARIES = "usr/lib/i386-linux-gnu"
 NAME = "MicroPython of 32 bits"
@@ -55,12 +81,18 @@ def _fetch(work: Path) -> Path:
         "Dir::Etc::sourceparts": "-", "Dir::State::lists": work / "lists", "Dir::Cache": work,
     }  # fmt: skip
     apt = ["apt-get", "-qq", *(f"-o{key}={value}" for key, value in settings.items())]
-    _done([*apt, "update"], work)
-    _done([*apt, "download", *PACKAGES], work)
+    if not (_works([*apt, "update"], work) and _works([*apt, "download", *PACKAGES], work)):
+        for path, digest in PACKAGES.values():
+            file = work / Path(path).name
+            _done([HELPER, "download-file", f"{site}/pool/{path}", str(file), f"SHA256:{digest}"])
     root = work / "root"
     for package in sorted(work.glob("*.deb")):
         _done(["dpkg-deb", "-x", str(package), str(root)])
     return root
+
+
+def _works(command: list[str], folder: Path) -> bool:
+    return not subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode
 
 
 def _done(command: list[str], folder: Path | None = None) -> str:
