@@ -26,7 +26,7 @@ GOAL = 100_000
 
 
 def visit(clock: VirtualClock) -> tuple[Visit, Any]:
-    names = ("primary", "secondary", "primary_goal", "secondary_goal")
+    names = ("primary", "secondary", "primary_goal", "secondary_goal", "boots")
     rows = np.zeros(1, [(name, float) for name in names])
     field = SimpleNamespace(place=lambda _: 0, rows=rows, counted_at=np.array([-np.inf]))
     plant = SimpleNamespace(
@@ -40,7 +40,7 @@ def visit(clock: VirtualClock) -> tuple[Visit, Any]:
 def hear(made: Visit, field: Any, at: float, off: float) -> None:
     """Hear the axes at a time, the first ``off`` steps from its goal, which follows the sun."""
     goal = GOAL - 3.0 * at
-    field.rows[0] = (goal + off, GOAL, goal, GOAL)
+    field.rows[0] = (goal + off, GOAL, goal, GOAL, 1)
     field.counted_at[0] = at
     made.note()
 
@@ -65,7 +65,7 @@ def test_a_photograph_is_less_sure_where_an_axis_may_have_taken_up_its_play(
         made, field = visit(clock)
         for at in (1.0, 2.0, 3.0, 4.0):
             here = POSE - (fall * np.eye(2)[turn] if at > 2.5 else 0.0)
-            field.rows[0] = (*here, *here)
+            field.rows[0] = (*here, *here, 1)
             field.counted_at[0] = at
             made.note()
         for early in (1.5, 3.5):
