@@ -18,6 +18,7 @@ from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibrati
 from heliotrope.errors import FetchError, InputError
 from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
+from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.authority import RefusedError
@@ -173,6 +174,33 @@ def test_movements_on_a_target_wait_for_no_turn_to_join_the_receiver() -> None:
         assert 8 * 2.0 <= end - begin + 1e-6 < 8 * 4.0
 
     joint(scene, settings=PlantSettings(join_rate=0.5, join_burst=2))
+
+
+def test_movements_beside_a_target_wait_for_no_turn_but_those_near_a_receiver_do() -> None:
+    """A beam that misses is looked for beside the target, in a stack with others."""
+
+    async def scene(here: Scene) -> None:
+        plant, name = here.live.plant, here.names[0]
+        target, receiver = here.live.design.targets[0], here.live.design.receivers[0]
+
+        async def seconds(point: FloatArray) -> float:
+            begin = plant.now()
+            assert await plant.aim(ENGINEER, here.token, {name: point}).end(10.0)
+            return plant.now() - begin
+
+        beside = target.center + 0.8 * target.width * target.axes[0]
+        assert not target.holds(beside)
+        assert np.linalg.norm(beside - receiver.center) > 10.0
+        await seconds(beside)
+        for step in (0.5, -0.5, 0.5):
+            assert await seconds(beside + step * target.axes[0]) < 1.0
+        # Each of these takes a turn, one in five seconds: far from the last point, near a receiver.
+        edge = 0.5 * np.hypot(receiver.width, receiver.height)
+        await seconds(receiver.center + np.array([0.0, 0.0, edge + 2.0]))
+        assert await seconds(receiver.center + np.array([0.0, 0.0, edge + 1.5])) > 3.0
+        assert await seconds(beside) > 3.0
+
+    joint(scene, settings=PlantSettings(join_rate=0.2, join_burst=1))
 
 
 def test_a_photograph_that_cannot_be_read_ends_the_visit_soon() -> None:

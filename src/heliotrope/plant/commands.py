@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import UnknownNameError
-from heliotrope.field.target import Target
+from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages as wire
 from heliotrope.lcu import states
@@ -30,6 +30,8 @@ SETTINGS = frozenset({"LOCK_AIM", "ROUGH"})
 POINTS = frozenset({"AIM", "STANDBY"})
 #: States in which a beam is at its aim.
 _ON_AIM = (states.TRACKING, states.SEARCHING)
+#: A new point so near the last one, and both so far off all receivers, bring no light there, m.
+_BESIDE = 3.0
 
 
 class Commands:
@@ -45,8 +47,8 @@ class Commands:
         Who may command what.
     ways
         Where beams may go.
-    targets
-        Of the plant: staying on one brings no light to a receiver.
+    design
+        Knows the targets and receivers.
     wanted
         Parameters that local controllers should store, their standby points among them.
     patience
@@ -63,14 +65,14 @@ class Commands:
         joining: JoinQueue,
         permission: Permission,
         ways: BeamWatch,
-        targets: Sequence[Target],
+        design: Plant,
         wanted: Wanted,
         patience: float,
         movements: Movements,
     ) -> None:
         self._now, self._field, self._orders, self._joining = now, field, orders, joining
         self._permission, self._ways = permission, ways
-        self._targets, self._wanted, self._patience = targets, wanted, patience
+        self._design, self._wanted, self._patience = design, wanted, patience
         self._movements = movements
 
     def give(
@@ -304,7 +306,7 @@ class Commands:
     ) -> None:
         """Send points that are stored; heliostats that track join their new aim.
 
-        Those that stay on one target bring no light to a receiver and need no turn to join.
+        Those that bring no light to a receiver need no turn to join: see `_stays`.
         """
         names = [n for members in groups.values() for n in members]
         rows = np.array([self._field.place(n) for n in names], dtype=np.intp)
@@ -320,11 +322,20 @@ class Commands:
                 self._join(ticket, name, point, [n for n in members if n in moving], token)
 
     def _stays(self, rows: npt.NDArray[np.intp], wanted: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return which heliostats' aims and new points (K, 3) lie on the same target, (K,)."""
-        found = np.zeros(len(rows), dtype=np.bool_)
-        for target in self._targets:
-            found |= target.holds(self._ways.points.aims[rows]) & target.holds(wanted)
-        return found
+        """Return which heliostats bring no light to a receiver by new points (K, 3), (K,).
+
+        Aim and new point lie on the same target, or near each other and off every receiver: so
+        moves a beam that is sent beside a target, because it misses.
+        """
+        aims = self._ways.points.aims[rows]
+        found = np.linalg.norm(wanted - aims, axis=-1) <= _BESIDE
+        for receiver in self._design.receivers:
+            clear = 0.5 * float(np.hypot(receiver.width, receiver.height)) + _BESIDE
+            for points in (aims, wanted):
+                found &= np.linalg.norm(points - receiver.center, axis=-1) > clear
+        for target in self._design.targets:
+            found |= target.holds(aims) & target.holds(wanted)
+        return np.asarray(found)
 
     def _join(
         self,

@@ -263,7 +263,7 @@ class PlantController:
             self._joining,
             self._permission,
             self._ways,
-            self.design.targets,
+            self.design,
             self.wanted,
             self.settings.join_wait,
             self.movements,
