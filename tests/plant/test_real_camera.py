@@ -32,6 +32,7 @@ from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.imaging.targets.view import posed_view
 from heliotrope.links.clock import SystemClock
 from heliotrope.plant.cameras import RealCameras, source_of
+from heliotrope.plant.visits.stacks import light_on
 from heliotrope.safety import Alarm
 from heliotrope.twin.cameras import FieldSnapshot, RenderedCamera
 from heliotrope.twin.drawing import Optics
@@ -266,7 +267,7 @@ def test_the_light_on_a_target_is_seen_from_its_front(plant: Plant, frame: Frame
     cameras.start(unheard)
     try:
         before = SystemClock().monotonic()
-        light = asyncio.run(cameras.light(target))
+        light = asyncio.run(light_on(cameras, target))
         assert light.at >= before - 0.02
         rows, columns = light.values.shape
         assert columns * light.step == pytest.approx(target.width, abs=0.1)
@@ -277,14 +278,14 @@ def test_the_light_on_a_target_is_seen_from_its_front(plant: Plant, frame: Frame
         assert place == pytest.approx([OFF, 0.0], abs=0.2)
         assert not light.seen[[0, rows - 1]].any(), "the rim shows what is behind the target"
         assert 0.0 < np.sqrt(np.trace(light.covariance_at(place))) < 0.05
-        again = asyncio.run(cameras.light(target, light.view))
+        again = asyncio.run(light_on(cameras, target, light.view))
         assert again.view is light.view
         np.testing.assert_array_equal(again.values, light.values)
         assert "joint visit" in cameras.view(target.name).reading[0]
         assert asyncio.run(cameras.beside(threading.get_ident)) != threading.get_ident()
         script.deviation = 2.0
         with pytest.raises(FetchError, match="is known within 2 s only"):
-            asyncio.run(cameras.light(target))
+            asyncio.run(light_on(cameras, target))
     finally:
         cameras.close()
 
@@ -303,7 +304,7 @@ def test_the_camera_of_a_receiver_serves_it_and_no_target(plant: Plant, frame: F
     try:
         assert cameras.eye(target.name).name == camera.name
         assert cameras.eye("receiver").name == "lit"
-        light = asyncio.run(cameras.light(receiver.face, posed_view(lit, receiver.face)))
+        light = asyncio.run(light_on(cameras, receiver.face, posed_view(lit, receiver.face)))
         shown = np.where(light.seen, light.values, 0.0)
         row, column = np.unravel_index(int(np.argmax(shown)), shown.shape)
         place = light.first + light.step * np.array([column, -row])

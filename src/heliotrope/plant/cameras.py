@@ -319,18 +319,6 @@ class RealCameras:
 
         return Exposed(at, loop.run_in_executor(self._pool, work))
 
-    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
-        """Return the light on a target; see `plant.visits.stacks.StackCamera`.
-
-        Raises
-        ------
-        FetchError
-            No frame comes, or its time is not known well enough.
-        InputError
-            The target is not found in it.
-        """
-        return await (await self.expose(target, view)).light
-
     async def beside(self, work: Callable[[], T]) -> T:
         """Return the result of a computation made in a thread."""
         return await asyncio.to_thread(work)

@@ -26,7 +26,7 @@ from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.sensors import Readings
 from heliotrope.plant.visits.photographs import Shot
-from heliotrope.plant.visits.stacks import Exposed, TargetLight
+from heliotrope.plant.visits.stacks import Exposed
 from heliotrope.safety import Alarm
 from heliotrope.store.records import Records
 
@@ -67,22 +67,12 @@ class Cameras(Protocol):
         ...
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
-        """Photograph the target; return when it is taken, before it is read; see `StackCamera`.
+        """Photograph the target for a joint visit; see `StackCamera`.
 
         Raises
         ------
         FetchError, InputError
-            No photograph.
-        """
-        ...
-
-    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
-        """Return the light on the target, for a joint visit; see `StackCamera`.
-
-        Raises
-        ------
-        FetchError, InputError
-            No usable photograph.
+            No photograph; or, as its light is awaited, no usable one.
         """
         ...
 

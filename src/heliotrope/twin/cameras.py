@@ -375,18 +375,6 @@ class RenderedCamera:
 
         return Exposed(at, asyncio.create_task(read()))
 
-    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
-        """Return the light on a target; see `plant.visits.stacks.StackCamera`.
-
-        Raises
-        ------
-        InputError
-            The target is not found in the photograph.
-        UnknownNameError
-            There is no scene of the target.
-        """
-        return await (await self.expose(target, view)).light
-
     async def beside(self, work: Callable[[], T]) -> T:
         """Return the result of a computation, made in a thread if there are any."""
         return await asyncio.to_thread(work) if self._pool is not None else work()

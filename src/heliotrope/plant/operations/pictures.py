@@ -353,10 +353,6 @@ class KeptCamera:
 
         return Exposed(exposed.at, asyncio.create_task(kept()))
 
-    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
-        """Return the light on a target in a photograph of a joint visit."""
-        return await (await self.expose(target, view)).light
-
     async def beside(self, work: Callable[[], T]) -> T:
         """Return the result of a computation that must not hold up the loop."""
         return await self._camera.beside(work)

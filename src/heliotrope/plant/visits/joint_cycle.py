@@ -38,7 +38,14 @@ from heliotrope.plant.visits.joint_visit import JointVisit
 from heliotrope.plant.visits.neighbours import Standing
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.stack_counts import counts_at_rest
-from heliotrope.plant.visits.stacks import Exposed, StackCamera, TargetLight, noting, stack_of
+from heliotrope.plant.visits.stacks import (
+    Exposed,
+    StackCamera,
+    TargetLight,
+    light_on,
+    noting,
+    stack_of,
+)
 from heliotrope.plant.visits.verification import Confirming
 from heliotrope.plant.visits.visit import Visit
 
@@ -177,7 +184,7 @@ class JointCycle:
             visits = dict(joint.visits)
             before = {name: _Before.of(visit) for name, visit in visits.items()}
             tell("the empty target")
-            empty = await self._camera.light(place)
+            empty = await light_on(self._camera, place)
             proven, lost = await self._stack(joint, layout, empty, tell)
             results |= lost
             if first:

@@ -31,7 +31,7 @@ from heliotrope.plant.visits.neighbours import Standing
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.receiver_layout import ReceiverLayout, arranged_on, production
 from heliotrope.plant.visits.stack_counts import counts_at_rest
-from heliotrope.plant.visits.stacks import StackCamera, TargetLight, noting
+from heliotrope.plant.visits.stacks import StackCamera, TargetLight, light_on, noting
 from heliotrope.plant.visits.visit import Visit
 
 #: Longest time of a movement, and of the way back to the aims, s.
@@ -148,7 +148,7 @@ class ReceiverCycle:
         tell("is the sun steady?")
         seen = []
         for _ in range(_LOOKS):
-            seen.append(_brightness(await self._camera.light(self.face, self._view)))
+            seen.append(_brightness(await light_on(self._camera, self.face, self._view)))
             await asyncio.sleep(_BETWEEN)
         change = (max(seen) - min(seen)) / max(*seen, 1e-300)
         if not change <= self.settings.steady:
@@ -216,7 +216,8 @@ class ReceiverCycle:
     async def _light(self) -> TargetLight:
         """Photograph the receiver: the mean of several frames."""
         frames = [
-            await self._camera.light(self.face, self._view) for _ in range(self.settings.exposures)
+            await light_on(self._camera, self.face, self._view)
+            for _ in range(self.settings.exposures)
         ]
         seen = np.logical_and.reduce([frame.seen for frame in frames])
         if seen.mean() < _SEEN:

@@ -115,16 +115,22 @@ class StackCamera(TargetCamera, Protocol):
     """A camera that gives the light on targets, and a place for computations."""
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
-        """Photograph a target as `light` does; return as soon as the photograph is taken."""
-        ...
+        """Photograph a target, and return as soon as the photograph is taken.
 
-    async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
-        """Photograph a target; with the view of an earlier photograph it is not searched for."""
+        With the view of an earlier photograph the target is not searched for.
+        """
         ...
 
     async def beside(self, work: Callable[[], T]) -> T:
         """Return the result of a computation that must not hold up the loop."""
         ...
+
+
+async def light_on(
+    camera: StackCamera, target: Target, view: FaceView | None = None
+) -> TargetLight:
+    """Return the light on a target in a new photograph; see `StackCamera.expose`."""
+    return await (await camera.expose(target, view)).light
 
 
 async def noting(look: Callable[[], Awaitable[None]], made: Awaitable[T]) -> T:
