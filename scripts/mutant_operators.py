@@ -2,7 +2,8 @@
 
 import ast
 import copy
-import random
+import hashlib
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,12 +36,15 @@ class Mutant:
         Its line.
     change
         The change in words.
+    name
+        Identity that outlives changes elsewhere in the file: function, change, and which of them.
     """
 
     file: str
     place: int
     line: int
     change: str
+    name: str = ""
 
     @property
     def key(self) -> str:
@@ -119,13 +123,27 @@ def walk(tree: ast.AST) -> Iterator[ast.AST]:
             yield from walk(child)
 
 
+def _scopes(tree: ast.AST, scope: str, found: dict[ast.AST, str]) -> dict[ast.AST, str]:
+    """Note for each node the function or class that it stands in."""
+    found[tree] = scope
+    if isinstance(tree, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        scope = f"{scope}.{tree.name}"
+    for child in ast.iter_child_nodes(tree):
+        _scopes(child, scope, found)
+    return found
+
+
 def mutants_of(file: str, source: str) -> list[Mutant]:
     """Return all mutants of a file."""
-    return [
-        Mutant(file, place, getattr(node, "lineno", 0), words)
-        for place, node in enumerate(walk(ast.parse(source)))
-        for words, _ in changed(node)
-    ]
+    tree, found, times = ast.parse(source), [], Counter[tuple[str, str]]()
+    scopes = _scopes(tree, "", {})
+    for place, node in enumerate(walk(tree)):
+        for words, _ in changed(node):
+            like = scopes[node], words
+            times[like] += 1
+            name = f"{scopes[node]} {words} {times[like]}"
+            found.append(Mutant(file, place, getattr(node, "lineno", 0), words, name))
+    return found
 
 
 class _Change(ast.NodeTransformer):
@@ -155,14 +173,22 @@ def mutated(mutant: Mutant, source: str) -> str:
 
 
 def sampled(count: int, seed: int) -> list[Mutant]:
-    """Return a seeded sample of the mutants of all packages."""
+    """Return a seeded sample of the mutants of all packages, in random order.
+
+    Each mutant is drawn by its own name, so a change of the sources changes the sample no further
+    than it changes mutants: survivors of one tree can be looked for in the next.
+    """
     found = [
         mutant
         for package in PACKAGES
         for path in sorted((SOURCE / package).rglob("*.py"))
         for mutant in mutants_of(str(path.relative_to(SOURCE)), path.read_text(encoding="utf-8"))
     ]
-    return random.Random(seed).sample(found, min(count, len(found)))
+    return sorted(found, key=lambda each: _lot(each, seed))[:count]
+
+
+def _lot(mutant: Mutant, seed: int) -> bytes:
+    return hashlib.sha256(f"{seed} {mutant.file} {mutant.name}".encode()).digest()
 
 
 def make_tree(mutant: Mutant, folder: Path) -> None:

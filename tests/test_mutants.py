@@ -70,6 +70,16 @@ def test_the_same_seed_draws_the_same_mutants(mutants: Any) -> None:
     assert {Path(each.file).parts[0] for each in first} <= set(mutants.PACKAGES)
 
 
+def test_a_change_elsewhere_in_a_file_draws_the_same_mutants(mutants: Any) -> None:
+    more = SOURCE.replace(
+        "LIMIT: float", "MOST = 4\n\ndef early() -> int:\n    return 1\n\nLIMIT: float"
+    )
+    names = [{each.name for each in mutants.mutants_of("a.py", text)} for text in (SOURCE, more)]
+    assert names[1] - names[0] == {" 4 to 5 1", ".early 1 to 2 1"}
+    assert not names[0] - names[1]
+    assert len(names[0]) == len(mutants.mutants_of("a.py", SOURCE))
+
+
 def test_what_only_asserts_is_spared(mutants: Any) -> None:
     source = """
 @dataclass(frozen=True)
