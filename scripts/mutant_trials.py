@@ -60,8 +60,10 @@ BESIDE = (
     "console/test_admission.py", "console/test_connections.py", "console/test_marking.py",
     "console/test_outlook_page.py", "console/test_parameters.py", "console/test_zero.py",
     "store/test_kept_alarms.py", "store/test_kept_audit.py",
-    "twin/test_live.py", "twin/test_parts.py",
+    "twin/test_live.py", "twin/test_parts.py", "test_limits_page.py",
 )  # fmt: skip
+#: The tests that read every constant and every default.
+READER = "tests/test_limits_page.py"
 #: Tests that run the code in another interpreter, where no mutant is.
 ELSEWHERE = ("--ignore-glob=*micropython*",)
 #: Time of the processor after which a test or a run hangs: this and so much more than it takes
@@ -410,7 +412,7 @@ class Bench:
         function = probes.function_of(chain)
         felt, executed = self._reach.felt[mutant.key], self._reach.executed[mutant.key]
         words = [] if function else probes.words(chain)
-        naming = self._naming([word for word in words if word.isupper()])
+        naming = set() if function else self._naming([each for each in words if each.isupper()])
         felt, executed = felt | naming, executed | naming
         if not function and not words:
             felt = executed = self._own(mutant) | set(self._kills)
@@ -434,16 +436,16 @@ class Bench:
 
     def _own(self, mutant: Mutant) -> set[str]:
         """Return the tests of a mutant's package."""
-        start = f"tests/{Path(mutant.file).parts[0]}/"
-        return {name for name in self._items if name.startswith(start)}
+        starts = f"tests/{Path(mutant.file).parts[0]}/", READER
+        return {name for name in self._items if name.startswith(starts)}
 
     def _naming(self, words: Sequence[str]) -> set[str]:
         """Return the tests of files that name a constant: they may read it without a function."""
-        if not words:
-            return set()
-        wanted = re.compile(rf"\b({'|'.join(map(re.escape, words))})\b")
-        files = {_file(name) for name in self._items}
-        good = {f for f in files if wanted.search((ROOT / f).read_text(encoding="utf-8"))}
+        good = {READER}
+        if words:
+            wanted = re.compile(rf"\b({'|'.join(map(re.escape, words))})\b")
+            files = {_file(name) for name in self._items}
+            good |= {f for f in files if wanted.search((ROOT / f).read_text(encoding="utf-8"))}
         return {name for name in self._items if _file(name) in good}
 
     def _shortest(
