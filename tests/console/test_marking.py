@@ -18,7 +18,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.imaging.targets.teaching import known_points, with_camera
 from heliotrope.plant.operations.marking import Marking
 from support.live_console import ROLES, LiveConsole
-from support.pages import NEEDS_BROWSER, entering, said
+from support.pages import NEEDS_BROWSER, entering, orders_counted, said
 
 Ask = Callable[..., httpx.Response]
 TARGET = "left"
@@ -214,6 +214,28 @@ def test_an_engineer_marks_corners_on_the_page(
     page.wait_for_selector(".hx-mark-ask")
     page.keyboard.press("Escape")
     page.wait_for_selector(".hx-mark", state="detached")
+
+
+@NEEDS_BROWSER
+@pytest.mark.parametrize("width", [1600, 800])
+def test_emergency_works_above_the_marking_of_corners(
+    enter: Callable[..., Any], width: int
+) -> None:
+    page = enter("engineer", viewport={"width": width, "height": 700}, has_touch=True)
+    calls = orders_counted(page)
+    page.click(".hx-tabs >> text=Targets")
+    page.click("text=Mark corners… >> nth=0")
+    page.wait_for_selector(".hx-mark-ask")
+    ways = (
+        lambda: page.click("#emergency"),
+        lambda: page.tap("#emergency"),
+        lambda: page.keyboard.press("Alt+e"),
+    )
+    for count, give in enumerate(ways, start=1):
+        give()
+        page.wait_for_selector("#emergency-said:has-text('ordered')")
+        page.evaluate("document.querySelector('#emergency-said').textContent = ''")
+        assert len(calls) == count
 
 
 @NEEDS_BROWSER

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from support.live_console import LiveConsole
-from support.pages import NEEDS_BROWSER, menu, said
+from support.pages import NEEDS_BROWSER, menu, orders_counted, said
 
 pytestmark = NEEDS_BROWSER
 
@@ -21,22 +21,6 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
 
 
 # -- EMERGENCY above everything ----------------------------------------------------------------
-
-
-def _counted(page: Any) -> set[str]:
-    """Answer orders of an emergency in place of the plant; return their words.
-
-    Each order is sent two ways, with one word.
-    """
-    calls: set[str] = set()
-
-    def take(route: Any) -> None:
-        assert route.request.method == "POST"
-        calls.add(route.request.post_data_json["call"])
-        route.fulfill(json={"act": "DEFOCUS", "heliostats": 64})
-
-    page.route("**/api/v1/emergency", take)
-    return calls
 
 
 def _open_order(page: Any) -> None:
@@ -78,7 +62,7 @@ def test_emergency_works_above_everything(
     width: int,
 ) -> None:
     page = enter("engineer", viewport={"width": width, "height": 700}, has_touch=True)
-    calls = _counted(page)
+    calls = orders_counted(page)
     lay_over(page)
     give(page)
     page.wait_for_selector("#emergency-said:has-text('ordered')", timeout=60_000)
@@ -88,7 +72,7 @@ def test_emergency_works_above_everything(
 def test_emergency_is_reached_by_tab_from_a_dialog(enter: Callable[..., Any]) -> None:
     """The rest of the page cannot be reached while a dialog is open; EMERGENCY can."""
     page = enter("engineer")
-    calls = _counted(page)
+    calls = orders_counted(page)
     _open_order(page)
     reached = set()
     for _ in range(12):
@@ -113,7 +97,7 @@ def test_every_layer_of_the_page_lies_below_emergency(enter: Callable[..., Any])
         """() => { const veil = document.createElement('div'); veil.id = 'veil';
         veil.style = 'position:fixed;inset:0;z-index:2147483646'; document.body.append(veil); }"""
     )
-    calls = _counted(page)
+    calls = orders_counted(page)
     _by_mouse(page)
     page.wait_for_selector("#emergency-said:has-text('ordered')")
     assert len(calls) == 1
