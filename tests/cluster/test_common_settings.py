@@ -6,8 +6,8 @@ from zlib import crc32
 
 import pytest
 
-from heliotrope.cluster import common_settings
-from heliotrope.cluster.common_settings import settings_checksum
+from heliotrope.links import common_settings
+from heliotrope.links.common_settings import CommonSettings, settings_checksum
 from heliotrope.safety import Watcher, conditions
 from support.clusters import SITE, Field, config_of, run
 
@@ -21,7 +21,6 @@ def test_it_is_the_checksum_of_the_documented_text(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(common_settings, "conditions", lambda: (*FOREIGN, line))
     text = (
         "delta_t_s=default\n"
-        "longest_autonomy_s=60.0\n"
         "plant_link_lost.act=3.0\n"
         "plant_link_lost.clear_for=2.0\n"
         "plant_link_lost.delay=0.0\n"
@@ -33,7 +32,7 @@ def test_it_is_the_checksum_of_the_documented_text(monkeypatch: pytest.MonkeyPat
         "silence_s=10.0\n"
         "steps_every_s=1.0\n"
     )
-    found = settings_checksum(replace(CONFIG, longest_autonomy=60.0))
+    found = settings_checksum(CONFIG.common)
     assert found == f"{crc32(text.encode()):08x}"
 
 
@@ -42,12 +41,11 @@ def test_it_is_the_checksum_of_the_documented_text(monkeypatch: pytest.MonkeyPat
     [
         {"silence": 11.0},
         {"steps_every": 2},
-        {"longest_autonomy": 60.0},
         {"site": replace(SITE, delta_t=69.0)},
     ],
 )
 def test_each_common_setting_changes_it(change: dict[str, Any]) -> None:
-    assert settings_checksum(replace(CONFIG, **change)) != settings_checksum(CONFIG)
+    assert settings_checksum(replace(CONFIG, **change).common) != settings_checksum(CONFIG.common)
 
 
 @pytest.mark.parametrize(
@@ -57,31 +55,36 @@ def test_each_common_setting_changes_it(change: dict[str, Any]) -> None:
         {"heliostats": CONFIG.heliostats[:1]},
         {"phase": 0.5},
         {"answer": 0.1},
+        {"longest_autonomy": 60.0},
         {"stored_answer": 0.9},
         {"site": replace(SITE, longitude_deg=1.0)},
         {"silence": 10},
     ],
 )
 def test_what_belongs_to_one_cluster_does_not(change: dict[str, Any]) -> None:
-    assert settings_checksum(replace(CONFIG, **change)) == settings_checksum(CONFIG)
+    assert settings_checksum(replace(CONFIG, **change).common) == settings_checksum(CONFIG.common)
 
 
 @pytest.mark.parametrize("watcher", Watcher)
 def test_a_threshold_changes_it_where_the_cluster_watches(
     watcher: Watcher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = settings_checksum(CONFIG)
+    before = settings_checksum(CONFIG.common)
     rows = list(conditions())
     place = next(i for i, row in enumerate(rows) if row.watcher is watcher)
     rows[place] = replace(rows[place], remedy="Do something else.")
     monkeypatch.setattr(common_settings, "conditions", lambda: tuple(rows))
-    assert settings_checksum(CONFIG) == before
+    assert settings_checksum(CONFIG.common) == before
     rows[place] = replace(rows[place], clear_for=rows[place].clear_for + 1.0)
-    assert (settings_checksum(CONFIG) != before) == (watcher is Watcher.CLUSTER)
+    assert (settings_checksum(CONFIG.common) != before) == (watcher is Watcher.CLUSTER)
 
 
 def test_the_status_of_a_running_cluster_carries_it() -> None:
     async def main(field: Field) -> None:
-        assert field.plant.status().settings == settings_checksum(config_of(2))
+        assert field.plant.status().settings == settings_checksum(config_of(2).common)
 
     run(main)
+
+
+def test_the_settings_of_a_cluster_that_states_none_are_the_defaults() -> None:
+    assert CONFIG.common == CommonSettings()

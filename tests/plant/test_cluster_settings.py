@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.common_settings import CommonSettings, settings_checksum
 from heliotrope.links.messages import ClusterStatus, Emergency
 from heliotrope.plant.cluster_settings import PATIENCE, ClusterSettings
+from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Alarm, Severity, alarms
 from support.plant_bench import Bench, running
 
@@ -22,11 +24,15 @@ def named(told: list[Alarm]) -> dict[str, str]:
     return {name: a.text for name, a in last.items() if a.active}
 
 
-def play(folder: Path, scene: Callable[[Bench], Awaitable[None]]) -> None:
+def play(
+    folder: Path,
+    scene: Callable[[Bench], Awaitable[None]],
+    settings: PlantSettings | None = None,
+) -> None:
     """Run a scene in virtual time."""
 
     async def main(clock: VirtualClock) -> None:
-        bench = Bench(clock, folder)
+        bench = Bench(clock, folder, settings=settings or PlantSettings())
         async with running(bench):
             await scene(bench)
 
@@ -69,10 +75,10 @@ def test_an_older_cluster_that_sends_none_is_not_named(tmp_path: Path) -> None:
     play(tmp_path, scene)
 
 
-def named_of(*settings: str) -> dict[str, str]:
+def named_of(*settings: str, expected: str = "") -> dict[str, str]:
     """Who is named where clusters A, B, C, … have sent these checksums for a while."""
     told: list[Alarm] = []
-    watch = ClusterSettings(told.append)
+    watch = ClusterSettings(told.append, expected)
     for second in range(10):
         for name, each in zip("ABCDEF", settings, strict=False):
             watch.take(name, replace(STATUS, settings=each), float(second))
@@ -134,3 +140,30 @@ def test_the_alarm_waits_is_told_once_and_follows_the_others() -> None:
     count = len(told)
     second(PATIENCE + 4.0, B=bad)
     assert len(told) == count
+
+
+def test_the_plants_own_settings_decide_where_it_knows_them(tmp_path: Path) -> None:
+    """All clusters alike are wrong together, and the only right one among many is not named."""
+    common = CommonSettings(steps_every=2)
+    right, wrong = settings_checksum(common), settings_checksum(CommonSettings())
+
+    async def scene(bench: Bench) -> None:
+        told = bench.plant.alarms
+        for cluster in bench.clusters.values():
+            cluster.settings = wrong
+        await bench.wait(10.0)
+        texts = named(list(told))
+        assert set(texts) == set(bench.clusters)
+        assert "settings differ from those of this plant." in texts["pod-2"]
+        assert not any(cluster.of(Emergency) for cluster in bench.clusters.values())
+        bench.clusters["pod-2"].settings = right
+        bench.clusters["pod-3"].settings = ""
+        await bench.wait(3.0)
+        assert set(named(list(told))) == set(bench.clusters) - {"pod-2", "pod-3"}
+
+    play(tmp_path, scene, PlantSettings(common=common))
+
+
+def test_one_cluster_alone_is_compared_with_the_plant() -> None:
+    assert set(named_of(OTHER, expected=SAME)) == {"A"}
+    assert not named_of(SAME, expected=SAME)

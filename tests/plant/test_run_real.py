@@ -36,6 +36,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver
 from heliotrope.lcu.journal import CODES_OF, Journal
 from heliotrope.links.clock import SystemClock
+from heliotrope.links.common_settings import CommonSettings
 from heliotrope.links.messages import Emergency, Lease
 from heliotrope.links.tcp import tcp_link
 from heliotrope.mechanism import kinds
@@ -732,6 +733,15 @@ def test_a_reading_that_programs_give_has_no_file(folder: Path) -> None:
     path.write_text(path.read_text().replace("[clusters]", table))
     made = read_links(path).build(clusters_of(design()), SystemClock())
     assert (made.given, made.sensors.names) == ({"wind_gust"}, {"wind_mean"})
+
+
+def test_the_links_file_holds_what_every_cluster_polls(folder: Path) -> None:
+    path = folder / "links.toml"
+    assert read_links(path).build(clusters_of(design()), SystemClock()).common == CommonSettings()
+    table = "[polling]\nsteps_every_s = 2\nsilence_s = 20.0\n[clusters]"
+    path.write_text(path.read_text().replace("[clusters]", table))
+    made = read_links(path).build(clusters_of(design()), SystemClock())
+    assert made.common == CommonSettings(2, 20.0)
 
 
 def test_a_sensor_that_no_row_needs_is_refused(folder: Path) -> None:

@@ -50,7 +50,7 @@ class PlantLink:
     site
         Site for which it computes the sun.
     settings
-        Checksum of its common settings, see `common_settings`.
+        Checksum of its common settings, see `links.common_settings`.
     link, clock, nodes, watch, work, reports
         Parts of the cluster.
     wake

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.lcu import wire
+from heliotrope.links.common_settings import CommonSettings
 from heliotrope.sun import Site
 
 #: The number of unit loads that RS485 carries.
@@ -89,8 +90,8 @@ class ClusterConfig:
     heliostats: tuple[Member, ...]
     answer: float = 0.05
     stored_answer: float = 0.6
-    steps_every: int = 1
-    silence: float = 10.0
+    steps_every: int = CommonSettings.steps_every
+    silence: float = CommonSettings.silence
     longest_autonomy: float = 0.0
     phase: float = 0.0
 
@@ -120,6 +121,11 @@ class ClusterConfig:
                 raise InputError(f"{at}: {what} {number} s is not within {low:g} to {high:g} s")
         if not 1 <= self.steps_every <= 60:
             raise InputError(f"{at}: steps_every {self.steps_every} s is not within 1 to 60 s")
+
+    @property
+    def common(self) -> CommonSettings:
+        """The settings that all clusters should share."""
+        return CommonSettings(self.steps_every, self.silence, self.site.delta_t)
 
     def member(self, name: str) -> Member:
         """Return a heliostat by its name.

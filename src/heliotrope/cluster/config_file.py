@@ -14,6 +14,7 @@ from heliotrope.errors import FormatError, InputError
 from heliotrope.files.documents import read_document, read_toml
 from heliotrope.links.addresses import Table, check_encryption, url_parts
 from heliotrope.links.bus_key_file import read_bus_keys
+from heliotrope.links.common_settings import CommonSettings
 from heliotrope.links.keys import HELIOSTATS, BrokerPassword, KeyRing, Keys
 from heliotrope.sun import Site
 
@@ -99,10 +100,16 @@ class PollingTable(Table):
     """``[polling]``."""
 
     steps_every_s: int = Field(
-        1, ge=1, le=60, description="Interval between requests for step counts."
+        CommonSettings.steps_every,
+        ge=1,
+        le=60,
+        description="Interval between requests for step counts.",
     )
     silence_s: float = Field(
-        10.0, ge=2.0, le=3600.0, description="A heliostat silent for longer is reported."
+        CommonSettings.silence,
+        ge=2.0,
+        le=3600.0,
+        description="A heliostat silent for longer is reported.",
     )
     phase_s: float = Field(
         0.0, ge=0.0, lt=1.0, description="Delay of each second after that of GPS."

@@ -38,12 +38,12 @@ from heliotrope.cluster._questions import Questions
 from heliotrope.cluster._reports import Reports
 from heliotrope.cluster._watch import Watch
 from heliotrope.cluster._work import Work
-from heliotrope.cluster.common_settings import settings_checksum
 from heliotrope.cluster.config import ClusterConfig
 from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.timekeeping import Time, TimeKeeper
 from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
+from heliotrope.links.common_settings import settings_checksum
 from heliotrope.links.keys import KeyRing
 from heliotrope.links.link import Bus, Link, LinkClosedError, LinkError
 from heliotrope.safety import Alarm
@@ -134,7 +134,7 @@ class Cluster:
         self._plant = PlantLink(
             config.name,
             config.site,
-            settings_checksum(config),
+            settings_checksum(config.common),
             link,
             clock,
             self.nodes,

@@ -202,7 +202,7 @@ class ClusterStatus:
     ``utc_s`` is the cluster's own time (POSIX seconds), ``time_error_s`` the bound of its error.
     ``site`` holds `Site.numbers`, for which it computes the sun; () from an older cluster.
     ``settings`` is the checksum of the settings that all clusters should share, eight hexadecimal
-    digits (`cluster.common_settings`); "" from an older cluster.
+    digits (`links.common_settings`); "" from an older cluster.
     ``lease_left`` in s; below 0 the plant's lease is over. ``cycle_s`` is the last poll cycle.
     ``run`` is the run of the plant that it belongs to, ``barred`` those that get no lease.
     With the names come the ``alarms`` of the cluster that are active, each as "condition subject",

@@ -8,23 +8,28 @@ from heliotrope.safety import Alarm, alarms
 
 #: An alarm waits this long, s: after a start, the first clusters heard need not be most of them.
 PATIENCE = 5.0
+#: From what a cluster differs, where the plant knows what every cluster should have.
+EXPECTED = "this plant"
 
 
 class ClusterSettings:
-    """The comparison of the clusters' settings with each other.
+    """The comparison of the clusters' settings with those that the plant expects.
 
-    A cluster is named if its checksum differs from those of more than half of the others; of two
-    that differ, both are. A cluster that has fallen silent counts with its last checksum; one that
-    sends none, as an older one, is not compared.
+    Where it expects none, they are compared with each other: a cluster is named if its checksum
+    differs from those of more than half of the others; of two that differ, both are. A cluster
+    that has fallen silent counts with its last checksum; one that sends none, as an older one, is
+    not compared.
 
     Parameters
     ----------
     tell
         Called with each alarm, raised or over, and again when its text changes.
+    expected
+        Checksum of the settings that every cluster should have; "": none is known.
     """
 
-    def __init__(self, tell: Callable[[Alarm], None]) -> None:
-        self._tell = tell
+    def __init__(self, tell: Callable[[Alarm], None], expected: str = "") -> None:
+        self._tell, self._expected = tell, expected
         #: Checksums by cluster, and how many clusters have each.
         self._known: dict[str, str] = {}
         self._counts: Counter[str] = Counter()
@@ -56,8 +61,11 @@ class ClusterSettings:
             self._known[cluster] = checksum
 
     def _differing(self, cluster: str) -> str:
-        """Return in words the others from which a cluster differs; "" if it need not be named."""
-        own, total = self._counts[self._known.get(cluster, "")], len(self._known)
+        """Return in words from what a cluster differs; "" if it need not be named."""
+        checksum = self._known.get(cluster, "")
+        if self._expected:
+            return EXPECTED if checksum not in ("", self._expected) else ""
+        own, total = self._counts[checksum], len(self._known)
         others, differ = total - 1, total - own
         if not own or 2 * differ <= others:
             return ""

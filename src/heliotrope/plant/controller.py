@@ -28,6 +28,7 @@ from heliotrope.field.volumes import Volume
 from heliotrope.files.disk import AtOnce, Disk
 from heliotrope.geometry import FloatArray
 from heliotrope.links.clock import Clock, sleep_until
+from heliotrope.links.common_settings import settings_checksum
 from heliotrope.links.link import Link
 from heliotrope.links.messages import (
     Acknowledge,
@@ -179,7 +180,9 @@ class PlantController:
         self.doubts = Doubts(self.field, design, self.aims, self._tell)
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
         self._rivals, self._told_alarms = Rivals(self.name, self._tell), ToldAlarms()
-        self._cluster_settings = ClusterSettings(self._tell)
+        common = self.settings.common
+        expected = "" if common is None else settings_checksum(common)
+        self._cluster_settings = ClusterSettings(self._tell, expected)
         self._orders = PlantOrders(
             clock,
             audit,

@@ -19,6 +19,7 @@ from heliotrope.errors import FormatError
 from heliotrope.files.documents import read_document
 from heliotrope.links.addresses import Table, check_encryption, url_parts
 from heliotrope.links.clock import Clock
+from heliotrope.links.common_settings import CommonSettings
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.keys import CLUSTERS, BrokerPassword, KeyRing, Keys
 from heliotrope.links.link import Link
@@ -60,6 +61,23 @@ class MqttTable(Table):
     unencrypted: bool = Field(False, description="Accept a broker elsewhere without TLS.")
 
 
+class ExpectedPolling(Table):
+    """``[polling]``: what every cluster file of this plant has in its table of that name."""
+
+    steps_every_s: int = Field(
+        CommonSettings.steps_every,
+        ge=1,
+        le=60,
+        description="Interval between requests for step counts.",
+    )
+    silence_s: float = Field(
+        CommonSettings.silence,
+        ge=2.0,
+        le=3600.0,
+        description="A heliostat silent for longer is reported.",
+    )
+
+
 class LinksDocument(Table):
     """The whole file."""
 
@@ -68,6 +86,10 @@ class LinksDocument(Table):
     keys: str = Field("", description="File of the keys, beside this one.")
     tcp: TcpTable | None = None
     mqtt: MqttTable | None = None
+    polling: ExpectedPolling = Field(
+        default_factory=ExpectedPolling,  # type: ignore[arg-type]
+        description="What every cluster file of this plant has in its table of that name.",
+    )
     sensors: dict[str, str] = Field(
         default_factory=dict,
         description='File with one number, or `"api"`, by reading of the safety table.',
@@ -80,7 +102,7 @@ class LinksDocument(Table):
 #: Says that programs give a reading, in place of the name of a file.
 GIVEN = "api"
 #: The tables, for the reference and for hints.
-TABLES: tuple[type[Table], ...] = (LinksDocument, TcpTable, MqttTable)
+TABLES: tuple[type[Table], ...] = (LinksDocument, TcpTable, MqttTable, ExpectedPolling)
 
 
 @dataclass(frozen=True)
@@ -154,6 +176,8 @@ class LinksFile:
         sensors = self.document.sensors
         made.sensors = SensorFiles({n: folder / f for n, f in sensors.items() if f != GIVEN})
         made.given = frozenset(n for n, f in sensors.items() if f == GIVEN)
+        polling = self.document.polling
+        made.common = CommonSettings(polling.steps_every_s, polling.silence_s)
         served = {n: self.keys[n] for n, how in self.document.clusters.items() if how == "tcp"}
         if served:
             self._serve(made, served, clock)
@@ -228,6 +252,8 @@ class PlantLinks:
         Readings of the safety table from files.
     given
         Readings of the safety table that programs give by the HTTP API.
+    common
+        Settings that every cluster should have, as far as this file holds them.
     """
 
     papers: Papers
@@ -237,6 +263,7 @@ class PlantLinks:
     server: TcpServer | None = None
     sensors: SensorFiles = field(default_factory=lambda: SensorFiles({}))
     given: frozenset[str] = frozenset()
+    common: CommonSettings = field(default_factory=CommonSettings)
 
     def facts(self) -> dict[str, str]:
         """Return, by name, why the last connection was refused and whose new key is not used."""

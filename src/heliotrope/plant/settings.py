@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
+from heliotrope.links.common_settings import CommonSettings
 from heliotrope.plant.field_state import STALE
 
 
@@ -47,6 +48,8 @@ class PlantSettings:
         their drives do not start together; 0: all at once. By the default 10,000 take 50 s, with
         2 % of the field starting in a second. A person's LOCK takes one that waits out of its
         order. Emergencies and the safety table never wait.
+    common
+        Settings that every cluster should have; None: the clusters are compared with each other.
     """
 
     lease: float = 3.0
@@ -66,6 +69,7 @@ class PlantSettings:
     repeat: float = 1.0
     largest_change: float = 5e-3
     stow_rate: float = 200.0
+    common: CommonSettings | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < 2.0 * self.period <= self.lease < math.inf:

@@ -143,13 +143,14 @@ SETTINGS_DIFFER = AlarmKind(
     "cluster_settings_differ",
     _PLANT,
     Severity.WARNING,
-    "For 5 s, limits, periods or safety thresholds of a cluster have differed from those of most "
-    "others.",
+    "For 5 s, periods or safety thresholds of a cluster have differed from those that the plant "
+    "expects, or where it expects none, from those of most other clusters.",
     "cluster {subject}: its settings differ from those of {others}",
     "It goes on with its own settings.",
-    "Compare [polling], [safety] and delta_t_s in its cluster file, and the version of its "
-    "program, with another cluster's; correct the wrong one and restart that cluster.",
-    over="cluster {subject}: its settings are no longer known to differ from those of most others",
+    "Compare [polling] of its cluster file with that of the plant's links file, delta_t_s with "
+    "that of the plant file, and the versions of the two programs; correct the wrong one and "
+    "restart its program.",
+    over="cluster {subject}: its settings are no longer known to differ",
 )
 CONSOLE = AlarmKind(
     "console",

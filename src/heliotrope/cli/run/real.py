@@ -66,7 +66,7 @@ def run_real(design: Plant, choice: RealChoice, shown: Shown) -> None:
     if choice.check:
         _check(
             design,
-            _settings(choice, shown, outside),
+            _settings(design, choice, shown, outside),
             outside,
             _cameras(design, choice, shown, clock),
             clock,
@@ -90,9 +90,12 @@ def _papers(outside: "_Outside", shown: Shown) -> "Papers":
     return papers
 
 
-def _settings(choice: RealChoice, shown: Shown, outside: "_Outside") -> AssemblySettings:
+def _settings(
+    design: Plant, choice: RealChoice, shown: Shown, outside: "_Outside"
+) -> AssemblySettings:
+    common = replace(outside.links.common, delta_t=design.site.delta_t)
     return AssemblySettings(
-        plant=replace(shown.plant, given=outside.links.given),
+        plant=replace(shown.plant, given=outside.links.given, common=common),
         # A heliostat that a person gives to automatic control is calibrated too.
         work=AutomaticSettings(wanted=not choice.idle, foresee=FORESEE),
         machines=MachineTables.WRITTEN if choice.configure else MachineTables.UNKNOWN,
@@ -188,7 +191,7 @@ async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outsid
         ports = outside.ports(design, choice, shown, clock, keeper)
         kept = pictures(shown, folder)
         ports = replace(ports, pictures=kept, marks=shown.marks)
-        live = PlantAssembly(design, ports, _settings(choice, shown, outside))
+        live = PlantAssembly(design, ports, _settings(design, choice, shown, outside))
         if live.plant.unwatched:
             print(f"no readings for: {', '.join(live.plant.unwatched)}", flush=True)
         papers = _papers(outside, shown)

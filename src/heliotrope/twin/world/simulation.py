@@ -21,6 +21,7 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import ticks
 from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of
+from heliotrope.links.common_settings import CommonSettings
 from heliotrope.links.tapped import TappedLink
 from heliotrope.mechanism.board_items import Wanted
 from heliotrope.plant.controller import PlantController
@@ -83,7 +84,11 @@ MOST_HOURS = 8.0
 SHIFT_PAUSE, PARTY_PAUSE = 90.0, 300.0
 #: With this few mirrors they join one at a time.
 SETTINGS = PlantSettings(
-    join_rate=0.5, join_burst=1, stow_rate=1.0, sensors=frozenset({FLUX_READING})
+    join_rate=0.5,
+    join_burst=1,
+    stow_rate=1.0,
+    sensors=frozenset({FLUX_READING}),
+    common=CommonSettings(),
 )
 #: The same plant in the world "sensors".
 MEASURED = replace(SETTINGS, sensors=frozenset(READINGS))

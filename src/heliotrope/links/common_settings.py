@@ -1,0 +1,61 @@
+"""Settings that all clusters of a plant share, and their checksum, sent in each status.
+
+The plant computes the same checksum from what it is told, and compares.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from zlib import crc32
+
+from heliotrope.safety import Watcher, conditions, watched_by
+
+#: What a row of the safety table does; its texts may differ between editions of the program.
+_ROW = ("trips", "releases", "delay", "clear_for", "stale_after", "then_stow", "act", "scope")
+
+
+@dataclass(frozen=True)
+class CommonSettings:
+    """Settings that should be the same in all clusters.
+
+    Parameters
+    ----------
+    steps_every
+        Interval at which the step counts of each heliostat are requested, in s.
+    silence
+        Time without an answer after which a heliostat is reported, in s.
+    delta_t
+        TT − UT1, in s; None: from the date.
+    """
+
+    steps_every: int = 1
+    silence: float = 10.0
+    delta_t: float | None = None
+
+
+def settings_checksum(common: CommonSettings) -> str:
+    """Return the checksum of common settings, eight hexadecimal digits.
+
+    It is the CRC-32 of ASCII text with a line ``name=value`` for each setting, in the order of the
+    names, each line ended by a newline. A value is the shortest decimal that gives the same
+    binary64 number ("inf" for never), or "default".
+
+    The settings are those of ``[polling]``, ΔT of the site, and the numbers of the rows of the
+    safety table that a cluster watches. Not among them: name, heliostats, phase, keys; ports, and
+    the answer times that depend on the bus; the rest of the site, which each status carries in
+    full; and the longest autonomy, which follows from the emergency line that a cluster has or has
+    not. Where that is less than the plant grants, the cluster says so (`autonomy_limited`).
+    """
+    values: dict[str, float | None] = {
+        "delta_t_s": common.delta_t,
+        "silence_s": common.silence,
+        "steps_every_s": common.steps_every,
+    }
+    for row in watched_by(conditions(), Watcher.CLUSTER):
+        fields = dataclasses.asdict(row)
+        values |= {f"{row.name}.{field}": fields[field] for field in _ROW}
+    lines = (f"{name}={_text(value)}\n" for name, value in sorted(values.items()))
+    return f"{crc32(''.join(lines).encode('ascii')):08x}"
+
+
+def _text(value: float | None) -> str:
+    return "default" if value is None else repr(float(value))
