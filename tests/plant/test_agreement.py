@@ -10,6 +10,7 @@ import pytest
 
 from heliotrope.field.example import example_plant
 from heliotrope.lcu import states
+from heliotrope.lcu.names import FLAGS
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency
 from heliotrope.mechanism.board_items import items_of
@@ -204,6 +205,15 @@ def test_a_new_calibration_counts_once_the_local_controller_has_it(tmp_path: Pat
     agreement._look(2.0)
     assert np.array_equal(agreement._armature[row], other.armature.table)
     assert np.array_equal(agreement._drives[row], other.drives.table)
+    # Of drives alone no checksum comes with the status: they count once nothing wanted is missing.
+    own = other.drives.table + 0.01
+    plant.wanted.missing[NAME] = ("drives",)
+    agreement.believe(row, other.armature.table, own)
+    agreement._look(3.0)
+    assert np.array_equal(agreement._drives[row], other.drives.table)
+    del plant.wanted.missing[NAME]
+    agreement._look(4.0)
+    assert np.array_equal(agreement._drives[row], own)
 
 
 def test_many_that_disagree_defocus_the_field(tmp_path: Path) -> None:
@@ -216,5 +226,137 @@ def test_many_that_disagree_defocus_the_field(tmp_path: Path) -> None:
         assert plant.emergency_on
         assert plant.emergency is not None
         assert plant.emergency.act is Act.DEFOCUS
+
+    play(tmp_path, scene)
+
+
+def standing_at(bench: Bench, point: tuple[float, float, float], late: float) -> None:
+    """Put the step counts and goals of a heliostat where a late sun sends its beam to a point."""
+    sun = fast_vector(bench.clock.utc().timestamp() - late, DESIGN.site)
+    group, row = DESIGN.find(NAME)
+    counts = track(group.mechanism[row], sun, np.array(point)).best_counts
+    cluster = bench.cluster_of(NAME)
+    for axis, value in zip(("primary", "secondary"), counts, strict=True):
+        for name in (axis, f"{axis}_goal"):
+            cluster.rows[name][cluster.names.index(NAME)] = round(float(value))
+
+
+async def follow(
+    bench: Bench, seconds: int, point: tuple[float, float, float], late: float
+) -> set[str]:
+    """Let the beam follow a point by a late sun for some seconds; return who is named."""
+    for _ in range(seconds):
+        standing_at(bench, point, late)
+        bench.plant.authority.keep(OPERATOR, bench.plant.authority.token)
+        await bench.wait(1.0)
+    return alarmed(bench, "pointing_disagrees")
+
+
+REST = (8.0, 2.0, 15.0)
+
+
+async def resting(bench: Bench, late: float, ready: bool = True) -> int:
+    """Bring a heliostat up to standby by a late sun; return the token."""
+    token = await bench.commanded()
+    assert await bench.plant.standby(OPERATOR, token, {NAME: REST}).end(5.0)
+    cluster = bench.cluster_of(NAME)
+    cluster.rows["flags"] = (1 << FLAGS.index("READY")) if ready else 0
+    cluster.set(states.APPROACHING, NAME)
+    await follow(bench, 6, REST, late)
+    cluster.set(states.IDLE, NAME)
+    return token
+
+
+@pytest.mark.parametrize("late", [0.0, 600.0])
+def test_a_beam_at_standby_by_a_wrong_sun_is_named_and_defocused(
+    late: float, tmp_path: Path
+) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, cluster = bench.plant, bench.cluster_of(NAME)
+        token = await resting(bench, late)
+        named = await follow(bench, 10, REST, late)
+        assert named == ({NAME} if late else set())
+        assert [m.heliostats for m in cluster.of(Emergency)] == ([(NAME,)] if late else [])
+        if not late:
+            return
+        # Turned away, it does not come back, by nobody's command, before somebody has looked.
+        assert cluster.rows["state"][cluster.names.index(NAME)] == states.DEFOCUSED
+        await follow(bench, 8, REST, late)
+        with pytest.raises(RefusedError, match=r"IDLE P5A: pointing_disagrees .*acknowledge"):
+            plant.command(OPERATOR, token, "IDLE", (NAME,))
+        plant.acknowledge(OPERATOR, "pointing_disagrees", NAME)
+        assert plant.command(OPERATOR, token, "IDLE", (NAME,))
+
+    play(tmp_path, scene)
+
+
+ELSEWHERE = {"JOG": (0, 20_000), "GOTO": (0, 0), "DIAGNOSE": (), "LOCK": (), "UNLOCK": ()}
+
+
+@pytest.mark.parametrize("name", ELSEWHERE)
+def test_a_heliostat_that_a_person_left_elsewhere_is_left_in_peace(
+    name: str, tmp_path: Path
+) -> None:
+    """Until IDLE has sent it to its standby point again."""
+
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        token = await resting(bench, 0.0)
+        assert not await follow(bench, 6, REST, 0.0)
+        plant._orders.command(
+            plant._orders.accept((OPERATOR.name, "operator", name), (), (NAME,)),
+            name,
+            tuple(float(x) for x in ELSEWHERE[name]),
+            (NAME,),
+            token,
+        )
+        await follow(bench, 1, REST, 0.0)
+        bench.cluster_of(NAME).set(states.IDLE, NAME)
+        assert not await follow(bench, 10, REST, 600.0)
+        assert await plant.command(OPERATOR, token, "IDLE", (NAME,)).end(5.0)
+        assert await follow(bench, 10, REST, 600.0) == {NAME}
+
+    play(tmp_path, scene)
+
+
+def test_a_heliostat_that_never_came_to_standby_by_the_way_from_stow_holds_still(
+    tmp_path: Path,
+) -> None:
+    async def scene(bench: Bench) -> None:
+        await resting(bench, 600.0, ready=False)
+        assert not await follow(bench, 10, REST, 600.0)
+
+    play(tmp_path, scene)
+
+
+def test_a_new_standby_point_that_the_beam_does_not_go_to_is_no_disagreement(
+    tmp_path: Path,
+) -> None:
+    """It may be on its way, or refused: the beam rests where it was sent before."""
+
+    async def scene(bench: Bench) -> None:
+        other = (-8.0, 2.0, 15.0)
+        await resting(bench, 0.0)
+        assert not await follow(bench, 6, REST, 0.0)
+        bench.plant.standbys[bench.plant.field.place(NAME)] = other
+        assert not await follow(bench, 8, REST, 0.0)
+        assert not await follow(bench, 4, other, 0.0)
+        assert await follow(bench, 10, REST, 0.0) == {NAME}
+
+    play(tmp_path, scene)
+
+
+@pytest.mark.parametrize(("radius", "wrong"), [(8e-3, False), (2e-3, True)])
+def test_a_search_keeps_to_its_radius(radius: float, wrong: bool, tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        token = await tracking(bench)
+        await go(bench, 4, 0.0)
+        plant = bench.plant
+        assert await plant.command(OPERATOR, token, "SEARCH", (NAME,), (1e-3, radius)).end(5.0)
+        vertex = plant.beams.position[plant.field.place(NAME)]
+        aside = np.cross(np.array(AIM) - vertex, (0.0, 0.0, 1.0))
+        aside *= 7e-3 * np.linalg.norm(np.array(AIM) - vertex) / np.linalg.norm(aside)
+        x, y, z = (float(value) for value in np.array(AIM) + aside)
+        assert await follow(bench, 10, (x, y, z), 0.0) == ({NAME} if wrong else set())
 
     play(tmp_path, scene)

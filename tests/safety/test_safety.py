@@ -66,7 +66,7 @@ TRIPS = {
         "in a keep-out volume or headin",
     ),
     "beam_unsent": (1.0, 0.0, Act.DEFOCUS, Scope.HELIOSTAT, "on a receiver, and nobody sent it"),
-    "pointing_disagrees": (5e-3, 0.0, Act.DEFOCUS, Scope.HELIOSTAT, r"beam 0.286° beside its aim"),
+    "pointing_disagrees": (5e-3, 0.0, Act.DEFOCUS, Scope.HELIOSTAT, r"beam 0.286° beside where it"),
     "pointing_disagrees_many": (120.0, 0.0, Act.DEFOCUS, Scope.FIELD, "counts of 120 heliostats"),
     "cluster_time_differs": (5.0, 0.0, Act.DEFOCUS, Scope.CLUSTER, "differs from the .* by 5 s"),
     "cluster_site_differs": (0.04, 0.0, Act.DEFOCUS, Scope.CLUSTER, "site is 2.29° off that of"),

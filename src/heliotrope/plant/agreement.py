@@ -1,12 +1,19 @@
 """The plant's own view of time, site and pointing, compared with what is reported.
 
 A cluster with a wrong clock or site sends its local controllers a wrong sun, and each of them then
-tracks, in good order, beside its aim. So the plant compares the time and the site in each status
-with its own; and from the step counts of each heliostat that tracks, the sun and the parameters
-that it knows, it computes where the beam goes, and compares that with the aim.
+follows it, in good order, beside its aim or its standby point. So the plant compares the time and
+the site in each status with its own; and from the step counts of each heliostat, the sun and the
+parameters that it knows, it computes where the beam goes, and compares that with the point where
+the beam was sent.
+
+A beam is sent to a point in three states: TRACKING, SEARCHING (within the radius that the plant
+ordered), and IDLE, unless the heliostat holds still there: it does so after UNLOCK and CLEAR_FAULT,
+where a person moved it, and until it has come to standby by the way from stow. In every other state
+it is turned away, on its way, locked, or at stow by the counts that it stores itself, and no point
+is to be compared.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from zlib import crc32
 
 import numpy as np
@@ -14,6 +21,7 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, normalize
+from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.messages import ClusterStatus
 from heliotrope.mechanism.armature import Armature
@@ -21,7 +29,7 @@ from heliotrope.mechanism.board_items import packed
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import Points
-from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.field_state import FieldState, Mask
 from heliotrope.safety import Reading
 from heliotrope.sun import Site, fast_vector
 
@@ -31,14 +39,65 @@ LOOK_PERIOD = 2.0
 NOTED = 1e-3
 #: Most heliostats that are named; with more, the field is the subject.
 MOST_NAMED = 150
-#: Step counts count from this time after a heliostat was first seen to track, s.
+#: Step counts count from this time after a beam was first seen to be sent to its point, s.
 _SETTLE = 1.0
 #: An axis that comes nearer to its goal by this between two looks is on its way, rad.
 _CLOSING = 1e-4
 #: The motion of the sun is taken over this time, s.
 _SPAN = 10.0
+#: Commands after which an idle heliostat holds still.
+_STILL = ("JOG", "GOTO", "DIAGNOSE", "LOCK", "UNLOCK", "CLEAR_FAULT", "ZERO")
+#: Longest time that one of them is under way to its heliostat, s.
+_UNDER_WAY = 15.0
+#: States from which a heliostat that is ready comes to IDLE by following its standby point.
+_COMES = (states.APPROACHING, states.TRACKING, states.SEARCHING, states.DEFOCUSED)
+_ON_AIM = (states.TRACKING, states.SEARCHING)
+_READY = 1 << meanings.FLAGS.index("READY")
 
 Rows = npt.NDArray[np.intp]
+
+
+class _Points:
+    """Assigned points of one kind, and where the beams were found.
+
+    Parameters
+    ----------
+    points
+        ENU, m, (N, 3); NaN where there is none; assigned by others.
+
+    Attributes
+    ----------
+    found
+        Points at which the beams were found, (N, 3): an assigned point may wait for its turn, or
+        be refused by the local controller, and then the beam goes on to the one before.
+    changed_at
+        When each point was seen to change, monotonic s, (N,).
+    """
+
+    def __init__(self, points: FloatArray) -> None:
+        self.points, self._last = points, points.copy()
+        self.found = np.full(points.shape, np.nan)
+        self.changed_at = np.full(len(points), -np.inf)
+
+    def look(self, now: float) -> Mask:
+        """Return which points have changed since the last look, (N,)."""
+        new, last = self.points, self._last
+        changed = ~np.all((new == last) | (np.isnan(new) & np.isnan(last)), axis=-1)
+        # Until the beam is at the new point it may be at the one before, found or not.
+        unfound = changed & np.isnan(self.found).any(axis=-1)
+        self.found[unfound] = last[unfound]
+        self.changed_at[changed], last[changed] = now, new[changed]
+        return np.asarray(changed)
+
+    def beside(self, rows: Rows, beam: FloatArray, vertex: FloatArray) -> FloatArray:
+        """Return the angle between beams (K, 3) and the nearer of their two points, rad, (K,)."""
+        points, before = self.points[rows], self.found[rows]
+        error = _angle(beam, points - vertex)
+        here = error < NOTED
+        older = np.isfinite(before).all(axis=-1)
+        error[older] = np.minimum(error, _angle(beam, before - vertex))[older]
+        self.found[rows[here]] = points[here]
+        return error
 
 
 class Agreement:
@@ -54,6 +113,8 @@ class Agreement:
         Site of the plant.
     utc
         Returns the plant's time, POSIX s.
+    differing
+        Returns which heliostats do not store the wanted parameters, and why.
     """
 
     def __init__(
@@ -63,28 +124,57 @@ class Agreement:
         check: BeamCheck,
         site: Site,
         utc: Callable[[], float],
+        differing: Callable[[Sequence[str]], Mapping[str, str]],
     ) -> None:
-        self._field, self._points, self._site, self._utc = field, points, site, utc
+        self._field, self._site, self._utc, self._differing = field, site, utc, differing
+        self._aims, self._standbys = _Points(points.aims), _Points(points.standbys)
         self._armature, self._drives = check.armature.table.copy(), check.drives.table.copy()
         #: New parameters that the local controllers do not store yet: checksum, armature, drives.
         self._pending: dict[int, tuple[int, FloatArray, FloatArray]] = {}
         self._time_off = dict.fromkeys(field.clusters, 0.0)
         self._sun_off = dict.fromkeys(field.clusters, 0.0)
         count = len(field)
-        self._since = np.full(count, np.inf)
-        #: Aims at the last look, and when each was seen to change.
-        self._aims, self._aimed_at = points.aims.copy(), np.full(count, -np.inf)
+        #: States at the last look; those whose beams are sent to aims and to standby points.
+        self._states = np.full(count, -1, dtype=np.int64)
+        self._on_aim, self._at_rest = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+        #: Since when they are; when a command that leaves them still was last sent, monotonic s.
+        self._since, self._stilled_at = np.full(count, np.inf), np.full(count, -np.inf)
+        #: Radius of the last search, rad.
+        self._radius = np.full(count, np.nan)
         self._lag = np.full(count, np.inf)
         #: Whether the axes stand beside their goals, by counts that came at a time, monotonic s.
         self._stands, self._counted = np.zeros(count, dtype=bool), np.full(count, -np.inf)
-        #: Aims at which the beams were found: an assigned aim may wait for its turn.
-        self._found = np.full((count, 3), np.nan)
         self._wrong: dict[str, float] = {}
         self._at = -np.inf
 
     def believe(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
         """Take new parameters, which hold once the local controller reports their checksum."""
         self._pending[row] = crc32(packed("armature", tuple(armature))), armature, drives
+
+    def sent(
+        self, name: str, values: Sequence[float], heliostats: Collection[str], now: float
+    ) -> None:
+        """Note a command that has been sent."""
+        if name != "SEARCH" and name not in _STILL:
+            return
+        rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
+        if name == "SEARCH":
+            # One that searches already goes on with its spiral if it refuses the new one.
+            searches = self._field.rows["state"][rows] == states.SEARCHING
+            self._radius[rows] = np.fmax(values[1], np.where(searches, self._radius[rows], np.nan))
+            return
+        self._stilled_at[rows], self._at_rest[rows] = now, False
+
+    def obeyed(self, name: str, accepted_at: float, heliostats: Sequence[str], now: float) -> None:
+        """Note a command, accepted at a monotonic time, that has been acknowledged.
+
+        IDLE brings back to its standby point one that is IDLE already and stands elsewhere.
+        """
+        if name == "IDLE":
+            rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
+            rows = rows[(self._stilled_at[rows] < accepted_at) & ~self._at_rest[rows]]
+            rows = rows[self._field.rows["state"][rows] == states.IDLE]
+            self._at_rest[rows], self._since[rows] = True, now
 
     def take(self, cluster: str, status: ClusterStatus) -> None:
         """Take a cluster's status that has just arrived."""
@@ -111,38 +201,54 @@ class Agreement:
         return found
 
     def _look(self, now: float) -> None:
-        field, aims = self._field, self._points.aims
+        field = self._field
         for row, (crc, armature, drives) in list(self._pending.items()):
-            if int(field.rows["armature_crc"][row]) == crc:
+            stored = int(field.rows["armature_crc"][row]) == crc
+            if stored and not self._differing((field.names[row],)):
                 self._armature[row], self._drives[row] = armature, drives
                 del self._pending[row]
-        tracking = field.among((states.TRACKING,), now)
-        self._since = np.where(tracking, np.minimum(self._since, now), np.inf)
-        self._found[~tracking] = np.nan
-        changed = ~np.all((aims == self._aims) | (np.isnan(aims) & np.isnan(self._aims)), axis=-1)
-        begins = ~tracking | changed
+        begins = self._sort(now)
+        self._aims.found[~self._on_aim] = np.nan
+        aims, standbys = self._aims.look(now), self._standbys.look(now)
+        begins |= np.where(self._on_aim, aims, standbys)
         self._lag[begins], self._stands[begins] = np.inf, False
-        # A new aim may wait for its turn: until then the beam is on the one before, found or not.
-        unfound = changed & np.isnan(self._found).any(axis=-1)
-        self._found[unfound] = self._aims[unfound]
-        self._aimed_at[changed], self._aims[changed] = now, aims[changed]
-        # Counts from before a new aim say nothing about it.
-        begun = np.maximum(self._since, self._aimed_at) + _SETTLE
-        known = np.isfinite(aims).all(axis=-1) & (field.counted_at >= begun)
-        rows = np.flatnonzero(tracking & known)
-        error = self._errors(rows, now)
+        kinds = ((self._on_aim, self._aims), (self._at_rest, self._standbys))
+        error = np.zeros(len(field))
+        for mine, sent in kinds:
+            # Counts from before a new point say nothing about it.
+            begun = np.maximum(self._since, sent.changed_at) + _SETTLE
+            known = np.isfinite(sent.points).all(axis=-1) & (field.counted_at >= begun)
+            rows = np.flatnonzero(mine & known & field.sure(now))
+            error[rows] = self._errors(rows, sent, now)
+        searches = self._on_aim & (self._states == states.SEARCHING)
+        error[searches] -= self._radius[searches]
         bad = np.flatnonzero(error >= NOTED)
         worst = bad[np.argsort(-error[bad], kind="stable")][:MOST_NAMED]
-        self._wrong = {field.names[rows[i]]: float(error[i]) for i in worst}
+        self._wrong = {field.names[row]: float(error[row]) for row in worst}
 
-    def _errors(self, rows: Rows, now: float) -> FloatArray:
-        """Return the angle between each beam (K,) and its aim, rad, by goals and counts."""
+    def _sort(self, now: float) -> Mask:
+        """Find which beams are sent to which points; return those for which that has changed."""
+        field = self._field
+        live, state = field.live(now), field.rows["state"].astype(np.int64)
+        ready = live & (state == states.IDLE) & (field.rows["flags"] & _READY != 0)
+        came = ready & np.isin(self._states, _COMES) & (self._stilled_at < now - _UNDER_WAY)
+        at_rest = np.where(live, ready & (self._at_rest | came), self._at_rest)
+        on_aim = live & np.isin(state, _ON_AIM)
+        on_aim &= (state == states.TRACKING) | np.isfinite(self._radius)
+        begins = (on_aim & ~self._on_aim) | (at_rest & ~self._at_rest)
+        self._since[begins] = now
+        self._on_aim, self._at_rest = on_aim, at_rest
+        self._states[live] = state[live]
+        return np.asarray(begins | ~(on_aim | at_rest))
+
+    def _errors(self, rows: Rows, sent: _Points, now: float) -> FloatArray:
+        """Return the angle between each beam (K,) and its point, rad, by goals and counts."""
         field = self._field
         sun = self._sun_at(now - field.counted_at[rows])
         drives = Drive(self._drives[rows])
         ends = np.asarray(drives.angles(field.goals(rows)))
         here = np.asarray(drives.angles(field.counts(rows)))
-        error = self._beside(rows, ends, sun)
+        error = self._beside(rows, sent, ends, sun)
         lag = np.abs(ends - here).max(axis=-1)
         # Axes that come no nearer to their goals stand where they are.
         # In large fields counts are older than a look: the same counts say nothing new.
@@ -152,7 +258,7 @@ class Agreement:
         self._lag[rows], self._stands[rows] = lag, stands
         self._counted[rows] = field.counted_at[rows]
         if stands.any():
-            beside = self._beside(rows[stands], here[stands], sun[stands])
+            beside = self._beside(rows[stands], sent, here[stands], sun[stands])
             error[stands] = np.maximum(error[stands], beside)
         return error
 
@@ -163,18 +269,11 @@ class Agreement:
         rate = (sun - fast_vector(utc_s - _SPAN, self._site)) / _SPAN
         return normalize(sun - rate * ages[:, None], "sun")
 
-    def _beside(self, rows: Rows, angles: FloatArray, sun: FloatArray) -> FloatArray:
-        """Return the angle between beams (K,) and the nearer of their two aims, rad."""
+    def _beside(self, rows: Rows, sent: _Points, angles: FloatArray, sun: FloatArray) -> FloatArray:
+        """Return the angle between beams (K,), the axes at angles (K, 2), and their points, rad."""
         normal, vertex = Armature(self._armature[rows]).pose(angles)
         beam = 2.0 * np.sum(sun * normal, axis=-1, keepdims=True) * normal - sun
-        aims = self._points.aims[rows]
-        error = _angle(beam, aims - vertex)
-        before = self._found[rows]
-        older = np.isfinite(before).all(axis=-1)
-        error[older] = np.minimum(error, _angle(beam, before - vertex))[older]
-        at_aim = _angle(beam, aims - vertex) < NOTED
-        self._found[rows[at_aim]] = aims[at_aim]
-        return error
+        return sent.beside(rows, beam, vertex)
 
 
 def _angle(a: FloatArray, b: FloatArray) -> FloatArray:

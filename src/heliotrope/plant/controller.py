@@ -37,6 +37,7 @@ from heliotrope.links.messages import (
     Lease,
     Progress,
     ProtocolError,
+    Stage,
 )
 from heliotrope.mechanism.board_items import POSE_ITEMS, Wanted, items_of, tables_with
 from heliotrope.mechanism.chain import Mechanism
@@ -167,7 +168,12 @@ class PlantController:
         self.movements = Movements(design.receivers, self.beams.armature)
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, self.beams.machines)
         self._agreement = Agreement(
-            self.field, points, self.beams, design.site, lambda: clock.utc().timestamp()
+            self.field,
+            points,
+            self.beams,
+            design.site,
+            lambda: clock.utc().timestamp(),
+            self._differing,
         )
         self._clusters = Clusters(members, links, clock, self.counters)
         self._identities = Identities(
@@ -192,6 +198,7 @@ class PlantController:
             self.settings.lifetime,
             self.settings.patience,
             self.settings.stow_rate,
+            self._agreement.sent,
         )
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
         self._sync = ParameterSync(
@@ -312,6 +319,9 @@ class PlantController:
                 found = self._orders.take(end.name, message)
                 if found is not None:
                     self._sentinel.take_progress(*found, message)
+                    if message.stage is Stage.ACKNOWLEDGED:
+                        ticket, part = found
+                        self._agreement.obeyed(ticket.name, ticket.accepted_at, part, now)
             case Alarm():
                 for alarm in self._told_alarms.take(end.name, message):
                     self._tell(alarm)
@@ -749,6 +759,9 @@ class PlantController:
 
     def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
         return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
+
+    def _differing(self, heliostats: Sequence[str]) -> Mapping[str, str]:
+        return self._sync.differing(heliostats)
 
     def _aimed(self, row: int) -> FloatArray:
         """Return the points at which a heliostat may aim, ENU, m, (K, 3)."""

@@ -92,6 +92,8 @@ class PlantOrders:
         Time allowed until a command is acknowledged, and from then until it is done, s.
     stow_rate
         Heliostats a second that `stow_in_turn` sends; 0: all at once.
+    sent
+        Called with name, values and heliostats of each command that is sent, and the time.
 
     Attributes
     ----------
@@ -112,8 +114,10 @@ class PlantOrders:
         prefix: str,
         lifetime: float,
         patience: float,
-        stow_rate: float = 0.0,
+        stow_rate: float,
+        sent: Callable[[str, tuple[float, ...], tuple[str, ...], float], None],
     ) -> None:
+        self._sent = sent
         self._clock, self._audit, self._disk, self._clusters = clock, audit, disk, clusters
         self._prefix, self._lifetime, self._patience = prefix, lifetime, patience
         self._number = self._messages = 0
@@ -316,6 +320,7 @@ class PlantOrders:
         if name == "LOCK":
             for other, names in self._stowing.take(heliostats).items():
                 other.advance(names, Stage.FAILED, "superseded by LOCK")
+        self._sent(name, values, heliostats, self._clock.monotonic())
         life = self._lifetime if lifetime is None else lifetime
         for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part)

@@ -4,6 +4,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 from heliotrope.files.disk import Work
 from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
 from heliotrope.plant import refusals
 from heliotrope.plant.audit import AuditError
 from heliotrope.plant.authority import Authority, Person
@@ -22,6 +23,12 @@ from heliotrope.plant.tickets import Ticket
 JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
 #: Commands that move heliostats by their parameters.
 MOTIONS = JOINING | {"APPROACH", "IDLE", "JOG", "GOTO", "DIAGNOSE"}
+#: Commands that bring beams to standby.
+_TO_STANDBY = ("APPROACH", "IDLE")
+#: States in which beams are off.
+_AWAY = (states.STOWED, states.DEFOCUSED)
+#: Row of the safety table for beams that are not where they were sent.
+ASTRAY = "pointing_disagrees"
 
 
 class Permission:
@@ -60,7 +67,8 @@ class Permission:
         """Return the heliostats that may be given a command, and why the others may not.
 
         Everything but LOCK needs a board that is the heliostat's; a motion, the wanted parameters;
-        joining, that no alarm bars the heliostat.
+        joining, that no alarm bars the heliostat. One whose beam went astray does not come back to
+        standby either, before its alarm is acknowledged: its beam would go astray again.
 
         Raises
         ------
@@ -72,10 +80,17 @@ class Permission:
             wrong = self._sync.differing(names) | self._orders.to_stow(names) | wrong
         if name in JOINING:
             wrong |= self._sentinel.barred(names) | self._doubts.barred(names)
+        elif name in _TO_STANDBY:
+            wrong |= self._sentinel.barred(self._off(names), ASTRAY)
         if wrong and len(wrong) == len(names):
             self.refuse_now(name, names)
             raise BeamError(name, wrong)
         return tuple(n for n in names if n not in wrong), wrong
+
+    def _off(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Return which heliostats are at stow or have turned away."""
+        state, index = self._field.rows["state"], self._field.index
+        return tuple(name for name in names if state[index[name]] in _AWAY)
 
     def strange(self, names: Sequence[str]) -> dict[str, str]:
         """Return which heliostats' boards are not known to be theirs, and why."""

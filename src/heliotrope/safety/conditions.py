@@ -301,17 +301,17 @@ def _mirrors() -> tuple[Condition, ...]:
         ),
         Condition(
             "pointing_disagrees", _PLANT, "pointing_error", "rad",
-            "angle between its beam, by its step counts, and its aim",
-            "its step counts send its beam {value} beside its aim", 3e-3, 2e-3, _DEFOCUS,
+            "angle between its beam, by its step counts, and its aim or standby point",
+            "its step counts send its beam {value} beside where it was sent", 3e-3, 2e-3, _DEFOCUS,
             _HELIOSTAT, _SERIOUS, 30.0, delay=3.0, role=_OPERATOR,
-            release="its step counts agree with its aim, or its beam is off",
+            release="its step counts agree with its aim or standby point, or its beam is off",
             remedy="Check the parameters and the address of its local controller, and the time and"
             " the site of its cluster; then acknowledge.",
         ),
         Condition(
             "pointing_disagrees_many", _PLANT, "pointing_errors", "count",
-            "number of heliostats whose step counts disagree with their aims",
-            "the step counts of {value} heliostats or more disagree with their aims", 100.0, 20.0,
+            "number of heliostats whose step counts disagree with their aims or standby points",
+            "the step counts of {value} heliostats or more send their beams astray", 100.0, 20.0,
             _DEFOCUS, _FIELD, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=3.0, role=_OPERATOR,
             release="few heliostats disagree",
             remedy="Check the clock of the plant's machine and its site first, then the clusters.",

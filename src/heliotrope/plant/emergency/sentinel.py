@@ -290,9 +290,9 @@ class Sentinel:
         stowed = self._field.rows["state"][rows] == states.STOWED
         return np.asarray(self._ways.unsent.lit(rows) & ~stowed)
 
-    def barred(self, heliostats: Iterable[str]) -> dict[str, str]:
-        """Return which heliostats may not join their aims, and why."""
-        barred = self.table.barred()
+    def barred(self, heliostats: Iterable[str], condition: str = "") -> dict[str, str]:
+        """Return which heliostats one row, or any, keeps from their aims, and why."""
+        barred = self.table.barred(condition)
         return {name: barred[name] for name in heliostats if name in barred}
 
     def _last_of(self, row: int, now: float) -> str:

@@ -245,12 +245,13 @@ class TableWatch:
             if a.scope is Scope.HELIOSTAT and a.act >= Act.DEFOCUS and a.subject and not a.waits
         }
 
-    def barred(self) -> dict[str, str]:
-        """Return the heliostats that may not join their aims, by name, and why."""
+    def barred(self, condition: str = "") -> dict[str, str]:
+        """Return the heliostats that one row, or any, keeps from their aims, by name, and why."""
         return {
             a.subject: a.text
             for a in self.actions
             if a.scope is Scope.HELIOSTAT and a.act >= Act.DEFOCUS and a.subject
+            if condition in ("", a.condition)
         }
 
     def caused(self) -> bool:
