@@ -69,6 +69,8 @@ ELSEWHERE = ("--ignore-glob=*micropython*",)
 #: Time of the processor after which a test or a run hangs: this and so much more than it takes
 #: unchanged; of a run; wall time for those that wait for ever, on a machine that does more. s.
 SPARE, FACTOR, RUN_LIMIT, WALL = 5.0, 1.5, 30.0, 300.0
+#: What finds a mutant with which the sources cannot be imported, so that no test or run begins.
+IMPORT = "import"
 #: Takes the line of a mutant that was tried.
 Keep = Callable[[dict[str, Any]], None]
 OPTIONS = ("-q", "-s", "-m", "not slow", "-p", "no:cacheprovider", "-p", "no:terminalreporter")
@@ -526,7 +528,9 @@ class Bench:
     def _judge(self, trial: Trial, *, good: bool) -> None:
         kind, found = trial.kind.split()[0], trial.found
         shutil.rmtree(trial.folder, ignore_errors=True)
-        if kind == "unit" and not good:
+        if not (good or found):
+            self._tell(trial, kind, IMPORT)
+        elif kind == "unit" and not good:
             # The same test on the unchanged code: does it fail by itself, on this machine, now?
             self._ready.insert(0, Trial("control inside", trial.mutant, [found], 60.0, then=trial))
         elif kind == "control" and not good:

@@ -290,6 +290,20 @@ def test_tests_that_are_left_out_when_the_time_is_up_find_nothing(
     assert ended.returncode == (0 if most < 0 else 1), ended.stdout + ended.stderr
 
 
+@pytest.mark.parametrize("kind", ["unit", "simulation"])
+def test_a_mutant_that_stops_the_import_is_found_at_once(
+    scripts: Any, tmp_path: Path, kind: str
+) -> None:
+    """No test begins, so none can be repeated without the mutant."""
+    lines: list[dict[str, Any]] = []
+    trials = scripts.mutant_trials
+    mutant = scripts.mutant_operators.Mutant("links/a.py", 3, 1, "Or to And")
+    bench = trials.Bench([mutant], [], tmp_path / "reach.json", 1, 0.0, lines.append)
+    bench._judge(trials.Trial(f"{kind} outside", mutant, ["one"], 1.0), good=False)
+    assert [(line["trial"], line["by"]) for line in lines] == [(kind, "import")]
+    assert not bench._ready
+
+
 def test_the_table_counts_and_names_survivors(scripts: Any) -> None:
     lines = [
         {
