@@ -17,6 +17,9 @@ from heliotrope.cli import main
 from heliotrope.field.camera import project
 from heliotrope.field.example import example_plant
 from heliotrope.field.formats.plant_file import read_plant, write_plant
+from heliotrope.imaging.files import write_image
+from heliotrope.imaging.receiver_file import read_reference
+from heliotrope.imaging.receiver_light import receiver_light
 from imaging.test_lens import HELD, MATRIX, drawn, held
 from imaging.test_teaching import (
     ALL,
@@ -30,6 +33,7 @@ from imaging.test_teaching import (
     at,
     photograph,
 )
+from support import receiver_scene
 
 TAUGHT = (
     "--kind",
@@ -423,3 +427,70 @@ def test_bad_input_is_one_line_and_changes_nothing(
     said = call(*arguments, code=2)
     assert text in said
     assert {file.name: file.read_bytes() for file in place.iterdir()} == before
+
+
+# -- receiver --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def lit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A plant whose camera sees its receiver, and photographs of it."""
+    folder = tmp_path_factory.mktemp("receiver")
+    plain = replace(
+        example_plant(), receivers=(receiver_scene.RECEIVER,), cameras=(receiver_scene.CAMERA,)
+    )
+    write_plant(plain, folder / "plant.toml")
+    write_plant(replace(plain, receivers=()), folder / "none.toml")
+    far = replace(receiver_scene.CAMERA, position=None, R_enu_camera=None)
+    write_plant(replace(plain, cameras=(far,)), folder / "far.toml")
+    for name, frame in {
+        "capped": receiver_scene.capped(),
+        "dark0": receiver_scene.frame(seed=1),
+        "dark1": receiver_scene.frame(seed=2),
+        "four": receiver_scene.frame(4, seed=3),
+        "eight": receiver_scene.frame(8, seed=4),
+    }.items():
+        write_image(frame, folder / f"{name}.png")
+    return folder
+
+
+def pictures_of(folder: Path) -> list[object]:
+    shares = {n: receiver_scene.true_share(receiver_scene.mirrors(n)) for n in (4, 8)}
+    return [
+        *("--camera", "eye", "--capped", folder / "capped.png"),
+        *("--dark", folder / "dark0.png", "--dark", folder / "dark1.png"),
+        *("--lit", f"{folder / 'four.png'}={shares[4]}"),
+        *("--lit", f"{folder / 'eight.png'}={shares[8]}"),
+    ]
+
+
+def test_receiver_takes_a_reference_that_measures(call: Any, lit: Path, tmp_path: Path) -> None:
+    out = tmp_path / "receiver.toml"
+    text = call("receiver", lit / "plant.toml", *pictures_of(lit), "--out", out)
+    assert re.search(r"nominal flux fills \d+ % of the scale; daylight on it counts as \d", text)
+    assert text.endswith(f"reference written to {out}\n")
+    shown = receiver_scene.frame(12, seed=5)
+    share = receiver_scene.true_share(receiver_scene.mirrors(12))
+    assert receiver_light(shown, read_reference(out)).share == pytest.approx(share, abs=0.01)
+    # The outline by hand, for a camera whose position nobody knows.
+    corners = project(receiver_scene.CAMERA, receiver_scene.FACE.corners)
+    by_hand = [word for x, y in corners for word in ("--outline", f"{x:.1f},{y:.1f}")]
+    found = json.loads(
+        call("receiver", lit / "far.toml", *pictures_of(lit), *by_hand, "--out", out, "--json")
+    )
+    assert found["receiver"] == "receiver"
+    assert np.array(found["outline_px"]) == pytest.approx(corners, abs=0.1)
+    assert receiver_light(shown, read_reference(out)).share == pytest.approx(share, abs=0.01)
+
+
+def test_receiver_writes_nothing_where_it_refuses(call: Any, lit: Path, tmp_path: Path) -> None:
+    out, given = tmp_path / "receiver.toml", pictures_of(lit)
+    for words, text in (
+        (("none.toml", *given, "--out", out), "0 receivers; a camera measures the flux where"),
+        (("far.toml", *given, "--out", out), "position is not known; give --outline X,Y"),
+        (("plant.toml", *given, "--out", tmp_path / "a.json"), "a reference is written as TOML"),
+        (("plant.toml", *given, "--lit", "four.png", "--out", out), "write FILE=SHARE"),
+        (("plant.toml", *given, "--lit", f"{lit / 'four.png'}=0.9", "--out", out), "share wrong"),
+    ):
+        assert text in call("receiver", lit / words[0], *words[1:], code=2)
+    assert not list(tmp_path.iterdir())

@@ -13,6 +13,7 @@ from heliotrope.errors import FormatError, InputError
 if TYPE_CHECKING:
     from heliotrope.field.camera import Camera
     from heliotrope.field.plant import Plant
+    from heliotrope.field.target import Receiver
     from heliotrope.imaging.frame import Frame
     from heliotrope.imaging.lens import Lens
     from heliotrope.imaging.pose import CameraFit
@@ -366,6 +367,100 @@ def _show_taught(taught: "Taught", place: Path, as_json: bool) -> None:
         f"camera {taught.camera} and {sum(p.mark is not None for p in taught.points)} marks "
         f"written to {place}"
     )
+
+
+@app.command()
+def receiver(
+    plant: PlantArgument,
+    camera: Annotated[str, typer.Option("--camera", help="Name of the camera.")],
+    capped: Annotated[list[Path], typer.Option(help="Pictures with the lens capped.")],
+    dark: Annotated[
+        list[Path], typer.Option(help="Pictures by day without a beam on the receiver.")
+    ],
+    lit: Annotated[
+        list[str],
+        typer.Option(help="Picture with beams, FILE=SHARE of the nominal flux, as a.png=0.1."),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="File to write (TOML), with a PNG beside it.")],
+    outline: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Corner of the receiver in the picture, X,Y in pixels, in order around it; "
+            "default: by the camera's position."
+        ),
+    ] = None,
+    gamma: Annotated[float, typer.Option(help="Of the camera's response; 1: linear.")] = 1.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Take the reference by which a camera measures the flux on the receiver."""
+    from heliotrope.imaging.receiver_file import write_reference
+    from heliotrope.imaging.receiver_light import ReceiverSight, take_reference
+    from heliotrope.imaging.sources import average
+
+    if out.suffix.lower() != ".toml":
+        raise InputError(f"{out}: a reference is written as TOML; name it receiver.toml")
+    loaded = open_plant(plant)
+    if len(loaded.receivers) != 1:
+        raise InputError(
+            f"{plant}: {len(loaded.receivers)} receivers; a camera measures the flux where the "
+            "plant has one"
+        )
+    eye, surface = loaded.camera(camera), loaded.receivers[0]
+    corners = _outline(outline or [], eye, surface)
+    sight = ReceiverSight(eye.name, surface.name, eye.size, corners, gamma)
+    plain = [_read(path) for path in dark]
+    reference = take_reference(
+        sight,
+        average(_read(path) for path in capped),
+        average(plain),
+        [_lit(text) for text in lit],
+        8 * plain[0].pixels.dtype.itemsize,
+    )
+    write_reference(reference, out)
+    if as_json:
+        print_json(
+            {
+                "camera": eye.name,
+                "receiver": surface.name,
+                "outline_px": sight.outline,
+                "black": reference.black,
+                "daylight_share": reference.daylight,
+                "rise": reference.rise,
+                "written": str(out),
+            }
+        )
+        return
+    print(
+        f"receiver {surface.name} in camera {eye.name}: nominal flux fills "
+        f"{100 * reference.rise:.0f} % of the scale; daylight on it counts as "
+        f"{100 * reference.daylight:.1f} % of nominal and is subtracted"
+    )
+    print(f"reference written to {out}")
+
+
+def _outline(texts: Sequence[str], camera: "Camera", receiver: "Receiver") -> Any:
+    """Return the corners of a receiver in a camera's frame, px, (N, 2)."""
+    from heliotrope.field.camera import project
+
+    if texts:
+        return [_at(f"corner={text}")[1] for text in texts]
+    if camera.position is None or receiver.kind != "planar":
+        raise InputError(
+            f"camera {camera.name}: receiver {receiver.name} is not planar, or the camera's "
+            "position is not known; give --outline X,Y for three corners or more"
+        )
+    return project(camera, receiver.face.corners)
+
+
+def _lit(text: str) -> "tuple[Frame, float]":
+    name, found, share = text.rpartition("=")
+    try:
+        value = float(share)
+    except ValueError:
+        found, value = "", 0.0
+    if not found or not name:
+        raise InputError(f"--lit {text!r}: write FILE=SHARE, as lit.png=0.1")
+    return _read(Path(name)), value
 
 
 @app.command()

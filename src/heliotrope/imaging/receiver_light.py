@@ -1,0 +1,498 @@
+"""The light on a receiver in a camera's frame, as a share of the nominal flux.
+
+The mean of the receiver's pixels rises with the flux in proportion, if the pixels are proportional
+to light. Daylight adds to it. The surroundings, a ring about the receiver's outline that no beam
+should meet, show how bright the daylight is against that of the reference. With the black level b,
+the mean of the receiver m, and that of each side of the ring s_i (reference: index 0)
+
+    a = min_i (s_i - b) / (s_i0 - b)
+    share = ((m - b) - a (m_0 - b)) / rise
+
+where rise is that of the receiver's mean at nominal flux. The least bright side counts, so that a
+beam beside the receiver, or a cloud behind it, is not taken for daylight on it.
+
+Where frames do not state their exposure, it may have become shorter by as much as a seems to have
+fallen below 1: the share is divided by a.
+
+Darkness must be proven, light need not be: whatever may hide light (a cap, a moved camera, clipped
+pixels) leaves the share as a lower bound, with the reason.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.imaging.frame import Frame, Image
+from heliotrope.imaging.targets.rectify import CLIPPED
+
+Mask = npt.NDArray[np.bool_]
+
+#: Outline of the measured face, and inner and outer edge of the surroundings, as multiples of the
+#: receiver's outline about its middle.
+FACE, INNER, OUTER = 0.97, 1.15, 1.7
+#: Least pixels of the face, and of a side of the surroundings that counts; least number of sides.
+LEAST_FACE, LEAST_SIDE, LEAST_SIDES = 100, 40, 2
+#: Largest share of clipped pixels in the face, and in a side that counts.
+CLIPPED_FACE, CLIPPED_SIDE = 0.0005, 0.01
+#: Daylight on the surroundings, as a multiple of that of the reference, within which they show the
+#: daylight on the receiver.
+DIMMEST, BRIGHTEST = 0.1, 4.0
+#: Share below which the receiver is darker than daylight alone would leave it.
+DARKER = -0.05
+#: Least likeness of the surroundings to those of the reference (1: the same), and the largest
+#: movement of the picture, as a share of the outline's diagonal.
+LIKENESS, MOVED = 0.4, 0.02
+#: Largest relative change of exposure times gain, where frames state them.
+EXPOSED = 0.01
+#: Longer side of the picture in which the surroundings are recognised, and the largest movement
+#: that is searched for, px of it.
+_LONGEST, _REACH = 320, 6
+#: Share of the surroundings, the steepest, by which they are recognised; and the deviation of the
+#: Gaussian that smooths them before, px of that picture.
+_STEEP, _SMOOTH = 0.08, 1.5
+#: Largest departure of a lit photograph from the common rise, as a share of its own.
+_LINEAR = 0.1
+#: Least and largest daylight of a lit photograph, as a multiple of that of the dark one.
+_ALIKE = (0.7, 1.4)
+
+
+@dataclass(frozen=True)
+class ReceiverSight:
+    """Where a camera sees a receiver.
+
+    Attributes
+    ----------
+    camera, receiver
+        Names.
+    size
+        Of a frame, px.
+    outline
+        Corners of the receiver in the frame, in order around it, px, (N, 2).
+    gamma
+        Exponent of the camera's response; 1 is linear.
+
+    Raises
+    ------
+    InputError
+        An outline that leaves the frame, is too small, or leaves no room for the surroundings.
+    """
+
+    camera: str
+    receiver: str
+    size: tuple[int, int]
+    outline: FloatArray
+    gamma: float = 1.0
+
+    def __post_init__(self) -> None:
+        who = f"camera {self.camera}: receiver {self.receiver}"
+        outline = as_float(self.outline)
+        if outline.ndim != 2 or outline.shape[1:] != (2,) or len(outline) < 3:
+            raise InputError(f"{who}: an outline of {outline.shape}; give 3 corners or more, px")
+        object.__setattr__(self, "outline", outline)
+        top = np.array(self.size) - 0.5
+        if not ((outline >= -0.5) & (outline <= top)).all():
+            raise InputError(
+                f"{who}: its outline leaves the frame of {self.size[0]} × {self.size[1]} px; turn "
+                "the camera, or use a wider lens"
+            )
+        pixels = int(self.face.sum())
+        if pixels < LEAST_FACE:
+            raise InputError(
+                f"{who}: it has {pixels} px in the frame, the limit is {LEAST_FACE}; use a longer "
+                "lens"
+            )
+        seen = sum(int(side.sum()) >= LEAST_SIDE for side in self.sides)
+        if seen < LEAST_SIDES:
+            raise InputError(
+                f"{who}: {seen} of its four sides have room about it in the frame, the limit is "
+                f"{LEAST_SIDES}; use a wider lens"
+            )
+
+    @cached_property
+    def box(self) -> tuple[slice, slice]:
+        """Rows and columns of the frame that show the receiver and its surroundings."""
+        far = self._grown(OUTER)
+        low = np.maximum(np.floor(far.min(axis=0)).astype(int), 0)
+        high = np.minimum(np.ceil(far.max(axis=0)).astype(int) + 1, self.size)
+        return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
+
+    @cached_property
+    def face(self) -> Mask:
+        """Pixels of the box on the receiver."""
+        return self._within(FACE)
+
+    @cached_property
+    def ring(self) -> Mask:
+        """Pixels of the box on the surroundings."""
+        return np.asarray(self._within(OUTER) & ~self._within(INNER))
+
+    @cached_property
+    def sides(self) -> tuple[Mask, ...]:
+        """Pixels of the box right of, below, left of and above the receiver."""
+        rows, columns = self.box
+        middle, extent = self._middle, np.ptp(self.outline, axis=0)
+        x = (np.arange(columns.start, columns.stop) - middle[0]) / extent[0]
+        y = ((np.arange(rows.start, rows.stop) - middle[1]) / extent[1])[:, None]
+        flat, steep = np.abs(x) >= np.abs(y), np.abs(x) < np.abs(y)
+        parts = (flat & (x > 0.0), steep & (y > 0.0), flat & (x <= 0.0), steep & (y <= 0.0))
+        return tuple(np.asarray(self.ring & part) for part in parts)
+
+    @property
+    def _middle(self) -> FloatArray:
+        return np.asarray(0.5 * (self.outline.min(axis=0) + self.outline.max(axis=0)))
+
+    def _grown(self, factor: float) -> FloatArray:
+        return np.asarray(self._middle + factor * (self.outline - self._middle))
+
+    def _within(self, factor: float) -> Mask:
+        import cv2
+
+        rows, columns = self.box
+        corners = self._grown(factor) - [columns.start, rows.start]
+        drawn = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
+        cv2.fillPoly(drawn, [np.round(corners).astype(np.int32)], 1)
+        return drawn > 0
+
+
+@dataclass(frozen=True)
+class ReceiverReference:
+    """What a camera sees of a receiver at known flux.
+
+    Levels are linear, as shares of the full scale.
+
+    Attributes
+    ----------
+    sight
+        Where the camera sees it.
+    bits
+        Of a value in the camera's frames, 8 or 16.
+    black
+        Level with the lens capped.
+    face
+        Level of the receiver in daylight without beams, above black.
+    sides
+        Levels of its surroundings then, above black, (4,); NaN where the frame does not show them.
+    rise
+        Rise of the receiver's level at nominal flux.
+    surroundings
+        Receiver and surroundings then, reduced (`reduced`), uint16.
+    exposure
+        Exposure times gain of the frames, s; NaN if they do not state it.
+    """
+
+    sight: ReceiverSight
+    bits: int
+    black: float
+    face: float
+    sides: FloatArray
+    rise: float
+    surroundings: Image
+    exposure: float = math.nan
+
+    def __post_init__(self) -> None:
+        who = f"camera {self.sight.camera}: receiver {self.sight.receiver}"
+        sides = as_float(self.sides)
+        object.__setattr__(self, "sides", sides)
+        numbers = np.array([self.black, self.face, self.rise])
+        if not (np.isfinite(numbers).all() and 0.0 <= self.black < 1.0 and self.rise > 0.0):
+            raise InputError(
+                f"{who}: a reference with levels {self.black:g} and {self.face:g} and a rise of "
+                f"{self.rise:g} is none; take it again"
+            )
+        if sides.shape != (4,) or int((sides > 0.0).sum()) < LEAST_SIDES:
+            raise InputError(f"{who}: a reference of {sides} shows too few sides; take it again")
+        shape = reduced(np.zeros(self.sight.face.shape, np.float32)).shape
+        if self.surroundings.shape != shape:
+            raise InputError(
+                f"{who}: the picture of its surroundings has {self.surroundings.shape} px, not "
+                f"{shape}; take the reference again"
+            )
+
+    @property
+    def daylight(self) -> float:
+        """The reference's daylight on the receiver, as a share of the nominal flux."""
+        return self.face / self.rise
+
+
+@dataclass(frozen=True)
+class ReceiverLight:
+    """The flux on a receiver in one frame.
+
+    Attributes
+    ----------
+    share
+        Share of the nominal flux, 0 or more; a lower bound if there is a ``doubt``. NaN if the
+        frame cannot be measured at all.
+    doubt
+        Why the flux may be higher, "" if nothing speaks for it.
+    """
+
+    share: float
+    doubt: str = ""
+
+
+def receiver_light(frame: Frame, reference: ReceiverReference) -> ReceiverLight:
+    """Return the flux on a receiver in a frame; see the module's text.
+
+    Parameters
+    ----------
+    frame
+        Of the reference's camera, with the exposure of the reference.
+    reference
+        See `take_reference`.
+    """
+    sight = reference.sight
+    if frame.size != sight.size or _bits(frame) != reference.bits:
+        kind = f"{frame.size[0]} × {frame.size[1]} px of {_bits(frame)} bit"
+        first = f"{sight.size[0]} × {sight.size[1]} px of {reference.bits} bit"
+        return ReceiverLight(math.nan, f"its frames have {kind}, those of the reference {first}")
+    seen = _Levels.of(frame, sight)
+    lit = np.asarray((seen.sides - reference.black) / reference.sides)
+    counting = np.isfinite(lit) & (seen.clipped_sides <= CLIPPED_SIDE)
+    daylight = float(lit[counting].min()) if counting.any() else 0.0
+    rise = seen.face - reference.black - max(daylight, 0.0) * reference.face
+    share = rise / reference.rise
+    doubt = _doubt(frame, seen, reference, daylight, int(counting.sum()), share)
+    if not math.isfinite(frame.exposure * frame.gain * reference.exposure):
+        # A darker picture may be one of a shorter exposure.
+        share /= min(max(daylight, DIMMEST), 1.0)
+    return ReceiverLight(max(share, 0.0), doubt)
+
+
+def _doubt(
+    frame: Frame,
+    seen: "_Levels",
+    reference: ReceiverReference,
+    daylight: float,
+    counting: int,
+    share: float,
+) -> str:
+    """Return why there may be more light than was measured."""
+    exposure = frame.exposure * frame.gain
+    if abs(exposure / reference.exposure - 1.0) > EXPOSED:
+        return (
+            f"exposure times gain is {exposure:.3g} s, that of the reference "
+            f"{reference.exposure:.3g} s; fix both"
+        )
+    if not counting:
+        return "the surroundings of the receiver are overexposed; shorten the exposure"
+    if daylight < DIMMEST:
+        return (
+            f"the surroundings of the receiver show {max(daylight, 0.0):.0%} of the reference's "
+            f"daylight, the limit is {DIMMEST:.0%}: night, or something covers the lens"
+        )
+    if daylight > BRIGHTEST:
+        return (
+            f"the surroundings of the receiver are {daylight:.1f} times as bright as in the "
+            f"reference, the limit is {BRIGHTEST:g}"
+        )
+    if seen.clipped_face > CLIPPED_FACE:
+        return f"{seen.clipped_face:.1%} of the receiver is overexposed; shorten the exposure"
+    if text := _strange(reference.sight, reference.surroundings, seen.picture):
+        return text
+    if share < DARKER:
+        return (
+            "the receiver is darker than in daylight without beams; something is in front of it, "
+            "or it has changed"
+        )
+    return ""
+
+
+def take_reference(
+    sight: ReceiverSight,
+    capped: Frame,
+    dark: Frame,
+    lit: Sequence[tuple[Frame, float]],
+    bits: int | None = None,
+) -> ReceiverReference:
+    """Return a reference from photographs with one exposure.
+
+    Parameters
+    ----------
+    sight
+        Where the camera sees the receiver.
+    capped
+        With the lens capped.
+    dark
+        In daylight, no beam on the receiver.
+    lit
+        Photographs with beams, soon after ``dark``, each with the share of the nominal flux; the
+        receiver must not be overexposed.
+    bits
+        Of a value in the camera's frames, where these are averages; None: as in ``dark``.
+
+    Raises
+    ------
+    InputError
+        Photographs that contradict each other, or of which one cannot be used.
+    """
+    who = f"camera {sight.camera}"
+    for frame in (capped, dark, *(frame for frame, _ in lit)):
+        if frame.size != sight.size:
+            raise InputError(
+                f"{who}: {frame.name} has {frame.size[0]} × {frame.size[1]} px, the camera "
+                f"{sight.size[0]} × {sight.size[1]}"
+            )
+    for frame, share in lit:
+        if not 0.0 < share <= 2.0:
+            raise InputError(
+                f"{who}: {frame.name} at a share of {share:g}; give above 0 to 2, 1 is nominal"
+            )
+    if not lit:
+        raise InputError(f"{who}: no photograph with beams; give one with its share of the flux")
+    black, plain = _Levels.of(capped, sight), _Levels.of(dark, sight)
+    level = max(black.face, float(np.nanmax(black.sides)))
+    sides = np.asarray(plain.sides - level)
+    good = (plain.clipped_sides <= CLIPPED_SIDE) & (sides > level * 0.1) & (sides > 0.0005)
+    if good.sum() < LEAST_SIDES:
+        raise InputError(
+            f"{who}: {dark.name} shows {int(good.sum())} sides of the receiver's surroundings "
+            f"brighter than a capped lens and not overexposed, the limit is {LEAST_SIDES}; change "
+            "the exposure, or have more of what stands about the receiver in the picture"
+        )
+    usual = np.where(good, sides, math.nan)
+    rises, shares = [], []
+    for frame, share in lit:
+        seen = _Levels.of(frame, sight)
+        if seen.clipped_face > CLIPPED_FACE:
+            raise InputError(
+                f"{who}: {frame.name}: {seen.clipped_face:.1%} of the receiver is overexposed; use "
+                "fewer beams, or a shorter exposure for all photographs"
+            )
+        daylight = float(np.nanmin((seen.sides - level) / usual))
+        if not _ALIKE[0] <= daylight <= _ALIKE[1]:
+            raise InputError(
+                f"{who}: the surroundings in {frame.name} are {daylight:.2f} times as bright as in "
+                f"{dark.name}; take all photographs with one fixed exposure, within a minute"
+            )
+        if text := _strange(sight, plain.picture, seen.picture):
+            raise InputError(f"{who}: {frame.name}: {text}")
+        rises.append(seen.face - level - daylight * (plain.face - level))
+        shares.append(share)
+    slope = float(np.dot(rises, shares) / np.dot(shares, shares))
+    for (frame, share), rise in zip(lit, rises, strict=True):
+        if not (slope > 0.0 and abs(rise / (slope * share) - 1.0) <= _LINEAR):
+            raise InputError(
+                f"{who}: {frame.name} rises by {rise:.4f} of full scale at a share of {share:g}, "
+                f"the others say {slope * share:.4f}; is a share wrong, or the response not linear "
+                "(gamma)?"
+            )
+    exposures = {frame.exposure * frame.gain for frame in (capped, dark, *(f for f, _ in lit))}
+    stated = [value for value in exposures if math.isfinite(value)]
+    if stated and max(stated) > (1.0 + EXPOSED) * min(stated):
+        raise InputError(
+            f"{who}: exposures times gain from {min(stated):.3g} to {max(stated):.3g} s; take all "
+            "photographs with one fixed exposure"
+        )
+    return ReceiverReference(
+        sight,
+        bits or _bits(dark),
+        level,
+        plain.face - level,
+        usual,
+        slope,
+        plain.picture,
+        stated[0] if stated else math.nan,
+    )
+
+
+@dataclass(frozen=True)
+class _Levels:
+    """Mean levels in a frame, linear, as shares of the full scale."""
+
+    face: float
+    sides: FloatArray
+    clipped_face: float
+    clipped_sides: FloatArray
+    picture: Image
+
+    @classmethod
+    def of(cls, frame: Frame, sight: ReceiverSight) -> "_Levels":
+        rows, columns = sight.box
+        part = Frame(frame.pixels[rows, columns], frame.name)
+        linear = part.linear(sight.gamma)
+        grey = np.asarray(linear.grey, dtype=np.float32) / np.float32(linear.full_scale)
+        highest = part.pixels if part.pixels.ndim == 2 else part.pixels.max(axis=2)
+        clipped = highest >= CLIPPED * part.full_scale
+        good = [side.sum() >= LEAST_SIDE for side in sight.sides]
+        nan = math.nan
+        pairs = [*zip(sight.sides, good, strict=True)]
+        return cls(
+            float(grey[sight.face].mean()),
+            np.array([float(grey[side].mean()) if seen else nan for side, seen in pairs]),
+            float(clipped[sight.face].mean()),
+            np.array([float(clipped[side].mean()) if seen else 1.0 for side, seen in pairs]),
+            np.asarray(np.round(65535.0 * np.clip(reduced(grey), 0.0, 1.0)), dtype=np.uint16),
+        )
+
+
+def _bits(frame: Frame) -> int:
+    return 8 * frame.pixels.dtype.itemsize
+
+
+# -- the surroundings ------------------------------------------------------------------
+
+
+def reduced(values: Image) -> Image:
+    """Return the means of blocks of pixels, so that the longer side has at most 320."""
+    import cv2
+
+    factor = _factor(values.shape)
+    if factor == 1:
+        return values
+    h, w = values.shape[0] // factor, values.shape[1] // factor
+    whole = values[: h * factor, : w * factor]
+    return cv2.resize(whole, (w, h), interpolation=cv2.INTER_AREA)
+
+
+def _factor(shape: tuple[int, ...]) -> int:
+    return max(1, math.ceil(max(shape) / _LONGEST))
+
+
+def _strange(sight: ReceiverSight, usual: Image, now: Image) -> str:
+    """Return why the surroundings are not those of the reference, in the same place; "" if so.
+
+    The directions of slopes are compared, weighted by the reference's slopes, so that neither the
+    strength of the light nor a veil over the picture counts.
+    """
+    # Slopes at the edge of the ring belong to the receiver, and to nothing at the box's edge.
+    ring = reduced(sight.ring.astype(np.float32)) > 0.999
+    inside = np.zeros_like(ring)
+    inside[_REACH + 2 : -_REACH - 2, _REACH + 2 : -_REACH - 2] = True
+    mine, theirs = _slopes(usual), _slopes(now)
+    steep = np.where(ring & inside, np.linalg.norm(mine, axis=0), 0.0)
+    # Elsewhere noise has slopes too.
+    row, column = np.nonzero(steep > np.quantile(steep[ring & inside], 1.0 - _STEEP))
+    mine = mine[:, row, column]
+    theirs = theirs / (np.linalg.norm(theirs, axis=0) + 1e-9)
+    whole = float(np.linalg.norm(mine, axis=0).sum())
+    if not whole > 0.0:
+        return "nothing about the receiver shows where the camera looks"
+    shifts = [(y, x) for y in range(-_REACH, _REACH + 1) for x in range(-_REACH, _REACH + 1)]
+    like = [float((mine * theirs[:, row + y, column + x]).sum()) / whole for y, x in shifts]
+    best = int(np.argmax(like))
+    if like[best] < LIKENESS:
+        return (
+            "the surroundings of the receiver are not those of the reference; the camera was "
+            "moved, or something is in front of it"
+        )
+    pixel = _factor(sight.face.shape)
+    away = math.hypot(*shifts[best]) * pixel
+    limit = max(MOVED * math.hypot(*np.ptp(sight.outline, axis=0)), float(pixel))
+    if away > limit:
+        return f"the picture has moved by {away:.0f} px, the limit is {limit:.1f} px"
+    return ""
+
+
+def _slopes(values: Image) -> FloatArray:
+    """Return the slopes of a picture to the right and down, (2, H, W)."""
+    import cv2
+
+    smooth = cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTH)
+    return np.stack([cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)])
