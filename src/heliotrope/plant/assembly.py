@@ -29,9 +29,10 @@ from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.pictures import KeptCamera
 from heliotrope.plant.operations.views import CalibrationEntry, Planned
-from heliotrope.plant.ports import Cameras, Ports, Sensors
+from heliotrope.plant.ports import Cameras, Ports
 from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
 from heliotrope.plant.schedule.scheduler import Scheduler
+from heliotrope.plant.sensors import Sensors
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.joint_cycle import JointCycle
@@ -233,7 +234,7 @@ class PlantAssembly:
         while True:
             news = await sensors.news()
             for name, value in news.values.items():
-                self.plant.put(name, value)
+                self.plant.put(name, value, made=news.made.get(name))
             for name, text in news.problems.items():
                 self.logbook.take_alarm(
                     alarms.SENSOR.raised(name, problem=text) if text else alarms.SENSOR.ended(name)

@@ -148,6 +148,8 @@ class RealCameras:
         Folder of the plant file.
     clock
         Clock of the plant.
+    watched
+        Receivers that are watched beside receiver visits, by name: their cameras.
     memory
         Folder in which models of empty targets are kept; None: they are learnt again at each start.
     patience
@@ -172,6 +174,7 @@ class RealCameras:
         folder: Path,
         clock: Clock,
         *,
+        watched: Mapping[str, str] | None = None,
         memory: Path | None = None,
         patience: float = PATIENCE,
         sources: Callable[[Camera, Path, threading.Event], Source] = source_of,
@@ -185,15 +188,18 @@ class RealCameras:
         self.silent: set[str] = set()
         self._eyes: dict[str, _Eye] = {}
         visits = design.receiver_visits
-        lit = None if visits is None else design.camera(visits.camera)
-        watching = [camera for camera in design.cameras if camera is not lit or camera.targets]
+        seen = {} if visits is None else {visits.receiver: visits.camera}
+        seen = {**(watched or {}), **seen}
+        lit = set(seen.values())
+        watching = [each for each in design.cameras if each.name not in lit or each.targets]
         for camera, targets in _watching(watching, design.targets):
             eye = _Eye(camera, targets, Feed(sources(camera, folder, self._stop)))
             self._eyes |= {target.name: eye for target in targets}
-        if visits is not None and lit is not None:
-            known = [eye for eye in self._eyes.values() if eye.camera is lit]
-            own = known or [_Eye(lit, (), Feed(sources(lit, folder, self._stop)))]
-            self._eyes[visits.receiver] = own[0]
+        for receiver, name in seen.items():
+            camera = design.camera(name)
+            known = [eye for eye in self._eyes.values() if eye.camera is camera]
+            own = known or [_Eye(camera, (), Feed(sources(camera, folder, self._stop)))]
+            self._eyes[receiver] = own[0]
         self._settings = PhotographSettings(pictures=read_pictures(folder, design.targets))
 
     def start(self, on_alarm: Callable[[Alarm], None]) -> None:
@@ -328,7 +334,7 @@ class RealCameras:
         asked, until = self._clock.utc(), self._clock.monotonic() + self._patience
         while self._clock.monotonic() < until:
             frame = eye.feed.newest
-            if frame is not None and _dated(frame, eye.camera) >= asked:
+            if frame is not None and dated(frame, eye.camera) >= asked:
                 if target in self.silent:
                     self._tell(target)
                 return frame
@@ -368,7 +374,7 @@ def _watching(
     return found
 
 
-def _dated(frame: Frame, camera: Camera) -> datetime:
+def dated(frame: Frame, camera: Camera) -> datetime:
     """Return the earliest instant at which a frame may have been exposed."""
     if frame.time is None:
         raise InputError(

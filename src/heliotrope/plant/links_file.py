@@ -17,6 +17,8 @@ from pydantic import Field
 
 from heliotrope.errors import FormatError
 from heliotrope.files.documents import read_document
+from heliotrope.imaging.receiver_file import read_reference
+from heliotrope.imaging.receiver_light import ReceiverReference
 from heliotrope.links.addresses import Table, check_encryption, url_parts
 from heliotrope.links.clock import Clock
 from heliotrope.links.common_settings import CommonSettings
@@ -28,6 +30,7 @@ from heliotrope.links.papers import Papers, authority_of
 from heliotrope.links.tcp import TcpServer
 from heliotrope.links.tls import RenewedTls, TlsSource, server_tls
 from heliotrope.plant.sensors import FED, SensorFiles
+from heliotrope.safety import FLUX_READING
 
 
 class TcpTable(Table):
@@ -92,7 +95,11 @@ class LinksDocument(Table):
     )
     sensors: dict[str, str] = Field(
         default_factory=dict,
-        description='File with one number, or `"api"`, by reading of the safety table.',
+        description='File with one number, or `"api"`, by reading of the safety table; '
+        '`receiver_flux_nominal` may be `"camera"`.',
+    )
+    receiver_light: str = Field(
+        "", description='Reference of the receiver\'s camera, beside this file: for `"camera"`.'
     )
     clusters: dict[str, str] = Field(
         min_length=1, description='`"tcp"`, `"mqtt"`, or the cluster file of a local bus, by name.'
@@ -101,6 +108,8 @@ class LinksDocument(Table):
 
 #: Says that programs give a reading, in place of the name of a file.
 GIVEN = "api"
+#: Says that the receiver's camera gives its flux.
+CAMERA = "camera"
 #: The tables, for the reference and for hints.
 TABLES: tuple[type[Table], ...] = (LinksDocument, TcpTable, MqttTable, ExpectedPolling)
 
@@ -174,7 +183,10 @@ class LinksFile:
         if self.document.keys:
             made.papers.renew("key file", [folder / self.document.keys], self._take_keys)
         sensors = self.document.sensors
-        made.sensors = SensorFiles({n: folder / f for n, f in sensors.items() if f != GIVEN})
+        files = {n: folder / f for n, f in sensors.items() if f not in (GIVEN, CAMERA)}
+        made.sensors = SensorFiles(files)
+        if self.document.receiver_light:
+            made.light = read_reference(folder / self.document.receiver_light)
         made.given = frozenset(n for n, f in sensors.items() if f == GIVEN)
         polling = self.document.polling
         made.common = CommonSettings(polling.steps_every_s, polling.silence_s)
@@ -254,6 +266,8 @@ class PlantLinks:
         Readings of the safety table that programs give by the HTTP API.
     common
         Settings that every cluster should have, as far as this file holds them.
+    light
+        Reference by which the receiver's camera gives its flux; None: it gives none.
     """
 
     papers: Papers
@@ -264,6 +278,7 @@ class PlantLinks:
     sensors: SensorFiles = field(default_factory=lambda: SensorFiles({}))
     given: frozenset[str] = frozenset()
     common: CommonSettings = field(default_factory=CommonSettings)
+    light: ReceiverReference | None = None
 
     def facts(self) -> dict[str, str]:
         """Return, by name, why the last connection was refused and whose new key is not used."""
@@ -313,6 +328,19 @@ def _check(found: LinksFile) -> None:
                 f"no row of the safety table needs it; give one of {', '.join(sorted(FED))}",
                 f"sensors.{name}",
             )
+    seen = [name for name, how in document.sensors.items() if how == CAMERA]
+    for name in seen:
+        if name != FLUX_READING:
+            raise FormatError(
+                path, f"a camera gives {FLUX_READING} only; name a file", f"sensors.{name}"
+            )
+    if bool(seen) != bool(document.receiver_light):
+        raise FormatError(
+            path,
+            f'{FLUX_READING} = "camera" and receiver_light, the reference of that camera, go '
+            "together; take one with heliotrope camera receiver",
+            "receiver_light",
+        )
     ways = set(document.clusters.values())
     for way, table in (("tcp", document.tcp), ("mqtt", document.mqtt)):
         if way in ways and table is None:

@@ -24,7 +24,7 @@ from heliotrope.plant.audit import Audit
 from heliotrope.plant.operations.learning import Learner
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import CameraView
-from heliotrope.plant.sensors import Readings
+from heliotrope.plant.sensors import Sensors
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.stacks import Exposed
 from heliotrope.safety import Alarm
@@ -106,19 +106,6 @@ class Cameras(Protocol):
 
     def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
         """Read later photographs by a camera, a target with its marks, and taught pictures."""
-        ...
-
-
-class Sensors(Protocol):
-    """Sensors that feed readings of the safety table."""
-
-    @property
-    def names(self) -> frozenset[str]:
-        """Readings that they feed."""
-        ...
-
-    async def news(self) -> Readings:
-        """Return the changes since the last call; it must not hold up the loop."""
         ...
 
 

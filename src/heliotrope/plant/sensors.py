@@ -1,4 +1,4 @@
-"""Readings of the safety table from files, written by whatever program reads the sensors.
+"""Sensors: readings of the safety table from outside, as from files that other programs write.
 
 A file holds one number in the unit of its row, and is replaced with each reading (written under
 another name, then renamed). A file that is not replaced gives no new reading: after some seconds
@@ -8,9 +8,10 @@ its row counts the worst case, as if the sensor were gone. See `safety.condition
 import asyncio
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 from heliotrope.plant.emergency import OWN_READINGS
 from heliotrope.safety import CONDITIONS, FLUX_READING, Watcher, watched_by
@@ -32,10 +33,55 @@ class Readings:
         New values, by reading.
     problems
         Why a reading cannot be read, by reading; "" once it can be read again.
+    made
+        When a new value was made, by reading, monotonic s; one that is not named: now.
     """
 
     values: dict[str, float] = field(default_factory=dict)
     problems: dict[str, str] = field(default_factory=dict)
+    made: dict[str, float] = field(default_factory=dict)
+
+
+class Sensors(Protocol):
+    """Sensors that feed readings of the safety table."""
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Readings that they feed."""
+        ...
+
+    async def news(self) -> Readings:
+        """Return the changes since the last call; it must not hold up the loop."""
+        ...
+
+
+class AllSensors:
+    """Several sensors as one.
+
+    Parameters
+    ----------
+    parts
+        Each feeds other readings.
+
+    Attributes
+    ----------
+    names
+        Readings of all.
+    """
+
+    def __init__(self, parts: Sequence[Sensors]) -> None:
+        self._parts = tuple(parts)
+        self.names = frozenset[str]().union(*(part.names for part in parts))
+
+    async def news(self) -> Readings:
+        """Return the changes of all since the last call."""
+        found = Readings()
+        for part in self._parts:
+            news = await part.news()
+            found.values.update(news.values)
+            found.problems.update(news.problems)
+            found.made.update(news.made)
+        return found
 
 
 class SensorFiles:

@@ -323,11 +323,11 @@ SENSOR = AlarmKind(
     "sensor",
     _PLANT,
     Severity.ALARM,
-    "The file of a sensor cannot be read.",
+    "A sensor gives no reading.",
     "sensor {subject}: {problem}",
     "Once its last reading is stale, the safety table counts the worst case.",
-    "Check the program that writes the file.",
-    over="sensor {subject}: its file is read again",
+    "Check the program that writes its file, or the camera of the receiver.",
+    over="sensor {subject}: its readings come again",
 )
 ORDER_UNACKNOWLEDGED = AlarmKind(
     "order_unacknowledged",

@@ -28,11 +28,14 @@ from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.learner import LearnerProcess
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.ports import Ports
+from heliotrope.plant.receiver_flux import check_reference, flux_by
+from heliotrope.plant.sensors import AllSensors, Sensors
 from heliotrope.plant.settings import clusters_of
 from heliotrope.store.keeper import Keeper
 
 if TYPE_CHECKING:
     from heliotrope.cluster.program import LocalCluster
+    from heliotrope.imaging.receiver_light import ReceiverReference
     from heliotrope.links.link import Link
     from heliotrope.links.papers import Papers
     from heliotrope.plant.links_file import PlantLinks
@@ -60,6 +63,8 @@ def run_real(design: Plant, choice: RealChoice, shown: Shown) -> None:
     """
     clock = SystemClock()
     outside = _outside(design, choice, clock)
+    if outside.links.light is not None:
+        check_reference(design, outside.links.light)
     if choice.configure:
         for name in design.names:
             design.machine(name)
@@ -68,7 +73,7 @@ def run_real(design: Plant, choice: RealChoice, shown: Shown) -> None:
             design,
             _settings(design, choice, shown, outside),
             outside,
-            _cameras(design, choice, shown, clock),
+            _cameras(design, choice, shown, outside.links.light, clock),
             clock,
         )
         for text in _papers(outside, shown).lines():
@@ -110,7 +115,8 @@ def _check(
     clock: SystemClock,
 ) -> None:
     """Build the whole plant without starting it, and print what it consists of."""
-    ports = Ports(outside.all_links, clock, Forgetful(), cameras, outside.links.sensors)
+    sensors = outside.sensors(cameras, clock)
+    ports = Ports(outside.all_links, clock, Forgetful(), cameras, sensors)
     PlantAssembly(design, ports, settings)
     seen = 0 if cameras is None else sum(cameras.sees(t.name) for t in design.targets)
     print(
@@ -141,16 +147,24 @@ class _Outside:
         """The links to all clusters, by name."""
         return {**self.links.links, **{one.cluster.config.name: one.link for one in self.local}}
 
+    def sensors(self, cameras: RealCameras | None, clock: SystemClock) -> Sensors:
+        """Return the sensors of the plant."""
+        files, light = self.links.sensors, self.links.light
+        if light is None or cameras is None:
+            return files
+        return AllSensors([files, flux_by(cameras, clock, light)])
+
     def ports(
         self, design: Plant, choice: RealChoice, shown: Shown, clock: SystemClock, keeper: Keeper
     ) -> Ports:
         """Return the ports of the plant."""
+        cameras = _cameras(design, choice, shown, self.links.light, clock)
         return Ports(
             self.all_links,
             clock,
             KeptAudit(keeper, clock, clock.utc()),
-            _cameras(design, choice, shown, clock),
-            self.links.sensors,
+            cameras,
+            self.sensors(cameras, clock),
             disk=DiskThread(),
             records=keeper,
             assigned=KeptPoints(keeper),
@@ -175,13 +189,18 @@ def _outside(design: Plant, choice: RealChoice, clock: SystemClock) -> _Outside:
 
 
 def _cameras(
-    design: Plant, choice: RealChoice, shown: Shown, clock: SystemClock
+    design: Plant,
+    choice: RealChoice,
+    shown: Shown,
+    light: "ReceiverReference | None",
+    clock: SystemClock,
 ) -> RealCameras | None:
     """Return the cameras; None if the plant has no camera that can work."""
-    if not design.targets or not design.cameras:
+    watched = {} if light is None else {light.sight.receiver: light.sight.camera}
+    if not design.cameras or not (design.targets or watched):
         return None
     memory = None if shown.data is None else shown.data / "targets"
-    return RealCameras(design, choice.folder, clock, memory=memory)
+    return RealCameras(design, choice.folder, clock, watched=watched, memory=memory)
 
 
 async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outside) -> None:
