@@ -35,9 +35,9 @@ from mutant_operators import ROOT, SOURCE, Mutant
 #: Runs of the simulation: name, seed, worlds, mean time between two faults, length, s.
 RUNS: tuple[tuple[str, int, tuple[str, ...], float, float], ...] = (
     ("tour 2", 2, ("tour",), 12.0, 300.0),
-    ("held 41", 41, ("held",), 12.0, 180.0),
+    ("usual 41", 41, (), 12.0, 180.0),
     ("calm 11", 11, ("calm",), 60.0, 180.0),
-    ("calm held 42", 42, ("calm", "held"), 30.0, 180.0),
+    ("calm 42", 42, ("calm",), 30.0, 180.0),
     ("swarm 21", 21, ("swarm",), 12.0, 180.0),
     ("site 61", 61, ("site",), 12.0, 180.0),
     ("visits 71", 71, ("visits",), 60.0, 180.0),
@@ -45,7 +45,7 @@ RUNS: tuple[tuple[str, int, tuple[str, ...], float, float], ...] = (
     ("day 73", 73, ("day", "visits"), 60.0, 180.0),
     ("calibrations 74", 74, ("calm", "calibrations", "parameters"), 30.0, 180.0),
     ("sensors 75", 75, ("calm", "sensors", "disk"), 30.0, 180.0),
-    ("place 76", 76, ("calm", "place", "held"), 30.0, 180.0),
+    ("place 76", 76, ("calm", "place"), 30.0, 180.0),
     ("parties 80", 80, ("calm", "parties"), 120.0, 300.0),
     ("parties 104", 104, ("parties",), 12.0, 360.0),
 )

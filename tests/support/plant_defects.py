@@ -17,6 +17,7 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency.order import EmergencyOrder
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.operations.automatic import AutomaticControl
+from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.parameters import ParameterSync
 from heliotrope.plant.tickets import Ticket
@@ -180,6 +181,11 @@ def sun_of_later(patch: pytest.MonkeyPatch) -> None:
 def evening_skipped(patch: pytest.MonkeyPatch) -> None:
     """Automatic control does not look at the height of the sun."""
     patch.setattr(AutomaticControl, "_night", lambda self: None)
+
+
+def goes_on_after_a_loss(patch: pytest.MonkeyPatch) -> None:
+    """Automatic control does not wait for a person, however many heliostats were lost."""
+    patch.setattr(Losses, "_wait", lambda self, text: None)
 
 
 #: Invariants that may find it, name, defect, faults to draw from, pause between them, and the seed

@@ -252,6 +252,19 @@ def _stays_after_boot(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(states, "TABLE", table)
 
 
+def _stays_without_counts(patch: pytest.MonkeyPatch) -> None:
+    """Every reset after the first loses the step counts, and without them no mirror turns away."""
+    defocus, doubt = motion.Motion.defocus, journal.Journal.doubt.fget
+    assert doubt is not None
+
+    def by_counts(self: Any) -> None:
+        (defocus if self.known else motion.Motion.hold)(self)
+
+    patch.setattr(motion.Motion, "defocus", by_counts)
+    lost = property(lambda self: -1 if self.boots > 0 else doubt(self))
+    patch.setattr(journal.Journal, "doubt", lost)
+
+
 def _lease_too_long(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(lease.SunLease, "fresh", lambda self: True)
     patch.setattr(lease.SunLease, "look", lambda self, now, elapsed: True)
@@ -366,6 +379,12 @@ DEFECTS = (
            faults=tuple(Fault(kind, at, long, i, 0.5) for i in range(3) for kind, at, long in
                         (("power_cut", 150.0, 2.0), ("bus_unplugged", 151.0, 60.0))),
            seconds=220.0, worlds=("calm",)),
+    Defect((13,), "a mirror without step counts stays where it was", _stays_without_counts,
+           faults=tuple(Fault("power_cut", 150.0, 2.0, i, 0.5) for i in range(3)),
+           seconds=220.0, worlds=("calm",)),
+    Defect((14,), "automatic control goes on after a loss", plant_defects.goes_on_after_a_loss,
+           faults=(Fault("line_cut", 110.0, 12.0, 0, 0.5),), seconds=200.0, first=2,
+           worlds=("visits",)),
     Defect((1,), "SEARCHING goes on without a sun", _search_without_sun,
            faults=tuple(Fault("cluster_crash", at, 12.0, i, 0.5)
                         for at in (70.0, 100.0, 130.0, 160.0, 190.0, 220.0) for i in range(3)),

@@ -15,7 +15,7 @@ import numpy as np
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.lcu.node import Node
-from heliotrope.links.messages import Command, Progress, Stage
+from heliotrope.links.messages import ClusterStatus, Command, Progress, Stage
 from heliotrope.mechanism.tracking import TrackingStatus, track
 from heliotrope.plant.controller import PlantController
 from heliotrope.safety import Act, Alarm, alarms
@@ -43,11 +43,19 @@ TOGETHER = 10.0
 UNDER_WAY = 5.0
 #: A status waits up to a second, and may be in transit for another, s.
 TOLD_WITHIN = 2.2
+#: Losses that automatic control must count together, s: of its 30 s less what it may be late by.
+LOST_TOGETHER = 15.0
+#: After this many reports in which a board was heard, automatic control knows of its state.
+REPORTS = 5
+#: A board was heard for a report if its answer is no older than this, s.
+_HEARD = 1.5
 #: Half angle of the largest search of the simulated persons, rad.
 _SEARCH = 8e-3
 #: States in which a beam is sent to a point.
 _LIT = {states.TRACKING: "aims", states.SEARCHING: "aims", states.IDLE: "standbys"}
 _ON = (states.TRACKING, states.SEARCHING)
+#: States from which automatic control may lose a mirror.
+_UP = (states.APPROACHING, states.IDLE, *_ON)
 #: States in which a mirror stands where a person has left it.
 _HELD = (states.LOCKED, states.UNCONFIGURED)
 #: Commands that leave an idle mirror elsewhere than at its standby point.
@@ -82,6 +90,13 @@ class _Mirror:
     ordered_at, off_at, resumed_at
         When the plant last sent it an order, and one that takes it off the receiver; when a person
         last sent it there, s.
+    lost_at
+        When it last left TRACKING or SEARCHING without an order, s.
+    given
+        Whether a person has given it to automatic control.
+    up, changed_at, reports, seen_up
+        Whether it is up, since when, s, and how often that was reported; whether automatic control
+        has seen it up since the plant last took it off.
     called_at, uncalled
         When the plant last sent its beam to a point, s; whether it went there without that.
     """
@@ -103,6 +118,12 @@ class _Mirror:
     ordered_at: float = float("-inf")
     off_at: float = float("-inf")
     resumed_at: float = float("-inf")
+    lost_at: float = float("-inf")
+    given: bool = False
+    up: bool = False
+    changed_at: float = float("-inf")
+    reports: int = 0
+    seen_up: bool = False
     called_at: float = float("-inf")
     uncalled: bool = False
 
@@ -151,16 +172,16 @@ class BeamObserver:
         Returns the true direction to the sun, (3,), at a time in s.
     keep_outs
         Balls that no beam may enter.
-    held
-        Whether mirrors that are locked or unconfigured, that a person left elsewhere than at
-        standby, or whose counts are unknown are judged too.
+    losses
+        Number of mirrors that automatic control may lose together and raise again without a person;
+        None: only persons command.
 
     Attributes
     ----------
     checks
         Number of checks of each invariant.
     losses
-        Number of losses that took every mirror off the receiver.
+        Number of losses after which the field waits for a person.
     """
 
     def __init__(
@@ -169,12 +190,11 @@ class BeamObserver:
         boards: Mapping[str, Sequence[Board]],
         sun: Callable[[float], FloatArray],
         keep_outs: Sequence[Ball],
-        *,
-        held: bool,
+        losses: int | None = None,
     ) -> None:
         self.checks: Counter[int] = Counter()
         self.losses = 0
-        self._start, self._sun, self._held = start, sun, held
+        self._start, self._sun, self._most = start, sun, losses
         self._keep_outs = tuple(keep_outs)
         self._mirrors = {
             board.outfit.name: _Mirror(board, cluster)
@@ -185,7 +205,7 @@ class BeamObserver:
             mirror.standbys.append(("", STANDBY))
         self._alarms: dict[tuple[str, str], tuple[float, bool]] = {}
         self._left: deque[tuple[float, str]] = deque(maxlen=64)
-        self._lost_at = float("-inf")
+        self._lost_at = self._lost_known_at = self._released_at = float("-inf")
         self._proved: dict[tuple[str, str], float] = {}
 
     def _check(self, number: int, good: bool, now: float, subject: str, saw: str) -> None:
@@ -216,13 +236,57 @@ class BeamObserver:
     def ordered_off(self, heliostats: Iterable[str], now: float) -> None:
         """Note DEFOCUS or STOW from the plant."""
         for name in heliostats or self._mirrors:
-            self._mirrors[name].ordered_at = self._mirrors[name].off_at = now
+            mirror = self._mirrors[name]
+            mirror.ordered_at = mirror.off_at = now
+            mirror.seen_up &= not mirror.up  # what is up leaves by this order, and is not lost
 
     def resumed(self, heliostats: Iterable[str], what: str, now: float) -> None:
         """Note a command of a person that the plant has accepted."""
+        self.taken(heliostats)
         if what in _RESUMES:
             for name in heliostats:
                 self._mirrors[name].resumed_at = now
+
+    def taken(self, heliostats: Iterable[str]) -> None:
+        """Note that a person commands mirrors: automatic control may not have them any more."""
+        for name in heliostats:
+            self._mirrors[name].given = False
+
+    def given(self, heliostats: Iterable[str]) -> None:
+        """Note that a person has given mirrors to automatic control."""
+        for name in heliostats:
+            self._mirrors[name].given = True
+
+    def released(self, now: float) -> None:
+        """Note that a person lets automatic control go on after a loss."""
+        self._left.clear()
+        self._released_at = now
+        for mirror in self._mirrors.values():
+            mirror.resumed_at = now
+
+    def reported(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
+        """Note a report that has come to the plant: what automatic control can know by it.
+
+        What is lost is told by the true states; the report only tells since when that is known.
+        """
+        for name, row in zip(names, status.nodes(), strict=True):
+            mirror, age = self._mirrors[name], 1e-3 * int(row["heard_ms"])
+            if age <= _HEARD and now - age >= mirror.changed_at:
+                mirror.reports += 1
+                if mirror.reports == REPORTS:
+                    self._known(mirror, now)
+
+    def _known(self, mirror: _Mirror, now: float) -> None:
+        """Note that automatic control knows by now that a mirror is up, or is not."""
+        lost, mirror.seen_up = mirror.seen_up and not mirror.up, mirror.up
+        at = mirror.changed_at
+        if self._most is None or not (lost and mirror.given) or at < self._released_at:
+            return
+        self._left.append((at, mirror.name))
+        together = [each for each in self._left if abs(each[0] - at) <= LOST_TOGETHER]
+        if len({name for _, name in together}) > self._most:
+            self._lost_at, self._lost_known_at = max(together)[0], now
+            self.losses += 1
 
     def progress(self, message: Progress) -> None:
         """Forget the points before the one that is reported as done."""
@@ -243,6 +307,10 @@ class BeamObserver:
         """Note that the plant's program has ended, and its alarms with it."""
         self._alarms.clear()
         self._proved.clear()
+        self._left.clear()
+        for mirror in self._mirrors.values():
+            mirror.given = mirror.seen_up = False
+            mirror.reports = 0
 
     # -- judgement ---------------------------------------------------------------------------
 
@@ -268,17 +336,22 @@ class BeamObserver:
                 mirror.node, mirror.approached = mirror.board.node, False
             self._enters(mirror, mirror.board.state, now)
             on += mirror.state in _ON
+            if mirror.state not in (-1, states.LOCKED) and (mirror.state in _UP) != mirror.up:
+                mirror.up, mirror.changed_at, mirror.reports = not mirror.up, now, 0
             if mirror.state < 0:
                 mirror.astray_since = mirror.lit_since = mirror.inside_since = None
                 continue
             self._placed(mirror, sun, now)
             self._dark(mirror, sun, now)
-        self._loss(on, now)
+        if self._most is None:
+            self._loss(on, now)
         if plant is not None:
+            if plant.emergency_on:  # automatic control has given up the field
+                self.taken(self._mirrors)
             self._proofs(plant, sun, now)
 
     def _enters(self, mirror: _Mirror, state: int, now: float) -> None:
-        """Note a new state; after a loss it must not be TRACKING unless a person said so."""
+        """Note a new state."""
         before, mirror.state = mirror.state, state
         if state == before:
             return
@@ -293,17 +366,28 @@ class BeamObserver:
             mirror.uncalled = False
         elif state != states.IDLE or before in _AWAY:
             mirror.uncalled = now - mirror.called_at > TOGETHER
-        if before in _ON and state not in _ON and now - mirror.off_at > TOGETHER:
-            self._left.append((now, mirror.name))
         if state in _ON and before not in _ON:
+            self._returns(mirror, now)
+        elif before in _ON and state not in _ON and now - mirror.off_at > TOGETHER:
+            mirror.lost_at = now
+            if self._most is None:
+                self._left.append((now, mirror.name))
+
+    def _returns(self, mirror: _Mirror, now: float) -> None:
+        """Check that a mirror returns to the receiver by a person's will, if one is needed."""
+        known = self._lost_at + TOLD_WITHIN if self._most is None else self._lost_known_at
+        losses = [(self._lost_at, known, "the field")]
+        if self._most is None:
+            losses.append((mirror.lost_at, mirror.lost_at + TOLD_WITHIN, "this mirror"))
+        for lost_at, known_at, whose in losses:
             saw = (
-                f"{states.STATES[state]} {now - self._lost_at:.1f} s after a loss that took every "
-                "mirror off, without a person's command since"
+                f"{states.STATES[mirror.state]} {now - lost_at:.1f} s after a loss of {whose}, "
+                "without a person's command since"
             )
             # An order that left before the plant could know of the loss cannot be called back.
-            unknowing = mirror.called_at <= self._lost_at + TOLD_WITHIN
+            unknowing = mirror.called_at <= known_at
             late = unknowing and now - mirror.called_at <= UNDER_WAY
-            good = late or mirror.resumed_at >= self._lost_at
+            good = late or mirror.resumed_at >= lost_at
             self._check(14, good, now, mirror.name, saw)
 
     def _placed(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
@@ -347,13 +431,7 @@ class BeamObserver:
 
     def _dark(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
         """Check that a beam that nobody sent to the receiver, or into a volume, leaves."""
-        board, node = mirror.board, mirror.board.node
-        assert node is not None
-        left = mirror.state in _HELD or mirror.left
-        if not self._held and (left or not node.controller.motion.known):
-            mirror.lit_since = mirror.inside_since = None
-            return
-        sent = mirror.state in _ON
+        board, sent = mirror.board, mirror.state in _ON
         lit = not sent and board.miss(sun, RECEIVER) <= OFF
         mirror.lit_since = _since(lit, mirror.lit_since, now)
         inside = any(board.miss(sun, middle) <= radius for middle, radius in self._keep_outs)

@@ -29,7 +29,8 @@ number    check
 12        A beam in a state that lights anything is where it was sent; otherwise an alarm names
           it within 10 s and it is off within 30 s.
 13        In no state does a beam stay on the receiver unsent, or in a keep-out volume, for 30 s.
-14        After a loss that took every mirror off, only a person's command brings one back.
+14        After a loss of more mirrors than automatic control may raise again, or of all, only a
+          person brings one back.
 15        A mirror proven to be done is off the receiver, or at stow.
 16        In quiet stretches what was ordered is done; a kept sighting is the mirror's own; while
           the sun is low, what automatic control was given is at stow.
@@ -630,9 +631,8 @@ class Observer:
         board, name = account.board, account.name
         account.served(now, leased)
         assert board.node is not None
-        motion = board.node.controller.motion
-        if board.state == states.UNCONFIGURED or not motion.known:
-            return
+        # Unknown counts tell nothing of the pose: there the true beam counts, with its error.
+        known = board.node.controller.motion.known
         on_way = board.state in (states.APPROACHING, states.IDLE) and account.from_stow
         for why, begin in account.deadlines(now):
             passed = now - begin
@@ -640,14 +640,14 @@ class Observer:
             if passed > DEFOCUS_WITHIN:
                 saw = f"{state} {passed:.1f} s after {why}, limit {DEFOCUS_WITHIN:g} s"
                 self.check(2, board.state not in NEED_SUN, now, name, saw)
-                miss = board.miss(sun, RECEIVER, believed=True)
+                miss = board.miss(sun, RECEIVER, believed=known)
                 crossing = account.crosses(miss <= OFF, now)
                 saw = (
                     f"{state} {passed:.1f} s after {why}, its beam within {OFF:g} m of the "
                     f"receiver's middle for {crossing:.1f} s, limit {CROSSING:g} s"
                 )
                 self.check(2, crossing <= CROSSING, now, name, saw)
-            if passed > STOW_WITHIN and account.must_stow(why):
+            if passed > STOW_WITHIN and account.must_stow(why) and known:
                 stow = sorted(account.stows)
                 saw = f"{state} at {account.place()} {passed:.1f} s after {why}, stow is {stow}"
                 self.check(2, account.place() in account.stows, now, name, saw)

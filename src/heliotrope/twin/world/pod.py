@@ -331,6 +331,7 @@ class PlantEar:
             self._names = message.names or self._names
             if len(self._names) == len(message.nodes()):
                 observer.status(message, self._names, now)
+                self._beams.reported(message, self._names, now)
         elif isinstance(message, Progress):
             counts[f"progress {message.stage.value}"] += 1
             observer.progress(message, now)

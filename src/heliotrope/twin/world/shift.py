@@ -97,19 +97,16 @@ class Shift:
         if operations.plant.emergency_on:
             return
         if operations.automatic.waits:
-            self._resumed()
+            self._beams.released(self._clock.monotonic())
             operations.resume(ENGINEER)
         names = tuple(name for name in self._names if name not in self._left)
         out = {lockout.heliostat for lockout in operations.holds()}
         if back := sorted(out - self._left):
             operations.unhold(ENGINEER, back)
-        self._resumed()
         operations.give_back(ENGINEER, names)
+        self._beams.given(names)
         self._day.given(names, self._clock.monotonic())
         self._left.clear()
-
-    def _resumed(self) -> None:
-        self._beams.resumed(self._names, "TRACK", self._clock.monotonic())
 
     # -- interruptions -----------------------------------------------------------------------
 
@@ -155,6 +152,7 @@ class Shift:
         name = self._chance.choice(self._names)
         self._day.taken((name,))
         what = self._chance.choice(["DEFOCUS", "STOW"])
+        self._beams.taken((name,))
         (operations.defocus if what == "DEFOCUS" else operations.stow)(VIEWER, (name,))
         self._observer.obeyed(VIEWER.name, what, self._clock.monotonic())
         self._left.add(name)
@@ -163,12 +161,14 @@ class Shift:
         """Take a mirror out of service: it goes to stow."""
         name = self._chance.choice(self._names)
         self._day.taken((name,))
+        self._beams.taken((name,))
         operations.hold(ENGINEER, (name,), "washing")
         self._observer.obeyed(ENGINEER.name, "STOW", self._clock.monotonic())
         self._left.add(name)
 
     async def _emergency(self, operations: Operations) -> None:
         self._day.taken(self._names)
+        self._beams.taken(self._names)
         self._operator.raises(operations.plant, VIEWER, Act.DEFOCUS)
         operations.automatic.want(self._names, wanted=False)
         await asyncio.sleep(self._chance.uniform(2.0, _EMERGENCY))

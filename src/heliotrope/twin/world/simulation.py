@@ -57,7 +57,7 @@ from heliotrope.twin.world.scene import scene_of
 from heliotrope.twin.world.shift import Shift, Working
 from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
 from heliotrope.twin.world.twice import SecondPlant
-from heliotrope.twin.world.work import Work
+from heliotrope.twin.world.work import LOSSES, Work
 from heliotrope.twin.world.worlds import (
     PARTY,
     Habits,
@@ -269,9 +269,8 @@ class Simulation:
         self.boards = [self._board(each) for each in stored]
         self.pods = self._new_pods()
         boards = {pod.name: pod.boards for pod in self.pods}
-        self.beams = BeamObserver(
-            self.begin, boards, self.sun, scene.keep_outs, held="held" in plan.worlds
-        )
+        most = LOSSES if works(plan.worlds) else None
+        self.beams = BeamObserver(self.begin, boards, self.sun, scene.keep_outs, most)
         self.readings = SensorObserver(self.begin, boards)
         self.quiet = self._quiet_observer()
         self.instruments = Instruments(self._clock, plan.seed, self._flux, self.readings)

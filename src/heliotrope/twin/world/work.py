@@ -30,8 +30,10 @@ from heliotrope.twin.boards.outfit import MACHINE
 from heliotrope.twin.cameras import FieldSnapshot
 from heliotrope.twin.world.photographs import LyingCamera
 
-#: With this few mirrors, the loss of two may be the loss of all; orders are given again soon.
-SETTINGS = AutomaticSettings(rate=1.0, losses=1, patience=20.0)
+#: Mirrors that may be lost together without a person: of so few, two may be all.
+LOSSES = 1
+#: Orders are given again soon.
+SETTINGS = AutomaticSettings(rate=1.0, losses=LOSSES, patience=20.0)
 #: A visit that fits into a run of some minutes.
 VISIT = CycleSettings(shots=3, interval=2.0, arrival=60.0, least=3, model=CYCLE.model)
 #: A search that stays near its target.

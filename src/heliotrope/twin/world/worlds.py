@@ -14,7 +14,6 @@ from heliotrope.twin.boards.outfit import MACHINE, Outfit
 WORLDS = {
     "calm": "persons seldom take mirrors off the receiver",
     "swarm": "each run draws its own weights of faults and of what persons do",
-    "held": "mirrors that are locked, unconfigured or left elsewhere by a person are judged too",
     "clock": "the clock of a cluster is wrong from the start, by a minute to an hour",
     "site": "the site of a cluster is wrong by up to 2.5 degrees of longitude or latitude",
     "addresses": "two boards of a cluster have exchanged addresses",
@@ -43,7 +42,7 @@ _SELDOM = 4.0
 ANY = "any"
 #: Worlds that hold, of which `mixed` chooses.
 MIX = (
-    "calm", "swarm", "held", "frozen", "disk", "place", "sensors", "parameters", "calibrations",
+    "calm", "swarm", "frozen", "disk", "place", "sensors", "parameters", "calibrations",
     "twice",
     "visits", "day",
 )  # fmt: skip
