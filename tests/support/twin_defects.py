@@ -27,7 +27,7 @@ from heliotrope.safety import evaluation
 from heliotrope.twin.boards import outfit
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.simulation import RunPlan
-from support import plant_defects, quiet_defects
+from support import plant_defects, quiet_defects, report_defects
 
 #: The plant stands still for a minute when mirrors track.
 STILL = (Fault("plant_silent", 110.0, 60.0, 0, 0.5),)
@@ -422,6 +422,8 @@ DEFECTS = (
     *(Defect((16,), name, defect, seconds=180.0, worlds=worlds, slow=slow,
              faults=(Fault("line_cut", 40.0, 9.0, 0, 0.5),))
       for name, defect, worlds, slow in quiet_defects.REJOIN_ROWS),
+    *(Defect(numbers, name, defect, only, pause, worlds=worlds, slow=slow)
+      for numbers, name, defect, only, pause, worlds, slow in report_defects.ROWS),
     *(Defect((11, 12), name, defect, faults=(), worlds=("tour",), slow=slow)
       for name, defect, slow in quiet_defects.TOUR_ROWS),
 )  # fmt: skip

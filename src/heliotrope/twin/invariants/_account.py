@@ -1,16 +1,20 @@
 """The observer's account of one heliostat."""
 
 from collections import deque
+from struct import unpack
 from typing import Any
 
 from heliotrope.lcu import messages, motion, states, wire
-from heliotrope.lcu.journal import items_of
+from heliotrope.lcu.journal import CODES_OF, items_of
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, STOW
 from heliotrope.twin.invariants.ledger import Sent
 
 #: Steps that a timer may be given ahead of its rate, s.
 AHEAD = 0.2
+#: Steps are made in slots of this length, s, in each of which the speed changes by one step more
+#: than the acceleration allows at most, since steps are whole; a longer pause is a stop, s.
+SLOT, PAUSE = 0.05, 0.5
 #: The sun is sent every second; a heliostat counts as served for this long after, s.
 SERVED = 2.0
 #: Braking takes half a second at most; after this only the axis whose turn it is may move, s.
@@ -76,6 +80,12 @@ class HeliostatAccount:
         Stow positions that it was ever given, steps.
     by_way
         Whether it has come to its standby point since it was last at stow or without power.
+    booted_at, boots, cuts
+        When it last booted, s; how often it has booted and lost its supply since the start.
+    stepped_at
+        When its timers were last given steps, s.
+    ticks_jumped, misled
+        Whether its counter has jumped since it booted; whether it has heard a stranger's frame.
     foot
         Nearest that its beam came to the foot of the way in this approach, m; 0 if that is unknown.
     """
@@ -97,6 +107,10 @@ class HeliostatAccount:
         self.stows = {STOW}
         self.by_way = False
         self.foot = float("inf")
+        self.booted_at, self.boots, self.cuts = now, 0, 0
+        self.stepped_at = float("-inf")
+        self._slot_ends, self._slot_steps = [float("-inf")] * 2, [0, 0]
+        self.ticks_jumped = self.misled = False
         self._history: deque[tuple[float, int]] = deque([(now, self.state)], maxlen=64)
         self._items = board.node.journal.items if board.node is not None else board.outfit.items
         self._pending: dict[str, bytes] = {}
@@ -129,6 +143,11 @@ class HeliostatAccount:
         self.state = state
         self._history.append((now, state))
 
+    @property
+    def changed_at(self) -> float:
+        """When it entered its state, or booted, s."""
+        return self._history[-1][0]
+
     def was_in(self, wanted: tuple[int, ...], since: float) -> bool:
         """Whether the heliostat was in one of some states at any time since."""
         begun = [state for at, state in self._history if at <= since][-1:]
@@ -145,6 +164,7 @@ class HeliostatAccount:
             self._pending = {"standby": sent.payload[8:]}
         self.in_hand, self.how, self.quiet = None, "", 0
         self._ordered.clear()
+        self.cuts += 1
         self._leg, self._stowing_since = 0, None
         self.from_stow = self.by_way = False
         self.state = -1
@@ -153,11 +173,14 @@ class HeliostatAccount:
     def booted(self, now: float) -> None:
         """Note a boot: its times start again, and no earlier frame counts."""
         self.state = self.board.state
+        self.booted_at, self.boots = now, self.boots + 1
+        self.ticks_jumped = self.misled = False
         self._history.append((now, self.state))
         self._served_at = now
         self.taken = -1
         self.sun_at = float("-inf")
         self._level = [0.0, 0.0]
+        self._slot_steps = [0, 0]
         self.keep()
 
     # -- the journal -----------------------------------------------------------------------
@@ -192,8 +215,14 @@ class HeliostatAccount:
         one, two = (a.emitted - s for a, s in zip(self.board.axes, self.board.slip, strict=True))
         return one, two
 
+    def stow(self) -> tuple[int, int]:
+        """Return the stow position that its journal holds, steps."""
+        one, two = unpack(CODES_OF["stow"], self._items["stow"])
+        return one, two
+
     def rate(self, axis: int, count: int, now: float) -> str:
         """Take steps handed to a timer now; return what is wrong with their rate, or ""."""
+        self.stepped_at = now
         limit = float(LIMITS[0])
         gone = limit * (now - self._filled_at[axis])
         self._filled_at[axis] = now
@@ -201,6 +230,21 @@ class HeliostatAccount:
         if level <= AHEAD * limit:
             return ""
         return f"axis {axis} is {level:.0f} steps ahead of {limit:.0f} steps/s"
+
+    def ramp(self, axis: int, steps: int, now: float) -> str:
+        """Take the signed steps of a slot; return what is wrong with their acceleration, or ""."""
+        most = LIMITS[1] * SLOT * SLOT + 2.0
+        begin = max(now, self._slot_ends[axis])
+        before = self._slot_steps[axis]
+        wrong = ""
+        if begin - self._slot_ends[axis] > PAUSE or before * steps < 0:  # it has stopped since
+            if abs(before) > most:
+                wrong = f"axis {axis} stopped from {before} steps in a slot, limit {most:.0f}"
+            before = 0
+        if abs(steps - before) > most:
+            wrong = f"axis {axis} went from {before} to {steps} steps in a slot, limit {most:.0f}"
+        self._slot_ends[axis], self._slot_steps[axis] = begin + SLOT, steps
+        return "" if self.ticks_jumped else wrong
 
     def order(self, axis: int) -> str | None:
         """Take a segment; return an error in the order of the axes, "", or None if any will do."""
@@ -227,6 +271,7 @@ class HeliostatAccount:
     def jumped(self) -> None:
         """Note a jump of the counter: the board may take pending steps for done."""
         self._leg, self.foot = 0, 0.0
+        self.ticks_jumped = True
 
     # -- deadlines -------------------------------------------------------------------------
 

@@ -19,13 +19,14 @@ number    check
 6         A damaged frame changes nothing.
 7         After a boot the state is a safe one, the journal holds the old or the new record, and
           the step counts are right to within their stated uncertainty.
-8         Steps keep to range and rate; counted steps are those that were ordered.
+8         Steps keep to range, rate and acceleration; counted steps are those that were ordered.
 9         As 1, and the plant's lease too, while a clock or counter has jumped; no sun is sent by a
           time that has jumped before a person has acknowledged it.
 10        Azimuth moves first from stow and last to stow; the beam goes by the foot of the way, and
           crosses the receiver only once it has come to its standby point.
 11        Every command on the bus was accepted and reported once; no value is reported younger
-          or other than it is. Where nothing fails (`world.tour`) it is done in time.
+          or other than it is, by boards, clusters or the plant. Where nothing fails
+          (`world.tour`) it is done in time.
 12        A beam in a state that lights anything is where it was sent; otherwise an alarm names
           it within 10 s and it is off within 30 s.
 13        In no state does a beam stay on the receiver unsent, or in a keep-out volume, for 30 s.
@@ -33,10 +34,12 @@ number    check
           person brings one back.
 15        A mirror proven to be done is off the receiver, or at stow.
 16        In quiet stretches what was ordered is done; a kept sighting is the mirror's own; while
-          the sun is low, what automatic control was given is at stow.
+          the sun is low, what automatic control was given is at stow. Alarms have causes, and
+          causes have alarms; each command ends, and says why it failed.
 ========  ============================================================================
 
-`twin.invariants.beams` checks 12 to 15, `twin.invariants.quiet`, `.visits` and `.day` 16.
+`twin.invariants.beams` checks 12 to 15, `twin.invariants.quiet`, `.visits`, `.day`, `.alarms` and
+`.tickets` 16, and `twin.invariants.answers` 11.
 """
 
 from collections import Counter, deque
@@ -308,7 +311,7 @@ class Observer:
         if account.board.node is None:
             return
         if how == "forged":
-            account.forged = _first(data)
+            account.forged, account.misled = _first(data), True
         account.quiet = self._expects_quiet(account, sent, how)
         if account.quiet:
             # Bring the board up to date first, so that only the frame can change anything.
@@ -484,6 +487,8 @@ class Observer:
         saw = f"{which} ordered to step {place}, range {low} to {high}"
         self.check(8, low <= place <= high, now, name, saw)
         saw = account.rate(axis, count, now)
+        self.check(8, not saw, now, name, saw)
+        saw = account.ramp(axis, direction * count, now)
         self.check(8, not saw, now, name, saw)
         wrong = account.order(axis)
         if wrong is not None:

@@ -42,9 +42,9 @@ TOLD_WITHIN, PROVEN_WITHIN = 8.0, 20.0
 #: Time for a beam to come to its point after an order or a change of state, s; if it is not there
 #: by then, its drives have the time that they need from there, see `beams.slew`.
 ON_POINT_WITHIN = 12.0
-#: A beam is this near its point: share of its length, rad, and m. Backlash is 0.6 mrad of the
-#: mirror, rough stepping 0.25 mrad, pushed biases 0.1 mrad; beams turn by twice as much.
-NEAR, NEAR_M = 4e-3, 0.1
+#: A beam is this near its point, by the steps made: share of its length, rad, and m. Rough stepping
+#: is 0.25 mrad of the mirror, pushed biases 0.1 mrad; beams turn by twice as much.
+NEAR, NEAR_M = 1.2e-3, 0.05
 #: An authority counts once the clusters have it, and orders given one after another cross, s.
 GRANTED, CROSSING = 4.0, 3.0
 
@@ -187,6 +187,10 @@ class QuietObserver:
     @property
     def stretches(self) -> frozenset[str]:
         """Heliostats that are in a quiet stretch."""
+        return self._quiet
+
+    def calm(self) -> frozenset[str]:
+        """Return `stretches`."""
         return self._quiet
 
     # -- orders and reports ------------------------------------------------------------------

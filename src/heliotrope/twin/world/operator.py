@@ -30,6 +30,7 @@ from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STANDBY, Outfit
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.plant_observer import VOID_WITHIN, PlantObserver
 from heliotrope.twin.invariants.quiet import QuietObserver
+from heliotrope.twin.invariants.tickets import TicketObserver
 from heliotrope.twin.world.pod import PlantEar, Pod
 from heliotrope.twin.world.worlds import Habits, narrow_limits
 
@@ -87,7 +88,7 @@ class Operator:
         Number of actions of each kind.
     refusal
         Why the plant refused last.
-    quiet
+    quiet, tickets
         Observer that judges whether the reason is true; None: it is not judged. Set by the owner.
     points
         Points last accepted, ENU, m, by command (AIM, STANDBY) and heliostat.
@@ -111,6 +112,7 @@ class Operator:
         self.counts: Counter[str] = Counter()
         self.refusal = ""
         self.quiet: QuietObserver | None = None
+        self.tickets: TicketObserver | None = None
         self.points: dict[tuple[str, str], Point] = {}
         self._clock, self._observer, self._flux = clock, observer, flux
         self._beams, self._habits = beams, habits
@@ -262,6 +264,8 @@ class Operator:
         now = self._clock.monotonic()
         self._observer.accepted(who, token, ticket, what, now)
         self._beams.resumed(ticket.heliostats, what, now)
+        if self.tickets is not None:
+            self.tickets.accepted(ticket, now)
         return ticket
 
     def _astray(self, plant: PlantController) -> None:

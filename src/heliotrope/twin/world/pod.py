@@ -32,6 +32,8 @@ from heliotrope.sun import Site
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.bus import TwinBus
 from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime
+from heliotrope.twin.invariants.alarms import AlarmObserver
+from heliotrope.twin.invariants.answers import AnswerObserver
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.invariants import Observer
 from heliotrope.twin.invariants.ledger import PlantCommand
@@ -79,6 +81,8 @@ class Pod:
         The plant's end of the line and its listener; None while no plant runs.
     plant
         Observer of the plant; set by the owner.
+    answers
+        Observer of what boards and cluster say of themselves.
     lines
         Observer of the line; None: a second plant takes it now and then.
     counts
@@ -120,6 +124,8 @@ class Pod:
         self.addresses = dict(zip(names, errors.addresses(own), strict=True))
         self._names_of = {address: name for name, address in self.addresses.items()}
         observer.call(self._names_of)
+        self.answers = AnswerObserver(name, observer.accounts, clock.monotonic())
+        self.answers.utc = lambda: clock.utc().timestamp()
         self._whole_since = clock.monotonic()
         self.lines = None if errors.shared else LineObserver(name, clock.monotonic())
 
@@ -183,7 +189,8 @@ class Pod:
     @property
     def checks(self) -> Counter[int]:
         """Number of checks of each invariant, of the cluster and of its line."""
-        return self.observer.checks + (Counter() if self.lines is None else self.lines.checks)
+        own = self.observer.checks + self.answers.checks
+        return own + (Counter() if self.lines is None else self.lines.checks)
 
     def carried(self, now: float) -> bool:
         """Whether an order given now must be carried out."""
@@ -198,10 +205,12 @@ class Pod:
     def heard(self, place: int, data: bytes, how: str, now: float) -> None:
         """Pass on bytes that a board is about to receive."""
         self.observer.heard(place, data, how, now)
+        self.answers.heard(how, now)
 
     def answered(self, data: bytes, how: str, now: float) -> None:
         """Pass on an answer to the cluster, and keep the states that it reports."""
         self.observer.answered(data, how, now)
+        self.answers.answered(data, how, now)
         if self.plant is None:
             return
         for frame in wire.Reader().feed(data):
@@ -244,8 +253,8 @@ class PlantEar:
         Observer of the plant.
     beams
         Observer of the beams.
-    quiet
-        Observer of what is done; None: it is not judged.
+    quiet, alarms
+        Observers of what is done, and of alarms; None: it is not judged.
     """
 
     def __init__(
@@ -254,8 +263,10 @@ class PlantEar:
         plant: PlantObserver,
         beams: BeamObserver,
         quiet: QuietObserver | None = None,
+        alarms: AlarmObserver | None = None,
     ) -> None:
         self._pod, self._plant, self._beams, self._quiet = pod, plant, beams, quiet
+        self._alarms = alarms
         self._addresses = pod.addresses
         self._names: tuple[str, ...] = ()
         self._goes = asyncio.Event()
@@ -328,10 +339,13 @@ class PlantEar:
         observer, counts = self._pod.observer, self._pod.counts
         if isinstance(message, ClusterStatus):
             counts["status"] += 1
+            if self._alarms is not None:
+                self._alarms.heard(self._pod.name, now)
             self._names = message.names or self._names
             if len(self._names) == len(message.nodes()):
                 observer.status(message, self._names, now)
                 self._beams.reported(message, self._names, now)
+                self._pod.answers.status(message, self._names, now)
         elif isinstance(message, Progress):
             counts[f"progress {message.stage.value}"] += 1
             observer.progress(message, now)

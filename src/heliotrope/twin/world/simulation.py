@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,12 +38,14 @@ from heliotrope.twin.boards.outfit import (
     outfits,
 )
 from heliotrope.twin.cameras import FieldSnapshot
+from heliotrope.twin.invariants.alarms import AlarmObserver
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.quiet import QuietObserver
 from heliotrope.twin.invariants.sensors import SensorObserver
+from heliotrope.twin.invariants.tickets import TicketObserver
 from heliotrope.twin.invariants.visits import VisitObserver
 from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
 from heliotrope.twin.true_mirrors import mirrors_of
@@ -272,7 +275,12 @@ class Simulation:
         most = LOSSES if works(plan.worlds) else None
         self.beams = BeamObserver(self.begin, boards, self.sun, scene.keep_outs, most)
         self.readings = SensorObserver(self.begin, boards)
+        self.alarms = AlarmObserver(self.begin, boards, alone="twice" not in plan.worlds)
+        self.tickets = TicketObserver(self.begin)
         self.quiet = self._quiet_observer()
+        for pod in self.pods:
+            if self.quiet is not None:
+                pod.answers.quiet = self.quiet.calm
         self.instruments = Instruments(self._clock, plan.seed, self._flux, self.readings)
         self._measured = "sensors" in plan.worlds
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
@@ -299,7 +307,7 @@ class Simulation:
             scene.keep_outs[0][0],
             None if self._measured else self._flux,
         )
-        self.operator.quiet = self.quiet
+        self.operator.quiet, self.operator.tickets = self.quiet, self.tickets
         self._exits = contextlib.ExitStack()
         self._work = self._new_work() if works(plan.worlds) else None
         self._tour: Tour | None = None
@@ -395,7 +403,7 @@ class Simulation:
         for pod in self.pods:
             seed = self._chance.getrandbits(31)
             link = pod.line.end(0, pod.name, self._clock, seed=seed)
-            pod.ear = PlantEar(pod, self.observer, self.beams, self.quiet)
+            pod.ear = PlantEar(pod, self.observer, self.beams, self.quiet, self.alarms)
             pod.tap = TappedLink(link, self._clock, pod.ear)
             links[pod.name] = pod.tap
         audit = self._audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
@@ -452,6 +460,7 @@ class Simulation:
             self._work.control.take_alarm(alarm)
         self.beams.alarmed(alarm, self._clock.monotonic())
         self.readings.alarmed(alarm)
+        self.alarms.alarmed(alarm, self._clock.monotonic())
         if self.quiet is not None:
             self.quiet.alarmed(alarm)
 
@@ -476,7 +485,8 @@ class Simulation:
         self.observer.ended(now)
         self.beams.ended()
         self.readings.ended(now)
-
+        self.alarms.ended()
+        self.tickets.ended()
         if self.quiet is not None:
             self.quiet.ended()
         for pod in self.pods:
@@ -565,6 +575,12 @@ class Simulation:
                 if self.quiet is not None:
                     going = None if self.operator.waits else self.plant
                     self.quiet.look(going, carried, damage.rest, now)
+                    for pod in self.pods:
+                        pod.answers.look(now)
+                    self.alarms.look(damage.rest, carried, now, runs=going is not None)
+                writes = not (self.disk.full or self.disk.busy(now))
+                going_on = self.plant is not None and not self.operator.waits
+                self.tickets.look(now, runs=going_on and writes)
                 if self._work is not None:
                     self._work.observer.look(self.plant, self.sun(now), now)
                     calm = frozenset() if self.quiet is None else self.quiet.stretches
@@ -588,6 +604,7 @@ def run(plan: RunPlan) -> RunResult:
     loop = runner.get_loop()
     assert isinstance(loop, VirtualLoop)
     begin = loop.time()
+    loop.set_exception_handler(lambda _, about: _lost(about, outcome))
     simulation = Simulation(plan, loop)
     try:
         runner.run(simulation.live())
@@ -602,13 +619,20 @@ def run(plan: RunPlan) -> RunResult:
         (pod.checks for pod in simulation.pods),
         simulation.observer.checks + simulation.beams.checks + simulation.readings.checks,
     )
-    for extra in (*simulation.working, simulation.quiet):
+    for extra in (*simulation.working, simulation.quiet, simulation.alarms, simulation.tickets):
         if extra is not None:
             outcome.checks += extra.checks
     outcome.faults = simulation.faults
     outcome.counts = sum((pod.counts for pod in simulation.pods), simulation.operator.counts)
     outcome.states = sum((pod.observer.entered for pod in simulation.pods), Counter())
     return outcome
+
+
+def _lost(about: dict[str, Any], outcome: RunResult) -> None:
+    """Note an exception that nobody has awaited: one of a task or of a callback."""
+    error = about.get("exception")
+    if isinstance(error, Exception) and not outcome.problem:
+        outcome.problem = f"{about['message']}: {type(error).__name__}: {error}"
 
 
 def _blame(error: BaseException, outcome: RunResult) -> None:

@@ -24,7 +24,6 @@ from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, RECEIVER, STANDBY
 from heliotrope.twin.invariants.invariants import OFF
 from heliotrope.twin.invariants.plant_observer import PlantObserver
-from heliotrope.twin.invariants.quiet import NEAR, NEAR_M
 from heliotrope.twin.world.operator import ENGINEER, VIEWER, Operator, Point
 
 #: Name of the world, and how long it takes, s.
@@ -51,6 +50,9 @@ LOOK = 0.2
 #: Steps of a JOG, and what the sun adds to them until it is carried out; least motion of each axis
 #: in a diagnosis, steps: it turns them by 0.02 rad.
 JOGGED, DRIFT, NUDGED = 200, 60, 1000
+#: The true beam is this near its point: share of its length, rad, and m. Backlash is 0.5 mrad of
+#: the mirror, rough stepping 0.25 mrad; beams turn by twice as much.
+NEAR, NEAR_M = 4e-3, 0.1
 #: A search comes to the last turn of its spiral: at least this share of its radius.
 OUTWARD = 0.7
 #: Commands that end with the beam at standby.

@@ -1,0 +1,176 @@
+"""The observer of alarms: each has its cause in the true world, is raised for it, and ends with it.
+
+An alarm excuses whom it names from work (`twin.invariants.quiet`), so an alarm without a cause
+hides whatever is wrong. The observer has a table of the alarms that faults of the simulation cause
+and of those that persons, weather and automatic control do; any other has no cause at all. One that
+faults cause is raised only while such a fault lasts, or soon after; once all is well it ends by
+itself, unless a person must end it. A board without power, a board in FAULT, and a cluster of which
+the plant hears nothing must be named within a time (invariant 16). The table and the times are its
+own.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Collection, Mapping
+from math import inf
+
+from heliotrope.lcu import states
+from heliotrope.safety import Alarm
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.invariants.invariants import InvariantError, Violation
+
+#: Alarms that only faults cause, and within what time they end once nothing has failed near the
+#: subject, s; inf: a person ends them, or another run of a program does.
+BY_FAULTS = {
+    "bus_errors": 60.0, "bus_failed": 60.0, "clock_jump": inf, "cluster_silent": 20.0,
+    "cluster_site_differs": 30.0, "cluster_time_differs": 30.0, "counts_doubtful": inf,
+    "database_unwritable": 25.0, "holdover_exhausted": 30.0, "node_fault": inf,
+    "node_silent": 15.0, "order_unacknowledged": 15.0, "plant_link_lost": 20.0, "second_plant": inf,
+    "sun_jumped": 75.0, "time_source": 30.0, "time_source_lost": 30.0, "two_plants": 90.0,
+}  # fmt: skip
+#: Alarms that persons, weather, wrong parameters and automatic control cause.
+BY_OTHERS = frozenset({
+    "authority_lost", "beam_blocked", "beam_disproved", "beam_unsent", "flux_after_emergency",
+    "identity", "keep_out_predicted", "nodes_unacknowledged", "operator_emergency",
+    "parameters_differ", "pointing_disagrees", "receiver_flux_high", "resume_needed",
+    "sun_below_horizon", "unknown_reading", "wind_gust_defocus", "wind_gust_stow",
+    "wind_mean_defocus", "wind_mean_stow",
+})  # fmt: skip
+#: An alarm comes this long after the end of its cause at most, s.
+RAISED_WITHIN = 15.0
+#: A board without power is named after this: silence for 10 s, asked each fifth second, and the way
+#: to the plant. A fault, and a cluster that is not heard, are named after these. s.
+SILENT_WITHIN, FAULT_WITHIN, UNHEARD_WITHIN = 18.0, 10.0, 8.0
+#: What no text for a person holds.
+_NONSENSE = re.compile(r"[{}]|\bnan\b|\bNone\b|\binf\b|<[a-z_.]+ ")
+
+
+class AlarmObserver:
+    """Observes the alarms of a plant.
+
+    Parameters
+    ----------
+    start
+        Zero of the times that it reports, s.
+    boards
+        Boards by name of the cluster.
+    alone
+        Whether no second plant runs at times: its alarms are told here too, and it takes lines.
+
+    Attributes
+    ----------
+    checks
+        Number of checks of each invariant.
+    """
+
+    def __init__(
+        self, start: float, boards: Mapping[str, Collection[Board]], *, alone: bool
+    ) -> None:
+        self.checks: Counter[int] = Counter()
+        self._start, self._alone = start, alone
+        self._boards = {each.outfit.name: each for some in boards.values() for each in some}
+        self._clusters = {name: [b.outfit.name for b in some] for name, some in boards.items()}
+        self._active: dict[tuple[str, str], float] = {}
+        self._new: list[Alarm] = []
+        self._heard = dict.fromkeys(boards, start)
+        self._runs_since = inf
+        self._well = dict.fromkeys(boards, inf)
+        self._off: dict[str, float] = {}
+        self._faulty: dict[str, float] = {}
+
+    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
+        self.checks[16] += 1
+        if not good:
+            raise InvariantError(Violation(16, now - self._start, subject or "plant", saw))
+
+    def alarmed(self, alarm: Alarm, now: float) -> None:
+        """Note an alarm of the plant; it is judged at the next look."""
+        key = alarm.condition, alarm.subject
+        if alarm.active:
+            self._active.setdefault(key, now)
+            self._new.append(alarm)
+        else:
+            self._active.pop(key, None)
+
+    def ended(self) -> None:
+        """Note that the plant's program has ended, and its alarms with it."""
+        self._active.clear()
+        self._new.clear()
+
+    def heard(self, cluster: str, now: float) -> None:
+        """Note a status that has reached the plant."""
+        self._heard[cluster] = now
+
+    def look(
+        self, rest: Mapping[str, float], carried: Collection[str], now: float, *, runs: bool
+    ) -> None:
+        """Judge all alarms.
+
+        Parameters
+        ----------
+        rest
+            When the last fault that concerns each heliostat ended, or will end, s.
+        carried
+            Clusters that the plant reaches.
+        now
+            s.
+        runs
+            Whether the plant's program runs.
+        """
+        rests = dict(rest)
+        rests |= {name: max(rest[each] for each in some) for name, some in self._clusters.items()}
+        rests[""] = max(rest.values())
+        new, self._new = self._new, []
+        for alarm in new:
+            self._caused(alarm, rests, now)
+        self._runs_since = min(self._runs_since, now) if runs else inf
+        if not (runs and self._alone):
+            self._heard = dict.fromkeys(self._heard, now)
+            return
+        for (kind, subject), since in self._active.items():
+            passed = now - max(since, rests.get(subject, inf), self._runs_since)
+            limit = BY_FAULTS.get(kind, inf)
+            saw = f"{kind} stands {passed:.0f} s after the last fault, limit {limit:g} s"
+            self._check(passed <= limit, now, subject, saw)
+        for cluster, some in self._clusters.items():
+            self._named_cluster(cluster, now)
+            there = cluster in carried
+            self._well[cluster] = min(self._well[cluster], now) if there else inf
+            for name in some:
+                self._named(name, max(self._well[cluster], self._runs_since), now)
+
+    def _caused(self, alarm: Alarm, rests: Mapping[str, float], now: float) -> None:
+        """Check that an alarm can have a cause, names something, and is readable."""
+        kind, subject = alarm.condition, alarm.subject
+        saw = f"{kind} is raised: {alarm.text}"
+        known = kind in BY_FAULTS or kind in BY_OTHERS
+        self._check(known, now, subject, f"{saw}: nothing in this world causes it")
+        self._check(subject in rests, now, subject, f"{saw}: there is no {subject!r}")
+        sense = len(alarm.text) > len(kind) and not _NONSENSE.search(alarm.text)
+        self._check(sense, now, subject, f"{saw}: that says nothing")
+        if kind in BY_FAULTS:
+            calm = now - rests[subject]
+            good = calm <= RAISED_WITHIN
+            self._check(good, now, subject, f"{saw}: the last fault ended {calm:.1f} s ago")
+
+    def _named_cluster(self, cluster: str, now: float) -> None:
+        silent = now - max(self._heard[cluster], self._runs_since)
+        named = ("cluster_silent", cluster) in self._active
+        saw = f"the plant has heard nothing of it for {silent:.1f} s, and no alarm says so"
+        self._check(named or silent <= UNHEARD_WITHIN, now, cluster, saw)
+
+    def _named(self, name: str, well: float, now: float) -> None:
+        """Check that a board without power, and one in FAULT, are named."""
+        state = self._boards[name].state
+        for since, holds, alarm, within in (
+            (self._off, state < 0, "node_silent", SILENT_WITHIN),
+            (self._faulty, state == states.FAULT, "node_fault", FAULT_WITHIN),
+        ):
+            if not holds:
+                since.pop(name, None)
+                continue
+            passed = now - max(since.setdefault(name, now), well)
+            named = (alarm, name) in self._active
+            what = "without power" if state < 0 else "in FAULT"
+            saw = f"it is {what} for {passed:.1f} s, and no {alarm} names it"
+            self._check(named or passed <= within, now, name, saw)

@@ -1,0 +1,284 @@
+"""The observer of answers: what a board says of itself, and a cluster of its boards, is true.
+
+A board answers questions at one instant of virtual time, so its answer is compared with the true
+board at that instant: where its motors are and whether they turn, how long ago it booted and the
+last sun left the cluster, how often it has booted, and what its journal holds. The rows and
+numbers of a cluster's status are compared with the answers that have reached it and with the true
+time (invariant 11). The meaning of each bit, and all limits, are the observer's own.
+"""
+
+import zlib
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
+from math import inf
+from typing import Any
+
+from heliotrope.lcu import states, wire
+from heliotrope.links.messages import NEVER, ClusterStatus
+from heliotrope.twin.boards.outfit import LIMITS, RANGES
+from heliotrope.twin.invariants._account import HeliostatAccount
+from heliotrope.twin.invariants.invariants import InvariantError, Violation
+
+#: Bits of the flags in STATUS.
+_MOVING, _SUN_FRESH, _CLOCK_SET, _CONFIGURED, _READY, _AT_STOW = (1 << i for i in range(6))
+_DOUBTFUL, _UNKNOWN = 1 << 8, 1 << 9
+#: Bits that nothing in the simulation can set: a fault that is present, the switch at the mirror,
+#: a key of the bus.
+_NEVER_SET = 1 << 14 | 1 << 17 | 1 << 18
+#: Motors that were given steps this recently turn, and those that were not for this long rest, s.
+TURNS, RESTS = 0.02, 1.0
+#: The lease of a sun, with what the clocks may differ by, s.
+FRESH, OLD = 5.0, 6.3
+#: Largest error of the time since the boot, s, and of the age of a sun, s, which counts from its
+#: second.
+UPTIME_NEAR, AGE_NEAR = 1.3, 0.5
+#: A status is this old at most as it arrives, s: it waits for a connection and is in transit.
+UNDER_WAY = 2.3
+#: Leases come every second and last for three: what is left of the last one, s.
+LEASE_LEAST, LEASE_MOST = 0.3, 3.1
+#: The cluster's time is this late and this early at most, as a status arrives on a line that
+#: carries, s; the longest second of work, s.
+LATE, EARLY, CYCLE_MOST = 1.0, 0.3, 1.5
+
+
+@dataclass
+class _Board:
+    """One board: its account, and what it has said.
+
+    Attributes
+    ----------
+    account
+        Its account.
+    moves_since, off_since
+        Since when it has said that it moves, and that its goals are not where it is, s.
+    boots, booted
+        Boots that it last told, and those and cuts of the account by then.
+    steps
+        Times (s) and values of the STEPS that the cluster received.
+    """
+
+    account: HeliostatAccount
+    moves_since: float = inf
+    off_since: float = inf
+    boots: int | None = None
+    booted: tuple[int, int] = (0, 0)
+    steps: deque[tuple[float, tuple[int, ...]]] = field(default_factory=lambda: deque(maxlen=64))
+
+
+class AnswerObserver:
+    """Observes the answers on one bus, and the statuses of its cluster.
+
+    Parameters
+    ----------
+    cluster
+        Name of the cluster.
+    accounts
+        Accounts of its heliostats.
+    start
+        Zero of the times that it reports, s.
+
+    Attributes
+    ----------
+    checks
+        Number of checks of each invariant.
+    quiet
+        Returns the heliostats in a quiet stretch; see `QuietObserver`.
+    utc
+        Returns the true POSIX time, s.
+    """
+
+    def __init__(self, cluster: str, accounts: Sequence[HeliostatAccount], start: float) -> None:
+        self.checks: Counter[int] = Counter()
+        self.quiet: Callable[[], Collection[str]] = frozenset
+        self.utc: Callable[[], float] = lambda: 0.0
+        self._cluster, self._start = cluster, start
+        self._boards = {each.address: _Board(each) for each in accounts}
+        self._late_at = -inf
+        self._later: list[tuple[bool, str, str]] = []
+
+    def _calmly(self, good: bool, subject: str, saw: str) -> None:
+        """Check what need not hold if something has just failed: at the next look, which knows."""
+        if subject == self._cluster:
+            calm = all(each.account.name in self.quiet() for each in self._boards.values())
+        else:
+            calm = subject in self.quiet()
+        if calm:
+            self._later.append((good, subject, saw))
+
+    def look(self, now: float) -> None:
+        """Judge what has been said since the last look, where nothing has failed meanwhile."""
+        later, self._later = self._later, []
+        calm = self.quiet()
+        whole = all(each.account.name in calm for each in self._boards.values())
+        for good, subject, saw in later:
+            if subject in calm or (subject == self._cluster and whole):
+                self._check(good, now, subject, saw)
+
+    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
+        self.checks[11] += 1
+        if not good:
+            raise InvariantError(Violation(11, now - self._start, subject, saw))
+
+    # -- the bus ---------------------------------------------------------------------------
+
+    def heard(self, how: str, now: float) -> None:
+        """Note how bytes are about to reach a board: a late frame may follow an answer."""
+        if how != "whole":
+            self._late_at = now
+
+    def answered(self, data: bytes, how: str, now: float) -> None:
+        """Judge an answer as it leaves its board; only a whole one is of this instant."""
+        frames = wire.Reader().feed(data)
+        # If a late answer came first, only the last frame is current.
+        for frame in frames[-1:] if how == "late" else frames:
+            board = self._boards.get(frame.sender)
+            values = frame.values()
+            if board is None or values is None:
+                continue
+            if frame.name == "STEPS":
+                board.steps.append((now, tuple(int(value) for value in values)))
+            if how != "whole" or now == self._late_at or board.account.board.node is None:
+                continue
+            if frame.name == "STATUS":
+                self._status(board, values, now)
+            elif frame.name == "STEPS":
+                self._steps(board, values, now)
+
+    def _status(self, board: _Board, values: Sequence[Any], now: float) -> None:
+        account = board.account
+        state, flags, fault, uptime, age_ms, supply, warmth, crc, boots = values
+        told = f"STATUS says {states.STATES[account.state]}: "
+        name = account.name
+
+        def check(good: bool, saw: str) -> None:
+            self._check(good, now, name, told + saw)
+
+        check(state == account.state, f"state {state}, and it is {account.state}")
+        check((supply, warmth) == (0, 0), f"{supply} mV, {warmth} °C; it measures neither")
+        faulty = account.state in (states.FAULT, states.LOCKED)
+        check(faulty or fault == 0, f"fault {fault}")
+        check(account.state != states.FAULT or fault != 0, "no fault")
+        held = account.board.node.journal.items if account.board.node is not None else {}
+        right = zlib.crc32(held.get("armature", b"")) if "armature" in held else 0
+        check(crc == right, f"armature {crc:08x}, and it stores {right:08x}")
+        self._booted(board, int(boots), now)
+        self._flags(board, int(flags), now)
+        if not account.ticks_jumped:
+            since = now - account.booted_at
+            near = abs(uptime + 0.5 - since) <= UPTIME_NEAR
+            check(near, f"{uptime} s since a boot of {since:.1f} s ago")
+            if flags & _SUN_FRESH:
+                age = now - account.sun_at
+                saw = f"{told}a sun of {age_ms} ms, and it left {age:.2f} s ago"
+                self._calmly(abs(age_ms / 1000.0 - age) <= AGE_NEAR, name, saw)
+        if not flags & _SUN_FRESH:
+            check(age_ms == NEVER, f"a sun of {age_ms} ms that is not fresh")
+
+    def _booted(self, board: _Board, boots: int, now: float) -> None:
+        account = board.account
+        before, (boots_then, cuts_then) = board.boots, board.booted
+        board.boots, board.booted = boots, (account.boots, account.cuts)
+        if before is not None:
+            least, most = account.boots - boots_then, account.cuts - cuts_then
+            saw = f"{boots} boots, after {before}; it has booted {least} times since"
+            # A boot that the supply cuts short may have been counted.
+            self._check(least <= boots - before <= most, now, account.name, saw)
+
+    def _flags(self, board: _Board, flags: int, now: float) -> None:
+        account = board.account
+        name, state = account.name, account.state
+
+        def check(good: bool, saw: str) -> None:
+            self._check(good, now, name, f"flags {flags:#x} as {states.STATES[state]}: {saw}")
+
+        check(not flags & _NEVER_SET, "a fault, a switch or a key that it does not have")
+        turns = now - account.stepped_at < TURNS
+        check(bool(flags & _MOVING) or not turns, "it does not move, and its motors turn")
+        # A motion that has just begun makes its first step in a moment.
+        board.moves_since = min(board.moves_since, now) if flags & _MOVING else inf
+        rests = now - max(account.stepped_at, account.changed_at, board.moves_since)
+        saw = f"it moves, and its motors have rested for {rests:.1f} s"
+        check(account.ticks_jumped or rests <= RESTS, saw)
+        age = now - account.sun_at
+        saw = f"the sun left {age:.1f} s ago"
+        check(not flags & _SUN_FRESH or age <= OLD, f"fresh, and {saw}")
+        # A stranger's frame can use up the counts of a bus without keys, that of SUN too.
+        fresh = bool(flags & _SUN_FRESH) or account.ticks_jumped or account.misled
+        self._calmly(fresh or age >= FRESH, name, f"STATUS says that no sun is fresh, and {saw}")
+        check(not flags & _SUN_FRESH or bool(flags & _CLOCK_SET), "a sun without a time")
+        complete = state != states.UNCONFIGURED
+        check(bool(flags & _CONFIGURED) == complete, "whether it is configured")
+        check(not flags & _READY or account.by_way, "ready, and it has not come to standby")
+        lit = state in (states.TRACKING, states.SEARCHING)
+        check(bool(flags & _READY) or not lit, "not ready")
+        stows = account.place() == account.stow()
+        known = not flags & _UNKNOWN
+        check(not flags & _AT_STOW or not known or stows, f"at stow, and at {account.place()}")
+        check(bool(flags & _AT_STOW) or state != states.STOWED, "not at stow")
+        slips = any(account.board.slip)
+        saw = f"its step counts are sure, and wrong by {account.board.slip}"
+        check(bool(flags & (_DOUBTFUL | _UNKNOWN)) or not slips, saw)
+        check(
+            not flags & (_DOUBTFUL | _UNKNOWN) or account.boots > 0, "counts in doubt, and no boot"
+        )
+
+    def _steps(self, board: _Board, values: Sequence[int], now: float) -> None:
+        account = board.account
+        node = account.board.node
+        if node is None or not node.controller.motion.known:
+            return
+        counts, goals = tuple(values[:2]), tuple(values[2:])
+        place = account.place()
+        saw = f"STEPS says {counts}, and it is at {place}"
+        self._check(counts == place, now, account.name, saw)
+        inside = all(low <= each <= high for each, (low, high) in zip(goals, RANGES, strict=True))
+        self._check(inside, now, account.name, f"STEPS says goals {goals} beyond its range")
+        # An axis that is stopped as it stands, before it takes up its backlash, keeps its old goal.
+        apart = max(abs(goal - at) for goal, at in zip(goals, place, strict=True))
+        near = 0 if account.state == states.STOWED else LIMITS[2]
+        held = account.state in (states.STOWED, states.LOCKED, states.FAULT) and apart > near
+        board.off_since = min(board.off_since, now) if held else inf
+        rests = now - max(account.stepped_at, account.changed_at, board.off_since)
+        saw = f"it rests at {place}, and STEPS says goals {goals}"
+        self._check(account.ticks_jumped or rests <= RESTS, now, account.name, saw)
+
+    # -- the line --------------------------------------------------------------------------
+
+    def status(self, message: ClusterStatus, names: Sequence[str], now: float) -> None:
+        """Judge a status of the cluster as it reaches the plant."""
+        by_name = {each.account.name: each for each in self._boards.values()}
+        for name, row in zip(names, message.nodes(), strict=True):
+            board = by_name.get(name)
+            if board is None:
+                continue
+            told = tuple(int(row[each]) for each in _STEPS)
+            if int(row["steps_ms"]) == NEVER:
+                self._check(not any(told), now, name, f"steps {told} that were never asked for")
+                continue
+            at = now - int(row["steps_ms"]) / 1000.0
+            near = [v for t, v in board.steps if at - UNDER_WAY <= t <= at + 0.2]
+            saw = f"steps {told} are reported, of {now - at:.2f} s ago, and it did not answer so"
+            self._check(told in near, now, name, saw)
+            asked, answered = int(row["asked"]), int(row["answered"])
+            self._check(answered <= asked, now, name, f"{answered} answers to {asked} questions")
+        self._numbers(message)
+
+    def _numbers(self, message: ClusterStatus) -> None:
+        """Judge the numbers of a cluster near which nothing has failed."""
+        left = message.lease_left
+        saw = f"{left:.2f} s are left of the plant's lease"
+        self._calmly(LEASE_LEAST <= left <= LEASE_MOST, self._cluster, saw)
+        off = message.utc_s - self.utc()
+        self._calmly(-LATE <= off <= EARLY, self._cluster, f"its time is {off:+.2f} s off")
+        cycle = message.cycle_s
+        saw = f"its second took {cycle:.2f} s"
+        self._calmly(0.0 < cycle <= CYCLE_MOST, self._cluster, saw)
+        saw = f"its safety table demands {', '.join(message.acts)}, and nothing has failed"
+        self._calmly(not message.acts, self._cluster, saw)
+        saw = f"the error of its time is {message.time_error_s} s, by {message.time_quality}"
+        self._calmly(0.0 <= message.time_error_s < 1.0, self._cluster, saw)
+
+
+#: Columns of a row that STEPS fills.
+_STEPS = ("primary", "secondary", "primary_goal", "secondary_goal")

@@ -1,0 +1,74 @@
+"""The observer of tickets: who gives a command learns in time what becomes of it.
+
+A ticket says for each heliostat how far its command has come. While the plant's program runs, a
+heliostat must have acknowledged it, or the ticket must have ended for it, within a time of the
+observer's own, whatever has failed; commands that wait for their turn to join are left out. One
+that has failed must say why (invariant 16).
+"""
+
+from collections import Counter
+
+from heliotrope.links.messages import Stage
+from heliotrope.plant.tickets import Ticket
+from heliotrope.twin.invariants.invariants import InvariantError, Violation
+
+#: A command that no heliostat has acknowledged has ended after this, s: it lives for 10 s.
+ENDS_WITHIN = 20.0
+#: Commands that may wait for their turn, and stages of a command that is under way.
+_WAIT = ("TRACK", "REFOCUS", "SEARCH")
+_UNDER_WAY = (None, Stage.ACCEPTED, Stage.SENT)
+#: The shortest reason, characters.
+_REASON = 8
+
+
+class TicketObserver:
+    """Observes the tickets of persons.
+
+    Parameters
+    ----------
+    start
+        Zero of the times that it reports, s.
+
+    Attributes
+    ----------
+    checks
+        Number of checks of each invariant.
+    """
+
+    def __init__(self, start: float) -> None:
+        self.checks: Counter[int] = Counter()
+        self._start = start
+        self._open: list[tuple[float, Ticket]] = []
+        self._stood_at = start
+
+    def accepted(self, ticket: Ticket, now: float) -> None:
+        """Note the ticket of a command that the plant has accepted."""
+        self._open.append((now, ticket))
+
+    def ended(self) -> None:
+        """Note that the plant's program has ended, and its tickets with it."""
+        self._open.clear()
+
+    def look(self, now: float, *, runs: bool) -> None:
+        """Judge all tickets; ``runs``: the plant's program does, and has records to write to."""
+        if not runs:
+            self._stood_at = now
+            return
+        for at, ticket in self._open:
+            passed = now - max(at, self._stood_at)
+            for name in ticket.heliostats:
+                stage = ticket.stage(name)
+                waits = ticket.name in _WAIT or stage not in _UNDER_WAY
+                what = "waiting" if stage is None else stage.value
+                saw = f"{ticket.name} of {name} is {what} {passed:.1f} s after it was accepted"
+                self._check(waits or passed <= ENDS_WITHIN, now, saw)
+                failed = stage in (Stage.FAILED, Stage.REFUSED)
+                why = ticket.refusals.get(name, "")
+                saw = f"{ticket.name} of {name} is {what}, and the reason is {why!r}"
+                self._check(not failed or len(why) >= _REASON, now, saw)
+        self._open = [(at, each) for at, each in self._open if not each.finished]
+
+    def _check(self, good: bool, now: float, saw: str) -> None:
+        self.checks[16] += 1
+        if not good:
+            raise InvariantError(Violation(16, now - self._start, "plant", saw))
