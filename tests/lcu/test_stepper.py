@@ -137,6 +137,19 @@ def test_stopping_keeps_to_the_acceleration() -> None:
     assert motors.made[0] < 30_000
 
 
+def test_an_axis_that_was_stopped_has_its_place_for_its_goal() -> None:
+    stepper = Stepper([Axis(-20_000, 400_000, 8000, 16_000, 40, SLOT) for _ in (0, 1)], SLOT, AHEAD)
+    motors = Motors(stepper)
+    stepper.go(50_000, 0, BOTH)
+    motors.run(30)
+    stepper.stop()
+    motors.run(60)
+    assert stepper.still()
+    assert 0 < motors.made[0] < 50_000
+    # A motion by so many steps begins there, and not at the goal that was given up.
+    assert [axis.goal for axis in stepper.axes] == motors.made
+
+
 def test_the_second_axis_waits_for_the_first() -> None:
     for order, first in ((PRIMARY_FIRST, 0), (SECONDARY_FIRST, 1)):
         stepper = _stepper(backlash=20)

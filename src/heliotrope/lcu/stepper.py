@@ -95,7 +95,7 @@ class Axis:
 
     def still(self) -> bool:
         """Whether the axis stands at its goal."""
-        return self.speed == 0 and (self.braking or self.count == self.leg == self.goal)
+        return self.speed == 0 and self.count == self.leg == self.goal
 
     def aim(self, goal: int) -> bool:
         """Set a goal to be reached from below; return False if it was cut to the range."""
@@ -115,14 +115,18 @@ class Axis:
     def brake(self) -> None:
         """Slow down and stop, giving the goal up."""
         self.braking = True
+        if self.speed == 0:
+            self.stand()
+
+    def stand(self) -> None:
+        """Take the present count for the goal: a stopped axis has no other."""
+        self.goal = self.leg = self.count
+        self.braking = False
 
     def slot(self, held: bool) -> int:
         """Advance by one slot, or slow down if held; return its steps, of sign ``direction``."""
         if self.speed == 0:
             self.phase = 0
-            if self.braking:
-                self.goal = self.leg = self.count
-                self.braking = False
             if self.count == self.leg:
                 self.leg = self.goal
             if held or self.count == self.leg:
@@ -139,6 +143,8 @@ class Axis:
         steps = moved // SCALE
         self.phase = moved % SCALE
         self.count += self.direction * steps
+        if self.braking and self.speed == 0:
+            self.stand()
         return steps
 
     def interval_us(self, steps: int) -> int:
@@ -208,8 +214,7 @@ class Stepper:
         for axis, steps in zip(self.axes, (primary, secondary)):  # noqa: B905
             axis.count -= steps
             axis.speed = axis.phase = 0
-            axis.goal = axis.leg = axis.count
-            axis.braking = False
+            axis.stand()
         self.queued_ms = 0
 
     def still(self) -> bool:
@@ -223,6 +228,8 @@ class Stepper:
             for axis in self.axes:
                 # The hardware ran dry, so the motors stand: they start from rest.
                 axis.speed = axis.phase = 0
+                if axis.braking:
+                    axis.stand()
             self.queued_ms = 0
         while self.queued_ms < self.ahead_ms:
             if self.axes[0].still() and self.axes[1].still():
