@@ -16,7 +16,7 @@ from typing import Any
 
 from heliotrope.lcu import states, wire
 from heliotrope.links.messages import NEVER, ClusterStatus
-from heliotrope.twin.boards.outfit import LIMITS, RANGES
+from heliotrope.twin.boards.outfit import RANGES
 from heliotrope.twin.invariants._account import HeliostatAccount
 from heliotrope.twin.invariants.invariants import InvariantError, Violation
 
@@ -234,10 +234,7 @@ class AnswerObserver:
         self._check(counts == place, now, account.name, saw)
         inside = all(low <= each <= high for each, (low, high) in zip(goals, RANGES, strict=True))
         self._check(inside, now, account.name, f"STEPS says goals {goals} beyond its range")
-        # An axis that is stopped as it stands, before it takes up its backlash, keeps its old goal.
-        apart = max(abs(goal - at) for goal, at in zip(goals, place, strict=True))
-        near = 0 if account.state == states.STOWED else LIMITS[2]
-        held = account.state in (states.STOWED, states.LOCKED, states.FAULT) and apart > near
+        held = account.state in (states.STOWED, states.LOCKED, states.FAULT) and goals != place
         board.off_since = min(board.off_since, now) if held else inf
         rests = now - max(account.stepped_at, account.changed_at, board.off_since)
         saw = f"it rests at {place}, and STEPS says goals {goals}"

@@ -14,8 +14,9 @@ from heliotrope.twin.invariants.invariants import InvariantError, Violation
 
 #: A command that no heliostat has acknowledged has ended after this, s: it lives for 10 s.
 ENDS_WITHIN = 20.0
-#: Commands that may wait for their turn, and stages of a command that is under way.
-_WAIT = ("TRACK", "REFOCUS", "SEARCH")
+#: Commands that may wait for their turn or for a safe place, and stages of a command that is under
+#: way.
+_WAIT = ("TRACK", "REFOCUS", "SEARCH", "PARAMETERS")
 _UNDER_WAY = (None, Stage.ACCEPTED, Stage.SENT)
 #: The shortest reason, characters.
 _REASON = 8
