@@ -342,7 +342,7 @@ DEFECTS = (
     Defect((1,), "lease that never ends", _lease_too_long, ("cluster_crash",), 20.0,
            first=1),
     Defect((2,), "defocus only holds", _defocus_holds, faults=STILL, seconds=180.0,
-           first=4, slow=True),
+           worlds=("calm",)),
     Defect((2,), "cluster goes on without the plant", _plant_forgotten, ("plant_silent",), 20.0),
     Defect((3,), "tracking follows approach by itself", _tracks_by_itself, ("line_drop",), 60.0,
            first=1),
