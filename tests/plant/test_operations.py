@@ -542,6 +542,32 @@ def test_what_a_person_raised_and_lost_is_left_to_people() -> None:
     live(work, AutomaticSettings(calibrate=True, margin=0.0))
 
 
+def test_losses_one_after_the_other_count_together_although_people_raised_them() -> None:
+    """A mirror that a person raised is left to people once lost: it is a loss all the same."""
+
+    async def work(plant: LivePlant) -> None:
+        shown = plant.operations
+        token = shown.take_authority(OPERATOR).token
+        for name in ("APPROACH", "TRACK"):
+            await asyncio.sleep(3.0)
+            if name == "TRACK":
+                shown.aim_at(OPERATOR, token, (), "receiver")
+            shown.command(OPERATOR, token, name)
+            for _ in range(12):
+                await asyncio.sleep(5.0)
+                shown.keep_authority(OPERATOR, token)
+        assert _states(plant) == ["TRACKING"] * 4
+        shown.release_authority(OPERATOR, token)
+        await asyncio.sleep(10.0)
+        await _cut(plant, "C1", 8.0)
+        assert not _waits(plant)
+        await _cut(plant, "C2", 8.0)
+        await asyncio.sleep(10.0)
+        assert _waits(plant)
+
+    live(work, AutomaticSettings(calibrate=True, margin=0.0))
+
+
 def test_the_wait_for_a_person_outlasts_a_restart(tmp_path: Path) -> None:
     keeper = Keeper(tmp_path / "store.sqlite", inline=True)
     settings_ = AutomaticSettings(wanted=True, calibrate=False, margin=0.0, losses=1)

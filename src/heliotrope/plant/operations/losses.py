@@ -79,7 +79,8 @@ class Losses:
         self._up = np.where(live & ~held, up, self._up)
         self._seen |= live
         self._lost_at[lost] = now
-        together = int((self.settling() & wanted).sum())
+        # Those that are left to people by now count too.
+        together = int(self.settling().sum())
         if together > self._most:
             since = datetime.fromtimestamp(self._plant.clock.utc().timestamp(), UTC)
             self._wait(alarms.RESUME_NEEDED.line(count=together, since=f"{since:%H:%M:%S}"))
