@@ -1,19 +1,28 @@
 """The calibration of every heliostat, for people: predicted errors grow until the next visit."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import cast
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from heliotrope.calibration.learn import drift
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.field.example import example_plant
+from heliotrope.field.plant import Plant
 from heliotrope.geometry import MRAD, FloatArray, direction
+from heliotrope.mechanism import parameters as parameter_table
+from heliotrope.mechanism.tracking import track
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.twin.boards.outfit import outfits
+from heliotrope.twin.invariants.visits import slope_of
+from heliotrope.twin.world.design import design_of
+from heliotrope.twin.world.scene import scene_of
 
 NAME = "P1A"
 
@@ -24,6 +33,10 @@ class Names:
     def __init__(self, names: Sequence[str]) -> None:
         self.names = tuple(names)
         self.place = self.names.index
+        self.heard = np.zeros((len(names), 2))
+
+    def counts(self, rows: npt.NDArray[np.intp]) -> FloatArray:
+        return self.heard[rows]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -32,8 +45,8 @@ class Names:
 class Scene:
     """What the book asks of a plant; the sun stands still, so only age changes a prediction."""
 
-    def __init__(self) -> None:
-        self.design = example_plant()
+    def __init__(self, design: Plant | None = None) -> None:
+        self.design = design or example_plant()
         self.beliefs, self.clock = Beliefs(self.design), self
         self.field = Names(self.design.names)
         self.at = datetime(2026, 6, 21, 10, 0, tzinfo=UTC)
@@ -81,3 +94,27 @@ def test_the_last_predictions_stay_over_the_night() -> None:
     scene.sun, scene.at = -scene.sun, scene.at + timedelta(hours=12)
     book.refresh()
     np.testing.assert_array_equal(book.error, before)
+
+
+def test_the_predicted_error_is_that_of_the_pose_that_the_mirror_takes() -> None:
+    """Without stops a mirror reaches its aim in two poses, whose errors differ."""
+    world = scene_of((), 1, 60.0, 3)
+    fits = outfits(3, 1, world.places)
+    names = [fit.name for fit in fits]
+    scene = Scene(design_of(fits, {"C1": names}, world))
+    nominal, aim = scene.beliefs.nominal(names[0])[0], scene.design.receivers[0].center
+    poses = [track(nominal, scene.sun, aim, branch=branch).best_counts for branch in (0, 1)]
+    model = parameter_table.model("malan8", scene.design.groups["all"].mechanism.parameters)
+    zeros, at = np.zeros(len(model)), scene.at.timestamp()
+    record = HeliostatCalibration(names[0], at, model, zeros, 1e-6 * np.eye(len(model)), zeros + 1)
+    # One combination of parameters is left open, which moves the beam in the other pose only.
+    slope = slope_of(record, nominal, poses[0], scene.sun)
+    free = np.linalg.svd(slope.T)[2][-1]
+    covariance = 1e-6 * np.outer(free, free) + 1e-12 * np.eye(len(model))
+    scene.beliefs.take(replace(record, covariance=covariance))
+    found = []
+    for pose in poses:
+        scene.field.heard[0] = pose
+        found.append(CalibrationBook(cast("PlantController", scene), "malan8").error[0])
+    assert 0.0 < found[0] < 1e-5
+    assert found[1] > 1e-4

@@ -90,6 +90,8 @@ def expected_error(
     sun: npt.ArrayLike,
     aim: npt.ArrayLike,
     noise: float = 0.0,
+    *,
+    current: npt.ArrayLike | None = None,
 ) -> ExpectedError:
     """Return the expected error of beams of mechanisms that track by their calibration.
 
@@ -105,6 +107,9 @@ def expected_error(
         Unit vectors to the sun and aim points (m), ENU, (3,) or (M, 3).
     noise
         Standard deviation in each direction to be added, rad of beam.
+    current
+        Present step counts, (D,) or (M, D): a mechanism without stops reaches most aims in two
+        poses, takes the nearer one, and its error is not that of the other; see `track`.
 
     Notes
     -----
@@ -116,7 +121,7 @@ def expected_error(
     aims = np.broadcast_to(aims, (count, 3))
     each = mechanism if mechanism.shape else mechanism[None]
     each = each[np.zeros(count, dtype=np.intp)] if len(each) == 1 else each
-    found = track(each, suns, aims)
+    found = track(each, suns, aims, current=current)
     reachable = found.reachable
     counts = np.where(reachable[:, None], found.best_counts, 0.0)
     slope = _beam_slope(each, counts, suns, aims, names)

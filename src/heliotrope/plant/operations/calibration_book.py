@@ -131,7 +131,9 @@ class CalibrationBook:
             mechanism = group.mechanism[places].with_parameters(parameters)
             points = self._aims(rows) if aim is None else np.broadcast_to(aim, (len(rows), 3))
             where.append(rows)
-            found.append(expected_error(mechanism, names, covariance, light, points).rms)
+            here = self._plant.field.counts(rows)
+            expected = expected_error(mechanism, names, covariance, light, points, current=here)
+            found.append(expected.rms)
         return np.concatenate(where), np.concatenate(found)
 
     def _aims(self, rows: npt.NDArray[np.intp]) -> FloatArray:

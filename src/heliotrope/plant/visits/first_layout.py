@@ -61,7 +61,9 @@ def newcomers(
         if error is None:
             present, names = plant.beliefs.present(name), model[name]
             prior = np.linalg.inv(precision(plant.beliefs.nominal(name), names))[0]
-            error = float(expected_error(present, names, prior, sun, target.center).rms[0])
+            here = plant.field.counts(np.array([plant.field.place(name)]))
+            expected = expected_error(present, names, prior, sun, target.center, current=here)
+            error = float(expected.rms[0])
         found = beam_of(plant, target, name, error) if np.isfinite(error) else "out of its reach"
         if isinstance(found, str):
             wrong[name] = found

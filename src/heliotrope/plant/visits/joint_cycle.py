@@ -514,9 +514,14 @@ def _middle(pictures: Sequence[tuple[int, TargetLight]]) -> float:
 
 def _error(waiting: Waiting, sun: FloatArray, target: Target) -> float:
     """Return the expected beam error of new parameters on a target, rad RMS (2-D)."""
-    fitted = waiting.fitted
+    fitted, visit = waiting.fitted, waiting.visit
     found = expected_error(
-        waiting.mechanism, tuple(fitted.names), fitted.covariance[0], sun, target.center
+        waiting.mechanism,
+        tuple(fitted.names),
+        fitted.covariance[0],
+        sun,
+        target.center,
+        current=visit.plant.field.counts(np.array([visit.row])),
     )
     return float(found.rms[0])
 

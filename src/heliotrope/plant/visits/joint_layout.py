@@ -244,7 +244,12 @@ def error_on(
         return None
     covariance = record.covariance_at(plant.clock.utc().timestamp())
     expected = expected_error(
-        plant.beliefs.present(name), record.names, covariance, plant.sun_vector(), target.center
+        plant.beliefs.present(name),
+        record.names,
+        covariance,
+        plant.sun_vector(),
+        target.center,
+        current=plant.field.counts(np.array([plant.field.place(name)])),
     )
     return float(np.hypot(expected.rms[0], np.sqrt(2.0) * settings.visit))
 

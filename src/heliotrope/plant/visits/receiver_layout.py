@@ -122,7 +122,8 @@ def _known(
     sun = plant.sun_vector()
     normal = bisector(sun, way / slant)
     covariance = record.covariance_at(plant.clock.utc().timestamp())
-    expected = expected_error(plant.beliefs.present(name), record.names, covariance, sun, aim)
+    present, here = plant.beliefs.present(name), plant.field.counts(np.array([row]))
+    expected = expected_error(present, record.names, covariance, sun, aim, current=here)
     error = float(np.hypot(expected.rms[0], sqrt(2.0) * settings.visit))
     if not error <= settings.known:
         return (
