@@ -27,7 +27,7 @@ from heliotrope.safety import evaluation
 from heliotrope.twin.boards import outfit
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.simulation import RunPlan
-from support import plant_defects, quiet_defects, report_defects
+from support import plant_defects, quiet_defects, report_defects, work_defects
 
 #: The plant stands still for a minute when mirrors track.
 STILL = (Fault("plant_silent", 110.0, 60.0, 0, 0.5),)
@@ -417,6 +417,9 @@ DEFECTS = (
            first=2, slow=True, worlds=("day",)),
     *(Defect(numbers, name, defect, only, pause, first=first)
       for numbers, name, defect, only, pause, first in plant_defects.ROWS),
+    *(Defect(numbers, name, defect, faults=faults, worlds=("visits",), slow=slow,
+             first=first)
+      for numbers, name, defect, faults, slow, first in work_defects.ROWS),
     *(Defect((16,), name, defect, faults=(), worlds=worlds, slow=slow)
       for name, defect, worlds, slow in quiet_defects.ROWS),
     *(Defect((16,), name, defect, seconds=180.0, worlds=worlds, slow=slow,

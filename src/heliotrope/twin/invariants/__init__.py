@@ -1,14 +1,18 @@
 """The observers that check the safety invariants.
 
 `Observer` watches one cluster with its boards, `PlantObserver` the plant, `BeamObserver` the true
-beams, `VisitObserver` what photographs have taught the plant, `DayObserver` whether the field
-is at stow while the sun is low; `TITLES` names the invariants.
+beams, `VisitObserver` what photographs have taught the plant, `ResultObserver` the results of
+visits, `ProgressObserver` the progress of automatic control, `ShownObserver` what the plant shows,
+`DayObserver` whether the field is at stow while the sun is low; `TITLES` names the invariants.
 """
 
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.invariants import TITLES, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.invariants.progress import ProgressObserver
+from heliotrope.twin.invariants.results import ResultObserver
+from heliotrope.twin.invariants.shown import ShownObserver
 from heliotrope.twin.invariants.visits import VisitObserver
 
 __all__ = [
@@ -18,6 +22,9 @@ __all__ = [
     "InvariantError",
     "Observer",
     "PlantObserver",
+    "ProgressObserver",
+    "ResultObserver",
+    "ShownObserver",
     "Violation",
     "VisitObserver",
 ]

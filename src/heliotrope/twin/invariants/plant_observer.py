@@ -96,6 +96,7 @@ class PlantObserver:
         self._clusters, self._automatic = clusters, automatic
         self._accounts = {a.name: a for each in clusters for a in each.accounts}
         self._holder: tuple[Person, int, float] | None = None
+        self._granted_at = float("-inf")
         #: When a command that was refused for other reasons may have renewed the authority.
         self._perhaps = float("-inf")
         self._accepted: Counter[tuple[str, str]] = Counter()
@@ -163,7 +164,7 @@ class PlantObserver:
                 self._noted(person.name, "AUTHORITY", now)
             self._end(now)
         self.check(4, good, now, saw)
-        self._holder = (person, token, now)
+        self._holder, self._granted_at = (person, token, now), now
 
     def kept(self, now: float) -> None:
         """Note that the holder has renewed it."""
@@ -204,6 +205,22 @@ class PlantObserver:
             if self._by_itself():
                 self._end(now)
             self.granted(AUTOMATIC, token, now, seized=False)
+
+    @property
+    def automatic(self) -> bool:
+        """Whether automatic control has the authority."""
+        return self._by_itself()
+
+    def holder(self, now: float) -> str | None:
+        """Return the person who has had the authority for a moment; None: it is not sure.
+
+        Automatic control gives it back without a word.
+        """
+        holder = self._live(now)
+        if holder is None or holder[0] == AUTOMATIC:
+            return None
+        sure = now - self._granted_at > _AT_ONCE and now - holder[2] < 2.0 * _AT_ONCE
+        return holder[0].name if sure else None
 
     def until(self, token: int, until: float) -> float:
         """Return when an order with a token becomes void."""
@@ -338,6 +355,10 @@ class PlantObserver:
     def heard(self, name: str, state: int, now: float) -> None:
         """Note a heliostat's report to its cluster."""
         self._heard[name].append((now, state))
+
+    def reports(self, name: str, since: float) -> set[int]:
+        """Return the states that a heliostat has reported to its cluster since a time, s."""
+        return {state for at, state in self._heard[name] if at >= since}
 
     def look(self, plant: PlantController | None, now: float) -> None:
         """Judge everything that must have happened by now; None: the plant does not run."""

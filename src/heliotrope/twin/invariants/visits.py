@@ -133,7 +133,7 @@ class VisitObserver:
             if not self._followed:
                 continue
             across = _across(aim - pose.vertex)
-            slope = _slope(record, nominal, counts, sun) @ across.T
+            slope = slope_of(record, nominal, counts, sun) @ across.T
             spread = slope.T @ record.covariance @ slope + FLOOR**2 * np.eye(2)
             off = across @ ray
             deviations = float(np.sqrt(off @ np.linalg.solve(spread, off)))
@@ -164,7 +164,7 @@ def _across(way: FloatArray) -> FloatArray:
     return np.stack([right / np.linalg.norm(right), above / np.linalg.norm(above)])
 
 
-def _slope(
+def slope_of(
     record: HeliostatCalibration, nominal: Mechanism, counts: FloatArray, sun: FloatArray
 ) -> FloatArray:
     """Return by how much the beam turns with each parameter of a calibration, (P, 3)."""

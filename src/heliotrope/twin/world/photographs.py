@@ -79,6 +79,8 @@ class LyingCamera:
         Number of photographs of each kind that lied.
     taken
         Times of all photographs of single beams, s of the monotonic clock.
+    told
+        Called with each of these: heliostat, target, point as it is read, ENU, m, (3,), and time.
     """
 
     def __init__(
@@ -95,6 +97,7 @@ class LyingCamera:
         self._stacked: list[float] = []
         self.lies = dict.fromkeys((*LIES, *SPOILS), 0)
         self.taken: list[float] = []
+        self.told: Callable[[str, str, FloatArray, float], None] | None = None
 
     def away(self, at: float) -> float:
         """Return how far a time is from that of the nearest photograph, s of the monotonic clock.
@@ -143,6 +146,12 @@ class LyingCamera:
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
         """Return what a photograph shows: the heliostat's beam, or something else."""
+        shot = await self._photographed(target, heliostat)
+        if self.told is not None:
+            self.told(heliostat, target.name, shot.point, shot.at)
+        return shot
+
+    async def _photographed(self, target: Target, heliostat: str) -> Shot:
         true = self._wavered(target, await self._true.photograph(target, heliostat), heliostat)
         self.taken.append(true.at)
         lie = self._lie.get(target.name)

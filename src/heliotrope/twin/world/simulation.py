@@ -43,8 +43,11 @@ from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.invariants.progress import ProgressObserver
 from heliotrope.twin.invariants.quiet import QuietObserver
+from heliotrope.twin.invariants.results import ResultObserver
 from heliotrope.twin.invariants.sensors import SensorObserver
+from heliotrope.twin.invariants.shown import ShownObserver
 from heliotrope.twin.invariants.tickets import TicketObserver
 from heliotrope.twin.invariants.visits import VisitObserver
 from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
@@ -54,10 +57,10 @@ from heliotrope.twin.world.damage import Damage
 from heliotrope.twin.world.design import MIRROR, design_of, wanted_of
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.instruments import READINGS, Instruments
-from heliotrope.twin.world.operator import Operator
+from heliotrope.twin.world.operator import ENGINEER, VIEWER, Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
 from heliotrope.twin.world.scene import scene_of
-from heliotrope.twin.world.shift import Shift, Working
+from heliotrope.twin.world.shift import Shift, Watch, Working
 from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
 from heliotrope.twin.world.twice import SecondPlant
 from heliotrope.twin.world.work import LOSSES, Work
@@ -336,14 +339,26 @@ class Simulation:
         sight = FieldSnapshot(clock, mirrors, lambda: self.sun(clock.monotonic()))
         lights, together = "lights" in plan.worlds, parties(plan.worlds)
         work = Work(plan.seed, sight, self._exits, lights=lights, together=together)
-        day, names = DayObserver(self.begin, self.boards), tuple(boards)
+        watch, names = self._new_watch(work, together=together), tuple(boards)
         pause = PARTY_PAUSE if together else SHIFT_PAUSE
         shift = Shift(
-            work, self.operator, self.observer, self.beams, day, names, clock, plan.seed, pause
+            work, self.operator, self.observer, self.beams, watch, names, clock, plan.seed, pause
         )
-        targets = self._scene.targets
-        observer = VisitObserver(self.begin, self.boards, targets, work.away, followed=work.centred)
-        return Working(work, shift, observer, day)
+        return Working(work, shift, watch)
+
+    def _new_watch(self, work: Work, *, together: bool) -> Watch:
+        begin, boards, targets = self.begin, self.boards, self._scene.targets
+        zero = self._clock.utc().timestamp() - self._clock.monotonic()
+        results = ResultObserver(begin, boards, work.records, self.sun, zero)
+        work.camera.told = results.photographed
+        persons = (ENGINEER.name, VIEWER.name)
+        return Watch(
+            VisitObserver(begin, boards, targets, work.away, followed=work.centred),
+            DayObserver(begin, boards),
+            results,
+            ProgressObserver(begin, boards, targets, together=together),
+            ShownObserver(begin, boards, self._homes, targets, self.observer, persons),
+        )
 
     def _board(self, outfit: Outfit) -> Board:
         chance = self._chance
@@ -391,9 +406,12 @@ class Simulation:
         return next(pod for pod in self.pods if board in pod.boards)
 
     @property
-    def working(self) -> tuple[VisitObserver | DayObserver, ...]:
-        """Observers of automatic control, if there is one."""
-        return () if self._work is None else (self._work.observer, self._work.day)
+    def checks(self) -> Counter[int]:
+        """Number of checks of each invariant by the observers of work, alarms and tickets."""
+        found = self.alarms.checks + self.tickets.checks
+        if self._work is not None:
+            found += self._work.watch.checks
+        return found if self.quiet is None else found + self.quiet.checks
 
     # -- the plant -------------------------------------------------------------------------
 
@@ -471,7 +489,7 @@ class Simulation:
                 pod.ear.end()
         if self._work is not None:
             self._work.control.ends()
-            self._work.observer.ended()
+            self._work.watch.visits.ended()
         if self.plant is not None:
             self._audit.lose()
         for task in self._program:
@@ -582,9 +600,15 @@ class Simulation:
                 going_on = self.plant is not None and not self.operator.waits
                 self.tickets.look(now, runs=going_on and writes)
                 if self._work is not None:
-                    self._work.observer.look(self.plant, self.sun(now), now)
                     calm = frozenset() if self.quiet is None else self.quiet.stretches
-                    self._work.day.look(self.plant, calm, self.sun(now), now)
+                    self._work.look(
+                        self.plant,
+                        calm,
+                        self.sun(now),
+                        now,
+                        waits=self.operator.waits,
+                        governs=self.observer.automatic,
+                    )
                 if self._measured:
                     runs = self.plant is not None and not self.operator.waits
                     self.readings.look(carried, now, runs=runs)
@@ -619,9 +643,7 @@ def run(plan: RunPlan) -> RunResult:
         (pod.checks for pod in simulation.pods),
         simulation.observer.checks + simulation.beams.checks + simulation.readings.checks,
     )
-    for extra in (*simulation.working, simulation.quiet, simulation.alarms, simulation.tickets):
-        if extra is not None:
-            outcome.checks += extra.checks
+    outcome.checks += simulation.checks
     outcome.faults = simulation.faults
     outcome.counts = sum((pod.counts for pod in simulation.pods), simulation.operator.counts)
     outcome.states = sum((pod.observer.entered for pod in simulation.pods), Counter())

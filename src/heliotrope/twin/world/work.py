@@ -101,6 +101,8 @@ class Work:
         Whether visits search for the beam and follow it; else they photograph what is there.
     camera
         Camera of the targets.
+    records
+        The store.
     operations, logbook
         Of the plant's program; None while it does not run.
     """
@@ -121,8 +123,8 @@ class Work:
         self.camera = LyingCamera(sight, seed, lies, VISIT.sigma, standing=lights)
         self._clock = sight.clock
         folder = exits.enter_context(tempfile.TemporaryDirectory())
-        self._records = Keeper(Path(folder) / "records.sqlite", inline=True)
-        exits.callback(self._records.close)
+        self.records = Keeper(Path(folder) / "records.sqlite", inline=True)
+        exits.callback(self.records.close)
         self.operations: Operations | None = None
         self.logbook: Logbook | None = None
 
@@ -133,7 +135,7 @@ class Work:
 
     def opens(self) -> Logbook:
         """Return the logbook of a new program."""
-        self.logbook = Logbook(self._clock, self._records)
+        self.logbook = Logbook(self._clock, self.records)
         return self.logbook
 
     def begins(self, plant: PlantController) -> Operations:
@@ -147,7 +149,7 @@ class Work:
             self.logbook,
             cycle,
             scheduler=self._schedule(plant) if self._together else rounds,
-            records=self._records,
+            records=self.records,
             settings=SETTINGS,
             joint=self._joint(plant, cycle),
             receiver=self._receiver(plant, cycle),

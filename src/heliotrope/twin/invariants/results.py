@@ -1,0 +1,259 @@
+"""The observer of results: what visits bring, beside the photographs that were taken.
+
+It is told of each photograph when the camera takes it, and reads the step counts of the true mirror
+then. A sighting that the plant keeps must have the time, the point and the step counts of a
+photograph, and the true sun. A result must count the sightings that it brought, and its errors must
+be those of the two calibrations, before and after. The store and the logbook must have it, and a
+new program must know what the one before it knew (16).
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from math import isfinite, nan
+
+import numpy as np
+
+from heliotrope.calibration.record import CalibrationOutcome
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.geometry import FloatArray, reflect
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.plant.operations import Operations
+from heliotrope.plant.operations.views import CalibrationEntry
+from heliotrope.store.records import Records
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.invariants.invariants import InvariantError, Violation
+
+#: Times of a sighting and of its photograph agree to within this, s.
+SAME = 1e-3
+#: A sighting's sun is within this of the true one, rad; its point of the one that was read, m.
+SUN_WITHIN, POINT_WITHIN = 1e-4, 1e-6
+#: Step counts of a sighting, interpolated between answers of a board, differ by at most this from
+#: those at the photograph, steps.
+COUNTS_WITHIN = 60.0
+#: A result is shown within this time after it is made, s.
+SHOWN_WITHIN = 1.0
+#: Errors of a result agree with the observer's own to within this share, and this, rad.
+SHARE, ERROR_WITHIN = 0.05, 2e-5
+#: Results of visits that broke off: what they brought is not counted.
+_BROKEN = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A photograph of one beam: s of the clock, target, point as read, and true step counts."""
+
+    at: float
+    target: str
+    point: FloatArray
+    counts: FloatArray
+
+
+@dataclass
+class _Account:
+    """What the observer knows of one heliostat's learning."""
+
+    pictures: list[Picture] = field(default_factory=list)
+    kept: int = 0
+    last: int = 0  # sightings at its last result
+    version: int = 0
+    told: int = 0  # version at its last result
+    before: Mechanism | None = None
+
+
+class ResultObserver:
+    """Observes sightings and results; see the module.
+
+    Parameters
+    ----------
+    start
+        Zero of the times that it reports, s.
+    boards
+        All heliostats.
+    records
+        The store, which outlives the plant's program.
+    sun
+        Returns the true direction to the sun, (3,), at a time in s.
+    zero
+        POSIX time at 0 s of the clock.
+
+    Attributes
+    ----------
+    checks
+        Number of checks of each invariant.
+    """
+
+    def __init__(
+        self,
+        start: float,
+        boards: Sequence[Board],
+        records: Records,
+        sun: Callable[[float], FloatArray],
+        zero: float,
+    ) -> None:
+        self.checks: Counter[int] = Counter()
+        self._start, self._records, self._sun, self._zero = start, records, sun, zero
+        self._boards = {board.outfit.name: board for board in boards}
+        self._accounts = {name: _Account() for name in self._boards}
+        self._results: set[tuple[str, float]] = set()
+        self._program: Operations | None = None
+
+    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
+        self.checks[16] += 1
+        if not good:
+            raise InvariantError(Violation(16, now - self._start, subject, saw))
+
+    def photographed(self, heliostat: str, target: str, point: FloatArray, now: float) -> None:
+        """Note a photograph at the moment of its exposure."""
+        board = self._boards[heliostat]
+        counts = np.array([axis.turned for axis in board.axes], dtype=np.float64) - board.slip
+        self._accounts[heliostat].pictures.append(Picture(now, target, point, counts))
+
+    def look(self, operations: Operations | None, now: float) -> None:
+        """Judge what is new since the last look; None: the plant's program does not run."""
+        if operations is None:
+            return
+        begins = operations is not self._program
+        self._program = operations
+        for name in self._boards:
+            self._learnt(operations, name, now, begins=begins)
+        results = operations.calibration().results
+        new = [each for each in results if (each.heliostat, each.at) not in self._results]
+        for entry in reversed(new):
+            self._results.add((entry.heliostat, entry.at))
+            self._concluded(operations, entry, now)
+
+    # -- sightings ---------------------------------------------------------------------------
+
+    def _learnt(self, operations: Operations, name: str, now: float, *, begins: bool) -> None:
+        account, beliefs = self._accounts[name], operations.plant.beliefs
+        record, seen = beliefs.record(name), beliefs.seen(name)
+        count, version = 0 if seen is None else len(seen), 0 if record is None else record.version
+        if begins:
+            # Sightings come back with the calibration that they led to.
+            saw = f"a new program knows calibration {version}, that before it {account.version}"
+            self._check(version >= account.version, now, name, saw)
+            saw = f"a new program knows {count} sightings, that before it {account.kept}"
+            self._check(count >= account.kept or version == 0, now, name, saw)
+            account.last, account.told = count, version
+        elif count > account.kept and seen is not None:
+            new = seen.sightings.take(np.arange(account.kept, count))
+            self._photographs(name, new, seen.targets[account.kept :], now)
+        saw = f"the plant knows {count} sightings, and knew {account.kept}"
+        self._check(begins or count >= account.kept, now, name, saw)
+        if account.before is None or begins:
+            account.before = beliefs.present(name)
+        account.kept, account.version = count, version
+
+    def _photographs(self, name: str, new: Sightings, targets: Sequence[str], now: float) -> None:
+        """Check that sightings are photographs, with the true sun and counts of their moment."""
+        account = self._accounts[name]
+        for k, target in enumerate(targets):
+            at = float(new.time[k]) - self._zero
+            away = float(np.linalg.norm(new.source[k] - self._sun(at)))
+            saw = f"a sighting has a sun {1e3 * away:.2f} mrad from the true one"
+            self._check(away <= SUN_WITHIN, now, name, saw)
+            own = [each for each in account.pictures if abs(each.at - at) < SAME]
+            if not own:
+                continue  # of a stack, which `VisitObserver` judges
+            picture = own[0]
+            saw = f"a sighting on {target} is a photograph of {picture.target}"
+            self._check(target == picture.target, now, name, saw)
+            off = float(np.linalg.norm(new.destination[k] - picture.point))
+            saw = f"a sighting is {off:.3f} m from the point that was photographed"
+            self._check(off <= POINT_WITHIN, now, name, saw)
+            steps = float(np.abs(new.counts[k] - picture.counts).max())
+            saw = f"a sighting's counts are {steps:.0f} steps from those at its photograph"
+            self._check(steps <= COUNTS_WITHIN, now, name, saw)
+
+    # -- results -----------------------------------------------------------------------------
+
+    def _concluded(self, operations: Operations, entry: CalibrationEntry, now: float) -> None:
+        name, account = entry.heliostat, self._accounts[entry.heliostat]
+        plant, at = operations.plant, entry.at - self._zero
+        record, seen = plant.beliefs.record(name), plant.beliefs.seen(name)
+        saw = f"a result is dated {now - at:.1f} s ago"
+        self._check(-SAME <= now - at <= SHOWN_WITHIN, now, name, saw)
+        brought = account.kept - account.last
+        new, version = account.version != account.told, account.version
+        before = account.before
+        account.last, account.told, account.before = (
+            account.kept,
+            version,
+            plant.beliefs.present(name),
+        )
+        self._noted(operations, entry, now)
+        saw = f"a visit to {entry.target} failed with an error: {entry.text}"
+        self._check(entry.outcome is not CalibrationOutcome.ERROR, now, name, saw)
+        if entry.outcome in _BROKEN:
+            return
+        saw = f"a result counts {entry.new} new sightings; {brought} came"
+        self._check(entry.new == brought, now, name, saw)
+        saw = f"a result counts {entry.sightings} sightings; {account.kept} are known"
+        self._check(entry.sightings == account.kept, now, name, saw)
+        saw = f"a result is {entry.outcome.value}; calibration {version} is believed"
+        self._check(entry.good == new, now, name, saw)
+        saw = f"a result names calibration {entry.version}; {version} is believed"
+        self._check(entry.version == (version if new else 0), now, name, saw)
+        if seen is None or before is None or brought == 0:
+            return
+        here = seen.sightings.take(np.arange(len(seen) - brought, len(seen)))
+        self._error(entry.measured, "its photographs missed", before, here, now, name)
+        self._error(entry.before, "they missed before", before, seen.sightings, now, name)
+        if new and record is not None:
+            after = record.mechanism(plant.beliefs.nominal(name))
+            self._error(entry.after, "they miss now", after, seen.sightings, now, name)
+
+    def _error(
+        self, said: float, what: str, by: Mechanism, seen: Sightings, now: float, name: str
+    ) -> None:
+        """Check an error of a result; one photograph may have come after it, to verify it."""
+        if not isfinite(said):
+            return
+        errors = _misses(by, seen)
+        own = [_rms(errors), _rms(errors[:-1])] if len(errors) > 1 else [_rms(errors)]
+        near = min(abs(said - each) for each in own)
+        told = " or ".join(f"{1e3 * each:.2f}" for each in own)
+        saw = f"a result says {what} by {1e3 * said:.2f} mrad; by the observer it is {told} mrad"
+        self._check(near <= ERROR_WITHIN + SHARE * max(own), now, name, saw)
+
+    def _noted(self, operations: Operations, entry: CalibrationEntry, now: float) -> None:
+        """Check that logbook and store have a result."""
+        name, start = entry.heliostat, f"at {entry.target}: {entry.text}"
+        events = operations.events(200)
+        there = any(
+            each.kind == "calibration" and each.who == name and each.text == start
+            for each in events
+            if abs(each.at - entry.at) < SHOWN_WITHIN
+        )
+        self._check(there, now, name, "a result is not in the logbook")
+        kept = [
+            each
+            for each in self._records.visits(5, name)
+            if abs(each.finished - entry.at) < SAME and each.begun <= each.finished
+        ]
+        saw = "a result is not in the store"
+        self._check(bool(kept), now, name, saw)
+        visit = kept[0]
+        same = (visit.target, visit.outcome, visit.sightings, visit.version) == (
+            entry.target, entry.outcome, entry.new, entry.version,
+        )  # fmt: skip
+        self._check(same, now, name, f"the store has a result as {visit}")
+        kept_sightings = self._records.sightings((name,))
+        count = len(kept_sightings)
+        known = self._accounts[name].kept
+        saw = f"the store has {count} sightings; the plant knows {known}"
+        self._check(count >= known, now, name, saw)
+
+
+def _misses(by: Mechanism, seen: Sightings) -> FloatArray:
+    """Return by how much a mechanism misses sightings, rad, (M,)."""
+    pose = by.pose(seen.counts)
+    way = seen.destination - pose.vertex
+    way /= np.linalg.norm(way, axis=-1, keepdims=True)
+    rays = reflect(seen.source, pose.normal)
+    return np.asarray(np.linalg.norm(np.cross(rays, way), axis=-1))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else nan

@@ -1,0 +1,335 @@
+"""The observer of what is shown: tables, one heliostat, summary and events, beside what happened.
+
+It asks the plant for what a page would ask. It knows from the boards where their motors stand and
+how their beams lie, from the bus what they have reported and when, and from the persons what they
+have done. A row must be what was reported; its age must be the true one; a calibration is shown
+with the error that its own covariance gives; each act of a person is an event, once, and no event
+names a person who did nothing (11).
+"""
+
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence, Set
+from math import inf, isfinite
+
+import numpy as np
+
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+from heliotrope.mechanism.tracking import track
+from heliotrope.plant.operations import Operations
+from heliotrope.plant.operations.views import FieldFrame, HeliostatView
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.outfit import RECEIVER
+from heliotrope.twin.invariants.invariants import InvariantError, Violation
+from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.invariants.visits import slope_of
+
+#: Time between two looks, s.
+EVERY = 2.0
+#: A frame is kept for a second; a value waits up to a second for a connection, and may be in
+#: transit for another, s.
+FRAME, TRANSIT = 1.1, 2.2
+#: State and place of a row that is not live.
+STALE, NOWHERE = 255, ""
+#: Step counts may be older than the row by this, for the way to the plant included, s: a cluster
+#: asks for them less often, and a question may be lost.
+COUNTED = 10.0
+#: A row in a quiet stretch is at most this old, s.
+OLD = 6.0
+#: Steps by which a shown count may be beyond those of the last seconds, and a share of their span.
+STEPS, AHEAD = 100.0, 0.3
+#: A beam that is shown on a surface has its point this near to it by the steps made, m, after it
+#: was sent there for this long, s.
+NEAR, SETTLED = 6.0, 20.0
+#: The predicted error of a row agrees with the observer's own to within this share.
+SHARE = 0.25
+#: An act of a person is an event within this, s.
+NOTED_WITHIN = 1.0
+
+
+class ShownObserver:
+    """Observes what is shown; see the module.
+
+    Parameters
+    ----------
+    start
+        Zero of the times that it reports, s.
+    boards
+        All heliostats.
+    homes
+        Names of the heliostats of each cluster.
+    targets
+        Calibration targets.
+    plant
+        Observer of the plant, which knows what boards have reported, and who has the authority.
+    persons
+        Names of the persons whose acts it is told of.
+
+    Attributes
+    ----------
+    checks
+        Number of checks of each invariant.
+    """
+
+    def __init__(
+        self,
+        start: float,
+        boards: Sequence[Board],
+        homes: Mapping[str, Sequence[str]],
+        targets: Sequence[Target],
+        plant: PlantObserver,
+        persons: Sequence[str],
+    ) -> None:
+        self.checks: Counter[int] = Counter()
+        self._start, self._plant, self._persons = start, plant, tuple(persons)
+        self._boards = {board.outfit.name: board for board in boards}
+        self._homes = {name: cluster for cluster, names in homes.items() for name in names}
+        self._middles = {target.name: target.center for target in targets}
+        self._middles["receiver"] = np.array(RECEIVER)
+        self._counts: dict[str, deque[tuple[float, FloatArray]]] = {
+            name: deque(maxlen=40) for name in self._boards
+        }
+        self._states: dict[str, tuple[int, float]] = {}
+        self._out: set[str] = set()
+        self._changed: dict[str, float] = {}
+        self._acts: list[tuple[float, str, str]] = []
+        self._told: set[tuple[float, str, str]] = set()
+        self._places: dict[str, tuple[str, float]] = {}
+        self._program: Operations | None = None
+        self._begun = self._looked = -inf
+        self._frame = 0
+        self._turn = 0
+
+    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
+        self.checks[11] += 1
+        if not good:
+            raise InvariantError(Violation(11, now - self._start, subject, saw))
+
+    # -- persons -----------------------------------------------------------------------------
+
+    def acted(self, person: str, word: str, now: float) -> None:
+        """Note an act of a person; its event has this word in it."""
+        self._acts.append((now, person, word))
+
+    def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
+        """Note that a person has taken heliostats out of service, or given them back."""
+        for name in heliostats:
+            self._changed[name] = now
+            if out:
+                self._out.add(name)
+            else:
+                self._out.discard(name)
+
+    # -- judgement ---------------------------------------------------------------------------
+
+    def look(
+        self, operations: Operations | None, quiet: Set[str], sun: FloatArray, now: float
+    ) -> None:
+        """Judge what is shown; None: the plant's program does not run, or is frozen."""
+        for name, board in self._boards.items():
+            turned = np.array([axis.turned for axis in board.axes], dtype=np.float64)
+            self._counts[name].append((now, turned - board.slip))
+            if self._states.get(name, (-1, 0.0))[0] != board.state:
+                self._states[name] = board.state, now
+        if operations is None:
+            self._acts.clear()
+            self._program = None
+            return
+        if operations is not self._program:
+            self._program, self._begun, self._frame = operations, now, 0
+            self._told.clear()
+            self._acts = [act for act in self._acts if act[0] >= now]
+        self._events(operations, now)
+        if now - self._looked < EVERY:
+            return
+        self._looked = now
+        frame = operations.frame()
+        self._rows(operations, frame, quiet, sun, now)
+        self._head(operations, now)
+        names = operations.names
+        name = names[self._turn % len(names)]
+        self._turn += 1
+        view = operations.heliostat(name)
+        self._detail(operations, view, now)
+
+    def _events(self, operations: Operations, now: float) -> None:
+        """Check that each act of a person is an event, once, and nothing else is."""
+        for row in operations.events(100):
+            key = (row.at, row.who, row.text)
+            if row.who not in self._persons or key in self._told:
+                continue
+            self._told.add(key)
+            own = [act for act in self._acts if act[1] == row.who and act[2] in row.text]
+            saw = f"an event of {row.who}, who did nothing like it: {row.text}"
+            self._check(bool(own), now, "logbook", saw)
+            self._acts.remove(own[0])
+        for at, who, word in self._acts:
+            saw = f"{who} did {word!r} {now - at:.1f} s ago, and no event says so"
+            self._check(now - at <= NOTED_WITHIN, now, "logbook", saw)
+
+    def _rows(
+        self,
+        operations: Operations,
+        frame: FieldFrame,
+        quiet: Set[str],
+        sun: FloatArray,
+        now: float,
+    ) -> None:
+        fresh = frame.number > self._frame
+        self._check(frame.number >= self._frame, now, "frame", "its number falls")
+        self._frame = frame.number
+        made = now if fresh else now - FRAME
+        for row, name in enumerate(operations.names):
+            age, state = float(frame.age[row]), int(frame.state[row])
+            home = operations.clusters[int(frame.cluster[row])]
+            saw = f"it is shown in {home}; it is in {self._homes[name]}"
+            self._check(home == self._homes[name], now, name, saw)
+            if now - self._changed.get(name, -inf) > FRAME:
+                held = bool(frame.held[row])
+                saw = f"it is shown as {'out of' if held else 'in'} service, and is not"
+                self._check(held == (name in self._out), now, name, saw)
+            if state == STALE:
+                saw = f"it is shown as stale, {age:.1f} s old"
+                calm = name in quiet and now - self._begun > OLD
+                self._check(not calm, now, name, saw)
+                continue
+            told = self._plant.reports(name, made - age - TRANSIT - FRAME)
+            saw = f"it is shown as {states.STATES[state]}; it has not reported that"
+            self._check(state in told, now, name, saw)
+            self._counted(name, frame.counts[row], made - age, now)
+            place = operations.aim_names[int(frame.on[row])]
+            self._placed(name, place, sun, now, calm=name in quiet)
+        self._learnt(operations, frame, quiet, sun, now)
+
+    def _counted(self, name: str, counts: FloatArray, at: float, now: float) -> None:
+        """Check that shown step counts are those of the last seconds."""
+        some = [c for when, c in self._counts[name] if when >= at - COUNTED]
+        if self._boards[name].node is None or len(some) < 2 or any(self._boards[name].slip):
+            return
+        low, high = np.min(some, axis=0), np.max(some, axis=0)
+        # Steps that are ordered of the motors ahead count before they are made.
+        room = STEPS + AHEAD * (high - low)
+        low, high = low - room, high + room
+        shown = ", ".join(str(int(each)) for each in counts)
+        saw = f"its counts are shown as {shown}; they were {low} to {high}"
+        self._check(bool(((counts >= low) & (counts <= high)).all()), now, name, saw)
+
+    def _placed(self, name: str, place: str, sun: FloatArray, now: float, *, calm: bool) -> None:
+        """Check that a beam that is shown on a surface is there, by the steps that were made."""
+        state, since = self._states[name]
+        before = self._places.get(name)
+        if before is None or before[0] != place or not calm:
+            self._places[name] = before = place, now
+        if not calm or now - max(since, before[1]) < SETTLED:
+            return
+        works = state in (states.TRACKING, states.SEARCHING)
+        saw = f"{states.STATES[state]}, and its beam is shown on {place or 'nothing'}"
+        self._check(works == (place != NOWHERE), now, name, saw)
+        if state == states.TRACKING and place in self._middles:
+            x, y, z = (float(each) for each in self._middles[place])
+            miss = self._boards[name].miss(sun, (x, y, z), believed=True)
+            saw += f", {miss:.1f} m from its middle"
+            self._check(miss <= NEAR, now, name, saw)
+
+    def _learnt(
+        self,
+        operations: Operations,
+        frame: FieldFrame,
+        quiet: Set[str],
+        sun: FloatArray,
+        now: float,
+    ) -> None:
+        beliefs = operations.plant.beliefs
+        for row, name in enumerate(operations.names):
+            record = beliefs.record(name)
+            at = float(frame.calibrated_at[row])
+            saw = f"it is shown with{'' if isfinite(at) else 'out'} a calibration"
+            if record is None:
+                self._check(not isfinite(at), now, name, saw)
+                continue
+            if now - (record.at - self._zero(operations)) < FRAME + 1.0 or now - self._begun < 15.0:
+                continue
+            self._check(at == record.at, now, name, saw)
+            state, since = self._states[name]
+            # What its error is depends on the pose: it stands near that of its work.
+            works = state in (states.IDLE, states.TRACKING) and now - since > SETTLED
+            if not works or name not in quiet:
+                continue
+            own = _expected(operations, name, self._counts[name][-1][1], sun)
+            said = float(frame.error[row])
+            saw = f"its predicted error is shown as {1e3 * said:.3f} mrad; it is {1e3 * own:.3f}"
+            good = not isfinite(own) or abs(said - own) <= SHARE * own
+            self._check(good, now, name, saw)
+
+    def _zero(self, operations: Operations) -> float:
+        clock = operations.plant.clock
+        return clock.utc().timestamp() - clock.monotonic()
+
+    def _head(self, operations: Operations, now: float) -> None:
+        head = operations.summary()
+        total = sum(head.states.values())
+        count = len(self._boards)
+        saw = f"{total} of {count} heliostats are counted in a state, {head.heliostats} in all"
+        self._check(total == count == head.heliostats, now, "summary", saw)
+        holder = self._plant.holder(now)
+        saw = f"{head.holder or 'nobody'} is shown with the command authority; {holder} has it"
+        self._check(holder is None or head.holder == holder, now, "summary", saw)
+        rows = operations.alarms()
+        still = sum(row.active or not row.acknowledged_by for row in rows)
+        saw = f"{head.alarms} alarms are counted, {still} shown"
+        self._check(head.alarms == still, now, "summary", saw)
+        for row in operations.cluster_rows():
+            members = [name for name, home in self._homes.items() if home == row.name]
+            saw = f"{row.heliostats} heliostats are shown, {len(members)} are there"
+            self._check(row.heliostats == len(members), now, row.name, saw)
+            good = not isfinite(row.answered) or 0.0 <= row.answered <= 1.0
+            self._check(good, now, row.name, f"it is shown to have answered {row.answered:.2f}")
+
+    def _detail(self, operations: Operations, view: HeliostatView, now: float) -> None:
+        name, board = view.name, self._boards[view.name]
+        where = board.outfit.mechanism.position
+        off = float(np.linalg.norm(view.position - np.asarray(where).reshape(-1)[:3]))
+        self._check(off < 1.0, now, name, f"it is shown {off:.1f} m from where it is")
+        if view.live:
+            told = {states.STATES[each] for each in self._plant.reports(name, now - view.age - 3.3)}
+            self._check(view.state in told, now, name, f"it is shown as {view.state} in detail")
+            for drive, axis in zip(view.drives, (0, 1), strict=True):
+                self._drive(name, drive.count, axis, now)
+        if view.calibration is not None:
+            for key, value in view.calibration.parameters.items():
+                shown = view.parameters.get(key)
+                saw = f"its parameter {key} is shown as {shown}; it is {value}"
+                self._check(shown is not None and shown.value == value, now, name, saw)
+        saw = f"why it is out of service is shown as {view.hold!r}"
+        self._check(bool(view.hold) == (name in self._out), now, name, saw)
+        if view.planned is not None:
+            at = view.planned.at - self._zero(operations)
+            saw = f"its next visit is shown as planned {now - at:.0f} s ago"
+            self._check(at >= now - 1800.0 and view.planned.heliostat == name, now, name, saw)
+
+    def _drive(self, name: str, count: int, axis: int, now: float) -> None:
+        some = [float(c[axis]) for when, c in self._counts[name] if when >= now - OLD - COUNTED]
+        if any(self._boards[name].slip) or len(some) < 2 or self._boards[name].node is None:
+            return
+        low, high = min(some), max(some)
+        room = STEPS + AHEAD * (high - low)
+        saw = f"drive {axis} is shown at {count}; it was {low:.0f} to {high:.0f}"
+        self._check(low - room <= count <= high + room, now, name, saw)
+
+
+def _expected(operations: Operations, name: str, here: FloatArray, sun: FloatArray) -> float:
+    """Return the expected error of a mirror's normal at the receiver, rad, by its covariance.
+
+    Of the two poses, it is the one nearer to the present counts (2,).
+    """
+    beliefs = operations.plant.beliefs
+    record = beliefs.record(name)
+    assert record is not None
+    nominal = beliefs.nominal(name)[0]
+    aim = operations.plant.default_aims((name,))[name]
+    counts = track(record.mechanism(nominal), sun, np.asarray(aim), current=here).best_counts
+    if not np.isfinite(counts).all():
+        return inf
+    slope = slope_of(record, nominal, counts, sun)
+    return 0.5 * float(np.sqrt(np.trace(slope.T @ record.covariance @ slope)))
