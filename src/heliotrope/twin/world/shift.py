@@ -86,16 +86,22 @@ class Working:
     def look(
         self,
         plant: PlantController | None,
-        quiet: frozenset[str],
+        quiet: frozenset[str] | None,
         sun: FloatArray,
         now: float,
         *,
         waits: bool,
         governs: bool,
     ) -> None:
-        """Judge the work; ``waits``: the plant's program is frozen; see the observers."""
+        """Judge the work; see the observers.
+
+        ``quiet`` is None where a cluster is wrong from the start: its mirrors may do nothing, and
+        what is reported is true of others. ``waits``: the plant's program is frozen.
+        """
         watch, operations = self.watch, None if waits else self.control.operations
         watch.visits.look(plant, sun, now)
+        if quiet is None:
+            return
         watch.day.look(plant, quiet, sun, now)
         watch.results.look(operations, now)
         watch.progress.look(operations, quiet, sun, now, governs=governs)

@@ -600,7 +600,7 @@ class Simulation:
                 going_on = self.plant is not None and not self.operator.waits
                 self.tickets.look(now, runs=going_on and writes)
                 if self._work is not None:
-                    calm = frozenset() if self.quiet is None else self.quiet.stretches
+                    calm = None if self.quiet is None else self.quiet.stretches
                     self._work.look(
                         self.plant,
                         calm,

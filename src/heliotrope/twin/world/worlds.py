@@ -155,24 +155,27 @@ def stored_by(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[
     """Return heliostats with the items that their boards store at the start.
 
     In the world "parameters" half of them store wrong ones: another mirror's, or their own with an
-    error from a scratch to a blunder, or limits that are too narrow.
+    error from a scratch to a blunder, or limits that are too narrow. Where addresses are exchanged,
+    none stores another mirror's: a board with the address and the armature of another mirror is
+    that mirror's by all that it reports, and only a photograph would tell.
     """
     if "parameters" not in worlds:
         return list(fits)
     chance = random.Random(f"parameters {seed}")
+    others = [] if "addresses" in worlds else fits
     return [
-        replace(fit, items={**fit.items, **wrong_items(fit, fits, chance)})
+        replace(fit, items={**fit.items, **wrong_items(fit, others, chance)})
         if chance.random() < 0.5
         else fit
         for fit in fits
     ]
 
 
-def wrong_items(fit: Outfit, fits: Sequence[Outfit], chance: random.Random) -> dict[str, bytes]:
-    """Return some wrong items of a heliostat."""
-    what = chance.choice(["another", "armature", "biases", "machine"])
+def wrong_items(fit: Outfit, others: Sequence[Outfit], chance: random.Random) -> dict[str, bytes]:
+    """Return some wrong items of a heliostat, or all that another one of a list has."""
+    what = chance.choice([*(["another"] if others else []), "armature", "biases", "machine"])
     if what == "another":
-        other = items_of(chance.choice(list(fits)).mechanism)
+        other = items_of(chance.choice(list(others)).mechanism)
         return {name: other[name] for name in ("location", "armature")}
     size = chance.choice([1e-3, 5e-3, 30e-3])
     if what == "armature":
