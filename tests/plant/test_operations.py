@@ -568,6 +568,26 @@ def test_losses_one_after_the_other_count_together_although_people_raised_them()
     live(work, AutomaticSettings(calibrate=True, margin=0.0))
 
 
+def test_a_mirror_left_on_a_target_goes_back_to_the_receiver() -> None:
+    """A person has broken off its visit, and gives it back while it lights the target."""
+
+    async def work(plant: LivePlant) -> None:
+        shown, name = plant.operations, plant.names[0]
+        await asyncio.sleep(200.0)
+        assert _states(plant) == ["TRACKING"] * 4
+        token = shown.take_authority(OPERATOR).token
+        shown.aim_at(OPERATOR, token, (name,), shown.targets[0])
+        await asyncio.sleep(10.0)
+        assert shown.heliostat(name).on == shown.targets[0]
+        shown.release_authority(OPERATOR, token)
+        shown.give_back(OPERATOR, (name,))
+        await asyncio.sleep(60.0)
+        assert shown.heliostat(name).on == "receiver"
+        assert _states(plant) == ["TRACKING"] * 4
+
+    live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0))
+
+
 def test_the_wait_for_a_person_outlasts_a_restart(tmp_path: Path) -> None:
     keeper = Keeper(tmp_path / "store.sqlite", inline=True)
     settings_ = AutomaticSettings(wanted=True, calibrate=False, margin=0.0, losses=1)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.geometry import FloatArray
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.plant import refusals
@@ -77,6 +78,11 @@ class Raising:
         self._blocked: set[str] = set()
         self._joins: list[Ticket] = []  # some of their heliostats still wait for their turn
         self._aims = plant.default_aims() if plant.design.receivers else {}
+        #: Middle, ENU, m, and radius of each target, m.
+        self._targets = [
+            (np.mean(each.corners, axis=0), 0.5 * math.hypot(each.width, each.height))
+            for each in plant.design.targets
+        ]
         self._clear = self._clear_of_targets(clearance)
 
     def want(self, heliostats: Sequence[str], *, wanted: bool, by_person: bool = False) -> None:
@@ -109,12 +115,17 @@ class Raising:
         points = np.stack([aims[name] for name in plant.field.names])
         slant = np.linalg.norm(points - plant.beams.armature.origin_1, axis=-1)
         room = np.full(len(points), math.inf)
-        for target in plant.design.targets:
-            middle = np.asarray(target.corners).mean(axis=0)
-            reach = 0.5 * math.hypot(target.width, target.height)
+        for middle, reach in self._targets:
             room = np.minimum(room, np.linalg.norm(points - middle, axis=-1) - reach)
         # The beam is off by twice as much as the normal; that error is two-dimensional.
         return np.asarray(math.sqrt(2.0) * clearance * slant < room)
+
+    def _on_targets(self, points: FloatArray) -> Mask:
+        """Return which points (N, 3) are on a target: a person has ended the visit there."""
+        found = np.zeros(len(points), dtype=np.bool_)
+        for middle, reach in self._targets:
+            found |= np.linalg.norm(points - middle, axis=-1) <= reach
+        return found
 
     def stuck(self, visiting: Collection[str], resting: Mask) -> Rows:
         """Return the rows of wanted heliostats that only the way from stow brings on.
@@ -157,8 +168,12 @@ class Raising:
         busy = (self._busy_until >= now) & (self._told_in == plant.field.rows["state"])
         free = self.wanted & ~busy & ~resting
         free[[plant.field.place(name) for name in visiting()]] = False
-        for state, name in ((states.STOWED, "APPROACH"), (states.DEFOCUSED, "IDLE")):
-            rows = np.flatnonzero(free & plant.field.among((state,), now))[: self._most]
+        strayed = (states.TRACKING, "IDLE", self._on_targets(plant.aims))
+        here = np.ones(len(free), dtype=np.bool_)
+        for state, name, where in (
+            (states.STOWED, "APPROACH", here), (states.DEFOCUSED, "IDLE", here), strayed
+        ):  # fmt: skip
+            rows = np.flatnonzero(free & where & plant.field.among((state,), now))[: self._most]
             if len(rows):
                 give = functools.partial(plant.command, self._person, token, name)
                 self._give(rows, state, give)

@@ -27,8 +27,8 @@ RAISED_WITHIN = 60.0
 IDLE_WITHIN, TOGETHER_WITHIN = 25.0, 110.0
 #: A visit ends within this, s.
 VISIT_WITHIN = 260.0
-#: A beam may stay on a target without a visit for this long, s.
-LEFT_WITHIN = 15.0
+#: A beam may stay on a target without a visit for this long, wherever a person has sent it, s.
+LEFT_WITHIN = 30.0
 #: Name of the alarm that a part of the work has failed.
 FAILED = "work"
 
@@ -66,7 +66,6 @@ class ProgressObserver:
         self._boards = {board.outfit.name: board for board in boards}
         self._together = together
         self._given: set[str] = set()
-        self._moved: set[str] = set()  # a person may have sent these to a target
         self._out: dict[str, float] = {}
         self._since: dict[tuple[str, ...], float] = {}
 
@@ -84,7 +83,6 @@ class ProgressObserver:
     def taken(self, heliostats: Sequence[str]) -> None:
         """Note that a person has moved heliostats, and may do so until they are given again."""
         self._given.difference_update(heliostats)
-        self._moved.update(heliostats)
 
     def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
         """Note that a person has taken heliostats out of service, or given them back."""
@@ -131,7 +129,6 @@ class ProgressObserver:
         visited = {name for run in running for name in run.heliostats}
         self._visits(running, now)
         stowed = {n for n, board in self._boards.items() if board.state == states.STOWED}
-        self._moved -= visited | stowed
         may = governs and not operations.automatic.waits and sun[2] > HIGH
         may &= not operations.plant.emergency_on
         working = [name for name in self._given & quiet if may and name not in self._out]
@@ -146,8 +143,7 @@ class ProgressObserver:
                 "it has stood at stow",
             )
             for target in self._targets.values():
-                lights = mine and name not in self._moved and board.state == states.TRACKING
-                lights = lights and self._on(board, target, sun)
+                lights = mine and board.state == states.TRACKING and self._on(board, target, sun)
                 saw = f"no visit is under way, and its beam has been on {target.name}"
                 key = ("left", name, target.name)
                 self._within(key, lights, now, LEFT_WITHIN, name, saw)
