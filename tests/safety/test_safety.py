@@ -690,3 +690,10 @@ def test_a_row_about_heliostats_is_evaluated_for_those_with_a_reading() -> None:
         assert {a.subject for a in actions} == tripped
         assert {a.act for a in actions} <= {Act.DEFOCUS}
     assert set(safety.narrowed(state, row.name, ()).tracks) == {(row.name, "")}
+
+
+def test_an_unknown_time_is_not_shown_as_a_number() -> None:
+    row = ROWS["holdover_exhausted"]
+    assert row.shown(3600.0) == "3.6e+03 s"
+    told = row.wrong.format(value=row.shown(1e9))
+    assert told == "the cluster's time is uncertain by an unknown time"

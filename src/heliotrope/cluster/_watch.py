@@ -32,7 +32,7 @@ _PLANT_LEASE = 3.0
 #: A row that has tripped releases below 2 s of silence; a shorter lease would never release it.
 _SHORTEST_LEASE = 1.0
 #: Stands for an unknown error of the time, s.
-_UNBOUNDED = 1e9
+_UNBOUNDED = 1e9  # beyond safety.condition.UNKNOWN_TIME
 
 
 @dataclass(frozen=True)

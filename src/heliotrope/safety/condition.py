@@ -6,6 +6,9 @@ from enum import Enum, IntEnum, StrEnum
 
 from heliotrope.errors import InputError
 
+#: A time from here on stands for one that nobody knows, s.
+UNKNOWN_TIME = 1e8
+
 
 class Act(IntEnum):
     """The acts, from weak to strong; the strongest wins."""
@@ -223,6 +226,8 @@ class Condition:
                 return "yes" if value >= 0.5 else "no"
             case "count":
                 return f"{value:.0f}"
+            case "s" if value >= UNKNOWN_TIME:
+                return "an unknown time"
             case _:
                 return f"{value:.3g} {self.unit}"
 
