@@ -346,6 +346,23 @@ def test_a_new_standby_point_that_the_beam_does_not_go_to_is_no_disagreement(
     play(tmp_path, scene)
 
 
+def test_of_several_new_standby_points_the_beam_may_be_at_each(tmp_path: Path) -> None:
+    """Simulated run 2300030: the second one came before anybody had looked at the first."""
+
+    async def scene(bench: Bench) -> None:
+        first, second = (-8.0, 2.0, 15.0), (3.0, -9.0, 15.0)
+        await resting(bench, 0.0)
+        assert not await follow(bench, 6, REST, 0.0)
+        for point in (first, second):
+            bench.plant.standbys[bench.plant.field.place(NAME)] = point
+            assert not await follow(bench, 3, REST, 0.0)
+        assert not await follow(bench, 8, first, 0.0)
+        assert not await follow(bench, 4, second, 0.0)
+        assert await follow(bench, 10, first, 0.0) == {NAME}
+
+    play(tmp_path, scene)
+
+
 @pytest.mark.parametrize(("radius", "wrong"), [(8e-3, False), (2e-3, True)])
 def test_a_search_keeps_to_its_radius(radius: float, wrong: bool, tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:

@@ -39,6 +39,8 @@ LOOK_PERIOD = 2.0
 NOTED = 1e-3
 #: Most heliostats that are named; with more, the field is the subject.
 MOST_NAMED = 150
+#: Points before the assigned one that a beam may still be on.
+_BEFORE = 4
 #: Step counts count from this time after a beam was first seen to be sent to its point, s.
 _SETTLE = 1.0
 #: An axis that comes nearer to its goal by this between two looks is on its way, rad.
@@ -67,36 +69,35 @@ class _Points:
 
     Attributes
     ----------
-    found
-        Points at which the beams were found, (N, 3): an assigned point may wait for its turn, or
-        be refused by the local controller, and then the beam goes on to the one before.
+    before
+        The last points before the assigned ones, the latest first, (`_BEFORE`, N, 3); NaN from
+        where the beam was found: an assigned point may wait for its turn, or be refused by the
+        local controller, and then the beam goes on to one before.
     changed_at
         When each point was seen to change, monotonic s, (N,).
     """
 
     def __init__(self, points: FloatArray) -> None:
         self.points, self._last = points, points.copy()
-        self.found = np.full(points.shape, np.nan)
+        self.before = np.full((_BEFORE, *points.shape), np.nan)
         self.changed_at = np.full(len(points), -np.inf)
 
     def look(self, now: float) -> Mask:
         """Return which points have changed since the last look, (N,)."""
         new, last = self.points, self._last
         changed = ~np.all((new == last) | (np.isnan(new) & np.isnan(last)), axis=-1)
-        # Until the beam is at the new point it may be at the one before, found or not.
-        unfound = changed & np.isnan(self.found).any(axis=-1)
-        self.found[unfound] = last[unfound]
+        self.before[1:, changed] = self.before[:-1, changed]
+        self.before[0, changed] = last[changed]
         self.changed_at[changed], last[changed] = now, new[changed]
         return np.asarray(changed)
 
     def beside(self, rows: Rows, beam: FloatArray, vertex: FloatArray) -> FloatArray:
-        """Return the angle between beams (K, 3) and the nearer of their two points, rad, (K,)."""
-        points, before = self.points[rows], self.found[rows]
-        error = _angle(beam, points - vertex)
-        here = error < NOTED
-        older = np.isfinite(before).all(axis=-1)
-        error[older] = np.minimum(error, _angle(beam, before - vertex))[older]
-        self.found[rows[here]] = points[here]
+        """Return the angle between beams (K, 3) and the nearest of their points, rad, (K,)."""
+        error = _angle(beam, self.points[rows] - vertex)
+        self.before[:, rows[error < NOTED]] = np.nan
+        for points in self.before[:, rows]:
+            some = np.isfinite(points).all(axis=-1)
+            error[some] = np.minimum(error[some], _angle(beam[some], (points - vertex)[some]))
         return error
 
 
@@ -208,7 +209,7 @@ class Agreement:
                 self._armature[row], self._drives[row] = armature, drives
                 del self._pending[row]
         begins = self._sort(now)
-        self._aims.found[~self._on_aim] = np.nan
+        self._aims.before[:, ~self._on_aim] = np.nan
         aims, standbys = self._aims.look(now), self._standbys.look(now)
         begins |= np.where(self._on_aim, aims, standbys)
         self._lag[begins], self._stands[begins] = np.inf, False
