@@ -93,10 +93,11 @@ class ShownObserver:
         self._states: dict[str, tuple[int, float]] = {}
         self._out: set[str] = set()
         self._changed: dict[str, float] = {}
-        self._acts: list[tuple[float, str, str]] = []
+        self._acts: list[tuple[float, str, str, Operations | None]] = []
         self._told: set[tuple[float, str, str]] = set()
         self._places: dict[str, tuple[str, float]] = {}
         self._program: Operations | None = None
+        self._waited = True
         self._begun = self._looked = -inf
         self._frame = 0
         self._turn = 0
@@ -108,9 +109,9 @@ class ShownObserver:
 
     # -- persons -----------------------------------------------------------------------------
 
-    def acted(self, person: str, word: str, now: float) -> None:
-        """Note an act of a person; its event has this word in it."""
-        self._acts.append((now, person, word))
+    def acted(self, operations: Operations | None, person: str, word: str, now: float) -> None:
+        """Note an act of a person in a program; its event there has this word in it."""
+        self._acts.append((now, person, word, operations))
 
     def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
         """Note that a person has taken heliostats out of service, or given them back."""
@@ -128,18 +129,19 @@ class ShownObserver:
     ) -> None:
         """Judge what is shown; None: the plant's program does not run, or is frozen."""
         for name, board in self._boards.items():
-            turned = np.array([axis.turned for axis in board.axes], dtype=np.float64)
-            self._counts[name].append((now, turned - board.slip))
+            steps = np.array([(a.turned, a.emitted) for a in board.axes], dtype=np.float64).T
+            self._counts[name].append((now, steps - board.slip))
             if self._states.get(name, (-1, 0.0))[0] != board.state:
                 self._states[name] = board.state, now
         if operations is None:
-            self._acts.clear()
-            self._program = None
+            self._waited = True
             return
         if operations is not self._program:
-            self._program, self._begun, self._frame = operations, now, 0
+            self._program, self._frame, self._waited = operations, 0, True
             self._told.clear()
-            self._acts = [act for act in self._acts if act[0] >= now]
+            self._acts = [act for act in self._acts if act[3] is operations]
+        if self._waited:
+            self._begun, self._waited = now, False
         self._events(operations, now)
         if now - self._looked < EVERY:
             return
@@ -151,7 +153,7 @@ class ShownObserver:
         name = names[self._turn % len(names)]
         self._turn += 1
         view = operations.heliostat(name)
-        self._detail(operations, view, now)
+        self._detail(operations, view, quiet, now)
 
     def _events(self, operations: Operations, now: float) -> None:
         """Check that each act of a person is an event, once, and nothing else is."""
@@ -164,7 +166,7 @@ class ShownObserver:
             saw = f"an event of {row.who}, who did nothing like it: {row.text}"
             self._check(bool(own), now, "logbook", saw)
             self._acts.remove(own[0])
-        for at, who, word in self._acts:
+        for at, who, word, _ in self._acts:
             saw = f"{who} did {word!r} {now - at:.1f} s ago, and no event says so"
             self._check(now - at <= NOTED_WITHIN, now, "logbook", saw)
 
@@ -205,16 +207,22 @@ class ShownObserver:
 
     def _counted(self, name: str, counts: FloatArray, at: float, now: float) -> None:
         """Check that shown step counts are those of the last seconds."""
-        some = [c for when, c in self._counts[name] if when >= at - COUNTED]
-        if self._boards[name].node is None or len(some) < 2 or any(self._boards[name].slip):
-            return
-        low, high = np.min(some, axis=0), np.max(some, axis=0)
-        # Steps that are ordered of the motors ahead count before they are made.
-        room = STEPS + AHEAD * (high - low)
-        low, high = low - room, high + room
+        low, high = self._span(name, at)
         shown = ", ".join(str(int(each)) for each in counts)
         saw = f"its counts are shown as {shown}; they were {low} to {high}"
         self._check(bool(((counts >= low) & (counts <= high)).all()), now, name, saw)
+
+    def _span(self, name: str, at: float) -> tuple[FloatArray, FloatArray]:
+        """Return the least and the greatest step counts, (2,) each, that a row of a time shows.
+
+        Steps count once they are ordered of the motors, ahead of being made.
+        """
+        some = [c for when, c in self._counts[name] if when >= at - COUNTED]
+        if self._boards[name].node is None or len(some) < 2 or any(self._boards[name].slip):
+            return np.full(2, -inf), np.full(2, inf)
+        low, high = np.min(some, axis=(0, 1)), np.max(some, axis=(0, 1))
+        room = STEPS + AHEAD * (high - low)
+        return low - room, high + room
 
     def _placed(self, name: str, place: str, sun: FloatArray, now: float, *, calm: bool) -> None:
         """Check that a beam that is shown on a surface is there, by the steps that were made."""
@@ -257,7 +265,7 @@ class ShownObserver:
             works = state in (states.IDLE, states.TRACKING) and now - since > SETTLED
             if not works or name not in quiet:
                 continue
-            own = _expected(operations, name, self._counts[name][-1][1], sun)
+            own = _expected(operations, name, self._counts[name][-1][1][0], sun)
             said = float(frame.error[row])
             saw = f"its predicted error is shown as {1e3 * said:.3f} mrad; it is {1e3 * own:.3f}"
             good = not isfinite(own) or abs(said - own) <= SHARE * own
@@ -287,7 +295,9 @@ class ShownObserver:
             good = not isfinite(row.answered) or 0.0 <= row.answered <= 1.0
             self._check(good, now, row.name, f"it is shown to have answered {row.answered:.2f}")
 
-    def _detail(self, operations: Operations, view: HeliostatView, now: float) -> None:
+    def _detail(
+        self, operations: Operations, view: HeliostatView, quiet: Set[str], now: float
+    ) -> None:
         name, board = view.name, self._boards[view.name]
         where = board.outfit.mechanism.position
         off = float(np.linalg.norm(view.position - np.asarray(where).reshape(-1)[:3]))
@@ -296,7 +306,8 @@ class ShownObserver:
             told = {states.STATES[each] for each in self._plant.reports(name, now - view.age - 3.3)}
             self._check(view.state in told, now, name, f"it is shown as {view.state} in detail")
             for drive, axis in zip(view.drives, (0, 1), strict=True):
-                self._drive(name, drive.count, axis, now)
+                if name in quiet:
+                    self._drive(name, drive.count, axis, now - view.age, now)
         if view.calibration is not None:
             for key, value in view.calibration.parameters.items():
                 shown = view.parameters.get(key)
@@ -309,14 +320,10 @@ class ShownObserver:
             saw = f"its next visit is shown as planned {now - at:.0f} s ago"
             self._check(at >= now - 1800.0 and view.planned.heliostat == name, now, name, saw)
 
-    def _drive(self, name: str, count: int, axis: int, now: float) -> None:
-        some = [float(c[axis]) for when, c in self._counts[name] if when >= now - OLD - COUNTED]
-        if any(self._boards[name].slip) or len(some) < 2 or self._boards[name].node is None:
-            return
-        low, high = min(some), max(some)
-        room = STEPS + AHEAD * (high - low)
-        saw = f"drive {axis} is shown at {count}; it was {low:.0f} to {high:.0f}"
-        self._check(low - room <= count <= high + room, now, name, saw)
+    def _drive(self, name: str, count: int, axis: int, at: float, now: float) -> None:
+        low, high = self._span(name, at)
+        saw = f"drive {axis} is shown at {count}; it was {low[axis]:.0f} to {high[axis]:.0f}"
+        self._check(bool(low[axis] <= count <= high[axis]), now, name, saw)
 
 
 def _expected(operations: Operations, name: str, here: FloatArray, sun: FloatArray) -> float:

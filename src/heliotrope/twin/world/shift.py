@@ -55,9 +55,9 @@ class Watch:
 
     # -- what persons tell -------------------------------------------------------------------
 
-    def acted(self, person: Person, word: str, now: float) -> None:
-        """Note an act; its event has this word in it."""
-        self.shown.acted(person.name, word, now)
+    def acted(self, operations: Operations | None, person: Person, word: str, now: float) -> None:
+        """Note an act in a program; its event there has this word in it."""
+        self.shown.acted(operations, person.name, word, now)
 
     def given(self, heliostats: Sequence[str], now: float) -> None:
         """Note that heliostats were given to automatic control."""
@@ -190,7 +190,7 @@ class Shift:
         self._left.clear()
 
     def _acted(self, word: str, person: Person = ENGINEER) -> None:
-        self._watch.acted(person, word, self._clock.monotonic())
+        self._watch.acted(self._work.operations, person, word, self._clock.monotonic())
 
     # -- interruptions -----------------------------------------------------------------------
 
