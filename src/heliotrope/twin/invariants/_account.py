@@ -5,7 +5,7 @@ from struct import unpack
 from typing import Any
 
 from heliotrope.lcu import messages, motion, states, wire
-from heliotrope.lcu.journal import CODES_OF, items_of
+from heliotrope.lcu.journal import items_of
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, STOW
 from heliotrope.twin.invariants.ledger import Sent
@@ -217,7 +217,7 @@ class HeliostatAccount:
 
     def stow(self) -> tuple[int, int]:
         """Return the stow position that its journal holds, steps."""
-        one, two = unpack(CODES_OF["stow"], self._items["stow"])
+        one, two = unpack("<ii", self._items["stow"])
         return one, two
 
     def rate(self, axis: int, count: int, now: float) -> str:

@@ -7,6 +7,10 @@ faults cause is raised only while such a fault lasts, or soon after; once all is
 itself, unless a person must end it. A board without power, a board in FAULT, and a cluster of which
 the plant hears nothing must be named within a time (invariant 16). The table and the times are its
 own.
+
+An alarm of a mirror that points elsewhere says that what should have kept it from moving has
+failed. It has a cause only where a cluster is wrong from the start, where what is believed changes,
+or where a fault is near.
 """
 
 import re
@@ -37,6 +41,13 @@ BY_OTHERS = frozenset({
     "sun_below_horizon", "unknown_reading", "wind_gust_defocus", "wind_gust_stow",
     "wind_mean_defocus", "wind_mean_stow",
 })  # fmt: skip
+#: Alarms of mirrors that point elsewhere, and the worlds in which they come without a fault.
+MISLED = {
+    "identity": frozenset({"addresses", "parameters", "calibrations"}),
+    "pointing_disagrees": frozenset({
+        "clock", "site", "calibrations", "visits", "day", "lights", "parties",
+    }),
+}  # fmt: skip
 #: An alarm comes this long after the end of its cause at most, s.
 RAISED_WITHIN = 30.0
 #: A board without power is named after this: silence for 10 s, asked each fifth second, and the way
@@ -55,8 +66,9 @@ class AlarmObserver:
         Zero of the times that it reports, s.
     boards
         Boards by name of the cluster.
-    alone
-        Whether no second plant runs at times: its alarms are told here too, and it takes lines.
+    worlds
+        Worlds of the run. Where a second plant runs at times, its alarms are told here too, and it
+        takes lines.
 
     Attributes
     ----------
@@ -65,10 +77,12 @@ class AlarmObserver:
     """
 
     def __init__(
-        self, start: float, boards: Mapping[str, Collection[Board]], *, alone: bool
+        self, start: float, boards: Mapping[str, Collection[Board]], worlds: Collection[str]
     ) -> None:
         self.checks: Counter[int] = Counter()
-        self._start, self._alone = start, alone
+        self._start, self._alone = start, "twice" not in worlds
+        sound = [kind for kind, ways in MISLED.items() if ways.isdisjoint(worlds)]
+        self._by_faults = BY_FAULTS | dict.fromkeys(sound, inf)
         self._boards = {each.outfit.name: each for some in boards.values() for each in some}
         self._clusters = {name: [b.outfit.name for b in some] for name, some in boards.items()}
         self._active: dict[tuple[str, str], float] = {}
@@ -130,7 +144,7 @@ class AlarmObserver:
             return
         for (kind, subject), since in self._active.items():
             passed = now - max(since, rests.get(subject, inf), self._runs_since)
-            limit = BY_FAULTS.get(kind, inf)
+            limit = self._by_faults.get(kind, inf)
             saw = f"{kind} stands {passed:.0f} s after the last fault, limit {limit:g} s"
             self._check(passed <= limit, now, subject, saw)
         for cluster, some in self._clusters.items():
@@ -149,7 +163,7 @@ class AlarmObserver:
         self._check(subject in rests, now, subject, f"{saw}: there is no {subject!r}")
         sense = len(alarm.text) > len(kind) and not _NONSENSE.search(alarm.text)
         self._check(sense, now, subject, f"{saw}: that says nothing")
-        if kind in BY_FAULTS:
+        if kind in self._by_faults:
             calm = now - rests[subject]
             good = calm <= RAISED_WITHIN
             self._check(good, now, subject, f"{saw}: the last fault ended {calm:.1f} s ago")

@@ -3,7 +3,8 @@
 It knows from the persons what they have given to automatic control, and who has the command
 authority. In a quiet stretch (`quiet`) a heliostat that was given must leave stow, and be measured
 when a target is free; a visit must end, and leave no beam on its target; no part of the work may
-fail (16). All times are the observer's own.
+fail (16). One that stays at stow because volumes lie across its way must be named. All times are
+the observer's own.
 """
 
 from collections import Counter
@@ -29,8 +30,8 @@ IDLE_WITHIN, TOGETHER_WITHIN = 25.0, 110.0
 VISIT_WITHIN = 260.0
 #: A beam may stay on a target without a visit for this long, wherever a person has sent it, s.
 LEFT_WITHIN = 30.0
-#: Name of the alarm that a part of the work has failed.
-FAILED = "work"
+#: Names of the alarms that a part of the work has failed, and that a way from stow is not free.
+FAILED, BLOCKED = "work", "beam_blocked"
 
 
 class ProgressObserver:
@@ -46,6 +47,8 @@ class ProgressObserver:
         Calibration targets.
     together
         Whether heliostats wait for each other, to be measured at once.
+    across
+        Whether keep-out volumes may lie across the ways from stow.
 
     Attributes
     ----------
@@ -60,11 +63,12 @@ class ProgressObserver:
         targets: Sequence[Target],
         *,
         together: bool,
+        across: bool,
     ) -> None:
         self.checks: Counter[int] = Counter()
         self._start, self._targets = start, {target.name: target for target in targets}
         self._boards = {board.outfit.name: board for board in boards}
-        self._together = together
+        self._together, self._across = together, across
         self._given: set[str] = set()
         self._out: dict[str, float] = {}
         self._since: dict[tuple[str, ...], float] = {}
@@ -121,7 +125,8 @@ class ProgressObserver:
         if operations is None:
             self._since.clear()
             return
-        failures = [row.text for row in operations.alarms() if row.condition == FAILED]
+        rows = operations.alarms()
+        failures = [row.text for row in rows if row.condition == FAILED]
         self._check(not failures, now, "automatic control", failures[0] if failures else "")
         if operations.plant.emergency is not None:
             self._given.clear()
@@ -129,6 +134,8 @@ class ProgressObserver:
         visited = {name for run in running for name in run.heliostats}
         self._visits(running, now)
         stowed = {n for n, board in self._boards.items() if board.state == states.STOWED}
+        blocked = {row.subject for row in rows if row.condition == BLOCKED and row.active}
+        stowed -= blocked if self._across else set()
         may = governs and not operations.automatic.waits and sun[2] > HIGH
         may &= not operations.plant.emergency_on
         working = [name for name in self._given & quiet if may and name not in self._out]

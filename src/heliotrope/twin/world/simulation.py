@@ -278,7 +278,7 @@ class Simulation:
         most = LOSSES if works(plan.worlds) else None
         self.beams = BeamObserver(self.begin, boards, self.sun, scene.keep_outs, most)
         self.readings = SensorObserver(self.begin, boards)
-        self.alarms = AlarmObserver(self.begin, boards, alone="twice" not in plan.worlds)
+        self.alarms = AlarmObserver(self.begin, boards, plan.worlds)
         self.tickets = TicketObserver(self.begin)
         self.quiet = self._quiet_observer()
         for pod in self.pods:
@@ -356,7 +356,9 @@ class Simulation:
             VisitObserver(begin, boards, targets, work.away, followed=work.centred),
             DayObserver(begin, boards),
             results,
-            ProgressObserver(begin, boards, targets, together=together),
+            ProgressObserver(
+                begin, boards, targets, together=together, across=drawn(self.plan.worlds)
+            ),
             ShownObserver(begin, boards, self._homes, targets, self.observer, persons),
         )
 
