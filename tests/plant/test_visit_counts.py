@@ -9,6 +9,7 @@ import pytest
 
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import direction
+from heliotrope.lcu.states import DEFOCUSED, TRACKING
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.authority import Person, RefusedError, Role
@@ -26,7 +27,7 @@ GOAL = 100_000
 
 
 def visit(clock: VirtualClock) -> tuple[Visit, Any]:
-    names = ("primary", "secondary", "primary_goal", "secondary_goal", "boots")
+    names = ("primary", "secondary", "primary_goal", "secondary_goal", "boots", "state")
     rows = np.zeros(1, [(name, float) for name in names])
     field = SimpleNamespace(place=lambda _: 0, rows=rows, counted_at=np.array([-np.inf]))
     plant = SimpleNamespace(
@@ -37,10 +38,12 @@ def visit(clock: VirtualClock) -> tuple[Visit, Any]:
     return made, field
 
 
-def hear(made: Visit, field: Any, at: float, off: float) -> None:
+def hear(
+    made: Visit, field: Any, at: float, off: float, *, turned: float = 0.0, state: int = TRACKING
+) -> None:
     """Hear the axes at a time, the first ``off`` steps from its goal, which follows the sun."""
-    goal = GOAL - 3.0 * at
-    field.rows[0] = (goal + off, GOAL, goal, GOAL, 1)
+    goal = GOAL - 3.0 * at + turned
+    field.rows[0] = (goal + off, GOAL, goal, GOAL, 1, state)
     field.counted_at[0] = at
     made.note()
 
@@ -55,6 +58,20 @@ def test_a_row_from_a_swing_is_left_out() -> None:
     run_virtual(main)
 
 
+def test_a_row_from_where_it_is_turned_away_is_left_out() -> None:
+    """Simulated run 2300036: a mirror that was turned away is at its goals again, elsewhere."""
+
+    async def main(clock: VirtualClock) -> None:
+        made, field = visit(clock)
+        hear(made, field, 1.0, 0.0)
+        hear(made, field, 2.0, 0.0)
+        hear(made, field, 4.0, 0.0, turned=5000.0, state=DEFOCUSED)
+        with pytest.raises(RefusedError, match="not heard at its aim within 10 s of the photo"):
+            await made.counts_at(2.5)
+
+    run_virtual(main)
+
+
 @pytest.mark.parametrize(("fall", "turn"), [(10.0, 0), (10.0, 1), (0.0, 0), (-10.0, 0)])
 def test_a_photograph_is_less_sure_where_an_axis_may_have_taken_up_its_play(
     fall: float, turn: int
@@ -65,7 +82,7 @@ def test_a_photograph_is_less_sure_where_an_axis_may_have_taken_up_its_play(
         made, field = visit(clock)
         for at in (1.0, 2.0, 3.0, 4.0):
             here = POSE - (fall * np.eye(2)[turn] if at > 2.5 else 0.0)
-            field.rows[0] = (*here, *here, 1)
+            field.rows[0] = (*here, *here, 1, TRACKING)
             field.counted_at[0] = at
             made.note()
         for early in (1.5, 3.5):

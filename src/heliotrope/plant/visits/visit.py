@@ -199,7 +199,8 @@ class Visit(BroughtHome):
             self._times.append(counted)
             self._counts.append(np.array([node["primary"], node["secondary"]], dtype=np.float64))
             self._goals.append(np.array([node["primary_goal"], node["secondary_goal"]], np.float64))
-            self._there.append(self.left() < ARRIVED)
+            tracks = node["state"] == states.TRACKING
+            self._there.append(bool(tracks) and self.left() < ARRIVED)
 
     async def counts_at(self, instant: float, limit: float = 10.0) -> FloatArray:
         """Return the step counts at an instant, between the rows before and after it, (2,).
