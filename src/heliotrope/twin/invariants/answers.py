@@ -52,6 +52,8 @@ class _Board:
         Its account.
     moves_since, off_since
         Since when it has said that it moves, and that its goals are not where it is, s.
+    told_at, goals
+        When it last told its flags, s; the goals that it last told.
     boots, booted
         Boots that it last told, and those and cuts of the account by then.
     steps
@@ -60,6 +62,8 @@ class _Board:
 
     account: HeliostatAccount
     moves_since: float = inf
+    told_at: float = -inf
+    goals: tuple[int, ...] = ()
     off_since: float = inf
     boots: int | None = None
     booted: tuple[int, int] = (0, 0)
@@ -195,8 +199,11 @@ class AnswerObserver:
         check(not flags & _NEVER_SET, "a fault, a switch or a key that it does not have")
         turns = now - account.stepped_at < TURNS
         check(bool(flags & _MOVING) or not turns, "it does not move, and its motors turn")
-        # A motion that has just begun makes its first step in a moment.
-        board.moves_since = min(board.moves_since, now) if flags & _MOVING else inf
+        # A motion that has just begun makes its first step in a moment. Between two answers that
+        # are far apart one may have ended, and another begun.
+        gone, board.told_at = now - board.told_at > RESTS, now
+        before = inf if gone else board.moves_since
+        board.moves_since = min(before, now) if flags & _MOVING else inf
         rests = now - max(account.stepped_at, account.changed_at, board.moves_since)
         saw = f"it moves, and its motors have rested for {rests:.1f} s"
         check(account.ticks_jumped or rests <= RESTS, saw)
@@ -235,7 +242,8 @@ class AnswerObserver:
         inside = all(low <= each <= high for each, (low, high) in zip(goals, RANGES, strict=True))
         self._check(inside, now, account.name, f"STEPS says goals {goals} beyond its range")
         held = account.state in (states.STOWED, states.LOCKED, states.FAULT) and goals != place
-        board.off_since = min(board.off_since, now) if held else inf
+        before = board.off_since if goals == board.goals else inf
+        board.goals, board.off_since = goals, min(before, now) if held else inf
         rests = now - max(account.stepped_at, account.changed_at, board.off_since)
         saw = f"it rests at {place}, and STEPS says goals {goals}"
         self._check(account.ticks_jumped or rests <= RESTS, now, account.name, saw)
