@@ -7,7 +7,9 @@ import pytest
 
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.example import example_plant
+from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.messages import Stage
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import AssignedError, AssignedFile, grouped, points_of
 from heliotrope.plant.audit import read
@@ -140,3 +142,31 @@ def test_standby_points_where_an_eye_sees_more_than_one_sun_are_refused(tmp_path
     run_virtual(main)
     with pytest.raises(InputError, match=r"eyes\[0, 2\]: nan is not a finite number"):
         BeamCheck(example_plant(), ("P1A",), (), ((0.0, 0.0, float("nan")),))
+
+
+def test_no_mirror_tracks_whose_last_aim_was_not_taken(tmp_path: Path) -> None:
+    """Simulated run 2300117: it would go to the aim before, and the plant would not know it."""
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path)
+        async with running(bench):
+            plant, token = bench.plant, await bench.commanded()
+            first, second = plant.field.names[:2]
+            bench.cluster_of(first).set(states.IDLE, first, second)
+            await bench.wait(2.0)
+            assert await plant.aim(OPERATOR, token, {first: AIM, second: AIM}).end(5.0)
+            cluster = bench.cluster_of(first)
+            cluster.stubborn.add(first)
+            assert not await plant.aim(OPERATOR, token, {first: STANDBY, second: STANDBY}).end(5.0)
+            cluster.stubborn.clear()
+            ticket = plant.command(OPERATOR, token, "TRACK", (first, second))
+            assert not await ticket.end(5.0)
+            assert ticket.stage(second) is Stage.DONE
+            assert ticket.refusals[first].startswith("its last aim was not taken (")
+            assert all(first not in message.heliostats for message in cluster.commands("TRACK"))
+            with pytest.raises(RefusedError, match=rf"SEARCH {first}: its last aim was not taken"):
+                plant.command(OPERATOR, token, "SEARCH", (first,), (1e-3, 5e-3))
+            assert await plant.aim(OPERATOR, token, {first: AIM}).end(5.0)
+            assert await plant.command(OPERATOR, token, "TRACK", (first,)).end(5.0)
+
+    run_virtual(main)

@@ -275,6 +275,8 @@ class Commands:
                 self._permission.refuse_now(ticket.name, names)
                 self._prove_points(ticket.name, names, rows, wanted)
             stays = assign()
+            if ticket.name == "AIM":
+                self._permission.aimed(ticket, names)
             self._send_points(ticket, ticket.name, grouped(names, wanted), token, stays)
 
         self._orders.when_recorded(ticket, send)

@@ -5,6 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 from heliotrope.files.disk import Work
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
+from heliotrope.links.messages import Stage
 from heliotrope.plant import refusals
 from heliotrope.plant.audit import AuditError
 from heliotrope.plant.authority import Authority, Person
@@ -62,13 +63,16 @@ class Permission:
         self._sentinel, self._rivals = sentinel, rivals
         self._identities, self._sync, self._doubts = identities, sync, doubts
         self._out = out_of_service
+        #: Ticket of the last aim that was given to each heliostat and may not have been taken.
+        self._aims: dict[str, Ticket] = {}
 
     def able(self, name: str, names: tuple[str, ...]) -> tuple[tuple[str, ...], dict[str, str]]:
         """Return the heliostats that may be given a command, and why the others may not.
 
         Everything but LOCK needs a board that is the heliostat's; a motion, the wanted parameters;
-        joining, that no alarm bars the heliostat. One whose beam went astray does not come back to
-        standby either, before its alarm is acknowledged: its beam would go astray again.
+        joining, its last aim, and that no alarm bars the heliostat. One whose beam went astray does
+        not come back to standby either, before its alarm is acknowledged: its beam would go astray
+        again.
 
         Raises
         ------
@@ -80,12 +84,29 @@ class Permission:
             wrong = self._sync.differing(names) | self._orders.to_stow(names) | wrong
         if name in JOINING:
             wrong |= self._sentinel.barred(names) | self._doubts.barred(names)
+            wrong |= self._without_aim(names)
         elif name in _TO_STANDBY:
             wrong |= self._sentinel.barred(self._off(names), ASTRAY)
         if wrong and len(wrong) == len(names):
             self.refuse_now(name, names)
             raise BeamError(name, wrong)
         return tuple(n for n in names if n not in wrong), wrong
+
+    def aimed(self, ticket: Ticket, heliostats: Sequence[str]) -> None:
+        """Note new aims that are sent now."""
+        self._aims.update(dict.fromkeys(heliostats, ticket))
+
+    def _without_aim(self, names: Sequence[str]) -> dict[str, str]:
+        """Return which heliostats have an aim other than the assigned one, and why."""
+        wrong = {}
+        for name in names:
+            stage = self._aims[name].stage(name) if name in self._aims else None
+            if stage in (Stage.REFUSED, Stage.FAILED):
+                reason = self._aims[name].refusals[name]
+                wrong[name] = refusals.AIM_NOT_TAKEN.text.format(reason=reason)
+            elif stage is Stage.DONE:
+                del self._aims[name]
+        return wrong
 
     def _off(self, names: Sequence[str]) -> tuple[str, ...]:
         """Return which heliostats are at stow or have turned away."""

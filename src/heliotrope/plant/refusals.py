@@ -177,6 +177,12 @@ NOT_VERIFIED = Refusal(
     "a calibration has yet to verify its new parameters by a photograph",
     "Wait until the visit has ended; DEFOCUS, STOW and LOCK end it at once.",
 )
+AIM_NOT_TAKEN = Refusal(
+    "aim not taken",
+    "A heliostat is sent to its aim, and its local controller did not take the last one.",
+    "its last aim was not taken ({reason}), so its beam would go to an earlier one",
+    "Give the aim again.",
+)
 SEEN_ASTRAY = Refusal(
     "seen astray from the air",
     "A heliostat is sent to the receiver that a flight of a drone sees far from where its "
