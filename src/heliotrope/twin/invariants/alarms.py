@@ -111,6 +111,7 @@ class AlarmObserver:
         """Note that the plant's program has ended, and its alarms with it."""
         self._active.clear()
         self._new.clear()
+        self._runs_since = inf  # it may begin again before the next look
 
     def heard(self, cluster: str, now: float) -> None:
         """Note a status that has reached the plant."""

@@ -204,6 +204,8 @@ class Damage:
             if board.node is not None:
                 continue
             back = self._off.setdefault(place, now + self._pause)
+            name = board.outfit.name
+            self._rest[name] = max(self._rest.get(name, -math.inf), back)
             if now >= back:
                 del self._off[place]
                 board.power_on(now)
