@@ -216,7 +216,11 @@ class AnswerObserver:
         check(not flags & _SUN_FRESH or age <= OLD, f"fresh, and {saw}")
         # A stranger's frame can use up the counts of a bus without keys, that of SUN too.
         fresh = bool(flags & _SUN_FRESH) or account.ticks_jumped or account.misled
-        self._calmly(fresh or age >= FRESH, name, f"STATUS says that no sun is fresh, and {saw}")
+        self._calmly(
+            bool(fresh) or age < BEGUN or age >= FRESH,
+            name,
+            f"STATUS says that no sun is fresh, and {saw}",
+        )
         check(not flags & _SUN_FRESH or bool(flags & _CLOCK_SET), "a sun without a time")
         complete = state != states.UNCONFIGURED
         check(bool(flags & _CONFIGURED) == complete, "whether it is configured")
