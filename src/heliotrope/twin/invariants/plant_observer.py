@@ -26,6 +26,8 @@ from heliotrope.twin.records import RecordsDisk
 YOUNGER = 2.2
 #: A record that may follow its command is there within this, s.
 RECORD_WITHIN = 2.0
+#: An order to turn away that is repeated within this is the same one, s.
+MOMENT = 0.3
 #: How long a cluster may accept a void token: until the last lease with it has arrived and has
 #: expired, s.
 VOID_WITHIN = 4.2
@@ -102,6 +104,7 @@ class PlantObserver:
         self._accepted: Counter[tuple[str, str]] = Counter()
         self._recorded: Counter[tuple[str, str]] = Counter()
         self._looked = 0  # records already counted
+        self._obeyed: dict[str, float] = {}
         self._noted_at: dict[tuple[str, str], float] = {}
         self._following: dict[str, float] = {}  # tickets whose record may follow
         self._awaited: dict[str, tuple[float, str, str]] = {}  # tickets accepted on a slow disk
@@ -277,8 +280,14 @@ class PlantObserver:
         right = record is not None and (record.who, record.what) == (who, what)
         self.check(11, right, now, f"{what} by {who} was accepted without its record")
 
-    def obeyed(self, who: str, what: str, now: float) -> None:
-        """Note a command that the plant must take from anybody, and may record later."""
+    def obeyed(self, who: str, what: str, now: float, identity: str = "") -> None:
+        """Note a command that the plant must take from anybody, and may record later.
+
+        One that is repeated within a moment is the same one, with the same identity.
+        """
+        if identity and now - self._obeyed.get(identity, float("-inf")) < MOMENT:
+            return
+        self._obeyed = {identity: now}
         self._noted(who, what, now)
 
     def _noted(self, who: str, what: str, now: float) -> None:

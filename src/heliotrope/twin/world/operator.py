@@ -419,7 +419,7 @@ class Operator:
     def safe(self, plant: PlantController, what: str, name: str) -> Ticket:
         """Defocus or stow one heliostat, which anybody may do."""
         ticket = (plant.defocus if what == "DEFOCUS" else plant.stow)(VIEWER.name, (name,))
-        self._observer.obeyed(VIEWER.name, what, self._clock.monotonic())
+        self._observer.obeyed(VIEWER.name, what, self._clock.monotonic(), ticket.identity)
         return ticket
 
     def clear(self, plant: PlantController) -> None:

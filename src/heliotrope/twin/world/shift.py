@@ -240,9 +240,9 @@ class Shift:
         self._watch.taken((name,))
         what = self._chance.choice(["DEFOCUS", "STOW"])
         self._beams.taken((name,))
-        (operations.defocus if what == "DEFOCUS" else operations.stow)(VIEWER, (name,))
+        ticket = (operations.defocus if what == "DEFOCUS" else operations.stow)(VIEWER, (name,))
         self._acted(f"{what} {name}", VIEWER)
-        self._observer.obeyed(VIEWER.name, what, self._clock.monotonic())
+        self._observer.obeyed(VIEWER.name, what, self._clock.monotonic(), ticket.identity)
         self._left.add(name)
 
     async def _holds(self, operations: Operations) -> None:
