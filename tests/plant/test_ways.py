@@ -340,6 +340,28 @@ def test_a_held_mirror_that_has_turned_is_stowed_at_once(state: int, tmp_path: P
     assert sent[0].name == "STOW"
 
 
+@pytest.mark.parametrize("name", ["CLEAR_FAULT", "UNLOCK"])
+def test_a_mirror_is_not_stopped_while_it_is_sent_off(name: str, tmp_path: Path) -> None:
+    """Simulated run 2401327: a cleared fault made it stand still in the volume."""
+
+    async def scene(bench: Bench) -> None:
+        inside, outside = (counts(bench.plant, "P5A", p) for p in ((0.0, -12.0, 8.0), WEST))
+        reports(bench, "P5A", states.LOCKED, inside, inside)
+        reports(bench, "P5B", states.LOCKED, outside, outside)
+        token = await bench.commanded(ENGINEER)
+        await bench.wait(6.0)
+        assert alarmed(bench.plant) == {"P5A"}
+        with pytest.raises(RefusedError, match=rf"{name} P5A: keep_out_predicted P5A: its beam"):
+            bench.plant.command(ENGINEER, token, name, ("P5A",))
+        assert bench.plant.command(ENGINEER, token, name, ("P5B",))
+        reports(bench, "P5A", states.LOCKED, outside, outside)
+        await bench.wait(6.0)
+        bench.plant.authority.keep(ENGINEER, token)
+        assert bench.plant.command(ENGINEER, token, name, ("P5A",))
+
+    play(tmp_path, scene)
+
+
 @pytest.mark.parametrize("state", [states.DEFOCUSED, states.LOCKED, states.FAULT])
 def test_a_way_off_that_would_end_in_a_volume_is_seen_before_it_ends(
     state: int, tmp_path: Path

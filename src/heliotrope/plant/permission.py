@@ -28,8 +28,12 @@ MOTIONS = JOINING | {"APPROACH", "IDLE", "JOG", "GOTO", "DIAGNOSE"}
 _TO_STANDBY = ("APPROACH", "IDLE")
 #: States in which beams are off.
 _AWAY = (states.STOWED, states.DEFOCUSED)
-#: Row of the safety table for beams that are not where they were sent.
+#: Commands after which a heliostat that turns away or goes to stow stands still.
+_STILL = ("UNLOCK", "CLEAR_FAULT")
+#: Row of the safety table for beams that are not where they were sent, and those by which beams
+#: are sent off from where they may not be.
 ASTRAY = "pointing_disagrees"
+_SENT_OFF = ("keep_out_predicted", "beam_unsent")
 
 
 class Permission:
@@ -72,7 +76,7 @@ class Permission:
         Everything but LOCK needs a board that is the heliostat's; a motion, the wanted parameters;
         joining, its last aim, and that no alarm bars the heliostat. One whose beam went astray does
         not come back to standby either, before its alarm is acknowledged: its beam would go astray
-        again.
+        again. Nor is one stopped that is just being sent off.
 
         Raises
         ------
@@ -87,6 +91,9 @@ class Permission:
             wrong |= self._without_aim(names)
         elif name in _TO_STANDBY:
             wrong |= self._sentinel.barred(self._off(names), ASTRAY)
+        elif name in _STILL:
+            for row in _SENT_OFF:
+                wrong |= self._sentinel.barred(names, row)
         if wrong and len(wrong) == len(names):
             self.refuse_now(name, names)
             raise BeamError(name, wrong)
