@@ -48,6 +48,8 @@ MISLED = {
         "clock", "site", "calibrations", "visits", "day", "lights", "parties",
     }),
 }  # fmt: skip
+#: The alarm that the records cannot be written.
+UNWRITTEN = "database_unwritable"
 #: An alarm comes this long after the end of its cause at most, s.
 RAISED_WITHIN = 30.0
 #: A board without power is named after this: silence for 10 s, asked each fifth second, and the way
@@ -89,6 +91,7 @@ class AlarmObserver:
         self._new: list[Alarm] = []
         self._heard = dict.fromkeys(boards, start)
         self._runs_since = inf
+        self._wrote_at = start
         self._well = dict.fromkeys(boards, inf)
         self._off: dict[str, float] = {}
         self._faulty: dict[str, float] = {}
@@ -118,7 +121,13 @@ class AlarmObserver:
         self._heard[cluster] = now
 
     def look(
-        self, rest: Mapping[str, float], carried: Collection[str], now: float, *, runs: bool
+        self,
+        rest: Mapping[str, float],
+        carried: Collection[str],
+        now: float,
+        *,
+        runs: bool,
+        writes: bool,
     ) -> None:
         """Judge all alarms.
 
@@ -132,7 +141,10 @@ class AlarmObserver:
             s.
         runs
             Whether the plant's program runs.
+        writes
+            Whether the disk of its records writes in time: works of a slow one end one by one.
         """
+        self._wrote_at = self._wrote_at if writes else now
         rests = dict(rest)
         rests |= {name: max(rest[each] for each in some) for name, some in self._clusters.items()}
         rests[""] = max(rest.values())
@@ -144,7 +156,8 @@ class AlarmObserver:
             self._heard = dict.fromkeys(self._heard, now)
             return
         for (kind, subject), since in self._active.items():
-            passed = now - max(since, rests.get(subject, inf), self._runs_since)
+            ends = max(since, rests.get(subject, inf), self._runs_since)
+            passed = now - (max(ends, self._wrote_at) if kind == UNWRITTEN else ends)
             limit = self._by_faults.get(kind, inf)
             saw = f"{kind} stands {passed:.0f} s after the last fault, limit {limit:g} s"
             self._check(passed <= limit, now, subject, saw)

@@ -592,13 +592,15 @@ class Simulation:
                 self.observer.look(self.plant, now)
                 carried = {pod.name for pod in self.pods if pod.carried(now)}
                 self.beams.look(self.plant, carried, now)
+                writes = not (self.disk.full or self.disk.busy(now))
                 if self.quiet is not None:
                     going = None if self.operator.waits else self.plant
                     self.quiet.look(going, carried, damage.rest, now)
                     for pod in self.pods:
                         pod.answers.look(now)
-                    self.alarms.look(damage.rest, carried, now, runs=going is not None)
-                writes = not (self.disk.full or self.disk.busy(now))
+                    self.alarms.look(
+                        damage.rest, carried, now, runs=going is not None, writes=writes
+                    )
                 going_on = self.plant is not None and not self.operator.waits
                 self.tickets.look(now, runs=going_on and writes)
                 if self._work is not None:
