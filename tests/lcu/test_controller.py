@@ -135,6 +135,15 @@ def test_without_sun_it_defocuses_and_stows_by_itself() -> None:
         assert tuple(bench.made) == STOW
 
 
+def test_orders_to_turn_away_do_not_put_off_the_stow_without_sun() -> None:
+    bench = tracking()
+    bench.sends_sun = False
+    for _ in range(8):
+        bench.run(5, until="STOWING")
+        bench.send("DEFOCUS", to=0xFFFF)
+    assert bench.state == "STOWING"
+
+
 def test_nothing_but_the_sun_renews_the_lease() -> None:
     bench = tracking()
     bench.sends_sun = False
@@ -1181,6 +1190,7 @@ def test_a_message_that_stores_needs_key_and_edition() -> None:
         ("SET_LIMITS", (0, -(2**31), 2**31 - 1, 10, 10, 0)),
         ("SET_STOW", (0, 2**30)),
         ("ZERO", (2**31 - 1, 0)),
+        ("ZERO", (0, 2**30)),
         ("SET_ADDRESS", (4711, 0)),
         ("SET_ADDRESS", (5, 3)),
     ],
