@@ -142,6 +142,17 @@ def test_the_alarm_waits_is_told_once_and_follows_the_others() -> None:
     assert len(told) == count
 
 
+def test_a_cluster_counts_with_its_last_settings_only() -> None:
+    """When one of two that agree goes over to the third, the other of them is the odd one."""
+    told: list[Alarm] = []
+    watch = ClusterSettings(told.append)
+    for begin, settings, odd in ((0, (SAME, SAME, OTHER), "C"), (10, (OTHER, SAME, OTHER), "B")):
+        for second in range(begin, begin + 10):
+            for name, each in zip("ABC", settings, strict=True):
+                watch.take(name, replace(STATUS, settings=each), float(second))
+        assert set(named(told)) == {odd}
+
+
 def test_the_plants_own_settings_decide_where_it_knows_them(tmp_path: Path) -> None:
     """All clusters alike are wrong together, and the only right one among many is not named."""
     common = CommonSettings(steps_every=2)
