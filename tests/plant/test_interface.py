@@ -9,7 +9,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import httpx
 import numpy as np
@@ -21,6 +22,9 @@ from heliotrope.local import EMERGENCY, ORDINARY, CallError, LocalConnection, as
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.interface import CALLS, frame_of, frame_parts, kind_of, plain, remade
 from heliotrope.plant.interface.console_process import Patience
+from heliotrope.plant.interface.desk import SAME, Desk
+from heliotrope.plant.interface.orders import EmergencyCall
+from heliotrope.plant.operations.operations import Operations
 from heliotrope.twin.field.field_bus import FieldBus
 from support.live_console import ROLES, LiveConsole
 
@@ -383,3 +387,33 @@ def test_every_urgent_call_takes_beams_away() -> None:
     assert {name for name, call in CALLS.items() if call.urgent} == {
         "order_emergency", "stow", "defocus"
     }  # fmt: skip
+
+
+def test_a_word_orders_one_emergency_however_often_it_is_sent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Another word, another person, no word and the same word much later order another."""
+    clock, given = SimpleNamespace(now=0.0), list[tuple[str, str]]()
+    monkeypatch.setattr(
+        "heliotrope.plant.interface.desk.time", SimpleNamespace(monotonic=lambda: clock.now)
+    )
+    operations = SimpleNamespace(
+        plant=None,
+        logbook=None,
+        emergency=lambda who, act, reason: given.append((who.name, reason)),
+        emergency_view=lambda: len(given),
+    )
+    desk = Desk(cast("Operations", operations))
+    vera, olga = Person("Vera", Role.VIEWER), Person("Olga", Role.OPERATOR)
+
+    def sent(who: Person, word: str) -> Any:
+        return desk.order_emergency(who, EmergencyCall(reason="smoke", call=word))
+
+    assert [sent(vera, "one") for _ in range(3)] == [1, 1, 1]
+    assert [sent(vera, "two"), sent(olga, "one"), sent(vera, "one")] == [2, 3, 3]
+    assert [sent(vera, ""), sent(vera, "")] == [4, 5]
+    clock.now = SAME - 1.0
+    assert sent(vera, "one") == 5
+    clock.now = SAME + 1.0
+    assert sent(vera, "one") == 6
+    assert given[-1] == ("Vera", "smoke")
