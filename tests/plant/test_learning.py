@@ -147,6 +147,7 @@ def test_a_night_puts_in_force_what_it_learns_and_a_restart_brings_it_back(
     # Later versions begin from it.
     again.step()
     assert again.here.asked[0].before.noise == pytest.approx(entry_noise(entry.document))
+    assert again.learning.views()[0].version == 2
     again.close()
 
 
