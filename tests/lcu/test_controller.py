@@ -1390,6 +1390,8 @@ def test_questions_are_answered() -> None:
             assert values[0] == bench.controller.state
             assert values[3] == pytest.approx(bench.true_ms / 1000, abs=1.5)
             assert values[4] <= 1050  # type: ignore[operator]
+        elif name == "QUERY_DIAGNOSIS":
+            assert not any(values), "there was none"
     bench.answers.clear()
     bench.send("DISCOVER", 5000, 6000, to=0xFFFF)
     assert bench.answers == []

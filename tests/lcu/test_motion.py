@@ -1,11 +1,14 @@
 """Motion of the two axes: the goals between the poses that are computed."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from heliotrope.geometry import angle_between
 from heliotrope.lcu.journal import Journal
 from heliotrope.lcu.messages import DONE
+from heliotrope.lcu.motion import PIECE
 from support.lcu_machines import Bench, Flash, items_of_heliostat, standing_by, tracking
 
 #: A step of either axis, rad.
@@ -54,6 +57,20 @@ def test_beside_the_keyhole_the_goals_do_not_take_a_short_cut() -> None:
     motion.aim = beside_the_keyhole(bench)
     motion.track()
     assert worst_goal(bench, 4.0) < 2 * STEP + 0.2 * 0.5 * 7.3e-5
+
+
+def test_a_way_from_below_the_mirror_to_above_it_is_cut_finely_enough() -> None:
+    bench = standing_by()
+    config = bench.controller.config
+    assert config.pointing is not None
+    assert config.standby is not None
+    foot = (*config.standby[:2], -60.0)
+    config.path[:] = [foot]
+    points = bench.controller.motion.way()
+    assert (points[0], points[-1]) == (foot, config.standby)
+    seen = np.array(points) - config.pointing.origin
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    assert np.mean([angle_between(one, other) for one, other in pairwise(seen)]) <= PIECE
 
 
 def lacking(*names: str, known: bool) -> Bench:
