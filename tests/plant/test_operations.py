@@ -27,7 +27,7 @@ from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.visits.photographs import Shot, seen, spiral
 from heliotrope.plant.visits.settings import Centring
-from heliotrope.safety import Alarm, Severity
+from heliotrope.safety import Alarm, Severity, alarms
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Records, StoreError
 from support.live import LiveOptions, LivePlant
@@ -193,6 +193,14 @@ def test_a_book_counts_alarms_until_they_are_over_and_acknowledged() -> None:
         "wind: too strong",
     ]
     assert len(book.events(1)) == 1
+
+
+def test_an_alarm_that_ends_by_itself_is_an_event_in_the_book() -> None:
+    book = Logbook(VirtualClock())
+    book.take_alarm(alarms.PARAMETERS_DIFFER.raised("P1", items="armature"))
+    assert not book.alarms()
+    (event,) = book.events(9)
+    assert (event.who, "armature" in event.text) == ("P1", True)
 
 
 def test_a_book_keeps_packets_but_of_steady_ones_the_last() -> None:
