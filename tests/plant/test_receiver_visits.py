@@ -34,6 +34,7 @@ from heliotrope.plant.operations.production import ProductionVisits
 from heliotrope.plant.operations.views import PictureRow
 from heliotrope.plant.visits import CalibrationCycle, Centring, CycleResult, Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle, judged
+from heliotrope.plant.visits.receiver_layout import caught
 from support.live import LiveOptions, LivePlant
 from support.visit_scene import CYCLE, ENGINEER, START, VisitScene, believe, in_command
 
@@ -473,3 +474,19 @@ def test_a_plant_refuses_receiver_visits_without_a_camera_or_a_face() -> None:
         replace(whole, receivers=(around,))
     face = replace(whole.receivers[0], corners=None).face
     np.testing.assert_allclose(face.corners, whole.receivers[0].face.corners, atol=1e-9)
+
+
+def test_a_face_catches_half_of_a_beam_on_its_edge_and_nothing_of_one_beside_it() -> None:
+    face = malan_plant(1).receivers[0].face
+    corners = face.plane_coordinates(face.corners)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    middle, narrow = 0.5 * (low + high), 1e-4 * np.eye(2)
+    assert caught(face, middle, narrow) == pytest.approx(1.0)
+    assert caught(face, high, narrow) == pytest.approx(0.25)
+    for edge, out in ((low, -1.0), (high, 1.0)):
+        for k in range(2):
+            place = middle.copy()
+            place[k] = edge[k]
+            assert caught(face, place, narrow) == pytest.approx(0.5)
+            place[k] += out
+            assert caught(face, place, narrow) == pytest.approx(0.0, abs=1e-9)
