@@ -19,7 +19,7 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import MRAD, direction
 from heliotrope.lcu import states
 from heliotrope.plant.schedule import scheduler as schedule
-from heliotrope.plant.schedule.choice import Sight
+from heliotrope.plant.schedule.choice import Sight, hidden
 from heliotrope.plant.schedule.scheduler import (
     Assignment,
     Finished,
@@ -165,6 +165,14 @@ def test_a_low_sun_hides_mirrors_behind_others() -> None:
         while one.next(MORNING, low, Standing.ready(24), BOTH) is not None:
             count[name] += 1
     assert count["mild"] > count["strict"]
+
+
+def test_a_neighbour_hides_what_it_overlaps_from_however_near_in_front() -> None:
+    """Mirrors of 2 m by 2 m that look up, a neighbour half a mirror aside."""
+    up, size = np.array([[0.0, 0.0, 1.0]]), np.full((1, 2), 2.0)
+    for height, share in ((0.5, 0.5), (5.0, 0.5), (-0.5, 0.0)):
+        offsets = np.array([[[1.0, 0.0, height]]])
+        assert hidden(offsets, up, size, up[0]) == pytest.approx(share)
 
 
 def test_far_drives_are_a_cost() -> None:
