@@ -217,6 +217,13 @@ def test_by_night_and_without_volumes_nothing_is_in_the_way() -> None:
         assert check.around(rows, aim, 0.3, np.array(sun)) == {}
 
 
+def test_by_night_the_way_of_a_beam_is_that_under_an_overhead_sun() -> None:
+    check, rows = BeamCheck(DESIGN, DESIGN.names), np.arange(3)
+    aims = np.tile(WALKWAY.center, (3, 1))
+    night, noon = (check.poses(rows, aims, np.array([0.0, y, z])) for y, z in ((0.6, -0.8), (0, 1)))
+    np.testing.assert_array_equal(night.best_counts, noon.best_counts)
+
+
 def reports(bench: Bench, name: str, state: int, at: list[int], end: list[int]) -> None:
     """Let a heliostat report that it goes from counts to others."""
     cluster = bench.cluster_of(name)
@@ -437,6 +444,9 @@ def test_the_way_out_is_the_one_that_ends_outside_and_is_inside_for_less() -> No
     check = BeamCheck(DESIGN, DESIGN.names)
     assert way_out(check, machine, row, here, sun) is Act.DEFOCUS
     assert way_out(check, None, row, here, sun) is Act.DEFOCUS
+    # Along the walkway it would stay inside for longer than on the way to stow.
+    along = Machine(limits, (far[0], far[1]), (0.5, 0.02))
+    assert way_out(check, along, row, here, sun) is Act.STOW
     # Where the defocus ends, another volume begins.
     end = group.mechanism[place].armature.pose(turned_away(begin, machine, drives))
     normal, vertex = end[0], end[1]
