@@ -13,7 +13,8 @@ from heliotrope.lcu.states import DEFOCUSED, TRACKING
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.authority import Person, RefusedError, Role
-from heliotrope.plant.visits.photographs import Shot, measured
+from heliotrope.plant.visits.photographs import Plain, Shot, measured
+from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.plant.visits.swings import swung
 from heliotrope.plant.visits.visit import Visit
 
@@ -99,6 +100,49 @@ def test_a_photograph_is_less_sure_where_an_axis_may_have_taken_up_its_play(
     slant = float(np.linalg.norm(TARGET.center - DESIGN.position[0]))
     assert spread[0] < 0.05 * spread[1]
     assert 0.3e-3 * slant < spread[1] < 1.26e-3 * slant
+
+
+def test_the_play_is_reckoned_under_the_sun_of_the_exposure() -> None:
+    async def main(clock: VirtualClock) -> list[float]:
+        made, field = visit(clock)
+        suns: list[float] = []
+
+        def sun(ahead: float) -> Any:
+            suns.append(clock.monotonic() + ahead)
+            return SUN
+
+        plant: Any = made.plant
+        plant.sun_vector = sun
+        for at in (1.0, 2.0, 3.0, 4.0):
+            here = POSE - (10.0 if at > 2.5 else 0.0)
+            field.rows[0] = (*here, *here, 1, TRACKING)
+            field.counted_at[0] = at
+            made.note()
+        await measured(made, Shot(TARGET.center, 2.5, 1e-4))
+        return suns
+
+    assert set(run_virtual(main)) == {2.5}
+
+
+def test_plain_photographs_are_an_interval_apart() -> None:
+    async def main(clock: VirtualClock) -> list[float]:
+        made, field = visit(clock)
+        hear(made, field, 0.0, 0.0)
+        field.live = lambda _: np.array([True])
+        taken: list[float] = []
+
+        async def photograph(*_: object) -> Shot:
+            taken.append(clock.monotonic())
+            return Shot(TARGET.center, taken[-1], reasons=("a cloud",))
+
+        camera: Any = SimpleNamespace(photograph=photograph)
+        settings = CycleSettings(shots=3, interval=20.0)
+        found = await Plain(camera, settings).take(made, lambda _: None)
+        assert found.rejected == [f"photograph {k}: a cloud" for k in (1, 2, 3)]
+        assert clock.monotonic() == taken[-1], "after the last it waits no more"
+        return taken
+
+    assert np.diff(run_virtual(main)) == pytest.approx([20.0, 20.0], abs=1.0)
 
 
 def test_a_swing_is_as_likely_as_the_reports_leave_it() -> None:
