@@ -60,7 +60,7 @@ class EmergencyOrder:
         at: float,
         ticket: Ticket,
         *,
-        flux_measured: bool = True,
+        flux_measured: bool,
     ) -> None:
         self.act, self.who, self.reason, self.at, self.ticket = act, who, reason, at, ticket
         self._proof = Proof.of(act.name, ticket.heliostats, at, flux_measured=flux_measured)
