@@ -14,8 +14,9 @@ from heliotrope.geometry import bisector, reflect
 from heliotrope.imaging.coded import Verdict
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism.board_items import differing, items_of
-from heliotrope.plant.visits.first_layout import newcomers
+from heliotrope.plant.visits.first_layout import _brightest, newcomers
 from heliotrope.plant.visits.fitting import first_model
+from heliotrope.plant.visits.joint_layout import SentBeam
 from heliotrope.plant.visits.settings import CycleSettings
 from support.joint_scene import Scene, joint, spoil
 from support.live import LiveOptions, LivePlant
@@ -302,3 +303,11 @@ def test_settings_of_first_visits_that_cannot_be_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=said):
         JointSettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_a_beam_is_as_bright_beside_the_middle_of_a_target_as_on_it() -> None:
+    target = malan_plant(1).targets[0]
+    sent = {"A": SentBeam(100.0, np.eye(2), np.eye(2), 1.0, 16.0)}
+    aside = np.array([[0.25 * target.width, 0.25 * target.height]])
+    middle = _brightest(target, sent, np.zeros((1, 2)))
+    assert _brightest(target, sent, aside) == pytest.approx(middle, rel=0.1)
