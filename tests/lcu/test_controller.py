@@ -698,11 +698,11 @@ def held_by(how: str) -> Bench:
         bench = standing_by()
         assert bench.order("JOG", 0, 20_000) == DONE
         bench.run(0.5)
-    elif how == "without its armature":
+    elif how.startswith("without its "):
         bench = tracking()
         bench.run(1)
         items = items_of_heliostat(bench.machine)
-        del items["armature"]
+        del items[how.removeprefix("without its ")]
         journal = controller_journal(bench.flash)
         bench.flash.data[: 2 * bench.flash.block_size] = b"\xff" * (2 * bench.flash.block_size)
         journal.load()
@@ -721,8 +721,8 @@ def held_by(how: str) -> Bench:
         if how == "locked over a reset":
             bench.start(bench.flash)
     assert bench.state == {
-        "jogged": "IDLE", "without its armature": "UNCONFIGURED", "searching": "SEARCHING",
-        "at fault": "FAULT",
+        "jogged": "IDLE", "searching": "SEARCHING", "at fault": "FAULT",
+        "without its armature": "UNCONFIGURED", "without its stow": "UNCONFIGURED",
     }.get(how, "LOCKED")  # fmt: skip
     return bench
 
@@ -745,6 +745,17 @@ def test_no_state_outlives_its_cluster(how: str) -> None:
         assert bench.true_ms - begin < 300_000
     bench.run(1)
     assert bench.state == ("STOWED" if how in ("jogged", "searching") else state)
+
+
+def test_a_stow_without_a_stow_position_does_not_end_a_turn_away() -> None:
+    """The beam would stay where it is, and the mirror has nowhere else to go."""
+    bench = held_by("without its stow")
+    bench.run(0.3)
+    assert bench.miss(AIM) < OFF
+    assert bench.order("STOW") == DONE
+    bench.run(30)
+    assert bench.miss(AIM) > OFF
+    assert bench.state == "UNCONFIGURED"
 
 
 def test_a_mirror_that_is_locked_at_stow_stands_still_without_a_cluster() -> None:

@@ -376,11 +376,8 @@ class Motion:
         """Go to stow at once, azimuth last."""
         self.ready = False
         stow = self.config.stow
-        if not self.known:
+        if not self.known or self.stepper is None or stow is None or not self.config.fits():
             self.defocus()  # stow cannot be found, but the beam can go
-            return
-        if self.stepper is None or stow is None or not self.config.fits():
-            self.hold()
             return
         self.kind = STOW
         order = SECONDARY_FIRST if self.config.azimuth_axis == 0 else PRIMARY_FIRST
