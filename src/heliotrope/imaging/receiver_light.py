@@ -304,6 +304,26 @@ def _doubt(
     return ""
 
 
+def _check_photographs(
+    sight: ReceiverSight, capped: Frame, dark: Frame, lit: Sequence[tuple[Frame, float]]
+) -> None:
+    """Refuse photographs of another size, shares that cannot be, and none with beams."""
+    who = f"camera {sight.camera}"
+    for frame in (capped, dark, *(frame for frame, _ in lit)):
+        if frame.size != sight.size:
+            raise InputError(
+                f"{who}: {frame.name} has {frame.size[0]} × {frame.size[1]} px, the camera "
+                f"{sight.size[0]} × {sight.size[1]}"
+            )
+    for frame, share in lit:
+        if not 0.0 < share <= 2.0:
+            raise InputError(
+                f"{who}: {frame.name} at a share of {share:g}; give above 0 to 2, 1 is nominal"
+            )
+    if not lit:
+        raise InputError(f"{who}: no photograph with beams; give one with its share of the flux")
+
+
 def take_reference(
     sight: ReceiverSight,
     capped: Frame,
@@ -333,19 +353,7 @@ def take_reference(
         Photographs that contradict each other, or of which one cannot be used.
     """
     who = f"camera {sight.camera}"
-    for frame in (capped, dark, *(frame for frame, _ in lit)):
-        if frame.size != sight.size:
-            raise InputError(
-                f"{who}: {frame.name} has {frame.size[0]} × {frame.size[1]} px, the camera "
-                f"{sight.size[0]} × {sight.size[1]}"
-            )
-    for frame, share in lit:
-        if not 0.0 < share <= 2.0:
-            raise InputError(
-                f"{who}: {frame.name} at a share of {share:g}; give above 0 to 2, 1 is nominal"
-            )
-    if not lit:
-        raise InputError(f"{who}: no photograph with beams; give one with its share of the flux")
+    _check_photographs(sight, capped, dark, lit)
     black, plain = _Levels.of(capped, sight), _Levels.of(dark, sight)
     level = max(black.face, float(np.nanmax(black.sides)))
     sides = np.asarray(plain.sides - level)

@@ -8,7 +8,7 @@ SAFE, COMMAND, INTERNAL = range(3)
 #: Event: kind, meaning.
 EVENTS = {
     "DEFOCUS": (SAFE, "beams off the receiver, now"),
-    "STOW": (SAFE, "go to the stow position"),
+    "STOW": (SAFE, "go to stow; where it or the counts are unknown, turn away"),
     "LOCK": (COMMAND, "stop and hold position"),
     "APPROACH": (COMMAND, "leave stow for standby"),
     "IDLE": (COMMAND, "go to standby; where none was reached yet, hold"),

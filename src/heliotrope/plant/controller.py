@@ -167,14 +167,7 @@ class PlantController:
         self.aims, self.standbys = points.aims, points.standbys
         self.movements = Movements(design.receivers, self.beams.armature)
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, self.beams.machines)
-        self._agreement = Agreement(
-            self.field,
-            points,
-            self.beams,
-            design.site,
-            lambda: clock.utc().timestamp(),
-            self._differing,
-        )
+        self._agreement = self._compared(points)
         self._clusters = Clusters(members, links, clock, self.counters)
         self._identities = Identities(
             self.field,
@@ -186,9 +179,7 @@ class PlantController:
         self.doubts = Doubts(self.field, design, self.aims, self._tell)
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
         self._rivals, self._told_alarms = Rivals(self.name, self._tell), ToldAlarms()
-        common = self.settings.common
-        expected = "" if common is None else settings_checksum(common)
-        self._cluster_settings = ClusterSettings(self._tell, expected)
+        self._cluster_settings = ClusterSettings(self._tell, _expected(self.settings))
         self._orders = PlantOrders(
             clock,
             audit,
@@ -262,6 +253,17 @@ class PlantController:
             self._sync,
             self.doubts,
             self.out_of_service,
+        )
+
+    def _compared(self, points: Points) -> Agreement:
+        """Return what compares reports with the plant's own knowledge."""
+        return Agreement(
+            self.field,
+            points,
+            self.beams,
+            self.design.site,
+            lambda: self.clock.utc().timestamp(),
+            self._differing,
         )
 
     def _directed(self) -> Commands:
@@ -800,6 +802,11 @@ class PlantController:
         """
         self.field.place(heliostat)
         return await self._sync.stored(heliostat, timeout)
+
+
+def _expected(settings: PlantSettings) -> str:
+    """Return the checksum that clusters should report; "" if the plant is told nothing."""
+    return "" if settings.common is None else settings_checksum(settings.common)
 
 
 def _checked(

@@ -265,8 +265,7 @@ class Simulation:
         self.plan = plan
         self.faults: Counter[str] = Counter()
         self._chance = random.Random(f"simulation {plan.seed}")
-        scene = scene_of(plan.worlds, plan.seed, plan.seconds, plan.size)
-        self._scene = scene
+        scene = self._scene = scene_of(plan.worlds, plan.seed, plan.seconds, plan.size)
         self._loop, self._clock = loop, VirtualClock(loop.time, scene.start)
         self.begin = loop.time()
         self._suns: dict[int, FloatArray] = {}
