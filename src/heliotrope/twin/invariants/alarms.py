@@ -41,8 +41,7 @@ BY_OTHERS = frozenset({
     "sun_below_horizon", "unknown_reading", "wind_gust_defocus", "wind_gust_stow",
     "wind_mean_defocus", "wind_mean_stow",
 })  # fmt: skip
-#: Alarms of mirrors that point elsewhere, and the worlds in which they come without a fault. A
-#: plant that begins again does not know which of its points the local controllers had not taken.
+#: Alarms of mirrors that point elsewhere, and the worlds in which they come without a fault.
 MISLED = {
     "identity": frozenset({"addresses", "parameters", "calibrations"}),
     "pointing_disagrees": frozenset({
@@ -92,7 +91,7 @@ class AlarmObserver:
         self._new: list[Alarm] = []
         self._heard = dict.fromkeys(boards, start)
         self._runs_since = inf
-        self._wrote_at, self._began_again = start, False
+        self._wrote_at = start
         self._well = dict.fromkeys(boards, inf)
         self._off: dict[str, float] = {}
         self._faulty: dict[str, float] = {}
@@ -116,7 +115,6 @@ class AlarmObserver:
         self._active.clear()
         self._new.clear()
         self._runs_since = inf  # it may begin again before the next look
-        self._began_again = True
 
     def heard(self, cluster: str, now: float) -> None:
         """Note a status that has reached the plant."""
@@ -179,7 +177,7 @@ class AlarmObserver:
         self._check(subject in rests, now, subject, f"{saw}: there is no {subject!r}")
         sense = len(alarm.text) > len(kind) and not _NONSENSE.search(alarm.text)
         self._check(sense, now, subject, f"{saw}: that says nothing")
-        if kind in self._by_faults and not (kind in MISLED and self._began_again):
+        if kind in self._by_faults:
             calm = now - rests[subject]
             good = calm <= RAISED_WITHIN
             self._check(good, now, subject, f"{saw}: the last fault ended {calm:.1f} s ago")

@@ -133,10 +133,8 @@ class VisitObserver:
             spread = slope.T @ record.covariance @ slope + FLOOR**2 * np.eye(2)
             off = across @ ray
             deviations = float(np.sqrt(off @ np.linalg.solve(spread, off)))
-            # A far target leaves the direction to the receiver open; the plant knows how far.
-            near = miss <= ASTRAY or deviations <= DEVIATIONS
             saw = f"by the calibration that the plant believes its beam is {miss:.1f} m astray"
-            self._check(12, near, now, name, saw)
+            self._check(12, miss <= ASTRAY, now, name, saw)
             if self._followed:
                 saw = f"its calibration misses by {deviations:.1f} of its own standard deviations"
                 self._check(12, deviations <= DEVIATIONS, now, name, saw)
