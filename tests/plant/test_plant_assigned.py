@@ -11,7 +11,7 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Stage
 from heliotrope.plant.aims import BeamCheck
-from heliotrope.plant.assigned import AssignedError, AssignedFile, grouped, points_of
+from heliotrope.plant.assigned import AssignedError, AssignedFile, Points, grouped, points_of
 from heliotrope.plant.audit import read
 from heliotrope.plant.authority import RefusedError
 from support.plant_bench import OPERATOR, Bench, running
@@ -170,3 +170,84 @@ def test_no_mirror_tracks_whose_last_aim_was_not_taken(tmp_path: Path) -> None:
             assert await plant.command(OPERATOR, token, "TRACK", (first,)).end(5.0)
 
     run_virtual(main)
+
+
+def test_after_a_restart_the_plant_knows_which_points_were_not_taken(tmp_path: Path) -> None:
+    """Simulated run 2401709: it named a sound mirror, which was where it had been sent before."""
+    store, names = AssignedFile(tmp_path / "assigned.json"), ("P1A", "P1B", "P2B")
+    more = [(4.0 + i, 0.0, 14.0) for i in range(6)]
+
+    async def before(clock: VirtualClock) -> None:
+        async with running(Bench(clock, tmp_path, assigned=store)) as bench:
+            plant, token = bench.plant, await bench.commanded()
+            for give in (plant.aim, plant.standby):
+                assert await give(OPERATOR, token, dict.fromkeys(names, AIM)).end(5.0)
+                for name in names[:2]:
+                    bench.cluster_of(name).stubborn.add(name)
+                for point in more:
+                    assert not await give(OPERATOR, token, dict.fromkeys(names, point)).end(5.0)
+                bench.cluster_of("P1B").stubborn.discard("P1B")
+                assert await give(OPERATOR, token, {"P1B": AIM}).end(5.0)
+                bench.cluster_of("P1A").stubborn.clear()
+            await bench.wait(3.0)
+
+    async def after(clock: VirtualClock) -> None:
+        folder = tmp_path / "again"
+        folder.mkdir()
+        async with running(Bench(clock, folder, seed=2, assigned=store)) as bench:
+            plant, token = bench.plant, await bench.commanded()
+            points = plant._ways.points
+            rows = [plant.field.place(name) for name in names]
+            for kind, assigned in (("AIM", plant.aims), ("STANDBY", plant.standbys)):
+                assert assigned[rows].tolist() == [list(p) for p in (more[-1], AIM, more[-1])]
+                # The last ones, and that which it took.
+                earlier = [*more[-2:-5:-1], AIM]
+                assert points.earlier[kind][:, rows[0]].tolist() == [list(p) for p in earlier]
+                assert np.isnan(points.earlier[kind][:, rows[1:]]).all()
+            for name in names:
+                bench.cluster_of(name).set(states.IDLE, name)
+            await bench.wait(2.0)
+            ticket = plant.command(OPERATOR, token, "TRACK", names)
+            assert not await ticket.end(5.0)
+            assert ticket.refusals.keys() == {"P1A"}
+            text = "its last aim was not taken (the plant's program ended before it was ackn"
+            assert ticket.refusals["P1A"].startswith(text)
+            assert await plant.aim(OPERATOR, token, {"P1A": AIM}).end(5.0)
+            assert await plant.command(OPERATOR, token, "TRACK", ("P1A",)).end(5.0)
+            assert np.isnan(points.earlier["AIM"]).all()
+
+    run_virtual(before)
+    run_virtual(after)
+
+
+def test_a_point_taken_late_is_taken_and_one_replaced_meanwhile_is_not(tmp_path: Path) -> None:
+    store = AssignedFile(tmp_path / "assigned.json")
+    points = Points(("A", "B"), store)
+    both = np.arange(2)
+
+    def give(east: float) -> None:
+        new = np.tile((east, 0.0, 9.0), (2, 1))
+        points.storing("AIM", both, new)[0]()
+        points.assign("AIM", both, new)
+
+    give(1.0)
+    points.taken("AIM", both)
+    give(2.0)
+    points.taken("AIM", both[:1])
+    settle = points.settling()
+    assert settle is not None
+    assert points.settling() is None
+    points.storing("AIM", both[:1], np.array([[3.0, 0.0, 9.0]]))[0]()
+    settle()
+    # A's next point is in the store already: what comes before it stays known.
+    assert store.read()["AIM-1"] == {"A": (2.0, 0.0, 9.0), "B": (1.0, 0.0, 9.0)}
+    again = Points(("A", "B"), store)
+    assert again.earlier["AIM"][:, 0, 0].tolist()[:2] == [2.0, 1.0]
+    # One that is given again, and one that is taken back, are no other points.
+    store_it, take_back = again.storing("AIM", both[1:], np.array([[7.0, 0.0, 9.0]]))
+    store_it()
+    assert store.read()["AIM-2"]["B"] == (1.0, 0.0, 9.0)
+    take_back()
+    again.storing("AIM", both[1:], np.array([[2.0, 0.0, 9.0]]))[0]()
+    assert store.read()["AIM-1"]["B"] == (1.0, 0.0, 9.0)
+    assert "B" not in store.read()["AIM-2"]

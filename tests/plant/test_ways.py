@@ -152,6 +152,34 @@ def test_to_standby_only_where_the_way_is_clear(tmp_path: Path) -> None:
     play(tmp_path, scene)
 
 
+def test_standby_points_that_were_not_taken_count_as_long_as_the_mirror_may_go_there(
+    tmp_path: Path,
+) -> None:
+    """Simulated run 2401709: a local controller goes to the standby point that it has."""
+
+    async def scene(bench: Bench) -> None:
+        plant, other = bench.plant, (-12.0, 0.0, 8.0)
+        token, points = await bench.commanded(), plant._ways.points
+        row = np.array([plant.field.place("P5A")])
+        points.assign("STANDBY", row, np.array([EAST]))
+        points.assign("STANDBY", row, np.array([other]))
+        await stands(bench, "P5A", states.TRACKING, counts(plant, "P5A", WEST))
+        with pytest.raises(RefusedError, match="IDLE P5A: the beam enters walkway"):
+            plant.command(OPERATOR, token, "IDLE", ("P5A",))
+        points.taken("STANDBY", row)
+        assert await plant.command(OPERATOR, token, "IDLE", ("P5A",)).end(5.0)
+        # The way from stow to a point before is not free, that to the new one is.
+        rest_on(plant.standbys, (4.0, 0.0, 14.0))
+        blocked = tuple(plant.command(OPERATOR, token, "APPROACH").blocked)
+        rows = np.array([plant.field.place(name) for name in blocked])
+        points.assign("STANDBY", rows, np.tile(other, (len(rows), 1)))
+        assert plant.command(OPERATOR, token, "APPROACH").blocked.keys() >= set(blocked)
+        points.taken("STANDBY", rows)
+        assert not set(blocked) <= plant.command(OPERATOR, token, "APPROACH").blocked.keys()
+
+    play(tmp_path, scene)
+
+
 def test_a_search_does_not_reach_into_a_volume(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         plant = bench.plant

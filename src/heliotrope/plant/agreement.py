@@ -28,7 +28,7 @@ from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.board_items import packed
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.aims import BeamCheck
-from heliotrope.plant.assigned import Points
+from heliotrope.plant.assigned import Points, differ, put_before
 from heliotrope.plant.field_state import FieldState, Mask
 from heliotrope.safety import Reading
 from heliotrope.sun import Site, fast_vector
@@ -39,8 +39,6 @@ LOOK_PERIOD = 2.0
 NOTED = 1e-3
 #: Most heliostats that are named; with more, the field is the subject.
 MOST_NAMED = 150
-#: Points before the assigned one that a beam may still be on.
-_BEFORE = 4
 #: Step counts count from this time after a beam was first seen to be sent to its point, s.
 _SETTLE = 1.0
 #: An axis that comes nearer to its goal by this between two looks is on its way, rad.
@@ -66,30 +64,31 @@ class _Points:
     ----------
     points
         ENU, m, (N, 3); NaN where there is none; assigned by others.
+    before
+        The points before that were not replaced for certain when the plant's program began.
 
     Attributes
     ----------
     before
-        The last points before the assigned ones, the latest first, (`_BEFORE`, N, 3); NaN from
+        The points before the assigned ones, the latest first, (`assigned.BEFORE`, N, 3); NaN from
         where the beam was found: an assigned point may wait for its turn, or be refused by the
         local controller, and then the beam goes on to one before.
     changed_at
         When each point was seen to change, monotonic s, (N,).
     """
 
-    def __init__(self, points: FloatArray) -> None:
+    def __init__(self, points: FloatArray, before: FloatArray) -> None:
         self.points, self._last = points, points.copy()
-        self.before = np.full((_BEFORE, *points.shape), np.nan)
+        self.before = before.copy()
         self.changed_at = np.full(len(points), -np.inf)
 
     def look(self, now: float) -> Mask:
         """Return which points have changed since the last look, (N,)."""
         new, last = self.points, self._last
-        changed = ~np.all((new == last) | (np.isnan(new) & np.isnan(last)), axis=-1)
-        self.before[1:, changed] = self.before[:-1, changed]
-        self.before[0, changed] = last[changed]
+        changed = differ(new, last)
+        put_before(self.before, np.flatnonzero(changed), last[changed])
         self.changed_at[changed], last[changed] = now, new[changed]
-        return np.asarray(changed)
+        return changed
 
     def beside(self, rows: Rows, beam: FloatArray, vertex: FloatArray) -> FloatArray:
         """Return the angle between beams (K, 3) and the nearest of their points, rad, (K,)."""
@@ -128,7 +127,8 @@ class Agreement:
         differing: Callable[[Sequence[str]], Mapping[str, str]],
     ) -> None:
         self._field, self._site, self._utc, self._differing = field, site, utc, differing
-        self._aims, self._standbys = _Points(points.aims), _Points(points.standbys)
+        self._aims = _Points(points.aims, points.earlier["AIM"])
+        self._standbys = _Points(points.standbys, points.earlier["STANDBY"])
         self._armature, self._drives = check.armature.table.copy(), check.drives.table.copy()
         #: New parameters that the local controllers do not store yet: checksum, armature, drives.
         self._pending: dict[int, tuple[int, FloatArray, FloatArray]] = {}
@@ -209,7 +209,7 @@ class Agreement:
                 self._armature[row], self._drives[row] = armature, drives
                 del self._pending[row]
         begins = self._sort(now)
-        self._aims.before[:, ~self._on_aim] = np.nan
+        self._aims.before[:, field.live(now) & ~self._on_aim] = np.nan
         aims, standbys = self._aims.look(now), self._standbys.look(now)
         begins |= np.where(self._on_aim, aims, standbys)
         self._lag[begins], self._stands[begins] = np.inf, False

@@ -4,6 +4,9 @@ A plant that has forgotten where its beams are cannot prove where they may go. S
 disk before the commands that assign them are sent. `Assigned` is the protocol of their store.
 `AssignedFile` is one small file, written under another name and renamed, so that the old or the new
 file is always there.
+
+A local controller may refuse a point, or never get it. So the points before are kept too until it
+has acknowledged the new one: a program that starts anew then knows where a beam may still be.
 """
 
 import json
@@ -24,7 +27,15 @@ from heliotrope.lcu.config import FAR
 #: Points of one kind (AIM, STANDBY) by name of the heliostat, ENU, m.
 Places = dict[str, tuple[float, ...]]
 KINDS = ("AIM", "STANDBY")
+#: Points before the assigned one that a local controller may still have.
+BEFORE = 4
+#: Kinds under which they are stored, the latest first.
+EARLIER = {kind: tuple(f"{kind}-{i}" for i in range(1, BEFORE + 1)) for kind in KINDS}
 VERSION = 1
+
+Rows = npt.NDArray[np.intp]
+#: Points by kind; None: there is none any more.
+_Changes = dict[str, dict[str, tuple[float, ...] | None]]
 
 
 class AssignedError(HeliotropeError):
@@ -75,7 +86,8 @@ class AssignedFile:
             raise FormatError(
                 self.path, f"holds no assigned points of version {VERSION}; remove it"
             )
-        return {kind: self._places(kind, document.get(kind)) for kind in KINDS}
+        earlier = [kind for kinds in EARLIER.values() for kind in kinds if kind in document]
+        return {kind: self._places(kind, document.get(kind)) for kind in (*KINDS, *earlier)}
 
     def _places(self, kind: str, rows: object) -> Places:
         if not isinstance(rows, dict):
@@ -131,24 +143,55 @@ class Points:
     ----------
     aims, standbys
         ENU, m, (N, 3); NaN where there is none.
+    earlier
+        By kind, the points before that a local controller may still have, the latest first,
+        (`BEFORE`, N, 3); NaN where there is none: the assigned point was taken.
     """
 
     def __init__(self, names: Sequence[str], store: Assigned | None) -> None:
         self.aims, self.standbys = (np.full((len(names), 3), np.nan) for _ in KINDS)
+        self.earlier = {kind: np.full((BEFORE, len(names), 3), np.nan) for kind in KINDS}
         self._names, self._store = names, store
         self._arrays = {"AIM": self.aims, "STANDBY": self.standbys}
+        every = self._arrays | {
+            name: self.earlier[kind][i] for kind in KINDS for i, name in enumerate(EARLIER[kind])
+        }
         #: The points in the store; only work of the disk changes them.
-        self._stored: dict[str, Places] = {kind: {} for kind in KINDS}
+        self._stored: dict[str, Places] = {kind: {} for kind in every}
+        #: Points that were taken since the store was last told, by kind.
+        self._taken: dict[str, Places] = {kind: {} for kind in KINDS}
         index = {name: row for row, name in enumerate(names)}
         for kind, places in ({} if store is None else store.read()).items():
             for name, point in places.items():
                 if name in index:
-                    self._arrays[kind][index[name]] = point
+                    every[kind][index[name]] = point
                     self._stored[kind][name] = point
 
     def assign(self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray) -> None:
         """Assign points (K, 3) to heliostats (K,); they must be stored (`storing`)."""
-        self._arrays[kind][rows] = points
+        known = self._arrays[kind]
+        changed = np.asarray(rows)[differ(known[rows], points)]
+        put_before(self.earlier[kind], changed, known[changed])
+        known[rows] = points
+
+    def taken(self, kind: str, rows: npt.NDArray[np.intp]) -> None:
+        """Note that local controllers have the points that are assigned now; see `settling`."""
+        self.earlier[kind][:, rows] = np.nan
+        places = map(tuple, self._arrays[kind][rows].tolist())
+        self._taken[kind].update(zip((self._names[row] for row in rows), places, strict=True))
+
+    def possible(self, kind: str, rows: npt.NDArray[np.intp]) -> list[tuple[Rows, FloatArray]]:
+        """Return where local controllers (K,) may send their beams.
+
+        First the assigned points, of those that have one; then the points before, of those that may
+        still have them.
+        """
+        found = []
+        for points in (self._arrays[kind], *self.earlier[kind]):
+            known = rows[np.isfinite(points[rows]).all(axis=-1)]
+            if known.size:
+                found.append((known, points[known]))
+        return found
 
     def storing(
         self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray
@@ -159,26 +202,81 @@ class Points:
         were replaced meanwhile; it may be done again.
         """
         new = {self._names[i]: tuple(p) for i, p in zip(rows, points.tolist(), strict=True)}
-        old: dict[str, tuple[float, ...] | None] = {}
+        kinds = (kind, *EARLIER[kind])
+        old: dict[str, list[tuple[float, ...] | None]] = {}
+
+        def keep(chains: Mapping[str, Sequence[tuple[float, ...] | None]]) -> None:
+            self._keep({k: {n: c[i] for n, c in chains.items()} for i, k in enumerate(kinds)})
 
         def store() -> None:
-            old.update({name: self._stored[kind].get(name) for name in new})
-            self._keep(kind, dict(new))
+            old.update({n: [self._stored[k].get(n) for k in kinds] for n in new})
+            keep({n: _followed(old[n], point) for n, point in new.items()})
 
         def take_back() -> None:
             known = self._stored[kind]
-            self._keep(kind, {n: p for n, p in old.items() if known.get(n) == new[n]})
+            keep({n: chain for n, chain in old.items() if known.get(n) == new[n]})
 
         return store, take_back
 
-    def _keep(self, kind: str, changes: Mapping[str, tuple[float, ...] | None]) -> None:
-        """Store points by heliostat; None: it has none any more."""
-        changed = {**self._stored[kind], **changes}
+    def settling(self) -> Work | None:
+        """Return work of a disk that forgets what came before points that were taken, if any.
+
+        It raises `AssignedError` if that cannot be stored, and may be done again.
+        """
+        if not any(self._taken.values()):
+            return None
+        taken, self._taken = self._taken, {kind: {} for kind in KINDS}
+
+        def settle() -> None:
+            changes: _Changes = {}
+            for kind, places in taken.items():
+                known = self._stored[kind]
+                names = [n for n, point in places.items() if known.get(n) == point]
+                for each in EARLIER[kind]:
+                    changes[each] = {n: None for n in names if n in self._stored[each]}
+            if any(changes.values()):
+                self._keep(changes)
+
+        return settle
+
+    def _keep(self, changes: _Changes) -> None:
+        """Store points by kind and heliostat."""
         places = {k: dict(known) for k, known in self._stored.items()}
-        places[kind] = {name: point for name, point in changed.items() if point is not None}
+        for kind, points in changes.items():
+            changed = {**places[kind], **points}
+            places[kind] = {name: point for name, point in changed.items() if point is not None}
         if self._store is not None:
             self._store.keep(places)
         self._stored = places
+
+
+def differ(a: FloatArray, b: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return which points (K, 3) differ, (K,); NaN is like NaN."""
+    return np.asarray(~np.all((a == b) | (np.isnan(a) & np.isnan(b)), axis=-1))
+
+
+def put_before(earlier: FloatArray, rows: npt.NDArray[np.intp], points: FloatArray) -> None:
+    """Put points (K, 3) of heliostats (K,) before all earlier ones (`BEFORE`, N, 3).
+
+    The oldest stays, since it is the one that was taken; where there is no more room, the one after
+    it is forgotten.
+    """
+    oldest = earlier[-1, rows]
+    full = np.isfinite(oldest).all(axis=-1, keepdims=True)
+    earlier[-1, rows] = np.where(full, oldest, earlier[-2, rows])
+    earlier[1:-1, rows] = earlier[:-2, rows]
+    earlier[0, rows] = points
+
+
+def _followed(
+    chain: Sequence[tuple[float, ...] | None], point: tuple[float, ...]
+) -> Sequence[tuple[float, ...] | None]:
+    """Return the points of one heliostat, the assigned one first, with a new one assigned."""
+    last, *earlier = chain
+    if last == point:
+        return chain
+    oldest = earlier[-2] if earlier[-1] is None else earlier[-1]
+    return [point, last, *earlier[:-2], oldest]
 
 
 def rest_on(standbys: FloatArray, point: tuple[float, float, float] | None) -> None:

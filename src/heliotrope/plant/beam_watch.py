@@ -16,7 +16,7 @@ from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.mechanism.tracking import TrackingStatus
 from heliotrope.plant.aims import BeamCheck
-from heliotrope.plant.assigned import Points
+from heliotrope.plant.assigned import BEFORE, KINDS, Points
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.leaving import way_out
 from heliotrope.plant.parameters import Tables
@@ -120,14 +120,32 @@ class BeamWatch:
         BeamError
             If one of the beams may not go there.
         """
-        aims, standbys = self.points.aims, self.points.standbys
-        start = np.where(tracking[:, None], aims[rows], standbys[rows])
-        stopped, light = name == "AIM", self._sun(0.0)
-        wrong = self._check.problems(rows, wanted, light, start=start, stopped=stopped)
+        stopped, light, wrong = name == "AIM", self._sun(0.0), dict[str, str]()
+        for start, among in self._starts(rows, tracking):
+            of = rows[among], wanted[among], light
+            wrong |= self._check.problems(*of, start=start, stopped=stopped)
         if not stopped:
-            wrong |= self._check.glare(rows, wanted, standbys, light)
+            wrong |= self._check.glare(rows, wanted, self.points.standbys, light)
         if wrong:
             raise BeamError(name, wrong)
+
+    def _starts(
+        self, rows: Rows, tracking: npt.NDArray[np.bool_]
+    ) -> list[tuple[FloatArray, npt.NDArray[np.intp]]]:
+        """Return points (M, 3) where the beams of some of K heliostats may be, and which, (M,).
+
+        All are among the first, NaN where no point is known.
+        """
+        points = self.points
+        start = np.where(tracking[:, None], points.aims[rows], points.standbys[rows])
+        found = [(start, np.arange(len(rows)))]
+        for k in range(BEFORE):
+            aims, standbys = (points.earlier[kind][k, rows] for kind in KINDS)
+            before = np.where(tracking[:, None], aims, standbys)
+            among = np.flatnonzero(np.isfinite(before).all(axis=-1))
+            if among.size:
+                found.append((before[among], among))
+        return found
 
     def clear(
         self, name: str, values: Sequence[float], heliostats: tuple[str, ...], now: float
@@ -162,16 +180,21 @@ class BeamWatch:
         if not self._check.volumes:
             wrong = {}  # a way to a point that is not known here is not proven
         stow, counts = self._ways.stow[rows], self._field.counts(rows)
-        begin = np.where(np.isfinite(stow), stow, counts)
-        return wrong | self._ways.approach(rows, begin, self.points.standbys[rows], self._sun)
+        begin = dict(zip(rows.tolist(), np.where(np.isfinite(stow), stow, counts), strict=True))
+        for some, standbys in self.points.possible("STANDBY", rows):
+            here = np.array([begin[row] for row in some.tolist()])
+            wrong |= self._ways.approach(some, here, standbys, self._sun)
+        return wrong
 
     def _back_to_standby(self, rows: Rows) -> dict[str, str]:
         """Return which heliostats may not go straight to their standby points, and why."""
         rows, wrong = self._resting(rows)
         light = self._sun(0.0)
-        wrong |= self._by_earlier(rows, self.points.standbys[rows])
-        rows, path = self._to_standby(rows, light)
-        return wrong | self._check.moving(rows, path, light)
+        for some, standbys in self.points.possible("STANDBY", rows):
+            wrong |= self._by_earlier(some, standbys)
+            good, path = self._to_standby(some, standbys, light)
+            wrong |= self._check.moving(good, path, light)
+        return wrong
 
     def _resting(self, rows: Rows) -> tuple[Rows, dict[str, str]]:
         """Return the heliostats whose standby points are known, and why the others do not go."""
@@ -268,7 +291,7 @@ class BeamWatch:
         here = self._angles(rows, self._field.posed[rows])
         wrong = self._check.moving(rows, np.repeat(here[:, None], 2, axis=1), light)
         known = rows[np.isfinite(self.points.standbys[rows]).all(axis=-1)]
-        good, path = self._to_standby(known, light)
+        good, path = self._to_standby(known, self.points.standbys[known], light)
         wrong |= {
             self._field.names[row]: "its standby point cannot be reached"
             for row in np.setdiff1d(known, good)
@@ -297,9 +320,12 @@ class BeamWatch:
                 found |= self._check.around(known, aims[~unknown], values[1], light)
         return found
 
-    def _to_standby(self, rows: Rows, light: FloatArray) -> tuple[Rows, FloatArray]:
+    def _to_standby(
+        self, rows: Rows, standbys: FloatArray, light: FloatArray
+    ) -> tuple[Rows, FloatArray]:
+        """Return the heliostats that reach their standby points (K, 3), and their ways there."""
         counts = self._field.counts(rows)
-        found = self._check.poses(rows, self.points.standbys[rows], light, counts)
+        found = self._check.poses(rows, standbys, light, counts)
         good = found.chosen(found.status) == TrackingStatus.OK
         rows, ends = rows[good], found.best_counts[good]
         return rows, self._ways.motion(rows, counts[good], ends)

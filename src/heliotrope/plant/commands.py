@@ -18,6 +18,7 @@ from heliotrope.plant.audit import AuditError
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.given import Given
 from heliotrope.plant.joining import JoiningJob, JoinQueue, in_slices
 from heliotrope.plant.movements import Movements
 from heliotrope.plant.orders import PlantOrders, whole
@@ -45,6 +46,8 @@ class Commands:
         The plant's.
     permission
         Who may command what.
+    given
+        Points that were given, and whether they were taken.
     ways
         Where beams may go.
     design
@@ -64,6 +67,7 @@ class Commands:
         orders: PlantOrders,
         joining: JoinQueue,
         permission: Permission,
+        given: Given,
         ways: BeamWatch,
         design: Plant,
         wanted: Wanted,
@@ -71,7 +75,7 @@ class Commands:
         movements: Movements,
     ) -> None:
         self._now, self._field, self._orders, self._joining = now, field, orders, joining
-        self._permission, self._ways = permission, ways
+        self._permission, self._given, self._ways = permission, given, ways
         self._design, self._wanted, self._patience = design, wanted, patience
         self._movements = movements
 
@@ -275,8 +279,7 @@ class Commands:
                 self._permission.refuse_now(ticket.name, names)
                 self._prove_points(ticket.name, names, rows, wanted)
             stays = assign()
-            if ticket.name == "AIM":
-                self._permission.aimed(ticket, names)
+            self._given.sent(ticket, names)
             self._send_points(ticket, ticket.name, grouped(names, wanted), token, stays)
 
         self._orders.when_recorded(ticket, send)

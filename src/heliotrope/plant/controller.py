@@ -44,7 +44,7 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant import refusals
 from heliotrope.plant.agreement import Agreement
 from heliotrope.plant.aims import BeamCheck, default_aims
-from heliotrope.plant.assigned import Assigned, Points
+from heliotrope.plant.assigned import KINDS, Assigned, Points
 from heliotrope.plant.audit import Audit
 from heliotrope.plant.authority import Authority, Grant, Person, Role
 from heliotrope.plant.beam_watch import BeamError, BeamWatch
@@ -55,6 +55,7 @@ from heliotrope.plant.commands import Commands
 from heliotrope.plant.doubts import Doubts
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.given import Given
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.joining import JoinDispatcher, JoinQueue
 from heliotrope.plant.lockouts import Lockout
@@ -202,6 +203,7 @@ class PlantController:
             self._identities.barred,
         )
         self._sentinel = self._guarded(table)
+        self._given = Given(self.field, points)
         self._permission = self._permitting()
         self._commands = self._directed()
         life, barred, examine = self.settings.join_life, self.doubts.barred, self._commands.examine
@@ -253,6 +255,7 @@ class PlantController:
             self._sync,
             self.doubts,
             self.out_of_service,
+            self._given,
         )
 
     def _compared(self, points: Points) -> Agreement:
@@ -274,6 +277,7 @@ class PlantController:
             self._orders,
             self._joining,
             self._permission,
+            self._given,
             self._ways,
             self.design,
             self.wanted,
@@ -321,9 +325,7 @@ class PlantController:
                 found = self._orders.take(end.name, message)
                 if found is not None:
                     self._sentinel.take_progress(*found, message)
-                    if message.stage is Stage.ACKNOWLEDGED:
-                        ticket, part = found
-                        self._agreement.obeyed(ticket.name, ticket.accepted_at, part, now)
+                    self._obeyed(*found, message.stage, now)
             case Alarm():
                 for alarm in self._told_alarms.take(end.name, message):
                     self._tell(alarm)
@@ -333,6 +335,15 @@ class PlantController:
                 raise ProtocolError(
                     f"{type(message).__name__.lower()}: a cluster must not send this kind"
                 )
+
+    def _obeyed(self, ticket: Ticket, part: Sequence[str], stage: Stage, now: float) -> None:
+        """Note what some heliostats of a ticket have acknowledged or done."""
+        if stage is Stage.ACKNOWLEDGED:
+            self._agreement.obeyed(ticket.name, ticket.accepted_at, part, now)
+        elif stage is Stage.DONE and ticket.name in KINDS:
+            self._given.done(ticket, part)
+            for name in self.wanted.missing.keys() & part:
+                self._sync.compare(name)
 
     def _take_status(self, end: ClusterEnd, status: ClusterStatus, now: float) -> None:
         self.counters.statuses += 1
@@ -373,6 +384,8 @@ class PlantController:
             self._orders.pay()
         if slow:
             self._slow_at = now
+            if work := self._ways.points.settling():
+                self._orders.owe(work)
             self._sync.beat(now, token, not self._sentinel.refusal(self.field.clusters))
 
     def _tell(self, alarm: Alarm) -> None:

@@ -268,6 +268,10 @@ class PlantOrders:
         del self._open[ticket.identity]
         self._owe_result(ticket.identity, "done")
 
+    def owe(self, work: Work) -> None:
+        """Give work to the disk after the records that are owed; it may be done again."""
+        self._owed.append(work)
+
     def pay(self) -> None:
         """Give the oldest owed records to the disk, unless earlier ones are on their way."""
         if self._paying:

@@ -5,7 +5,6 @@ from collections.abc import Collection, Mapping, Sequence
 from heliotrope.files.disk import Work
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
-from heliotrope.links.messages import Stage
 from heliotrope.plant import refusals
 from heliotrope.plant.audit import AuditError
 from heliotrope.plant.authority import Authority, Person
@@ -13,6 +12,7 @@ from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.doubts import Doubts
 from heliotrope.plant.emergency import Sentinel
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.given import Given
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.lockouts import Lockout, locked_out
 from heliotrope.plant.orders import PlantOrders
@@ -49,6 +49,8 @@ class Permission:
         Whether a heliostat is what it seems to be.
     out_of_service
         Heliostats that nobody moves, by name.
+    given
+        Points that were given, and whether they were taken.
     """
 
     def __init__(
@@ -62,13 +64,12 @@ class Permission:
         sync: ParameterSync,
         doubts: Doubts,
         out_of_service: Mapping[str, Lockout],
+        given: Given,
     ) -> None:
         self._field, self._authority, self._orders = field, authority, orders
         self._sentinel, self._rivals = sentinel, rivals
         self._identities, self._sync, self._doubts = identities, sync, doubts
-        self._out = out_of_service
-        #: Ticket of the last aim that was given to each heliostat and may not have been taken.
-        self._aims: dict[str, Ticket] = {}
+        self._out, self._given = out_of_service, given
 
     def able(self, name: str, names: tuple[str, ...]) -> tuple[tuple[str, ...], dict[str, str]]:
         """Return the heliostats that may be given a command, and why the others may not.
@@ -88,7 +89,8 @@ class Permission:
             wrong = self._sync.differing(names) | self._orders.to_stow(names) | wrong
         if name in JOINING:
             wrong |= self._sentinel.barred(names) | self._doubts.barred(names)
-            wrong |= self._without_aim(names)
+            for each, reason in self._given.untaken("AIM", names).items():
+                wrong[each] = refusals.AIM_NOT_TAKEN.text.format(reason=reason)
         elif name in _TO_STANDBY:
             wrong |= self._sentinel.barred(self._off(names), ASTRAY)
         elif name in _STILL:
@@ -98,22 +100,6 @@ class Permission:
             self.refuse_now(name, names)
             raise BeamError(name, wrong)
         return tuple(n for n in names if n not in wrong), wrong
-
-    def aimed(self, ticket: Ticket, heliostats: Sequence[str]) -> None:
-        """Note new aims that are sent now."""
-        self._aims.update(dict.fromkeys(heliostats, ticket))
-
-    def _without_aim(self, names: Sequence[str]) -> dict[str, str]:
-        """Return which heliostats have an aim other than the assigned one, and why."""
-        wrong = {}
-        for name in names:
-            stage = self._aims[name].stage(name) if name in self._aims else None
-            if stage in (Stage.REFUSED, Stage.FAILED):
-                reason = self._aims[name].refusals[name]
-                wrong[name] = refusals.AIM_NOT_TAKEN.text.format(reason=reason)
-            elif stage is Stage.DONE:
-                del self._aims[name]
-        return wrong
 
     def _off(self, names: Sequence[str]) -> tuple[str, ...]:
         """Return which heliostats are at stow or have turned away."""

@@ -24,7 +24,8 @@ class CycleSettings:
     least
         Sightings that a fit needs, all visits together.
     sigma
-        Standard deviation of a beam beside that of its centroid, rad.
+        Standard deviation of a beam beside that of its centroid, rad, motions within hours
+        included. Half of it is taken to change from photograph to photograph until it is learnt.
     most
         Largest credible deviation of a parameter, in standard deviations of its prior.
     gain

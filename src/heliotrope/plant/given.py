@@ -1,0 +1,62 @@
+"""Points that were given to local controllers, and whether they were taken.
+
+The plant proves and records a point before it is sent, and counts on it from then on. A local
+controller that is busy refuses it, and goes on with the one before.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from heliotrope.links.messages import Stage
+from heliotrope.plant.assigned import KINDS, Points
+from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.tickets import Ticket
+
+#: Why a point of an earlier program may not have been taken.
+_BEFORE_START = "the plant's program ended before it was acknowledged"
+
+
+class Given:
+    """The last ticket of each heliostat's points that may not have been taken.
+
+    Parameters
+    ----------
+    field, points
+        The plant's.
+    """
+
+    def __init__(self, field: FieldState, points: Points) -> None:
+        self._field, self._points = field, points
+        #: By kind and heliostat; None where the ticket ended with an earlier program.
+        self._tickets: dict[str, dict[str, Ticket | None]] = {}
+        for kind in KINDS:
+            open_ = np.isfinite(points.earlier[kind]).any(axis=(0, 2))
+            self._tickets[kind] = {field.names[row]: None for row in np.flatnonzero(open_)}
+
+    def sent(self, ticket: Ticket, heliostats: Sequence[str]) -> None:
+        """Note new points that are sent now."""
+        self._tickets[ticket.name].update(dict.fromkeys(heliostats, ticket))
+
+    def done(self, ticket: Ticket, heliostats: Sequence[str]) -> None:
+        """Note points that were taken, unless others were sent since."""
+        last = self._tickets[ticket.name]
+        names = [name for name in heliostats if last.get(name) is ticket]
+        for name in names:
+            del last[name]
+        if names:
+            rows = np.array([self._field.place(name) for name in names], dtype=np.intp)
+            self._points.taken(ticket.name, rows)
+
+    def untaken(self, kind: str, heliostats: Sequence[str]) -> dict[str, str]:
+        """Return which heliostats have a point other than the assigned one, and why."""
+        last, found = self._tickets[kind], {}
+        for name in heliostats:
+            if name not in last:
+                continue
+            ticket = last[name]
+            if ticket is None:
+                found[name] = _BEFORE_START
+            elif ticket.stage(name) in (Stage.REFUSED, Stage.FAILED):
+                found[name] = ticket.refusals[name]
+        return found
