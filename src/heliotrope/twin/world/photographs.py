@@ -1,7 +1,7 @@
 """The camera of visits to targets: true centroids with noise, and photographs that lie.
 
-A beam wavers by as much as the settings of a visit say, so that the covariance of a calibration,
-which stands on them, is the true one, and `VisitObserver` can judge it.
+A beam wavers by as much as the plant believes before it has learnt it, so that the covariance of a
+calibration, which stands on that, is the true one, and `VisitObserver` can judge it.
 """
 
 import math

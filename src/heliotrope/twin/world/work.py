@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration.learn.drift import START_NOISE
 from heliotrope.links.clock import Clock
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.assembly import CYCLE
@@ -120,7 +121,8 @@ class Work:
         # A stack of photographs tells beams apart, as a search does.
         self.centred = together or random.Random(f"visits {seed}").random() < searches
         self._together = together
-        self.camera = LyingCamera(sight, seed, lies, VISIT.sigma, standing=lights)
+        waver = START_NOISE * VISIT.sigma
+        self.camera = LyingCamera(sight, seed, lies, waver, standing=lights)
         self._clock = sight.clock
         folder = exits.enter_context(tempfile.TemporaryDirectory())
         self.records = Keeper(Path(folder) / "records.sqlite", inline=True)
