@@ -1,11 +1,10 @@
 """Read many photographs, in parallel or one by one, and turn them into sightings."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +30,7 @@ from heliotrope.imaging.photograph import (
 )
 from heliotrope.imaging.spots.placed import PlacedSpot
 from heliotrope.imaging.targets.view import FaceView
+from heliotrope.processes import pool
 from heliotrope.sun import Site, Times, vector
 
 if TYPE_CHECKING:
@@ -349,14 +349,15 @@ def _outcomes(
     if client is not None:
         yield from _on_cluster(tasks, job, client)
     elif processes > 1 and len(tasks) >= FEWEST_FOR_PROCESSES:
-        # A forked child would inherit the locks of this process's threads.
-        with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-            futures = {pool.submit(process, path, job, e): k for k, (path, e) in enumerate(tasks)}
+        with pool(processes) as workers:
+            futures = {
+                workers.submit(process, path, job, e): k for k, (path, e) in enumerate(tasks)
+            }
             try:
                 for future in as_completed(futures):
                     yield futures[future], future.result()
             finally:
-                pool.shutdown(cancel_futures=True)
+                workers.shutdown(cancel_futures=True)
     else:
         for k, (path, entry) in enumerate(tasks):
             yield k, process(path, job, entry)

@@ -6,9 +6,8 @@ the image. A photograph that cannot be used is reported with the reason; it rais
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass, field, fields, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +41,7 @@ from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.field.camera import undistort
 from heliotrope.files.archives import read_arrays
 from heliotrope.geometry import FloatArray
+from heliotrope.processes import pool
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -474,14 +474,15 @@ def _read(
         for future in completed(list(tasks)):  # type: ignore[no-untyped-call]
             yield tasks[future], future.result()
     elif processes > 1 and len(photos) >= FEWEST_FOR_PROCESSES:
-        # A forked child would inherit the locks of this process's threads.
-        with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-            futures = {pool.submit(read_photo, p, camera, stand): k for k, p in enumerate(photos)}
+        with pool(processes) as workers:
+            futures = {
+                workers.submit(read_photo, p, camera, stand): k for k, p in enumerate(photos)
+            }
             try:
                 for done in as_completed(futures):
                     yield futures[done], done.result()
             finally:
-                pool.shutdown(cancel_futures=True)
+                workers.shutdown(cancel_futures=True)
     else:
         for k, photo in enumerate(photos):
             yield k, read_photo(photo, camera, stand)

@@ -3,15 +3,15 @@
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from itertools import islice
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from heliotrope.errors import FormatError, InputError
 from heliotrope.links.clock import Clock, SystemClock
+from heliotrope.processes import pool
 from heliotrope.twin.world.simulation import RunPlan, RunResult, run
 
 
@@ -129,12 +129,13 @@ def _results(
             yield _one(plan)
         return
     left = iter(plans)
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+    with pool(processes) as workers:
         running: set[Future[dict[str, Any]]] = set()
         while True:
             if goes_on():
                 running |= {
-                    pool.submit(_one, plan) for plan in islice(left, 2 * processes - len(running))
+                    workers.submit(_one, plan)
+                    for plan in islice(left, 2 * processes - len(running))
                 }
             if not running:
                 return
