@@ -3,8 +3,9 @@
 An axis that goes down with the sun swings below its goal every few seconds, to come from below
 (`lcu.stepper`). The step counts, heard once a second or less often, miss most swings; but the goal
 falls as each begins. Where it fell between the counts before and after a photograph, the exposure
-was in the swing with a known chance, and the beam may be off by as much as the swing. Where it did
-not fall, the mirror stood at its goal.
+was in the swing with a known chance, and the beam may be off by as much as the swing. Where it was
+heard in the swing beside the exposure, that chance is one. Where the goal did not fall, the mirror
+stood at it.
 """
 
 import math
@@ -28,7 +29,7 @@ _TAIL = 3.0
 _STEPS = 10.0
 
 
-def swung(axis: AxisLimits, fall: float, span: float) -> float:
+def swung(axis: AxisLimits, fall: float, span: float, heard: float = math.inf) -> float:
     """Return the variance of an axis's distance from its goal at an unknown instant, steps².
 
     Parameters
@@ -39,13 +40,16 @@ def swung(axis: AxisLimits, fall: float, span: float) -> float:
         Steps by which its goal fell between two reports from its goals; 0 or less: it did not.
     span
         Time between the reports, s.
+    heard
+        Time from the instant to the nearest report from beside its goal, s.
     """
     if axis.backlash == 0 or not (fall > 0.0 and span > 0.0):
         return 0.0
     lead = 2.0 * math.ceil(_LEAD * axis.backlash)
     deep, times = lead + axis.backlash, max(1.0, round(fall / lead))
     lasts = _lasts(axis, deep) + _lasts(axis, axis.backlash)
-    return _MEAN_SQUARE * axis.backlash**2 * min(1.0, _TAIL * times * lasts / span)
+    chance = 1.0 if heard <= lasts else min(1.0, _TAIL * times * lasts / span)
+    return _MEAN_SQUARE * axis.backlash**2 * chance
 
 
 def _lasts(axis: AxisLimits, steps: float) -> float:
@@ -82,7 +86,7 @@ def spread_at(visit: Visit, instant: float, counts: FloatArray) -> FloatArray:
         return np.asarray(target.intersect(vertex, reflect(sun, normal)))
 
     for i, axis in enumerate(machine.axes):
-        square = swung(axis, float(falls[i]), span)
+        square = swung(axis, float(falls[i]), span, visit.heard_moving(instant))
         if square > 0.0:
             slope = (point(counts) - point(counts - _STEPS * np.eye(2)[i])) / _STEPS
             covariance += square * np.outer(slope, slope)

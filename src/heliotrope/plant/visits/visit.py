@@ -1,6 +1,7 @@
 """A heliostat's visit to a target: the way there, the observed stay, and the way back."""
 
 import asyncio
+import math
 from abc import ABC, abstractmethod
 from bisect import bisect_right
 from typing import Self
@@ -238,6 +239,11 @@ class Visit(BroughtHome):
         goals = [row for row, there in zip(self._goals, self._there, strict=True) if there]
         after = min(max(bisect_right(times, instant), 1), len(times) - 1)
         return goals[after - 1] - goals[after], times[after] - times[after - 1]
+
+    def heard_moving(self, instant: float) -> float:
+        """Return how near to an instant it was heard away from its goals, s; infinite if never."""
+        rows = zip(self._times, self._there, strict=True)
+        return min((abs(at - instant) for at, there in rows if not there), default=math.inf)
 
     def _heard_there(self) -> list[float]:
         """Return the times of the rows in which both axes are at their goals."""

@@ -26,9 +26,10 @@ from heliotrope.twin.invariants.invariants import InvariantError, Violation
 #: play of the gears and counts that are interpolated stay below it.
 FOREIGN = 1.0
 #: A calibration misses by at most this many of its own standard deviations, in the direction of the
-#: miss; and what its covariance need not hold, rad of beam in each direction: single steps, and
-#: step counts that are interpolated to the moment of a photograph.
-DEVIATIONS, FLOOR = 2.5, 1e-4
+#: miss: one photograph at the deepest point of a swing is two of them away (`visits.swings`). And
+#: what its covariance need not hold, rad of beam in each direction: single steps, and step counts
+#: that are interpolated to the moment of a photograph.
+DEVIATIONS, FLOOR = 3.0, 1e-4
 #: A sighting has the time of a photograph, to within this, s.
 SAME_TIME = 1.0
 
