@@ -9,6 +9,7 @@ from heliotrope.geometry import normalize
 from heliotrope.lcu import states
 from heliotrope.links.messages import NODE, ClusterStatus, Command
 from heliotrope.mechanism.tracking import track
+from heliotrope.safety import alarms
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, RECEIVER, outfits
 from heliotrope.twin.invariants.beams import (
@@ -65,6 +66,34 @@ def test_a_beam_is_astray_once_its_drives_could_have_brought_it(turned: float) -
     last_look(turned, SETTLE + NAMED_WITHIN + needs)
     with pytest.raises(InvariantError, match=r"H01: TRACKING, its beam .* and no alarm names it"):
         last_look(turned, SETTLE + NAMED_WITHIN + needs + 2.0)
+
+
+def rests_in_doubt(ends_at: float, named_again_at: float, until: float) -> None:
+    """Look at a mirror in doubt about its counts, beside its standby point, over a new program."""
+    board = standing(0.0)
+    assert board.node is not None
+    board.node.controller.state = states.APPROACHING
+    observer = BeamObserver(0.0, {"C1": [board]}, lambda now: SUN, ())
+    observer.sent(Command("s", "STANDBY", (60.0, 0.0, 40.0)), ("H01",), 0.0)
+    observer.sent(Command("a", "APPROACH"), ("H01",), 0.0)
+    for axis in board.axes:
+        axis.turned, axis.joint = axis.turned - 60_000, axis.joint - 60_000.0
+    for half in range(round(2.0 * until)):
+        now = 0.5 * half
+        if now == 1.0:
+            board.node.controller.state = states.IDLE
+        if now in (5.0, named_again_at):
+            observer.alarmed(alarms.COUNTS_DOUBTFUL.raised("H01"), now)
+        if now == ends_at:
+            observer.ended()
+        observer.look(None, {"C1"}, now)
+
+
+def test_a_doubt_must_be_named_anew_by_a_new_program() -> None:
+    """Simulated run 2700083: the program ended with the doubt, and 30 s were over at once."""
+    rests_in_doubt(80.0, 83.0, 200.0)
+    with pytest.raises(InvariantError, match=r"H01: IDLE, its beam .* beside where it was sent"):
+        rests_in_doubt(80.0, 1e3, 200.0)
 
 
 def last_quiet_look(turned: float, until: float) -> None:

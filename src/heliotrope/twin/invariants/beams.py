@@ -304,7 +304,14 @@ class BeamObserver:
         self._alarms[alarm.condition, alarm.subject] = (now, alarm.active)
 
     def ended(self) -> None:
-        """Note that the plant's program has ended, and its alarms with it."""
+        """Note that the plant's program has ended, and its alarms with it.
+
+        A mirror whose step counts were in doubt must be named anew by the next one, in the time
+        that any mirror has.
+        """
+        for mirror in self._mirrors.values():
+            if self._doubted(mirror):
+                mirror.astray_since = None
         self._alarms.clear()
         self._proved.clear()
         self._left.clear()
@@ -420,9 +427,14 @@ class BeamObserver:
         unnamed = 0.0 if since is None else now - max(since, mirror.named_at)
         saw = f"{beside}, and no alarm names it"
         self._check(12, unnamed <= NAMED_WITHIN, now, mirror.name, saw)
-        doubtful = self._alarms.get((alarms.COUNTS_DOUBTFUL.name, mirror.name), (0.0, False))[1]
-        off = doubtful and mirror.state == states.IDLE and not self._lights(mirror, sun)
+        off = (
+            self._doubted(mirror) and mirror.state == states.IDLE and not self._lights(mirror, sun)
+        )
         self._check(12, off or passed <= OFF_WITHIN, now, mirror.name, beside)
+
+    def _doubted(self, mirror: _Mirror) -> bool:
+        """Whether an alarm names a mirror for its step counts."""
+        return self._alarms.get((alarms.COUNTS_DOUBTFUL.name, mirror.name), (0.0, False))[1]
 
     def _lights(self, mirror: _Mirror, sun: FloatArray) -> bool:
         """Whether a beam is on the receiver or inside a volume."""
