@@ -578,7 +578,7 @@ def test_no_more_orders_are_taken_than_the_bus_can_carry() -> None:
         await field.until(field.sun_is_fresh)
         for board in field.boards:
             board.on = False
-        command = Command("c", "AIM", AIM, token=TOKEN, lifetime=20.0)
+        command = Command("c", "ROUGH", (1,), token=TOKEN, lifetime=20.0)
         for _ in range(1030):
             field.cluster._work.take(command)
         await asyncio.sleep(1.5)
@@ -925,3 +925,23 @@ def test_a_status_is_not_delivered_later_than_the_next_one_is_due() -> None:
         assert max(left) <= 1.0
 
     run(main)
+
+
+@pytest.mark.parametrize("name", ["AIM", "STANDBY"])
+def test_a_point_that_is_tried_again_does_not_come_after_a_newer_one(name: str) -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        field.bus.lose(name, 3)
+        await field.order("old", name, 0.0, 0.0, 52.0, heliostats=("A1", "A2"))
+        await field.order("new", name, 0.0, 0.0, 51.0, heliostats=("A1",))
+        assert await final(field, "new") is Stage.DONE
+        assert await final(field, "old", "A2") is Stage.DONE
+        assert await final(field, "old") is Stage.FAILED
+        await asyncio.sleep(3.0)
+        first, second = (board.node.controller for board in field.boards[:2])
+        points = [first.motion.aim, second.motion.aim]
+        if name == "STANDBY":
+            points = [first.config.standby, second.config.standby]
+        assert points == [(0.0, 0.0, 51.0), (0.0, 0.0, 52.0)]
+
+    run(main, "IDLE", bus=interrupted)

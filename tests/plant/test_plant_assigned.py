@@ -9,14 +9,41 @@ from heliotrope.errors import FormatError, InputError
 from heliotrope.field.example import example_plant
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.links.messages import Stage
+from heliotrope.links.messages import Progress, Stage
 from heliotrope.plant.aims import BeamCheck
-from heliotrope.plant.assigned import AssignedError, AssignedFile, Points, grouped, points_of
+from heliotrope.plant.assigned import (
+    AssignedError,
+    AssignedFile,
+    Points,
+    grouped,
+    points_of,
+    rest_on,
+)
 from heliotrope.plant.audit import read
 from heliotrope.plant.authority import RefusedError
-from support.plant_bench import OPERATOR, Bench, running
+from heliotrope.plant.settings import PlantSettings
+from support.plant_bench import OPERATOR, Bench, SlowDisk, running
 
-AIM, STANDBY = (0.1, 0.2, 16.5), (4.0, 0.0, 14.0)
+AIM, OTHER, STANDBY = (0.1, 0.2, 16.5), (0.0, 0.0, 16.0), (4.0, 0.0, 14.0)
+
+
+def give(points: Points, kind: str, *places: tuple[float, float, float]) -> None:
+    """Store and assign points of the first heliostats, as a command does."""
+    rows, wanted = np.arange(len(places)), np.array(places)
+    points.storing(kind, rows, wanted)[0]()
+    points.assign(kind, rows, wanted)
+
+
+def places(points: Points, kind: str) -> list[list[float]]:
+    """Where the first heliostat's local controller may send its beam."""
+    return [point[0].tolist() for _, point in points.possible(kind, np.arange(1))]
+
+
+async def idle(bench: Bench, *names: str) -> None:
+    """Let heliostats be at standby."""
+    for name in names:
+        bench.cluster_of(name).set(states.IDLE, name)
+    await bench.wait(2.0)
 
 
 def test_what_was_assigned_is_known_after_a_restart(tmp_path: Path) -> None:
@@ -251,3 +278,168 @@ def test_a_point_taken_late_is_taken_and_one_replaced_meanwhile_is_not(tmp_path:
     again.storing("AIM", both[1:], np.array([[2.0, 0.0, 9.0]]))[0]()
     assert store.read()["AIM-1"]["B"] == (1.0, 0.0, 9.0)
     assert "B" not in store.read()["AIM-2"]
+
+
+def test_a_first_point_that_was_not_taken_is_known_after_a_restart(tmp_path: Path) -> None:
+    """Its local controller has an aim of its own, or none, whatever the plant's store knows."""
+    store = AssignedFile(tmp_path / "assigned.json")
+
+    async def before(clock: VirtualClock) -> None:
+        async with running(Bench(clock, tmp_path, assigned=store)) as bench:
+            token = await bench.commanded()
+            for name in ("P1A", "P1B"):
+                bench.cluster_of(name).stubborn.add(name)
+            both = {"P1A": AIM, "P1B": AIM}
+            assert not await bench.plant.aim(OPERATOR, token, both).end(5.0)
+            bench.cluster_of("P1B").stubborn.discard("P1B")
+            assert await bench.plant.aim(OPERATOR, token, {"P1B": AIM}).end(5.0)
+
+    async def after(clock: VirtualClock) -> None:
+        folder = tmp_path / "again"
+        folder.mkdir()
+        async with running(Bench(clock, folder, seed=2, assigned=store)) as bench:
+            token = await bench.commanded()
+            await idle(bench, "P1A", "P1B")
+            ticket = bench.plant.command(OPERATOR, token, "TRACK", ("P1A", "P1B"))
+            assert not await ticket.end(5.0)
+            assert ticket.refusals.keys() == {"P1A"}
+
+    run_virtual(before)
+    assert "P1B" not in store.read()["AIM-1"], "what was taken is settled at the end"
+    run_virtual(after)
+
+
+def test_a_standby_point_of_the_plant_file_is_one_before(tmp_path: Path) -> None:
+    store = AssignedFile(tmp_path / "assigned.json")
+    for _ in range(2):
+        points = Points(("A",), store)
+        rest_on(points.standbys, STANDBY)
+        if not store.read():
+            give(points, "STANDBY", OTHER)
+        assert places(points, "STANDBY") == [list(OTHER), list(STANDBY)]
+
+
+def test_an_earlier_aim_that_is_taken_after_a_later_one_counts(tmp_path: Path) -> None:
+    async def main(clock: VirtualClock) -> None:
+        async with running(Bench(clock, tmp_path)) as bench:
+            plant, token, cluster = bench.plant, await bench.commanded(), bench.cluster_of("P1A")
+            await idle(bench, "P1A")
+            cluster.deaf.add("P1A")
+            plant.aim(OPERATOR, token, {"P1A": OTHER})
+            await bench.wait(0.5)
+            cluster.deaf.clear()
+            assert await plant.aim(OPERATOR, token, {"P1A": AIM}).end(5.0)
+            late = cluster.commands("AIM")[0]
+            # A name that comes twice is one heliostat.
+            await cluster.send(Progress(late.identity, Stage.DONE, ("P1A", "P1A")))
+            await bench.wait(1.0)
+            with pytest.raises(RefusedError, match="TRACK P1A: its last aim was not taken"):
+                plant.command(OPERATOR, token, "TRACK", ("P1A",))
+            assert await plant.aim(OPERATOR, token, {"P1A": AIM}).end(5.0)
+            assert await plant.command(OPERATOR, token, "TRACK", ("P1A",)).end(5.0)
+
+    run_virtual(main)
+
+
+def test_what_was_refused_is_not_taken_by_a_report_on_all(tmp_path: Path) -> None:
+    async def main(clock: VirtualClock) -> None:
+        async with running(Bench(clock, tmp_path)) as bench:
+            plant, token, cluster = bench.plant, await bench.commanded(), bench.cluster_of("P1A")
+            await idle(bench, "P1A")
+            cluster.stubborn.add("P1A")
+            assert not await plant.aim(OPERATOR, token, {"P1A": OTHER}).end(5.0)
+            cluster.stubborn.clear()
+            await cluster.send(Progress(cluster.commands("AIM")[-1].identity, Stage.DONE))
+            await bench.wait(1.0)
+            with pytest.raises(RefusedError, match="TRACK P1A: its last aim was not taken"):
+                plant.command(OPERATOR, token, "TRACK", ("P1A",))
+
+    run_virtual(main)
+
+
+def test_a_point_given_again_is_not_taken_back_with_the_first(tmp_path: Path) -> None:
+    store = AssignedFile(tmp_path / "assigned.json")
+    points, one = Points(("A",), store), np.arange(1)
+    give(points, "AIM", AIM)
+    points.taken("AIM", one)
+    first, take_back = points.storing("AIM", one, np.array([OTHER]))
+    first()
+    give(points, "AIM", OTHER)
+    take_back()
+    assert store.read()["AIM"]["A"] == OTHER
+    # Nor does an older settling forget what came before the same point given again.
+    give(points, "AIM", AIM)
+    points.taken("AIM", one)
+    settle = points.settling()
+    assert settle is not None
+    give(points, "AIM", OTHER)
+    give(points, "AIM", AIM)
+    settle()
+    assert list(OTHER) in places(Points(("A",), store), "AIM")
+
+
+def test_who_waits_to_join_while_its_aim_is_refused_is_not_sent(tmp_path: Path) -> None:
+    async def main(clock: VirtualClock) -> None:
+        settings = PlantSettings(join_rate=1.0, join_burst=1)
+        async with running(Bench(clock, tmp_path, settings=settings)) as bench:
+            plant, token = bench.plant, await bench.commanded()
+            name, other = plant.field.names[:2]
+            cluster = bench.cluster_of(name)
+            await idle(bench, name, other)
+            assert await plant.aim(OPERATOR, token, {name: AIM, other: AIM}).end(5.0)
+            cluster.stubborn.add(name)
+            plant.aim(OPERATOR, token, {name: OTHER})
+            track = plant.command(OPERATOR, token, "TRACK", (other, name))
+            await bench.wait(0.5)
+            assert track.stage(name) is None, "it waits for its turn"
+            cluster.stubborn.clear()
+            assert not await track.end(10.0)
+            assert track.refusals[name].startswith("its last aim was not taken")
+            assert track.stage(other) is Stage.DONE
+
+    run_virtual(main)
+
+
+@pytest.mark.parametrize("pause", [0.0, 0.4])
+def test_a_beam_that_is_aimed_elsewhere_meanwhile_is_not_brought_back(
+    pause: float, tmp_path: Path
+) -> None:
+    async def main(clock: VirtualClock) -> None:
+        disk = SlowDisk(clock)
+        async with running(Bench(clock, tmp_path, disk=disk)) as bench:
+            plant, token, name = bench.plant, await bench.commanded(), "P1A"
+            await idle(bench, name)
+            base = np.array(plant.design.receivers[0].center)
+            target = np.array(plant.design.targets[0].center)
+            assert await plant.aim(OPERATOR, token, {name: base}).end(5.0)
+            assert await plant.command(OPERATOR, token, "TRACK", (name,)).end(5.0)
+            await bench.wait(2.0)
+            assert await plant.move(OPERATOR, token, {name: base + (0.01, 0.0, 0.0)}).end(5.0)
+            await bench.wait(pause)
+            disk.delay = 0.95
+            plant.aim(OPERATOR, token, {name: target})
+            plant.movements.end([name])
+            await bench.wait(10.0)
+            assert np.array_equal(bench.cluster_of(name).commands("AIM")[-1].values, target)
+            assert np.array_equal(plant.aims[plant.field.place(name)], target)
+
+    run_virtual(main)
+
+
+def test_a_beam_that_did_not_leave_its_standby_point_counts_in_an_eye(tmp_path: Path) -> None:
+    balcony, away = (4.0, -6.0, 12.0), (-6.0, 0.0, 15.0)
+
+    async def main(clock: VirtualClock) -> None:
+        async with running(Bench(clock, tmp_path, eyes=(balcony,))) as bench:
+            plant, token = bench.plant, await bench.commanded()
+            first, second = plant.field.names[:2]
+            assert await plant.standby(OPERATOR, token, {first: balcony}).end(5.0)
+            bench.cluster_of(first).stubborn.add(first)
+            assert not await plant.standby(OPERATOR, token, {first: away}).end(5.0)
+            with pytest.raises(RefusedError, match="at rest its beam shines on the place"):
+                plant.standby(OPERATOR, token, {second: balcony})
+            bench.cluster_of(first).stubborn.clear()
+            assert await plant.standby(OPERATOR, token, {first: away}).end(5.0)
+            plant.standby(OPERATOR, token, {second: balcony})
+
+    run_virtual(main)

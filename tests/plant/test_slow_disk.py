@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heliotrope.files.disk import DiskBusyError, DiskThread, Then, Work
+from heliotrope.files.disk import DiskBusyError, DiskThread
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual, sleep_until
 from heliotrope.links.messages import Command, Emergency, Lease, Stage
@@ -22,35 +22,9 @@ from heliotrope.plant.audit import read
 from heliotrope.plant.lockouts import Lockout
 from heliotrope.safety import Act
 from support.midsummer import DayClock
-from support.plant_bench import ENGINEER, OPERATOR, Bench, running
+from support.plant_bench import ENGINEER, OPERATOR, Bench, SlowDisk, running
 
 AIM = {"P1A": (0.1, 0.2, 16.5)}
-
-
-class SlowDisk:
-    """A disk in virtual time that takes some seconds for each piece of work."""
-
-    def __init__(self, clock: VirtualClock) -> None:
-        self.clock, self.delay = clock, 0.0
-        self._free_at = 0.0
-
-    def do(self, work: Work, then: Then) -> None:
-        """Do work when all earlier work is done and the time of this one is over."""
-        now = self.clock.monotonic()
-        self._free_at = max(self._free_at, now) + self.delay
-
-        def do() -> None:
-            try:
-                work()
-            except Exception as error:  # noqa: BLE001 - as every disk
-                then(error)
-            else:
-                then(None)
-
-        asyncio.get_running_loop().call_later(self._free_at - now, do)
-
-    def close(self) -> None:
-        """Nothing to do."""
 
 
 def play(folder: Path, scene) -> Bench:  # type: ignore[no-untyped-def]

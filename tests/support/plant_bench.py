@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from heliotrope.field.example import example_plant
 from heliotrope.field.plant import Plant
+from heliotrope.files.disk import Then, Work
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, sleep_until
 from heliotrope.links.in_process import Faults, MemoryLine, memory_pair
@@ -277,6 +278,32 @@ class Bench:
             await self.wait(0.5)
             self.plant.authority.keep(person, token)
         return token
+
+
+class SlowDisk:
+    """A disk in virtual time that takes some seconds for each piece of work."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self.clock, self.delay = clock, 0.0
+        self._free_at = 0.0
+
+    def do(self, work: Work, then: Then) -> None:
+        """Do work when all earlier work is done and the time of this one is over."""
+        now = self.clock.monotonic()
+        self._free_at = max(self._free_at, now) + self.delay
+
+        def do() -> None:
+            try:
+                work()
+            except Exception as error:  # noqa: BLE001 - as every disk
+                then(error)
+            else:
+                then(None)
+
+        asyncio.get_running_loop().call_later(self._free_at - now, do)
+
+    def close(self) -> None:
+        """Nothing to do."""
 
 
 @contextlib.asynccontextmanager

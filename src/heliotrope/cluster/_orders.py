@@ -45,6 +45,8 @@ _MOST_JOBS = 2048
 _FEW, FOLLOWED = 4, 60.0
 #: Commands written to flash before they are acknowledged.
 _STORED = ("STANDBY",)
+#: Commands of which the last one counts: an earlier one that waits to be tried again is given up.
+_POINTS = ("AIM", "STANDBY")
 #: Commands that may move a mirror: refused while a row of the safety table forbids motion.
 MOTIONS = frozenset(
     {"APPROACH", "IDLE", "TRACK", "REFOCUS", "AIM", "STANDBY", "JOG", "GOTO", "SEARCH", "DIAGNOSE"}
@@ -227,7 +229,25 @@ class Orders:
 
     def _begin(self, order: Order, node: ClusterNode) -> None:
         self._reports.add(order.identity, Stage.ACCEPTED, node.name)
+        if order.name in _POINTS:
+            self._supersede(order, node)
         self._ready.append(NodeOrder(order, node))
+
+    def _supersede(self, order: Order, node: ClusterNode) -> None:
+        """Give up an earlier point of a node: tried again, it would come after the new one."""
+        why = f"superseded by another {order.name}"
+
+        def earlier(job: NodeOrder) -> bool:
+            return job.node is node and job.order.name == order.name
+
+        if self._at_work is not None and earlier(self._at_work):
+            self._at_work.void = why
+        old = [job for job in (*self._ready, *self._later) if earlier(job)]
+        if old:
+            self._ready = deque(job for job in self._ready if not earlier(job))
+            self._later = [job for job in self._later if not earlier(job)]
+            for job in old:
+                self._fail(job, why)
 
     # -- time ------------------------------------------------------------------------------
 

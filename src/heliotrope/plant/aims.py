@@ -233,7 +233,11 @@ class BeamCheck:
         return found
 
     def glare(
-        self, rows: npt.NDArray[np.intp], points: FloatArray, standbys: FloatArray, sun: FloatArray
+        self,
+        rows: npt.NDArray[np.intp],
+        points: FloatArray,
+        possible: Sequence[tuple[npt.NDArray[np.intp], FloatArray]],
+        sun: FloatArray,
     ) -> dict[str, str]:
         """Return the heliostats whose resting beams would shine into an eye too brightly, and why.
 
@@ -244,30 +248,31 @@ class BeamCheck:
         ----------
         rows, points
             Heliostats (K,) and their new standby points, ENU, m, (K, 3).
-        standbys
-            Present standby points of all heliostats, (N, 3); NaN where there is none.
+        possible
+            Standby points that local controllers may have now, and whose; see `Points.possible`.
+            A heliostat counts at the one from which an eye sees the most of it.
         sun
             Unit vector, (3,).
         """
         if not len(self.eyes) or not len(rows):
             return {}
-        after = standbys.copy()
-        after[rows] = points
-        known = np.flatnonzero(np.isfinite(after).all(axis=-1))
-        solved = self.poses(known, after[known], sun)
+        some = [(rows, points), *possible]
+        known, places = (np.concatenate([each[i] for each in some]) for i in (0, 1))
+        solved = self.poses(known, places, sun)
         part = _rows_of(self.mirrors, known)
-        rest = beams(
-            solved.chosen(solved.vertex), after[known], part, reach=np.full(len(known), FAR)
-        )
-        seen = crossing(rest, self.eyes, dni=1.0)
+        rest = beams(solved.chosen(solved.vertex), places, part, reach=np.full(len(known), FAR))
+        seen = crossing(rest, self.eyes, dni=1.0).concentration * part.reflectivity
+        most = np.zeros((len(self.names), len(self.eyes)))
+        np.maximum.at(most, known, np.nan_to_num(seen).T)
+        total = most.sum(axis=0)
         found: dict[str, str] = {}
-        for eye in np.flatnonzero(~(seen.irradiance <= MOST_SUNS)):
-            lit = seen.concentration[eye] > 0.0
-            for row in np.intersect1d(known[lit], rows):
+        for eye in np.flatnonzero(~(total <= MOST_SUNS)):
+            lit = seen[eye, : len(rows)] > 0.0
+            for row in np.unique(rows[lit]):
                 found.setdefault(
                     self.names[row],
                     f"at rest its beam shines on the place {_point(self.eyes[eye])} m, where the "
-                    f"light of all beams together is {seen.irradiance[eye]:.2f} suns (limit "
+                    f"light of all beams together is {total[eye]:.2f} suns (limit "
                     f"{MOST_SUNS:g}); choose another standby point",
                 )
         return found

@@ -158,8 +158,11 @@ class Points:
         }
         #: The points in the store; only work of the disk changes them.
         self._stored: dict[str, Places] = {kind: {} for kind in every}
-        #: Points that were taken since the store was last told, by kind.
-        self._taken: dict[str, Places] = {kind: {} for kind in KINDS}
+        #: Points that were taken since the store was last told, by kind, each with its mark.
+        self._taken: dict[str, dict[str, tuple[tuple[float, ...], object]]]
+        self._taken = {kind: {} for kind in KINDS}
+        #: Who stored the assigned point last, by kind: the same point may be given twice.
+        self._marks: dict[str, dict[str, object]] = {kind: {} for kind in KINDS}
         index = {name: row for row, name in enumerate(names)}
         for kind, places in ({} if store is None else store.read()).items():
             for name, point in places.items():
@@ -177,8 +180,10 @@ class Points:
     def taken(self, kind: str, rows: npt.NDArray[np.intp]) -> None:
         """Note that local controllers have the points that are assigned now; see `settling`."""
         self.earlier[kind][:, rows] = np.nan
-        places = map(tuple, self._arrays[kind][rows].tolist())
-        self._taken[kind].update(zip((self._names[row] for row in rows), places, strict=True))
+        marks = self._marks[kind]
+        for row, place in zip(rows, self._arrays[kind][rows].tolist(), strict=True):
+            name = self._names[row]
+            self._taken[kind][name] = tuple(place), marks.get(name)
 
     def possible(self, kind: str, rows: npt.NDArray[np.intp]) -> list[tuple[Rows, FloatArray]]:
         """Return where local controllers (K,) may send their beams.
@@ -202,7 +207,12 @@ class Points:
         were replaced meanwhile; it may be done again.
         """
         new = {self._names[i]: tuple(p) for i, p in zip(rows, points.tolist(), strict=True)}
-        kinds = (kind, *EARLIER[kind])
+        present = self._arrays[kind][rows]
+        known = np.isfinite(present).all(axis=-1)
+        # Where none is stored: the one that machines store, or the new one, not taken yet.
+        first = np.where(known[:, None], present, points).tolist()
+        before = {self._names[i]: tuple(p) for i, p in zip(rows, first, strict=True)}
+        kinds, mark = (kind, *EARLIER[kind]), object()
         old: dict[str, list[tuple[float, ...] | None]] = {}
 
         def keep(chains: Mapping[str, Sequence[tuple[float, ...] | None]]) -> None:
@@ -210,11 +220,12 @@ class Points:
 
         def store() -> None:
             old.update({n: [self._stored[k].get(n) for k in kinds] for n in new})
-            keep({n: _followed(old[n], point) for n, point in new.items()})
+            keep({n: _followed(old[n], point, before[n]) for n, point in new.items()})
+            self._marks[kind].update(dict.fromkeys(new, mark))
 
         def take_back() -> None:
-            known = self._stored[kind]
-            keep({n: chain for n, chain in old.items() if known.get(n) == new[n]})
+            marks = self._marks[kind]
+            keep({n: chain for n, chain in old.items() if marks.get(n) is mark})
 
         return store, take_back
 
@@ -230,8 +241,12 @@ class Points:
         def settle() -> None:
             changes: _Changes = {}
             for kind, places in taken.items():
-                known = self._stored[kind]
-                names = [n for n, point in places.items() if known.get(n) == point]
+                known, marks = self._stored[kind], self._marks[kind]
+                names = [
+                    n
+                    for n, (point, mark) in places.items()
+                    if known.get(n) == point and marks.get(n) is mark
+                ]
                 for each in EARLIER[kind]:
                     changes[each] = {n: None for n in names if n in self._stored[each]}
             if any(changes.values()):
@@ -269,12 +284,15 @@ def put_before(earlier: FloatArray, rows: npt.NDArray[np.intp], points: FloatArr
 
 
 def _followed(
-    chain: Sequence[tuple[float, ...] | None], point: tuple[float, ...]
+    chain: Sequence[tuple[float, ...] | None], point: tuple[float, ...], before: tuple[float, ...]
 ) -> Sequence[tuple[float, ...] | None]:
     """Return the points of one heliostat, the assigned one first, with a new one assigned."""
     last, *earlier = chain
     if last == point:
         return chain
+    last = before if last is None else last
+    if earlier[0] == last:  # only said that it was not taken yet
+        earlier = [*earlier[1:], None]
     oldest = earlier[-2] if earlier[-1] is None else earlier[-1]
     return [point, last, *earlier[:-2], oldest]
 

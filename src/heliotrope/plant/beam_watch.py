@@ -125,7 +125,8 @@ class BeamWatch:
             of = rows[among], wanted[among], light
             wrong |= self._check.problems(*of, start=start, stopped=stopped)
         if not stopped:
-            wrong |= self._check.glare(rows, wanted, self.points.standbys, light)
+            every = self.points.possible("STANDBY", np.arange(len(self._field)))
+            wrong |= self._check.glare(rows, wanted, every, light)
         if wrong:
             raise BeamError(name, wrong)
 
@@ -312,12 +313,15 @@ class BeamWatch:
             for i in np.flatnonzero(unknown)
         }
         if not unknown.all():
-            known = rows[~unknown]
-            counts, light = self._field.counts(known), self._sun(0.0)
-            found |= self._by_earlier(known, aims[~unknown])
-            found |= self._check.on_the_way(known, counts, aims[~unknown], light, self._ways.motion)
-            if name == "SEARCH":
-                found |= self._check.around(known, aims[~unknown], values[1], light)
+            light = self._sun(0.0)
+            # AIM itself brings the new one; TRACK may come before it, and leads to one before.
+            possible = self.points.possible("AIM", rows[~unknown])
+            for known, places in possible[:1] if name == "AIM" else possible:
+                counts = self._field.counts(known)
+                found |= self._by_earlier(known, places)
+                found |= self._check.on_the_way(known, counts, places, light, self._ways.motion)
+                if name == "SEARCH":
+                    found |= self._check.around(known, places, values[1], light)
         return found
 
     def _to_standby(

@@ -199,7 +199,10 @@ class Commands:
         self._prove_points("AIM", names, rows, wanted)
 
         def assign() -> frozenset[str]:
-            self._movements.take(names, self._aims(rows), token, self._now())
+            aims, on = self._aims(rows), np.ones(len(rows), dtype=np.bool_)
+            if wrong := self._movements.refused(names, rows, aims, wanted, on):
+                raise BeamError("AIM", wrong)  # aimed elsewhere while the record was written
+            self._movements.take(names, aims, token, self._now())
             self._ways.points.assign("AIM", rows, wanted)
             return frozenset(names)
 
@@ -225,6 +228,9 @@ class Commands:
         wanted = np.stack([due[n] for n in names])
 
         def assign() -> frozenset[str]:
+            aimed = [name for name in names if name not in self._movements.names]
+            if aimed:  # while the record was written
+                raise BeamError("AIM", dict.fromkeys(aimed, "it has another aim now"))
             self._ways.points.assign("AIM", rows, wanted)
             return frozenset(names)
 

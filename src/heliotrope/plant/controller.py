@@ -208,7 +208,13 @@ class PlantController:
         self._commands = self._directed()
         life, barred, examine = self.settings.join_life, self.doubts.barred, self._commands.examine
         self._joiner = JoinDispatcher(
-            self._joining, self._orders, self._ways, life, barred, examine
+            self._joining,
+            self._orders,
+            self._ways,
+            life,
+            barred,
+            examine,
+            self._permission.untaken,
         )
         self._named_at, self._slow_at = dict.fromkeys(members, -math.inf), -math.inf
         self._closing = asyncio.Event()
@@ -301,6 +307,8 @@ class PlantController:
                 await end.link.close()
             for task in tasks:
                 task.cancel()
+        if work := self._ways.points.settling():
+            self._orders.owe(work)
         await self._orders.end(self.now())
 
     async def close(self) -> None:

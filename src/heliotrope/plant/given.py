@@ -30,6 +30,8 @@ class Given:
         self._field, self._points = field, points
         #: By kind and heliostat; None where the ticket ended with an earlier program.
         self._tickets: dict[str, dict[str, Ticket | None]] = {}
+        #: The last ticket that was taken, by kind and heliostat.
+        self._took: dict[str, dict[str, Ticket]] = {kind: {} for kind in KINDS}
         for kind in KINDS:
             open_ = np.isfinite(points.earlier[kind]).any(axis=(0, 2))
             self._tickets[kind] = {field.names[row]: None for row in np.flatnonzero(open_)}
@@ -40,10 +42,15 @@ class Given:
 
     def done(self, ticket: Ticket, heliostats: Sequence[str]) -> None:
         """Note points that were taken, unless others were sent since."""
-        last = self._tickets[ticket.name]
-        names = [name for name in heliostats if last.get(name) is ticket]
+        last, took = self._tickets[ticket.name], self._took[ticket.name]
+        for name in heliostats:
+            if name not in last and took.get(name, ticket) is not ticket:
+                last[name] = None  # it came after the one that was given later
+        names = [n for n in dict.fromkeys(heliostats) if last.get(n) is ticket]
+        names = [n for n in names if ticket.stage(n) is not Stage.REFUSED]
         for name in names:
             del last[name]
+            took[name] = ticket
         if names:
             rows = np.array([self._field.place(name) for name in names], dtype=np.intp)
             self._points.taken(ticket.name, rows)

@@ -122,6 +122,8 @@ class JoinDispatcher:
         Returns which of some heliostats may not join for another reason, and why.
     examine
         Examines a slice of those that leave stow.
+    untaken
+        Returns which of some heliostats have not taken their last aim, and why.
     """
 
     def __init__(
@@ -132,9 +134,10 @@ class JoinDispatcher:
         life: float,
         barred: Callable[[tuple[str, ...]], dict[str, str]],
         examine: Examine,
+        untaken: Callable[[tuple[str, ...]], dict[str, str]],
     ) -> None:
         self._queue, self._orders, self._beams, self._life = queue, orders, beams, life
-        self._barred, self._examine = barred, examine
+        self._barred, self._examine, self._untaken = barred, examine, untaken
 
     def beat(self, now: float, token: int) -> None:
         """Send the heliostats whose turn it is."""
@@ -147,7 +150,10 @@ class JoinDispatcher:
     def _wrong(self, job: JoiningJob, part: tuple[str, ...]) -> dict[str, str]:
         """Return which heliostats whose turn has come may not go, and why."""
         if job.name != SLICED:
-            return self._beams.joining(job.name, job.values, part) | self._barred(part)
+            wrong = self._barred(part)
+            if job.name != "AIM":
+                wrong |= self._untaken(part)
+            return self._beams.joining(job.name, job.values, part) | wrong
         try:
             return self._examine(job.name, job.values, part)[1]
         except BeamError as error:

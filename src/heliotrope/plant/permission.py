@@ -89,8 +89,7 @@ class Permission:
             wrong = self._sync.differing(names) | self._orders.to_stow(names) | wrong
         if name in JOINING:
             wrong |= self._sentinel.barred(names) | self._doubts.barred(names)
-            for each, reason in self._given.untaken("AIM", names).items():
-                wrong[each] = refusals.AIM_NOT_TAKEN.text.format(reason=reason)
+            wrong |= self.untaken(names)
         elif name in _TO_STANDBY:
             wrong |= self._sentinel.barred(self._off(names), ASTRAY)
         elif name in _STILL:
@@ -100,6 +99,13 @@ class Permission:
             self.refuse_now(name, names)
             raise BeamError(name, wrong)
         return tuple(n for n in names if n not in wrong), wrong
+
+    def untaken(self, names: Sequence[str]) -> dict[str, str]:
+        """Return which heliostats have not taken their last aim, and why."""
+        return {
+            name: refusals.AIM_NOT_TAKEN.text.format(reason=reason)
+            for name, reason in self._given.untaken("AIM", names).items()
+        }
 
     def _off(self, names: Sequence[str]) -> tuple[str, ...]:
         """Return which heliostats are at stow or have turned away."""

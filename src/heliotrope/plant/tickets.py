@@ -20,6 +20,7 @@ RANK = {
     Stage.FAILED: 6,
 }
 FINAL = RANK[Stage.DONE]
+_STAGES = {value: stage for stage, value in RANK.items()}
 
 
 class Ticket:
@@ -125,8 +126,7 @@ class Ticket:
 
     def stage(self, heliostat: str) -> Stage | None:
         """Return the stage of one heliostat; None while it waits in the plant."""
-        rank = int(self._stage[self._row[heliostat]])
-        return next((stage for stage, value in RANK.items() if value == rank), None)
+        return _STAGES.get(int(self._stage[self._row[heliostat]]))
 
     def counted(self) -> dict[str, int]:
         """Return the number of heliostats at each stage; "waiting" means in the plant."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
-from sqlalchemy import Connection, delete, func, select, update
+from sqlalchemy import Connection, bindparam, delete, func, select, update
 
 from heliotrope.errors import InputError
 from heliotrope.store import _rows as rows
@@ -101,10 +101,10 @@ def change_points(
 ) -> None:
     """Replace the assigned points, by kind."""
     table = tables.assigned_point
-    for kind, names in gone.items():
-        for name in names:
-            which = (table.c.kind == kind) & (table.c.heliostat == name)
-            connection.execute(delete(table).where(which))
+    left = [{"of": kind, "named": name} for kind, names in gone.items() for name in names]
+    if left:
+        which = (table.c.kind == bindparam("of")) & (table.c.heliostat == bindparam("named"))
+        connection.execute(delete(table).where(which), left)
     for kind, places in new.items():
         rows.replace(
             connection,
