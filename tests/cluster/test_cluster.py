@@ -299,6 +299,32 @@ def test_an_emergency_goes_before_orders_and_needs_no_token() -> None:
     run(main, "TRACKING")
 
 
+def test_a_heliostat_that_tells_no_step_counts_is_reported_with_its_beam() -> None:
+    """Its state is answered, so it is not silent; but its beam may be anywhere."""
+
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        real, lost = field.bus.carry, [True]
+
+        def carry(frame: bytes) -> bytes:
+            read = wire.Reader().feed(frame)[0]
+            steps = read.number == messages.NUMBER_OF["QUERY_STEPS"] and read.to == 1
+            return b"" if steps and lost[0] else real(frame)
+
+        field.bus.carry = carry
+        await field.until(lambda: bool(field.plant.alarms("node_silent")), 15.0)
+        (alarm,) = field.plant.alarms("node_silent")
+        assert alarm.severity is Severity.ALARM
+        assert alarm.text.startswith(
+            "A1: no answer for 10 s; it is TRACKING and does not tell its step counts; "
+            "the position of its beam is unknown. "
+        )
+        lost[0] = False
+        await field.until(lambda: not field.plant.alarms("node_silent")[-1].active, 8.0)
+
+    run(main, "TRACKING")
+
+
 def test_a_heliostat_that_falls_silent_is_reported_with_its_beam() -> None:
     async def main(field: Field) -> None:
         await asyncio.sleep(3.0)

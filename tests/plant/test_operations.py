@@ -5,7 +5,7 @@ import contextlib
 import math
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from heliotrope.field.layouts import lay_out
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Sphere
 from heliotrope.geometry import normalize
+from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import SendOutcome, Statistics
 from heliotrope.links.messages import Ask, ClusterStatus, Lease, encode
@@ -25,12 +26,16 @@ from heliotrope.optics import air_loss, intercept_rectangle, predict_flux
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.photographs import Shot, seen, spiral
 from heliotrope.plant.visits.settings import Centring
 from heliotrope.safety import Alarm, Severity, alarms
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Records, StoreError
+from heliotrope.sun import fast_vector
 from support.live import LiveOptions, LivePlant
+from support.plant_bench import Bench, running
 
 MRAD = 1e-3
 ENGINEER, OPERATOR, VIEWER = (
@@ -251,12 +256,15 @@ def live(
     settings: AutomaticSettings,
     count: int = 4,
     records: Records | None = None,
+    plant: PlantSettings | None = None,
+    start: datetime = START,
 ) -> None:
     """Run some heliostats on two clusters in virtual time."""
     design = lay_out("radial", count)
     (group,) = design.groups.values()
     group = replace(group, cluster=("C1",) * (count // 2) + ("C2",) * (count // 2))
-    options = LiveOptions(rendered=False, threads=0, work=settings)
+    plant = plant or PlantSettings()
+    options = LiveOptions(rendered=False, threads=0, work=settings, plant=plant)
 
     async def main(clock: VirtualClock) -> None:
         made = LivePlant(replace(design, groups={"azel": group}), clock, options, records=records)
@@ -265,7 +273,7 @@ def live(
             await work(plant)
             await plant.end()
 
-    run_virtual(main, start=START)
+    run_virtual(main, start=start)
 
 
 def test_whose_beam_has_no_way_is_named_and_the_others_join() -> None:
@@ -594,6 +602,71 @@ def test_a_mirror_left_on_a_target_goes_back_to_the_receiver() -> None:
         assert _states(plant) == ["TRACKING"] * 4
 
     live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0))
+
+
+def test_after_an_emergency_a_person_resumes_over_a_restart_too(tmp_path: Path) -> None:
+    keeper = Keeper(tmp_path / "store.sqlite", inline=True)
+    settings_ = AutomaticSettings(wanted=True, calibrate=False, margin=0.0)
+
+    async def call(plant: LivePlant) -> None:
+        await asyncio.sleep(200.0)
+        plant.operations.emergency(VIEWER, "STOW", "a fire")
+        await asyncio.sleep(60.0)
+        assert _waits(plant)
+        text = plant.operations.summary().resume
+        assert text.startswith("STOW was ordered for the whole field at ")
+
+    async def stay(plant: LivePlant) -> None:
+        assert _waits(plant)
+        await asyncio.sleep(100.0)
+        assert _states(plant) == ["STOWED"] * 4
+        plant.operations.resume(OPERATOR)
+        await asyncio.sleep(200.0)
+        assert _states(plant) == ["TRACKING"] * 4
+
+    for work in (call, stay):
+        live(work, settings_, records=keeper)
+    keeper.close()
+
+
+def test_the_stow_of_the_evening_is_no_loss_although_it_goes_in_turn() -> None:
+    evening = START
+    site = lay_out("radial", 4).site
+    while fast_vector(evening.timestamp(), site)[2] > math.sin(math.radians(9.2)):
+        evening += timedelta(minutes=1)
+
+    async def work(plant: LivePlant) -> None:
+        await asyncio.sleep(150.0)
+        assert "TRACKING" in _states(plant)
+        await asyncio.sleep(500.0)
+        assert set(_states(plant)) == {"STOWED"}
+        assert not _waits(plant)
+
+    settings_ = AutomaticSettings(wanted=True, calibrate=False, margin=0.0, losses=1)
+    live(work, settings_, 16, plant=PlantSettings(stow_rate=1.0), start=evening)
+
+
+def test_stow_from_before_a_lockout_does_not_park(tmp_path: Path) -> None:
+    """It had just been sent up, and the order to stow was lost with the line."""
+
+    async def main(clock: VirtualClock) -> None:
+        async with running(Bench(clock, tmp_path)) as bench:
+            plant, name = bench.plant, "P1A"
+            shown = Operations(plant, Logbook(clock), settings=AutomaticSettings(calibrate=False))
+            work = asyncio.create_task(shown.run())
+            token, cluster = await bench.commanded(), bench.cluster_of(name)
+            ticket = plant.command(OPERATOR, token, "APPROACH", (name,))
+            await bench.until(lambda: ticket.stage(name) is not None, 5.0)
+            await bench.until(lambda: cluster.rows["state"][0] == states.IDLE, 5.0)
+            bench.lines[cluster.name].cut()
+            shown.hold(OPERATOR, (name,), "washing")
+            await bench.wait(4.0)
+            bench.lines[cluster.name].heal()
+            await bench.until(lambda: cluster.rows["state"][0] == states.STOWED, 60.0)
+            await shown.close()
+            await work
+
+    run_virtual(main)
 
 
 def test_the_wait_for_a_person_outlasts_a_restart(tmp_path: Path) -> None:

@@ -153,3 +153,26 @@ def test_stow_is_ordered_where_defocus_ends_on_the_receiver(share: float, act: A
     # Held beside its aim on the receiver, it turns away from that.
     points.aims[row], points.standbys[row] = ON, BESIDE
     assert unsent.way_out("P5A", again=False) is Act.DEFOCUS
+
+
+def test_step_counts_from_before_an_order_prove_no_defocus(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, name = bench.plant, "P5A"
+        put(bench, name, states.IDLE, BESIDE)
+        await bench.wait(3.0)
+        cluster = bench.cluster_of(name)
+        cluster.untold.add(name)
+        await bench.wait(2.5)
+        order = plant.raise_emergency("Vera", Act.DEFOCUS)
+        await bench.wait(0.3)
+        # DEFOCUS turns it onto the receiver, which nobody hears.
+        put(bench, name, states.DEFOCUSED, ON)
+        await bench.wait(20.0)
+        assert not order.is_done(name)
+        assert order.report(plant.now()).not_done == (name,)
+        cluster.untold.clear()
+        put(bench, name, states.DEFOCUSED, BESIDE)
+        await bench.wait(5.0)
+        assert order.is_done(name)
+
+    play(tmp_path, scene)

@@ -66,6 +66,8 @@ class ScriptedCluster:
     ----------
     deaf, stubborn
         Heliostats that acknowledge nothing, and that refuse all commands.
+    untold
+        Heliostats whose step counts are not heard any more; their states are.
     mute
         It sends no status.
     taken
@@ -84,6 +86,8 @@ class ScriptedCluster:
         self.name, self.names, self.link, self.clock = name, names, link, clock
         self.deaf: set[str] = set()
         self.stubborn: set[str] = set()
+        self.untold: set[str] = set()
+        self._told: dict[str, tuple[float, Any]] = {}
         self.mute = False
         self.greets = True
         self.taken: list[tuple[float, Message]] = []
@@ -129,6 +133,14 @@ class ScriptedCluster:
                 rows = self.poses(self.rows.copy())
                 rows["heard_ms"] = np.where(self.age_ms < 0, NEVER, np.maximum(self.age_ms, 0))
                 rows["steps_ms"] = rows["heard_ms"]
+                for name in self.untold:
+                    at, last = self._told.setdefault(
+                        name, (self.clock.monotonic(), rows[self.names.index(name)].copy())
+                    )
+                    row = rows[self.names.index(name)]
+                    for each in _STEPS:
+                        row[each] = last[each]
+                    row["steps_ms"] += round(1e3 * (self.clock.monotonic() - at))
                 greet = self.first and self.greets
                 status = ClusterStatus(
                     self.name,

@@ -155,6 +155,9 @@ class Polling:
         limit = self._config.silence
         for node in self._nodes:
             silent = now - max(node.heard_at, self._started) > limit
+            # One that answers, but does not tell its step counts: its beam may be anywhere.
+            unsure = now - max(node.steps_at, self._started) > limit + self._config.steps_every
+            silent |= unsure and node.index not in self._strange
             if silent and node.index not in self._silent:
                 self._silent.add(node.index)
                 self._report_silence(node, limit)
@@ -166,6 +169,9 @@ class Polling:
         out = node.known and node.state in BEAM_OUT
         if not node.known:
             last = "never heard" if node.heard_at < self._started else "its state was never heard"
+        elif self._clock.monotonic() - node.heard_at <= limit:
+            last = f"it is {states.STATES[node.state]} and does not tell its step counts"
+            last += "; the position of its beam is unknown" if out else ""
         else:
             last = f"its last state was {states.STATES[node.state]}"
             last += "; the position of its beam is unknown" if out else ""

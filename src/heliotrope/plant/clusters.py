@@ -25,7 +25,7 @@ QUESTION_LIFE, ANSWER_PATIENCE = 5.0, 60.0
 
 @dataclass(frozen=True)
 class _Post:
-    data: bytes
+    message: Message | Callable[[], Message | None]
     expires: float | None
     told: Callable[[SendOutcome], None] | None
 
@@ -54,16 +54,19 @@ class ClusterEnd:
 
     def post(
         self,
-        message: Message,
+        message: Message | Callable[[], Message | None],
         lifetime: float | None,
         told: Callable[[SendOutcome], None] | None = None,
         *,
         urgent: bool = False,
     ) -> None:
-        """Send a message as soon as possible, within ``lifetime`` s (None: at once or never)."""
+        """Send a message as soon as possible, within ``lifetime`` s (None: at once or never).
+
+        A function makes the message when its turn comes; None: it is not sent any more.
+        """
         expires = None if lifetime is None else self._clock.monotonic() + lifetime
         box = self._urgent if urgent else self._normal
-        box.append(_Post(encode(message), expires, told))
+        box.append(_Post(message, expires, told))
         self._news[not urgent].set()
 
     async def deliver(self, *, urgent: bool) -> None:
@@ -72,8 +75,13 @@ class ClusterEnd:
         while not self.link.closed:
             while box:
                 post = box.popleft()
+                message = post.message() if callable(post.message) else post.message
                 try:
-                    outcome = await self.link.send(post.data, expires=post.expires)
+                    outcome = (
+                        SendOutcome.EXPIRED
+                        if message is None
+                        else await self.link.send(encode(message), expires=post.expires)
+                    )
                 except LinkClosedError:
                     outcome = SendOutcome.DISCONNECTED
                 if post.told is not None:

@@ -206,16 +206,7 @@ class PlantController:
         self._given = Given(self.field, points)
         self._permission = self._permitting()
         self._commands = self._directed()
-        life, barred, examine = self.settings.join_life, self.doubts.barred, self._commands.examine
-        self._joiner = JoinDispatcher(
-            self._joining,
-            self._orders,
-            self._ways,
-            life,
-            barred,
-            examine,
-            self._permission.untaken,
-        )
+        self._joiner = self._dispatching()
         self._named_at, self._slow_at = dict.fromkeys(members, -math.inf), -math.inf
         self._closing = asyncio.Event()
         self._last_safe: tuple[tuple[str, Act, tuple[str, ...]], Ticket] | None = None
@@ -289,6 +280,17 @@ class PlantController:
             self.wanted,
             self.settings.join_wait,
             self.movements,
+        )
+
+    def _dispatching(self) -> JoinDispatcher:
+        """Return what sends heliostats whose turn to join has come."""
+        return JoinDispatcher(
+            self._joining,
+            self._orders,
+            self._ways,
+            self.settings.join_life,
+            self._permission.kept_back,
+            self._commands.examine,
         )
 
     # -- running ---------------------------------------------------------------------------
@@ -384,7 +386,7 @@ class PlantController:
         for alarm in self._sentinel.beat(now):
             self._tell(alarm)
         token = self.authority.token
-        self._joiner.beat(now, token)
+        self._joiner.beat(now, token, held=bool(self._sentinel.refusal(("",))))
         self._orders.beat(now)
         self._commands.bring_back(token)
         slow = now - self._slow_at >= _SLOW_BEAT

@@ -68,14 +68,18 @@ class JoinQueue:
         """Add a job at the end."""
         self._jobs.append(job)
 
-    def admit(self, now: float, token: int) -> list[tuple[JoiningJob, tuple[str, ...]]]:
-        """Return the heliostats that may go now; drop jobs of an earlier command authority."""
+    def admit(
+        self, now: float, token: int, *, held: bool = False
+    ) -> list[tuple[JoiningJob, tuple[str, ...]]]:
+        """Return the heliostats that may go now, none while ``held``; drop jobs that are over."""
         for job in self._jobs:
             if job.token != token:
                 self._fail(job, "the command authority changed while it waited its turn")
             elif now >= job.until:
                 self._fail(job, "it waited too long for its turn; command it again")
         self._jobs = deque(job for job in self._jobs if job.waiting)
+        if held:
+            return []
         self._limiter, granted = self._limiter.admit(len(self), now)
         leave, admitted = SLICE, []
         for job in self._jobs:
@@ -119,11 +123,9 @@ class JoinDispatcher:
     life
         Life of a command whose turn has come, s.
     barred
-        Returns which of some heliostats may not join for another reason, and why.
+        Returns which of some heliostats may not be sent a command for another reason, and why.
     examine
         Examines a slice of those that leave stow.
-    untaken
-        Returns which of some heliostats have not taken their last aim, and why.
     """
 
     def __init__(
@@ -132,16 +134,15 @@ class JoinDispatcher:
         orders: PlantOrders,
         beams: BeamWatch,
         life: float,
-        barred: Callable[[tuple[str, ...]], dict[str, str]],
+        barred: Callable[[str, tuple[str, ...]], dict[str, str]],
         examine: Examine,
-        untaken: Callable[[tuple[str, ...]], dict[str, str]],
     ) -> None:
         self._queue, self._orders, self._beams, self._life = queue, orders, beams, life
-        self._barred, self._examine, self._untaken = barred, examine, untaken
+        self._barred, self._examine = barred, examine
 
-    def beat(self, now: float, token: int) -> None:
-        """Send the heliostats whose turn it is."""
-        for job, part in self._queue.admit(now, token):
+    def beat(self, now: float, token: int, *, held: bool) -> None:
+        """Send the heliostats whose turn it is, unless no new motion may begin (``held``)."""
+        for job, part in self._queue.admit(now, token, held=held):
             wrong = self._wrong(job, part)
             job.ticket.block(wrong)
             clear = [name for name in part if name not in wrong]
@@ -150,10 +151,7 @@ class JoinDispatcher:
     def _wrong(self, job: JoiningJob, part: tuple[str, ...]) -> dict[str, str]:
         """Return which heliostats whose turn has come may not go, and why."""
         if job.name != SLICED:
-            wrong = self._barred(part)
-            if job.name != "AIM":
-                wrong |= self._untaken(part)
-            return self._beams.joining(job.name, job.values, part) | wrong
+            return self._beams.joining(job.name, job.values, part) | self._barred(job.name, part)
         try:
             return self._examine(job.name, job.values, part)[1]
         except BeamError as error:

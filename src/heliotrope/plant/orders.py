@@ -124,6 +124,8 @@ class PlantOrders:
         self._open: dict[str, Ticket] = {}
         self.latest: Ticket | None = None
         self._under: dict[str, _Under] = {}
+        #: Identities of commands that wait for their turn on the line to their cluster.
+        self._unsent: set[str] = set()
         self._recording: dict[str, _Recording] = {}
         self._owed: deque[Work] = deque()
         self._paying = False
@@ -255,12 +257,20 @@ class PlantOrders:
             send(False)
 
     def _overtake(self, heliostats: frozenset[str], what: str) -> None:
-        """Give up commands that wait for their records: none may follow DEFOCUS, STOW or LOCK."""
+        """Give up commands that wait for their records or for the line to their cluster.
+
+        None may follow DEFOCUS, STOW or LOCK.
+        """
         for recording in self._recording.values():
             ticket = recording.ticket
             if ticket.name not in _STILL:
                 names = [name for name in ticket.heliostats if name in heliostats]
                 ticket.advance(names, Stage.FAILED, f"not sent: overtaken by {what}")
+        for identity in self._unsent:
+            under = self._under.get(identity)
+            if under is not None and under.ticket.name not in _STILL:
+                names = [name for name in under.heliostats if name in heliostats]
+                under.ticket.advance(names, Stage.FAILED, f"not sent: overtaken by {what}")
 
     def note(self, who: str, role: str, what: str, note: str) -> None:
         """Record an action that is complete at once, such as a change of the command authority."""
@@ -328,8 +338,16 @@ class PlantOrders:
         life = self._lifetime if lifetime is None else lifetime
         for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part)
-            named = () if len(part) == len(end.members) else part
-            message = Command(identity, name, values, named, token, life)
+            self._unsent.add(identity)
+
+            def message(
+                identity: str = identity, end: ClusterEnd = end, part: tuple[str, ...] = part
+            ) -> Command | None:
+                self._unsent.discard(identity)
+                left = ticket.waiting(part)  # without those that DEFOCUS or STOW has overtaken
+                named = () if len(left) == len(end.members) else left
+                return Command(identity, name, values, named, token, life) if left else None
+
             end.post(message, life, self._told(identity))
 
     def emergency(
@@ -340,7 +358,9 @@ class PlantOrders:
         A repetition (``again``) gives no more time to acknowledge.
         """
         if not again:
-            self._stowing.take(heliostats)
+            for other, names in self._stowing.take(heliostats).items():
+                if other is not ticket:
+                    other.advance(names, Stage.FAILED, f"superseded by {ticket.name}")
             self._supersede(ticket, frozenset(heliostats))
         # Further portions of a STOW must not put off the repetition of the first.
         self._sent_at.setdefault(ticket.identity, self._clock.monotonic())
@@ -380,10 +400,10 @@ class PlantOrders:
             self.emergency(ticket, act, left, again=True)
 
     def _supersede(self, ticket: Ticket, heliostats: frozenset[str]) -> None:
-        """End older repeated orders to the same heliostats: no DEFOCUS may follow a STOW."""
+        """End older repeated orders to the same heliostats, but no STOW by a DEFOCUS."""
         for identity in self._sent_at:
             other = self._open.get(identity)
-            if other is not None and other is not ticket:
+            if other is not None and other is not ticket and Act[other.name] <= Act[ticket.name]:
                 left = [name for name in other.unacknowledged() if name in heliostats]
                 other.advance(left, Stage.FAILED, f"superseded by {ticket.name}")
 

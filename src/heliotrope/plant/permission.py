@@ -89,7 +89,7 @@ class Permission:
             wrong = self._sync.differing(names) | self._orders.to_stow(names) | wrong
         if name in JOINING:
             wrong |= self._sentinel.barred(names) | self._doubts.barred(names)
-            wrong |= self.untaken(names)
+            wrong |= self._untaken(names)
         elif name in _TO_STANDBY:
             wrong |= self._sentinel.barred(self._off(names), ASTRAY)
         elif name in _STILL:
@@ -100,7 +100,15 @@ class Permission:
             raise BeamError(name, wrong)
         return tuple(n for n in names if n not in wrong), wrong
 
-    def untaken(self, names: Sequence[str]) -> dict[str, str]:
+    def kept_back(self, name: str, names: tuple[str, ...]) -> dict[str, str]:
+        """Return which heliostats whose turn to join has come may not be sent, and why."""
+        wrong = self._sync.differing(names) | self._identities.barred(names)
+        wrong |= self._doubts.barred(names)
+        if name in JOINING:
+            wrong |= self._sentinel.barred(names) | self._untaken(names)
+        return wrong
+
+    def _untaken(self, names: Sequence[str]) -> dict[str, str]:
         """Return which heliostats have not taken their last aim, and why."""
         return {
             name: refusals.AIM_NOT_TAKEN.text.format(reason=reason)

@@ -279,9 +279,10 @@ RESUME_NEEDED = AlarmKind(
     "resume_needed",
     _PLANT,
     Severity.ALARM,
-    "More heliostats than the setting `losses` left the receiver within 30 s without an order.",
-    "{count} heliostats left the receiver without an order, seen at {since} UTC",
-    "They have turned away by themselves; automatic control waits and raises nothing.",
+    "More heliostats than the setting `losses` left the receiver within 30 s without an order, or "
+    "an emergency was ordered while automatic control had heliostats.",
+    "{what} at {since} UTC",
+    "Automatic control waits and raises nothing.",
     "Find the cause, make sure that nobody is in the field, then press Resume.",
     over="automatic control was resumed",
 )

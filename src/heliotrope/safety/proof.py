@@ -149,6 +149,11 @@ class Proof:
             refused=self.refused + wrong,
         )
 
+    def without(self, nodes: Iterable[str]) -> "Proof":
+        """Return the proof without what some heliostats had done: it holds no longer."""
+        gone = frozenset(nodes)
+        return replace(self, done={n: at for n, at in self.done.items() if n not in gone})
+
     def with_flux(self, share: float, at: float) -> "Proof":
         """Return the proof with a flux reading, as a share of the nominal."""
         newer = self.flux is None or at > self.flux.at

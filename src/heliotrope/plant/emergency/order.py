@@ -93,6 +93,21 @@ class EmergencyOrder:
         """Whether a heliostat has carried out the order."""
         return heliostat in self._ready or heliostat in self._proof.done
 
+    def take_back(
+        self, names: tuple[str, ...], rows: npt.NDArray[Any], heard: npt.NDArray[np.float64]
+    ) -> tuple[str, ...]:
+        """Return which of K heliostats have carried out the order and have come back since.
+
+        They are no longer done. A row (`NODE`) from before that says nothing.
+        """
+        done = self.proof.done
+        out = np.isin(rows["state"], ON_BEAM)
+        later = heard > np.array([done.get(name, np.inf) for name in names])
+        back = tuple(names[i] for i in np.flatnonzero(out & later))
+        if back:
+            self._proof = self._proof.without(back)
+        return back
+
     def report(self, now: float) -> ProofReport:
         """Return how far the order has been carried out."""
         return replace(self.proof.report(now), unknown=tuple(self.unknown.values()))
@@ -115,6 +130,7 @@ class EmergencyOrder:
         names: tuple[str, ...],
         rows: npt.NDArray[Any],
         heard: npt.NDArray[np.float64],
+        counted: npt.NDArray[np.float64],
         drives: Drive,
         now: float,
         strange: Mask,
@@ -122,16 +138,16 @@ class EmergencyOrder:
     ) -> None:
         """Take the state of heliostats (K,): rows of `NODE`, when they were true, and drives.
 
+        Step counts (``counted``) from before the order prove no DEFOCUS.
+
         ``strange`` ones are not what their address says. They are done at stow only: the goals of
         their defocus may belong to another mirror. Where a beam is still on a receiver (``lit``),
         nothing is done.
         """
         settled = heard >= self.at + LEAVING
-        fulfilled = np.where(
-            strange,
-            carried_out(Act.STOW, rows, drives, settled),
-            carried_out(self.act, rows, drives, settled),
-        )
+        stowed = carried_out(Act.STOW, rows, drives, settled)
+        off = carried_out(self.act, rows, drives, settled) & (counted >= self.at)
+        fulfilled = stowed | (off & ~strange)
         fulfilled &= (heard >= self.at) & ~lit
         ready = tuple(names[i] for i in np.flatnonzero(fulfilled))
         if ready:

@@ -256,6 +256,7 @@ class Sentinel:
         if order is None or not self.on:
             return
         names = self._field.members[cluster]
+        self._order_again(order, names)
         rows = [self._field.index[n] for n in names if not order.is_done(n)]
         if rows:
             index = np.array(rows, dtype=np.intp)
@@ -263,6 +264,7 @@ class Sentinel:
                 tuple(self._field.names[r] for r in rows),
                 self._field.rows[index],
                 self._field.heard[index],
+                self._field.counted_at[index],
                 Drive(self._drives.table[index]),
                 now,
                 np.array([self._field.names[r] in self._identities.strange for r in rows]),
@@ -281,6 +283,13 @@ class Sentinel:
                 order.unknown[name] = f"{name}: {text}, so only stow proves that it is off"
             else:
                 order.unknown.pop(name, None)
+
+    def _order_again(self, order: EmergencyOrder, names: tuple[str, ...]) -> None:
+        """Send heliostats off again that have come back while the emergency holds."""
+        index = np.array([self._field.index[name] for name in names], dtype=np.intp)
+        back = order.take_back(names, self._field.rows[index], self._field.heard[index])
+        if back:
+            self.send_safe(_TABLE, order.act, back, "it has come back while an emergency holds")
 
     def _lit(self, rows: npt.NDArray[np.intp]) -> Mask:
         """Return which heliostats (K,) are not proven to be off: their beams are on a receiver.

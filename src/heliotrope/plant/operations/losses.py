@@ -61,6 +61,8 @@ class Losses:
         count = len(plant.field)
         self._up: Mask = np.zeros(count, dtype=np.bool_)
         self._seen: Mask = np.zeros(count, dtype=np.bool_)
+        #: Those that automatic control has ordered down, until they are seen to have left.
+        self._ordered: Mask = np.zeros(count, dtype=np.bool_)
         self._lost_at = np.full(count, -math.inf)
         self.reason = ""
         for alarm in _standing(records):
@@ -74,7 +76,8 @@ class Losses:
         held = field.among((states.LOCKED,), now)
         lost = live & ~up & ~held & self._up
         lost |= ~self._seen & field.among(_LEAVING, now)
-        lost &= wanted
+        lost &= wanted & ~self._ordered
+        self._ordered &= ~(live & ~up & ~held)
         # A heliostat that is not heard, or is locked, keeps what was seen of it last.
         self._up = np.where(live & ~held, up, self._up)
         self._seen |= live
@@ -82,8 +85,7 @@ class Losses:
         # Those that are left to people by now count too.
         together = int(self.settling().sum())
         if together > self._most:
-            since = datetime.fromtimestamp(self._plant.clock.utc().timestamp(), UTC)
-            self._wait(alarms.RESUME_NEEDED.line(count=together, since=f"{since:%H:%M:%S}"))
+            self._wait_for(f"{together} heliostats left the receiver without an order, seen")
         return lost
 
     def settling(self) -> Mask:
@@ -92,7 +94,11 @@ class Losses:
 
     def ordered(self, rows: npt.NDArray[np.intp]) -> None:
         """Note that automatic control itself takes heliostats down: they are not lost."""
-        self._up[rows] = False
+        self._up[rows], self._ordered[rows] = False, True
+
+    def emergency(self, what: str) -> None:
+        """Wait for a person after an emergency (``what``: DEFOCUS or STOW), over a restart too."""
+        self._wait_for(f"{what} was ordered for the whole field")
 
     def resume(self) -> None:
         """End the wait: a person has looked into the field."""
@@ -100,6 +106,10 @@ class Losses:
         if self.reason:
             self.reason = ""
             self._log.take_alarm(alarms.RESUME_NEEDED.ended())
+
+    def _wait_for(self, what: str) -> None:
+        since = datetime.fromtimestamp(self._plant.clock.utc().timestamp(), UTC)
+        self._wait(alarms.RESUME_NEEDED.line(what=what, since=f"{since:%H:%M:%S}"))
 
     def _wait(self, text: str) -> None:
         if not self.reason:

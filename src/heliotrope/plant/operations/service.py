@@ -39,7 +39,8 @@ class Service:
     def __init__(self, plant: PlantController, keeping: Keeping) -> None:
         self._plant, self._keeping = plant, keeping
         plant.out_of_service.update(keeping.lockouts())
-        self._unparked = set(plant.out_of_service)
+        #: Since when each has been out of service and not been seen in stow, monotonic s.
+        self._unparked = dict.fromkeys(plant.out_of_service, -math.inf)
         self._sent_at = -math.inf
 
     @property
@@ -63,7 +64,7 @@ class Service:
         for name in heliostats:
             lockout = Lockout(name, person.name, reason, since, until)
             self._plant.out_of_service[name] = lockout
-        self._unparked.update(heliostats)
+        self._unparked.update(dict.fromkeys(heliostats, self._plant.now()))
         self._plant.stow(person.name, heliostats)
         self._keeping.lock_out(heliostats, reason, person.name, since, until)
 
@@ -74,7 +75,8 @@ class Service:
         self._check_owner(person, heliostats, "give back")
         for name in heliostats:
             self._plant.out_of_service.pop(name, None)
-        self._unparked.difference_update(heliostats)
+        for name in heliostats:
+            self._unparked.pop(name, None)
         self._keeping.put_back(heliostats, person.name, self._utc())
 
     def _check_owner(self, person: Person, heliostats: Sequence[str], what: str) -> None:
@@ -92,7 +94,12 @@ class Service:
         if not self._unparked:
             return
         there = field.among((states.STOWED,), now)
-        self._unparked = {name for name in self._unparked if not there[field.place(name)]}
+        # A status from before the order says nothing: it may have been on its way from stow.
+        self._unparked = {
+            name: since
+            for name, since in self._unparked.items()
+            if not (there[row := field.place(name)] and field.heard[row] > since)
+        }
         away = field.among(_AWAY, now)
         left = sorted(name for name in self._unparked if away[field.place(name)])
         if left and now - self._sent_at >= _AGAIN:
