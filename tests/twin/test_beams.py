@@ -169,7 +169,7 @@ class Scene:
         for message in (Command("a", "AIM", RECEIVER), Command("t", "TRACK")):
             self.observer.sent(message, NAMES, 0.0)
         self.observer.resumed(NAMES, "TRACK", 0.0)
-        self.observer.given(NAMES)
+        self.observer.given(NAMES, 0.0)
         self.passes(20.0)
 
     def passes(self, seconds: float) -> None:

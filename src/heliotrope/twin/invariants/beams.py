@@ -92,8 +92,8 @@ class _Mirror:
         last sent it there, s.
     lost_at
         When it last left TRACKING or SEARCHING without an order, s.
-    given
-        Whether a person has given it to automatic control.
+    given, given_at
+        Whether a person has given it to automatic control, and since when, s.
     up, changed_at, reports, seen_up
         Whether it is up, since when, s, and how often that was reported; whether automatic control
         has seen it up since the plant last took it off.
@@ -120,6 +120,7 @@ class _Mirror:
     resumed_at: float = float("-inf")
     lost_at: float = float("-inf")
     given: bool = False
+    given_at: float = float("-inf")
     up: bool = False
     changed_at: float = float("-inf")
     reports: int = 0
@@ -252,10 +253,12 @@ class BeamObserver:
         for name in heliostats:
             self._mirrors[name].given = False
 
-    def given(self, heliostats: Iterable[str]) -> None:
-        """Note that a person has given mirrors to automatic control."""
+    def given(self, heliostats: Iterable[str], now: float) -> None:
+        """Note that a person has given mirrors to automatic control; it lost none before."""
         for name in heliostats:
-            self._mirrors[name].given = True
+            mirror = self._mirrors[name]
+            if not mirror.given:
+                mirror.given, mirror.given_at = True, now
 
     def released(self, now: float) -> None:
         """Note that a person lets automatic control go on after a loss."""
@@ -280,7 +283,8 @@ class BeamObserver:
         """Note that automatic control knows by now that a mirror is up, or is not."""
         lost, mirror.seen_up = mirror.seen_up and not mirror.up, mirror.up
         at = mirror.changed_at
-        if self._most is None or not (lost and mirror.given) or at < self._released_at:
+        lost = lost and mirror.given and at >= max(mirror.given_at, self._released_at)
+        if self._most is None or not lost:
             return
         self._left.append((at, mirror.name))
         together = [each for each in self._left if abs(each[0] - at) <= LOST_TOGETHER]

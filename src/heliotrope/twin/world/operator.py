@@ -408,6 +408,7 @@ class Operator:
         """Raise an emergency, which anybody may do."""
         self.counts["emergencies"] += 1
         order = plant.raise_emergency(who.name, act)
+        self._beams.taken(self._names)  # after it none is automatic control's
         self._observer.obeyed(who.name, act.name, self._clock.monotonic())
         self._called = True
         return order

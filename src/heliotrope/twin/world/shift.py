@@ -185,7 +185,7 @@ class Shift:
             self._watch.held(back, self._clock.monotonic(), out=False)
         operations.give_back(ENGINEER, names)
         self._acted(f"{len(names)} heliostats given")
-        self._beams.given(names)
+        self._beams.given(names, self._clock.monotonic())
         self._watch.given(names, self._clock.monotonic())
         self._left.clear()
 
