@@ -258,7 +258,6 @@ class Shift:
 
     async def _emergency(self, operations: Operations) -> None:
         self._watch.taken(self._names)
-        self._beams.taken(self._names)
         self._operator.raises(operations.plant, VIEWER, Act.DEFOCUS)
         operations.automatic.want(self._names, wanted=False)
         await asyncio.sleep(self._chance.uniform(2.0, _EMERGENCY))
