@@ -76,8 +76,9 @@ from heliotrope.twin.world.worlds import (
     works,
 )
 
-#: Longest interval between two looks at the boards, and between two judgements of everything, s.
-LOOK, JUDGE = 0.2, 0.5
+#: Longest interval between two looks at the boards, and between two judgements of everything, s: a
+#: board whose motion an order has begun meanwhile has handed steps for 0.1 s to its timer.
+LOOK, JUDGE = 0.09, 0.5
 #: The true sun is computed this often (s) and interpolated linearly, to within 1e-6 rad.
 _SUN_EVERY = 30.0
 #: The plant's program, for freezing it.
