@@ -4,11 +4,12 @@ import asyncio
 import contextlib
 import ctypes
 import math
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from heliotrope.cluster.timekeeping import SystemTime, kernel_bound
+from heliotrope.cluster.timekeeping import SystemTime, Time, kernel_bound
 from heliotrope.errors import InputError
 from heliotrope.links.clock import VirtualClock, gps_seconds, run_virtual
 from heliotrope.links.link import running
@@ -24,6 +25,13 @@ def test_the_system_tells_its_time_on_both_scales() -> None:
     assert now.utc_s == pytest.approx(START.timestamp() + 1.5, abs=1e-6)
     assert now.gps_s == pytest.approx(gps_seconds(START) + 1.5, abs=1e-6)
     assert (now.error, now.quality, now.jumped) == (0.2, "system", False)
+
+
+def test_a_time_is_sent_only_if_it_has_a_source_and_is_known_within_a_second() -> None:
+    known = Time(START.timestamp(), gps_seconds(START), 0.99, "holdover", jumped=False)
+    assert known.usable
+    assert not replace(known, error=1.01).usable
+    assert not replace(known, error=0.01, quality="none").usable
 
 
 @pytest.mark.parametrize("jump", [-3600.0, -0.2, 0.2, 86400.0])
