@@ -68,6 +68,15 @@ def test_new_keys_are_private_and_never_overwritten(tmp_path: Path) -> None:
     assert set(Keys(path, CLUSTERS).members) == {"K1", "K2"}
 
 
+def test_names_that_no_link_takes_get_no_key(tmp_path: Path) -> None:
+    path = tmp_path / "links.keys.toml"
+    for name in ("", 65 * "K", 33 * "é"):
+        with pytest.raises(InputError, match="a name has 1 to 64 bytes"):
+            KeyFile(path).new(["K1", name])
+        assert not path.exists()
+    assert set(KeyFile(path).new(["K", 64 * "K"])) == {"K", 64 * "K"}
+
+
 def test_a_rotation_keeps_passwords_and_the_keys_of_others(tmp_path: Path) -> None:
     before = f'plant = "{NEW.hex()}"\npassword = "word"\n[heliostats]\nA1 = "{"2a" * 32}"\n'
     path = private(tmp_path / "C1.keys.toml", before)
