@@ -11,7 +11,7 @@ from heliotrope.links.keys import KeyRing
 from heliotrope.safety import Alarm, Severity
 from heliotrope.twin.boards.bus import BusFaults
 from support.clusters import TOKEN, Board, Field, key_of, run
-from support.lcu_machines import sha256
+from support.lcu_machines import sha256, signer
 
 OLD, NEW = b"the old bus key.", b"the new bus key."
 KEYED = 1 << names.FLAGS.index("BUS_KEY")
@@ -127,6 +127,44 @@ def test_a_key_is_rotated_without_a_missed_lease(loss: float) -> None:
         assert not field.plant.alarms("bus_unsigned")
 
     run(main, "IDLE", seed=3, bus_keys=ring)
+
+
+def test_frames_are_signed_with_a_new_key_once_all_that_answer_have_it() -> None:
+    ring = KeyRing(OLD)
+
+    def signs(field: Field, key: bytes) -> bool:
+        sign = field.cluster._exchange.sender.sign
+        return sign is not None and sign(b"frame") == signer(key)(b"frame")
+
+    async def main(field: Field) -> None:
+        await field.until(lambda: both(field, OLD), 10.0)
+        ring.keys = (NEW, OLD)
+        while not both(field, NEW, OLD):
+            assert signs(field, OLD)
+            await asyncio.sleep(0.05)
+        await field.until(lambda: signs(field, NEW), 5.0)
+        await field.until(field.sun_is_fresh, 5.0)
+
+    run(main, bus_keys=ring)
+
+
+def test_boards_that_have_their_keys_are_given_no_more() -> None:
+    """Each key that is set is a record in flash, and a key set twice ends the old one."""
+    ring, sent = KeyRing(OLD), bytearray()
+
+    async def main(field: Field) -> None:
+        carry = field.bus.carry
+        field.bus.carry = lambda frame: (sent.extend(frame), carry(frame))[1]
+        await field.until(lambda: both(field, OLD), 10.0)
+        await asyncio.sleep(5.0)
+        ring.keys = (NEW, OLD)
+        await field.until(lambda: both(field, NEW, OLD), 10.0)
+        await asyncio.sleep(5.0)
+        assert both(field, NEW, OLD)
+
+    run(main, bus_keys=ring)
+    numbers = [frame.number for frame in wire.Reader().feed(bytes(sent))]
+    assert numbers.count(messages.NUMBER_OF["SET_BUS_KEY"]) == 4
 
 
 def test_a_board_that_was_off_during_a_rotation_is_given_the_new_key() -> None:
