@@ -1097,6 +1097,24 @@ def test_a_new_controller_is_told_everything_and_then_works() -> None:
     assert again.checksum("armature") == bench.controller.config.armature_crc
 
 
+def test_a_controller_that_lost_its_settings_is_told_them_again_and_its_fault_cleared() -> None:
+    flash = Flash()
+    flash.data[: 2 * flash.block_size] = bytes(2 * flash.block_size)
+    bench = Bench(flash)
+    bench.run(2)
+    assert bench.controller.fault == controller.JOURNAL
+    bench.edition += 1
+    head = TOKEN, bench.gps_ms() // 1000 + 5, bench.edition
+    bench.send("SET_ADDRESS", *head, 4711, ADDRESS, to=wire.BROADCAST)
+    for name, values in settings(bench):
+        assert bench.order(name, *values) == DONE
+    assert bench.order("UNLOCK") == DONE
+    assert bench.state == "FAULT"
+    assert bench.order("CLEAR_FAULT") == DONE
+    assert bench.state == "STOWED"
+    assert bench.controller.fault == controller.NO_FAULT
+
+
 def test_settings_change_in_safe_states_alone() -> None:
     bench = tracking()
     for name, values in settings(bench):
