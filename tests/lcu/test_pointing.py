@@ -147,6 +147,22 @@ def test_stops_choose_the_branch_and_give_the_nearest_pose() -> None:
     assert seen == {TrackingStatus.OK, TrackingStatus.STOPPED}
 
 
+def test_a_mirror_that_stands_near_one_of_two_poses_goes_to_that_one() -> None:
+    seen = 0
+    for table, sun, aim in field(60, 8):
+        own = pointing.Pointing(tuple(map(float, table)))
+        own.solve(tuple(sun), tuple(aim), FREE, HOME)
+        poses = [list(pose.angles) for pose in own.found if pose.status == pointing.OK]
+        if len(poses) < 2 or np.max(np.abs(np.subtract(*poses))) < 0.5:
+            continue
+        for angles in (*poses, *reversed(poses)):
+            near = [angles[0] - 0.1, angles[1] + 0.1]
+            found = own.solve(tuple(sun), tuple(aim), FREE, near)
+            np.testing.assert_allclose(found.angles, angles, rtol=0, atol=1e-9)
+        seen += 1
+    assert seen > 30
+
+
 def test_the_near_field_is_left_to_newton() -> None:
     machine = imperfect(every_kind()["two_axis"], 6, size=0.02)
     own = pointing.Pointing(tuple(map(float, machine.armature.table)))
