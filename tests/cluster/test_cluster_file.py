@@ -215,6 +215,24 @@ def test_the_bus_has_a_rate_that_its_port_can_have(folder: Path, rate: int, text
         assert read_cluster(path).bus.baud_rate == rate
 
 
+@pytest.mark.parametrize(
+    ("serial", "text"),
+    [
+        (-1, "input should be greater than or equal to 0"),
+        (0, ""),
+        (4294967295, ""),
+        (4294967296, "input should be less than or equal to 4294967295"),
+    ],
+)
+def test_a_serial_number_has_32_bits(folder: Path, serial: int, text: str) -> None:
+    path = changed(folder, "serial = 1002", f"serial = {serial}")
+    if text:
+        with pytest.raises(FormatError, match=f"heliostats.1.serial: {serial}: {text}"):
+            read_cluster(path)
+    else:
+        assert read_cluster(path).config.heliostats[1].serial == serial
+
+
 def test_the_bus_has_its_usual_rate_if_none_is_given(folder: Path) -> None:
     assert read_cluster(changed(folder, "baud_rate = 115200\n", "")).bus.baud_rate == 115200
 
