@@ -33,6 +33,8 @@ def test_an_alarm_comes_each_day_of_the_last_thirty(tmp_path: Path) -> None:
     papers = Papers(clock)
     papers.watch_end(pem)
     assert papers.look() == []
+    clock.days = 10.0
+    assert papers.look() == []
     clock.days = 11.0
     (alarm,) = papers.look()
     assert (alarm.condition, alarm.subject, alarm.severity.name) == (
