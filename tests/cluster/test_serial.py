@@ -281,6 +281,23 @@ def test_an_echo_that_differs_spoils_the_transaction(line: Line) -> None:
     real(main)
 
 
+def test_an_echo_that_comes_too_late_is_counted_as_stray(line: Line) -> None:
+    async def main() -> None:
+        bus = bus_of(line, BusSettings(echo=True))
+        async with running(bus):
+            await bus.opened()
+            await bus.transmit(b"to all\0")
+            port = bus._port
+            assert port is not None
+            before = port.last_at
+            line.say(b"to all\0")
+            await until(lambda: port.last_at > before)
+            await bus.transmit(b"next\0")
+            assert (bus.statistics.spoilt, bus.statistics.stray) == (2, 7)
+
+    real(main)
+
+
 def test_an_adapter_that_is_unplugged_is_found_again(line: Line) -> None:
     line.answer = lambda _: [b"answer\0"]
 
