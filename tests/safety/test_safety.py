@@ -398,6 +398,16 @@ def test_start_refuses_what_cannot_be_watched() -> None:
         safety.start(CONDITIONS, 0.0, {"cluster_slient": ("A",)})
 
 
+def test_an_alarm_tells_who_must_acknowledge_it_if_anybody_must() -> None:
+    row = ROWS["operator_emergency"]
+    assert row.consequence == (
+        "DEFOCUS of the field; STOW after 30 s; holds until acknowledged (operator)."
+    )
+    supervised = replace(row, role=AcknowledgeRole.SUPERVISOR)
+    assert supervised.consequence.endswith("; holds until acknowledged (engineer).")
+    assert replace(row, role=None).consequence == "DEFOCUS of the field; STOW after 30 s."
+
+
 def test_texts_of_acts_name_what_pre_empts() -> None:
     assert "pre-empts everything" in Act.STOW.text
     assert list(Act) == sorted(Act)
