@@ -6,11 +6,13 @@ import math
 import re
 import shutil
 import stat
+import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli_w
 
 from heliotrope.cli.cluster import _link
 from heliotrope.cluster import timekeeping
@@ -215,22 +217,46 @@ def test_the_bus_has_a_rate_that_its_port_can_have(folder: Path, rate: int, text
         assert read_cluster(path).bus.baud_rate == rate
 
 
-@pytest.mark.parametrize(
-    ("serial", "text"),
-    [
-        (-1, "input should be greater than or equal to 0"),
-        (0, ""),
-        (4294967295, ""),
-        (4294967296, "input should be less than or equal to 4294967295"),
-    ],
-)
-def test_a_serial_number_has_32_bits(folder: Path, serial: int, text: str) -> None:
-    path = changed(folder, "serial = 1002", f"serial = {serial}")
-    if text:
-        with pytest.raises(FormatError, match=f"heliostats.1.serial: {serial}: {text}"):
-            read_cluster(path)
-    else:
-        assert read_cluster(path).config.heliostats[1].serial == serial
+def ranges() -> list[tuple[str, str, str, str]]:
+    """Tables, keys, kinds and ranges of the numbers in the reference."""
+    text, found, table = (ROOT / "docs/reference/cluster-format.md").read_text(), [], ""
+    for line in text.splitlines():
+        if line.startswith("## "):
+            table = line.strip("#` []")
+        cells = [cell.strip(" `") for cell in line.split("|")]
+        if len(cells) > 4 and cells[2] in ("number", "whole number") and cells[3]:
+            found.append((table, cells[1], cells[2], cells[3]))
+    assert len(found) > 10
+    return found
+
+
+@pytest.mark.parametrize(("table", "key", "kind", "span"), ranges())
+def test_a_number_is_taken_to_the_ends_of_its_range_and_not_beyond(
+    folder: Path, table: str, key: str, kind: str, span: str
+) -> None:
+    path = folder / "C1.toml"
+    document = tomllib.loads(path.read_text())
+    document["bus"] |= {"answer_s": 0.001, "stored_answer_s": 2.0}  # the second is the longer one
+    place = document["heliostats"][0] if table == "heliostats" else document.setdefault(table, {})
+
+    def read(value: float) -> None:
+        place[key] = value
+        path.write_text(tomli_w.dumps(document))
+        read_cluster(path)
+
+    found = re.fullmatch(r"(above )?(\S+) to (below )?(\S+)", span)
+    assert found is not None
+    for text, is_open, way in ((found[2], found[1], -1), (found[4], found[3], 1)):
+        end = float(text.replace(",", ""))
+        if kind == "whole number":
+            good, bad = int(end), int(end) + way
+        elif is_open:
+            good, bad = math.nextafter(end, -way * math.inf), end
+        else:
+            good, bad = end, math.nextafter(end, way * math.inf)
+        read(good)
+        with pytest.raises(FormatError, match=rf"{key}: .*input should be"):
+            read(bad)
 
 
 def test_the_bus_has_its_usual_rate_if_none_is_given(folder: Path) -> None:
