@@ -475,6 +475,20 @@ def test_who_misses_the_call_is_told_again() -> None:
     run(main, "TRACKING")
 
 
+def test_who_brings_its_beam_out_in_the_dark_is_told_again() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        field.line.cut()
+        await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"], 6.0)
+        await asyncio.sleep(2.0)
+        own = field.boards[1].node.controller
+        own.state = states.IDLE
+        own.motion.hold()
+        await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"], 3.0)
+
+    run(main, "TRACKING")
+
+
 def test_after_a_restart_frames_of_before_are_void(tmp_path: pytest.TempPathFactory) -> None:
     path = tmp_path / "C1.state.json"  # type: ignore[operator]
     boards = [Board(1), Board(2)]
