@@ -996,6 +996,22 @@ def watch(bench: Bench, stuck: tuple[float, float] = (1.0, 1.0)) -> None:
         bench.tick()
 
 
+def test_idle_stops_a_motion_of_a_mirror_that_has_not_reached_standby() -> None:
+    bench = Bench()
+    bench.run(1.5)
+    assert bench.order("IDLE") == DONE
+    assert bench.order("GOTO", STOW[0] - 100_000, STOW[1] - 100_000) == DONE
+    bench.run(3)
+    assert bench.order("IDLE") == DONE
+    bench.run(2)
+    held = list(bench.made)
+    assert held != list(STOW)
+    assert bench.controller.motion.still()
+    bench.run(20)
+    assert bench.made == held
+    assert bench.state == "IDLE"
+
+
 def test_a_diagnosis_sees_the_elevation_move() -> None:
     bench = standing_by()
     bench.run(3)
@@ -1029,7 +1045,7 @@ def test_a_diagnosis_without_a_sensor_says_so() -> None:
     bench.run(3)
     bench.order("DIAGNOSE")
     bench.run(10)
-    assert bench.controller.motion.diagnosis[0] == 16
+    assert bench.controller.motion.diagnosis == (16, 0, 0, 0.0, 0.0)
     assert bench.state == "IDLE"
 
 
