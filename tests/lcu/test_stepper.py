@@ -227,6 +227,18 @@ def test_rough_stepping_ends_on_the_nearest_full_step() -> None:
         assert abs(motors.made[0]) > 180
 
 
+@pytest.mark.parametrize("beside", [1, -1])
+def test_rough_stepping_leaves_no_axis_one_microstep_beside_a_full_step(beside: int) -> None:
+    stepper = _stepper()
+    motors = Motors(stepper)
+    stepper.go(80 + beside, -40 + beside, BOTH)
+    motors.settle()
+    stepper.rough, stepper.full = 16, (8, 4)
+    stepper.follow(80 + beside, -40 + beside)
+    motors.settle()
+    assert motors.made == [80, -40]
+
+
 def test_a_dry_queue_starts_from_rest() -> None:
     stepper = _stepper()
     motors = Motors(stepper)
