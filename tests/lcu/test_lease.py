@@ -43,3 +43,15 @@ def test_a_leap_along_any_direction_is_refused_and_what_the_sun_can_do_is_taken(
     if name != "up" or way > 0:  # below the horizon there is no sun
         assert taken(3, way * 0.9 * REACH)
         assert (lease.bad, lease.leaps) == (1, 1)
+
+
+def test_a_clock_tells_how_far_its_time_jumps_and_of_no_jump_where_it_had_none() -> None:
+    clock = Clock()
+    assert clock.set(2000, 5500) == 0
+    clock.elapse(700)
+    assert clock.set(2000, 6200) == 0
+    assert clock.set(2000, 9100) == 2900
+    assert clock.set(2000, 8600) == -500
+    assert clock.set(2001, 0) == 604_791_400
+    clock.lose()
+    assert clock.set(2000, 5500) == 0
