@@ -86,6 +86,10 @@ def test_a_file_without_a_certificate_is_an_alarm(tmp_path: Path) -> None:
     (alarm,) = papers.look()
     assert "the end of certificate" in alarm.text
     assert "holds no PEM certificate" in alarm.text
+    papers.watch_end(tmp_path / "none.pem")
+    (alarm,) = papers.look()
+    assert "none.pem is unknown" in alarm.text
+    assert "cannot be read (No such file or directory)" in alarm.text
     with pytest.raises(FormatError, match="cannot be read"):
         end_of(tmp_path / "none.pem")
 
