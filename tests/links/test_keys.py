@@ -1,6 +1,7 @@
 """Keys of links: made by a command, and replaced while the links run."""
 
 import asyncio
+import os
 import stat
 import subprocess
 from collections.abc import Callable, Iterator
@@ -75,6 +76,17 @@ def test_names_that_no_link_takes_get_no_key(tmp_path: Path) -> None:
             KeyFile(path).new(["K1", name])
         assert not path.exists()
     assert set(KeyFile(path).new(["K", 64 * "K"])) == {"K", 64 * "K"}
+
+
+def test_a_key_file_that_root_changes_keeps_its_owner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = private(tmp_path / "links.keys.toml")
+    there, given = path.stat(), []
+    monkeypatch.setattr(os, "geteuid", lambda: there.st_uid + 1)
+    monkeypatch.setattr(os, "fchown", lambda _, *owner: given.append(owner))
+    KeyFile(path).new(["K1"])
+    assert given == [(there.st_uid, there.st_gid)]
 
 
 def test_a_rotation_keeps_passwords_and_the_keys_of_others(tmp_path: Path) -> None:
