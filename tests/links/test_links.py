@@ -233,6 +233,16 @@ def test_every_single_flipped_bit_is_noticed() -> None:
         assert pair.b.feed(envelope[:size])[0] is None
 
 
+@pytest.mark.parametrize("number", [0, 1])
+def test_who_has_heard_nobody_is_not_believed_whatever_the_number_of_the_session(
+    number: int,
+) -> None:
+    clock = VirtualClock()
+    own = Conversation(clock, SETTINGS, Statistics(), lambda size: number.to_bytes(size, "little"))
+    other = Conversation(clock, SETTINGS, Statistics(), random.Random(1).randbytes)
+    assert own.feed(other.data(b"aim", None)) == (None, False)
+
+
 def test_nothing_of_an_earlier_connection_is_taken() -> None:
     pair = Pair()
     pair.meet()
@@ -278,6 +288,19 @@ def test_a_restarted_end_is_taken_up_at_once_and_a_stale_one_is_not() -> None:
 # -- memory links in virtual time ------------------------------------------------------
 
 
+def test_a_line_that_damages_everything_connects_nobody() -> None:
+    async def main(clock: VirtualClock) -> None:
+        plant, cluster, line = memory_pair(clock, seed=2)
+        line.faults = Faults(corruption=1.0)
+        async with running(plant, cluster):
+            await asyncio.sleep(60.0)
+            assert not plant.connected
+            assert not cluster.connected
+            assert plant.statistics.refused > 20
+
+    run_virtual(main)
+
+
 def test_messages_pass_both_ways_in_order() -> None:
     async def main(clock: VirtualClock) -> None:
         plant, cluster, _ = memory_pair(clock)
@@ -292,6 +315,7 @@ def test_messages_pass_both_ways_in_order() -> None:
             assert (plant.name, cluster.name) == ("cluster", "plant")
             assert plant.problem == ""
         assert plant.closed
+        assert plant.problem == "closed"
         assert plant.statistics.sent == cluster.statistics.received == 5
         assert plant.statistics.last_received is not None
         with pytest.raises(LinkClosedError):
