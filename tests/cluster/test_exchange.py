@@ -23,6 +23,7 @@ def test_the_share_of_bad_frames_is_that_of_the_last_ten_seconds_with_questions(
             exchange._asked, exchange._bad, exchange._answered = asked, bad, answered
             return exchange.second()
 
+        assert exchange.second() == 0.0, "nothing has been asked"
         assert second(0, 0, 0) == 0.0
         assert second(4, 1, 3) == pytest.approx(1 / 4)
         assert second(4, 3, 1) == pytest.approx(4 / 8)
