@@ -499,7 +499,9 @@ def test_after_a_restart_frames_of_before_are_void(tmp_path: pytest.TempPathFact
         sender = field.cluster._exchange.sender
         expires = int(field.cluster._broadcast.bus_time() or 0) + 25
         await asyncio.sleep(0.0)
-        old.append(sender.frame(1, "AIM", TOKEN, expires, 1.0, 2.0, 3.0))
+        token = field.cluster._exchange.token(TOKEN)
+        sender.count += 500  # a frame that is new by its number in the next epoch too
+        old.append(sender.frame(1, "AIM", token, expires, 1.0, 2.0, 3.0))
 
     run(main, boards=boards, kept=Kept(path))
     first = Kept(path).epoch
