@@ -6,6 +6,7 @@ import ctypes
 import math
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 
 import pytest
 
@@ -47,6 +48,26 @@ def test_a_jump_is_told_until_it_has_settled(jump: float) -> None:
     clock.advance(1.5)
     assert not keeper.time().jumped
     assert keeper.jumps == 1
+
+
+@pytest.mark.parametrize(("step", "jumped"), [(0.5, False), (-0.5, False), (0.75, True)])
+def test_a_step_of_the_tolerance_is_no_jump(step: float, jumped: bool) -> None:
+    clock = VirtualClock(start=START)
+    keeper = SystemTime(clock, tolerance=0.5)
+    keeper.time()
+    clock.jump(step)
+    assert keeper.time().jumped is jumped
+
+
+@pytest.mark.parametrize(
+    ("ahead", "quality"), [(None, "system"), (2.0, "gps"), (-2.0, "gps"), (2.01, "none")]
+)
+def test_a_clock_and_a_receiver_contradict_each_other_beyond_two_seconds(
+    ahead: float | None, quality: str
+) -> None:
+    receiver = SimpleNamespace(ahead=ahead, problem="")
+    keeper = SystemTime(VirtualClock(start=START), gpsd=receiver)  # type: ignore[arg-type]
+    assert keeper.time().quality == quality
 
 
 def test_slewing_and_a_clock_that_runs_fast_are_no_jumps_but_many_small_steps_are() -> None:
