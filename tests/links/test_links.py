@@ -301,6 +301,23 @@ def test_a_line_that_damages_everything_connects_nobody() -> None:
     run_virtual(main)
 
 
+def test_on_a_line_of_uneven_delay_nothing_is_overtaken() -> None:
+    async def main(clock: VirtualClock) -> None:
+        plant, cluster, line = memory_pair(clock, seed=3)
+        line.faults = Faults(delay=(0.0, 0.2))
+        async with running(plant, cluster):
+            await plant.established()
+            for number in range(50):
+                await plant.send(bytes([number]))
+                await asyncio.sleep(0.05)
+            async with asyncio.timeout(10.0):
+                got = [await cluster.receive() for _ in range(50)]
+            assert got == [bytes([number]) for number in range(50)]
+            assert cluster.statistics.repeated == 0
+
+    run_virtual(main)
+
+
 def test_messages_pass_both_ways_in_order() -> None:
     async def main(clock: VirtualClock) -> None:
         plant, cluster, _ = memory_pair(clock)
