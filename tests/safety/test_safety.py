@@ -559,6 +559,7 @@ def test_proof_is_complete_only_with_every_node_and_the_flux() -> None:
     # The reading grows old, and proves nothing any more.
     assert proof.report(40.0).flux is FluxProof.NOT_BELOW
     assert "flux not proven to be below 10%" in proof.report(40.0).text
+    assert safety.proof_readings(proof, 40.0)["flux_after_emergency", ""].value == 1.0
 
 
 def test_proof_counts_what_is_late() -> None:
