@@ -45,6 +45,18 @@ def test_a_leap_along_any_direction_is_refused_and_what_the_sun_can_do_is_taken(
         assert (lease.bad, lease.leaps) == (1, 1)
 
 
+@pytest.mark.parametrize(
+    ("length", "taken"),
+    [(0.0, False), (0.7, False), (0.999, False), (1.0, True), (1.001, False), (1.4, False)],
+)
+def test_a_vector_that_is_no_direction_is_refused(length: float, taken: bool) -> None:
+    lease, clock = SunLease(SPAN_MS), Clock()
+    clock.set(0, 1000)
+    values = tuple(round(UNIT * length * part) for part in (0.0, 0.6, 0.8))
+    assert lease.take((1, *values, 0, 0, 0), clock, 1000) is taken
+    assert lease.bad == (not taken)
+
+
 def test_a_clock_tells_how_far_its_time_jumps_and_of_no_jump_where_it_had_none() -> None:
     clock = Clock()
     assert clock.set(2000, 5500) == 0
