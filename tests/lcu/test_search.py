@@ -27,6 +27,12 @@ def test_points_are_evenly_spaced_and_bounded(pitch: float, radius: float) -> No
     assert (np.abs(steps / pitch - 1.0) < 0.12).all()
 
 
+def test_points_are_a_pitch_apart_along_the_spiral() -> None:
+    angles = 2.0 * np.pi * np.linalg.norm(_points(1.0, 8.0), axis=1)
+    lengths = (angles * np.sqrt(1.0 + angles**2) + np.arcsinh(angles)) / (4.0 * np.pi)
+    np.testing.assert_allclose(np.diff(lengths), 1.0, atol=0.01)
+
+
 def test_no_place_within_the_radius_is_missed() -> None:
     points = np.vstack([[0.0, 0.0], _points(1.0, 10.0)])
     rng = np.random.default_rng(1)
