@@ -8,7 +8,7 @@ import pytest
 from heliotrope.geometry import angle_between
 from heliotrope.lcu.journal import Journal
 from heliotrope.lcu.messages import DONE
-from heliotrope.lcu.motion import PIECE
+from heliotrope.lcu.motion import PIECE, RENEW_MS
 from support.lcu_machines import Bench, Flash, items_of_heliostat, standing_by, tracking
 
 #: A step of either axis, rad.
@@ -71,6 +71,16 @@ def test_a_way_from_below_the_mirror_to_above_it_is_cut_finely_enough() -> None:
     seen = np.array(points) - config.pointing.origin
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
     assert np.mean([angle_between(one, other) for one, other in pairwise(seen)]) <= PIECE
+
+
+def test_goals_are_renewed_at_their_interval_and_not_at_every_tick() -> None:
+    bench = tracking()
+    stepper, times = bench.controller.motion.stepper, []
+    assert stepper is not None
+    follow = stepper.follow
+    stepper.follow = lambda *goals: (times.append(bench.true_ms), follow(*goals))[1]  # type: ignore[method-assign]
+    bench.run(10)
+    assert set(np.diff(times)) == {RENEW_MS}
 
 
 def lacking(*names: str, known: bool) -> Bench:
