@@ -108,6 +108,20 @@ def test_stow_leads_back_the_same_way() -> None:
     assert bench.journal.rest
 
 
+def test_stow_leads_by_the_standby_point_from_an_aim_beside_it() -> None:
+    bench = standing_by()
+    assert bench.order("AIM", STANDBY[0] + 5.0, *STANDBY[1:]) == DONE
+    assert bench.order("TRACK") == DONE
+    bench.run(10)
+    assert bench.miss(STANDBY) > 4.0
+    assert bench.order("STOW") == DONE
+    nearest = math.inf
+    while bench.state == "STOWING":
+        bench.tick()
+        nearest = min(nearest, bench.miss(STANDBY))
+    assert nearest < 0.1
+
+
 def test_a_sun_that_cannot_be_served_leaves_the_receiver() -> None:
     bench = tracking()
     bench.controller.motion.aim = tuple(bench.machine.position - [0.0, 0.0, 50.0])  # type: ignore[assignment]
@@ -118,6 +132,20 @@ def test_a_sun_that_cannot_be_served_leaves_the_receiver() -> None:
 
 
 # The lease.
+
+
+@pytest.mark.parametrize("framed", [True, False])
+def test_a_lease_that_ends_while_the_board_stands_still_has_ended_for_the_next_order(
+    framed: bool,
+) -> None:
+    bench = tracking()
+    bench.now, bench.true_ms = ticks.add(bench.now, 7000), bench.true_ms + 7000
+    if framed:
+        assert bench.order("TRACK") == REFUSED_STATE
+    else:
+        number = messages.NUMBER_OF["TRACK"]
+        bench.do(bench.controller.on_message(number, 1, (TOKEN, 0), b"", DONE, bench.now, True))
+    assert bench.state == "DEFOCUSED"
 
 
 def test_without_sun_it_defocuses_and_stows_by_itself() -> None:
