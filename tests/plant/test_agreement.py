@@ -151,6 +151,21 @@ def test_a_heliostat_that_follows_a_wrong_sun_is_named_and_defocused(
     play(tmp_path, scene)
 
 
+@pytest.mark.parametrize("late", [0.0, 600.0])
+def test_counts_that_come_seldom_are_compared_with_the_sun_of_their_time(
+    late: float, tmp_path: Path
+) -> None:
+    """A cluster may ask for them once a minute, in which the sun moves by 4 mrad."""
+
+    async def scene(bench: Bench) -> None:
+        await tracking(bench)
+        bench.cluster_of(NAME).polled_ms = 60_000
+        await go(bench, 75, 60.0 + late)
+        assert alarmed(bench, "pointing_disagrees") == ({NAME} if late else set())
+
+    play(tmp_path, scene)
+
+
 def test_a_heliostat_on_its_way_is_left_in_peace_and_one_that_stands_is_not(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         cluster = bench.cluster_of(NAME)

@@ -74,6 +74,8 @@ class ScriptedCluster:
         Messages in the order of arrival, with their times.
     rows, age_ms
         Its status, and the age of each row.
+    polled_ms
+        Age of the step counts beyond that of their row.
     stored
         Items of each heliostat's journal.
     poses
@@ -94,6 +96,7 @@ class ScriptedCluster:
         self.rows = np.zeros(len(names), NODE)
         self.rows["state"] = states.STOWED
         self.age_ms = np.zeros(len(names), dtype=np.int64)
+        self.polled_ms = 0
         self.stored: dict[str, dict[str, bytes]] = {name: {} for name in names}
         self.token = 0
         self.first = True
@@ -132,7 +135,9 @@ class ScriptedCluster:
             if self.link.connected and not self.mute:
                 rows = self.poses(self.rows.copy())
                 rows["heard_ms"] = np.where(self.age_ms < 0, NEVER, np.maximum(self.age_ms, 0))
-                rows["steps_ms"] = rows["heard_ms"]
+                rows["steps_ms"] = np.where(
+                    self.age_ms < 0, NEVER, rows["heard_ms"] + self.polled_ms
+                )
                 for name in self.untold:
                     at, last = self._told.setdefault(
                         name, (self.clock.monotonic(), rows[self.names.index(name)].copy())
