@@ -254,6 +254,7 @@ def test_a_beam_beside_the_target_is_looked_for_in_the_next_visit() -> None:
             layout, wrong = newcomers(plant, target, [lost], JointSettings(), model, {lost: missed})
             assert wrong == {}
             places.append(target.plane_coordinates(layout.aims)[0])
+        assert places[0] == pytest.approx((0.0, 0.0)), "alone it has the middle"
         away = np.array(places[1:9]) - places[0]
         # Around the target, each direction once; the last place stays.
         assert np.abs(away).max(axis=1) == pytest.approx(0.8 * target.width)

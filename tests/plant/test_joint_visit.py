@@ -127,6 +127,23 @@ def test_two_rows_in_place_are_waited_for_and_who_is_not_there_by_then_drops_out
     assert visit.lost == {"B": "B: not at its aim within 10 s"}
 
 
+def test_who_does_not_go_to_standby_at_the_end_is_taken_off_the_target() -> None:
+    sent: list[tuple[str, ...]] = []
+
+    async def scene(visit: Any, _: VirtualClock) -> None:
+        field, visit._away = visit.plant.field, set(NAMES)
+        field.place, field.live = NAMES.index, lambda _: np.ones(len(NAMES), dtype=bool)
+        field.rows = {"state": np.full(len(NAMES), states.TRACKING)}
+        visit.plant.waits_to_stow = lambda _: False
+        visit.plant.command = lambda *_: Order(("A",), {"C": "not in this state"})
+        visit.plant.defocus = lambda _, names: sent.append(names)
+        visit.person, visit.token = SimpleNamespace(name="Egon"), 1
+        await visit.home()
+
+    play(dict.fromkeys(NAMES, 0.0), scene)
+    assert sent == [("A", "C")]
+
+
 @pytest.mark.parametrize(("wide", "high"), [(12.0, 3.0), (3.0, 12.0), (6.0, 6.0)])
 def test_beams_stand_in_a_grid_of_the_targets_shape(wide: float, high: float) -> None:
     target = malan_plant(1).targets[0]

@@ -18,6 +18,7 @@ from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibrati
 from heliotrope.errors import FetchError, InputError
 from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
+from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.links.clock import VirtualClock, run_virtual
@@ -30,6 +31,7 @@ from heliotrope.plant.visits import (
     CycleResult,
 )
 from heliotrope.plant.visits.joint_layout import arranged, error_on
+from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.stacks import Exposed
 from support.joint_scene import Scene, joint, spoil
 from support.live import LiveOptions, LivePlant
@@ -161,6 +163,25 @@ def test_one_that_is_stowed_meanwhile_drops_out_and_the_others_go_on() -> None:
         assert here.states()[gone] == "STOWED", "a person's order is not undone"
 
     joint(scene)
+
+
+def test_neighbours_count_as_they_stood_in_the_middle_of_the_stack() -> None:
+    async def scene(here: Scene) -> None:
+        cycle, apart = here.cycle._cycle, list[float]()
+        alone = cycle.alone
+
+        async def noted(target: Target, name: str, shot: Shot, standing: Any) -> Shot:
+            apart.append(float(np.abs(standing.at - shot.at).max()))
+            return await alone(target, name, shot, standing)
+
+        cycle.alone = noted  # type: ignore[method-assign]
+        results = await here.run()
+        assert {r.outcome for r in results.values()} == {_CALIBRATED}, results
+        # Eight photographs take 16 s and more.
+        assert len(apart) == len(here.names)
+        assert max(apart) < 5.0
+
+    joint(scene, count=3)
 
 
 def test_movements_on_a_target_wait_for_no_turn_to_join_the_receiver() -> None:
