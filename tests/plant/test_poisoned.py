@@ -136,6 +136,20 @@ def test_light_that_no_photograph_shows_to_move_is_not_kept(tmp_path: Path) -> N
     assert "the light did not move with the aim" in result.rejected[-1]
 
 
+def test_a_centred_visit_ends_with_the_photographs_that_are_asked_for(tmp_path: Path) -> None:
+    async def main(clock: VirtualClock) -> list[str]:
+        whole = WholePlant(clock, tmp_path, clusters=1, target=WIDE)
+        async with whole.alive():
+            plant, token, stages = whole.plant, whole.token, list[str]()
+            assert await plant.command(ENGINEER, token, "APPROACH").end(400.0)
+            cycle = CalibrationCycle(plant, whole, CycleSettings(interval=5.0), Centring())
+            result = await cycle.run(ENGINEER, token, NAME, "white", stages.append)
+            assert result.new >= 3, result.text
+        return [stage for stage in stages if stage.startswith("photograph")]
+
+    assert run_virtual(main, 1) == ["photograph 1", "photograph 2", "photograph 3"]
+
+
 class Passing:
     """A camera that sees a light which follows the aim once, and then is gone."""
 

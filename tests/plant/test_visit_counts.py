@@ -118,7 +118,8 @@ def test_the_play_is_reckoned_under_the_sun_of_the_exposure() -> None:
             field.rows[0] = (*here, *here, 1, TRACKING)
             field.counted_at[0] = at
             made.note()
-        await measured(made, Shot(TARGET.center, 2.5, 1e-4))
+        shot, _ = await measured(made, Shot(TARGET.center, 2.5, 1e-4))
+        assert np.trace(np.asarray(shot.covariance)) > 4e-4, "it may have been in a swing"
         return suns
 
     assert set(run_virtual(main)) == {2.5}
@@ -167,6 +168,27 @@ def test_a_swing_that_is_heard_beside_a_photograph_is_one() -> None:
     for at, off in ((1.0, 0.0), (2.0, 0.0), (3.0, -40.0), (4.0, 0.0)):
         hear(made, field, at, off)
     assert made.heard_moving(2.9) == pytest.approx(0.1)
+
+
+def test_two_rows_in_place_are_waited_for_before_a_mirror_has_arrived() -> None:
+    """The first may have been on its way before the order."""
+
+    async def main(clock: VirtualClock) -> float:
+        made, field = visit(clock)
+        hear(made, field, 0.0, 0.0)
+        field.live = lambda _: np.array([True])
+        plant: Any = made.plant
+
+        def now() -> float:
+            field.counted_at[:] = np.floor(clock.monotonic())
+            return clock.monotonic()
+
+        plant.now = now
+        begin = clock.monotonic()
+        await made.arrived(10.0)
+        return clock.monotonic() - begin
+
+    assert 1.5 < run_virtual(main) <= 2.5
 
 
 def test_a_mirror_that_is_not_heard_at_its_aim_is_not_measured() -> None:
