@@ -13,7 +13,7 @@ from heliotrope.geometry import reflect
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Ask, Parameters
-from heliotrope.mechanism.board_items import Wanted, items_of, tables_with
+from heliotrope.mechanism.board_items import Wanted, items_of, packed, tables_with
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant.audit import read
 from heliotrope.plant.authority import RefusedError
@@ -164,6 +164,27 @@ def test_a_locked_mirror_takes_only_parameters_with_a_clear_way_to_standby(tmp_p
         assert await ticket.end(5.0)
 
     play(tmp_path, scene)
+
+
+def test_a_standby_point_that_was_given_is_the_wanted_one(tmp_path: Path) -> None:
+    """Its local controller stores it; the one of the plant file is not written over it."""
+    rest = (0.0, 0.0, 20.0)
+    first = {**items(NAME), "standby": packed("standby", (0.0, 0.0, 12.0))}
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path, wanted=Wanted({NAME: first}))
+        plant, cluster = bench.plant, bench.cluster_of(NAME)
+        cluster.stored[NAME] = dict(first)
+        async with running(bench):
+            token = await bench.commanded(ENGINEER)
+            assert await plant.standby(ENGINEER, token, {NAME: rest}).end(5.0)
+            cluster.stored[NAME]["standby"] = packed("standby", rest)
+            await plant.stored(NAME)
+            assert plant.wanted.missing == {}
+            await bench.wait(2.0)
+            assert not cluster.of(Parameters)
+
+    run_virtual(main)
 
 
 def test_stored_items_give_the_pose_that_they_were_made_of() -> None:
