@@ -27,6 +27,7 @@ import numpy as np
 import pytest
 
 from heliotrope.cli import main
+from heliotrope.cluster.config_file import read_cluster
 from heliotrope.cluster.program import LocalCluster
 from heliotrope.console.client import Client
 from heliotrope.errors import FormatError
@@ -742,6 +743,32 @@ def test_the_links_file_holds_what_every_cluster_polls(folder: Path) -> None:
     path.write_text(path.read_text().replace("[clusters]", table))
     made = read_links(path).build(clusters_of(design()), SystemClock())
     assert made.common == CommonSettings(2, 20.0)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "good"),
+    [
+        ("steps_every_s", 1, True),
+        ("steps_every_s", 60, True),
+        ("steps_every_s", 0, False),
+        ("steps_every_s", 61, False),
+        ("silence_s", 2.0, True),
+        ("silence_s", 3600.0, True),
+        ("silence_s", 1.9, False),
+        ("silence_s", 3601.0, False),
+    ],
+)
+def test_the_links_file_takes_what_a_cluster_file_takes(
+    folder: Path, setting: str, value: float, good: bool
+) -> None:
+    links, cluster = folder / "links.toml", folder / "K3.toml"
+    table = f"[polling]\n{setting} = {value}\n"
+    links.write_text(links.read_text().replace("[clusters]", f"{table}[clusters]"))
+    cluster.write_text(f"{cluster.read_text()}{table}")
+    refused = pytest.raises(FormatError, match=setting)
+    for read_one, path in ((read_links, links), (read_cluster, cluster)):
+        with contextlib.nullcontext() if good else refused:
+            read_one(path)
 
 
 def test_a_sensor_that_no_row_needs_is_refused(folder: Path) -> None:
