@@ -90,8 +90,9 @@ def test_a_beam_left_on_the_receiver_is_sent_off_in_every_state(state: int, tmp_
     assert sent[-1].name == "STOW"
 
 
+@pytest.mark.parametrize("way", [-1.0, 1.0], ids=["west", "east"])
 def test_a_beam_that_was_sent_there_or_comes_off_or_is_at_stow_is_left_in_peace(
-    tmp_path: Path,
+    way: float, tmp_path: Path
 ) -> None:
     async def scene(bench: Bench) -> None:
         cluster = bench.cluster_of("P5C")
@@ -102,7 +103,8 @@ def test_a_beam_that_was_sent_there_or_comes_off_or_is_at_stow_is_left_in_peace(
         cluster.rows["flags"][row] = 1 << names.FLAGS.index("AT_STOW")
         # P4A crosses the receiver slowly, on its way to a place beside it.
         for tick in range(20):
-            put(bench, "P4A", states.IDLE, (0.4 - 0.04 * tick, -12.0, 8.0), BESIDE)
+            at, end = way * (0.04 * tick - 0.4), (way * 8.0, 0.0, 8.0)
+            put(bench, "P4A", states.IDLE, (at, -12.0, 8.0), end)
             await bench.wait(1.0)
         assert not alarmed(bench.plant)
         # It stops there.
