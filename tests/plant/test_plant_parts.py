@@ -18,6 +18,7 @@ import pytest
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.field.example import example_plant
+from heliotrope.field.target import Receiver
 from heliotrope.lcu import drives, states
 from heliotrope.lcu.config import Config
 from heliotrope.links.clock import VirtualClock
@@ -31,12 +32,13 @@ from heliotrope.mechanism.board_items import (
     packed,
 )
 from heliotrope.mechanism.machine import AxisLimits, Machine
-from heliotrope.plant.aims import spread
+from heliotrope.plant.aims import BeamCheck, spread
 from heliotrope.plant.audit import STOPPED, AuditError, JsonLines, Record, read
 from heliotrope.plant.authority import Authority, Person, RefusedError, Role
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoiningJob, JoinQueue
 from heliotrope.plant.links_file import PlantLinks
+from heliotrope.plant.movements import Movements
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.views import CalibrationEntry
@@ -280,6 +282,14 @@ def test_stages_never_go_back_and_nothing_follows_the_end() -> None:
     assert "1 refused" in repr(ticket)
 
 
+def test_a_refusal_without_a_reason_is_told_all_the_same() -> None:
+    ticket = Ticket("1", "TRACK", ("A", "B", "C"), VirtualClock(), 60.0)
+    ticket.advance(("A",), Stage.REFUSED)
+    ticket.advance(("B",), Stage.FAILED)
+    ticket.advance(("C",), Stage.DONE)
+    assert ticket.refusals == {"A": "refused", "B": "failed"}
+
+
 def test_who_waits_too_long_to_join_is_given_up() -> None:
     clock = VirtualClock()
     queue = JoinQueue(1.0, 1)
@@ -298,9 +308,9 @@ def test_who_waits_too_long_to_join_is_given_up() -> None:
 
 def test_aim_points_are_given_out_evenly_and_neighbours_differ() -> None:
     rng = np.random.default_rng(1)
-    bearing = rng.uniform(-1.0, 1.0, 1000)
-    places = 500.0 * np.stack([np.sin(bearing), np.cos(bearing), 0.0 * bearing], axis=-1)
-    points = np.array([[-2.0, 0.0, 100.0], [0.0, 0.0, 100.0], [2.0, 0.0, 100.0]])
+    bearing, tower = rng.uniform(-1.0, 1.0, 1000), np.array([2000.0, -1000.0, 0.0])
+    places = 500.0 * np.stack([np.sin(bearing), np.cos(bearing), 0.0 * bearing], axis=-1) + tower
+    points = np.array([[-2.0, 0.0, 100.0], [0.0, 0.0, 100.0], [2.0, 0.0, 100.0]]) + tower
     given = spread(places, points)
     which = np.argmin(np.linalg.norm(given[:, None] - points, axis=-1), axis=-1)
     assert sorted(np.bincount(which)) == [333, 333, 334]
@@ -311,6 +321,19 @@ def test_aim_points_are_given_out_evenly_and_neighbours_differ() -> None:
         spread(places, np.empty((0, 3)))
     with pytest.raises(InputError, match="aim points"):
         spread(places, (np.nan, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("mrad", "good"), [(2.9, True), (3.1, False)])
+def test_a_beam_moves_by_3_mrad_about_its_aim_at_most(mrad: float, good: bool) -> None:
+    design, aim = example_plant(), np.array([0.0, -12.0, 8.0])
+    face = Receiver("furnace", "planar", aim, np.array([0.0, -1.0, 0.0]), 1.0, 1.0)
+    armature, rows = BeamCheck(design, design.names).armature, np.array([3])
+    slant = np.linalg.norm(aim - armature.origin_1[rows[0]])
+    beside = aim + np.array([1e-3 * mrad * slant, 0.0, 0.0])
+    movements, tracks = Movements((face,), armature), np.array([True])
+    wrong = movements.refused(("A",), rows, aim[None], beside[None], tracks)
+    said = {} if good else {"A": "3.1 mrad beside its aim; a movement has 3 mrad at most"}
+    assert wrong == said
 
 
 def test_a_field_that_does_not_hold_together_is_refused() -> None:
