@@ -336,6 +336,16 @@ def test_a_beam_moves_by_3_mrad_about_its_aim_at_most(mrad: float, good: bool) -
     assert wrong == said
 
 
+def test_a_moved_beam_goes_back_when_its_time_or_its_authority_is_over() -> None:
+    design, aim = example_plant(), np.array([0.0, -12.0, 8.0])
+    movements = Movements((), BeamCheck(design, design.names).armature)
+    movements.take(("A",), aim[None], 1, 100.0)
+    assert not movements.due(189.0, 1)
+    assert movements.due(190.0, 1).keys() == {"A"}
+    np.testing.assert_array_equal(movements.due(101.0, 2)["A"], aim)
+    assert not movements.due(190.0, 0), "without a command authority no cluster would obey"
+
+
 def test_a_field_that_does_not_hold_together_is_refused() -> None:
     with pytest.raises(InputError, match="heliostat A is in two clusters"):
         FieldState({"K": ("A",), "L": ("A",)})
