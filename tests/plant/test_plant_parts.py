@@ -387,10 +387,11 @@ def test_rows_are_put_by_their_names_and_strangers_left_out() -> None:
     assert field.failed_share(12.0) == pytest.approx(2.0 / 3.0)
     assert field.failed_share(611.0) == pytest.approx(2.0 / 3.0)
     assert field.failed_share(613.0) == 0.0
-    rows["state"][0] = 77
     rows["heard_ms"][1] = 0
-    field.take("K", status(3, ("B", "A", "C")), 13.0)
-    assert field.of("B", 13.0).state == "FAULT"
+    for unknown in (len(states.STATES), 77):
+        rows["state"][0] = unknown
+        field.take("K", status(3, ("B", "A", "C")), 13.0)
+        assert field.of("B", 13.0).state == "FAULT"
 
 
 class _Kept:
