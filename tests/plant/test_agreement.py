@@ -231,6 +231,19 @@ def test_a_new_calibration_counts_once_the_local_controller_has_it(tmp_path: Pat
     assert np.array_equal(agreement._drives[row], own)
 
 
+def test_one_that_disagrees_is_defocused_alone(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        agreement = bench.plant._agreement
+        agreement._wrong, agreement._at = {NAME: 0.1}, np.inf
+        await bench.wait(7.0)
+        assert alarmed(bench, "pointing_disagrees") == {NAME}
+        assert not bench.plant.emergency_on
+
+    bench = play(tmp_path, scene)
+    sent = [(m.name, m.heliostats) for c in bench.clusters.values() for m in c.of(Emergency)]
+    assert sent == [("DEFOCUS", (NAME,))]
+
+
 def test_many_that_disagree_defocus_the_field(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         plant = bench.plant
