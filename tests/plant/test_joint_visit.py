@@ -8,10 +8,12 @@ import pytest
 
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.target import Target
+from heliotrope.geometry import direction
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.beam_watch import BeamError
-from heliotrope.plant.visits.joint_layout import SentBeam, _places
+from heliotrope.plant.visits.joint_layout import SentBeam, _places, beam_of
 from heliotrope.plant.visits.joint_visit import JointVisit
 from heliotrope.plant.visits.visit import ARRIVED
 
@@ -142,6 +144,22 @@ def test_who_does_not_go_to_standby_at_the_end_is_taken_off_the_target() -> None
 
     play(dict.fromkeys(NAMES, 0.0), scene)
     assert sent == [("A", "C")]
+
+
+@pytest.mark.parametrize("before", [0.5, -0.5])
+def test_only_a_mirror_before_the_plane_of_a_target_sends_its_beam_there(before: float) -> None:
+    design = malan_plant(1)
+    like, beams = design.targets[0], BeamCheck(design, design.names)
+    center = beams.position[0] + 50.0 * like.axes[0] - before * like.normal
+    target = Target("aside", like.corners - like.center + center, center)
+    plant: Any = SimpleNamespace(
+        field=SimpleNamespace(place=lambda _: 0),
+        design=design,
+        beams=beams,
+        sun_vector=lambda: direction(np.radians(180.0), np.radians(60.0)),
+    )
+    found = beam_of(plant, target, design.names[0], 1e-3)
+    assert isinstance(found, SentBeam) if before > 0.0 else "the front of aside" in str(found)
 
 
 @pytest.mark.parametrize(("wide", "high"), [(12.0, 3.0), (3.0, 12.0), (6.0, 6.0)])
