@@ -13,7 +13,7 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.beam_watch import BeamError
-from heliotrope.plant.visits.joint_layout import SentBeam, _places, beam_of
+from heliotrope.plant.visits.joint_layout import SentBeam, _places, _too_bright, beam_of
 from heliotrope.plant.visits.joint_visit import JointVisit
 from heliotrope.plant.visits.visit import ARRIVED
 
@@ -160,6 +160,17 @@ def test_only_a_mirror_before_the_plane_of_a_target_sends_its_beam_there(before:
     )
     found = beam_of(plant, target, design.names[0], 1e-3)
     assert isinstance(found, SentBeam) if before > 0.0 else "the front of aside" in str(found)
+
+
+def test_beams_in_one_place_are_too_bright_wherever_it_is_and_those_apart_are_not() -> None:
+    beam = SentBeam(50.0, np.eye(2), 0.04 * np.eye(2), 1e-8, 1.0)
+    peak = 1.0 / (2.0 * np.pi * 0.04)
+    known = dict.fromkeys(NAMES, beam)
+    together = np.array([(-2.0, -1.5), (2.0, 1.0), (2.0, 1.0)])
+    assert _too_bright(known, together, 2.1 * peak) == ""
+    assert _too_bright(known, together, 1.9 * peak) == "B"
+    apart = np.array([(-2.0, -1.0), (2.0, 1.0), (0.0, 0.0)])
+    assert _too_bright(known, apart, 1.1 * peak) == ""
 
 
 @pytest.mark.parametrize(("wide", "high"), [(12.0, 3.0), (3.0, 12.0), (6.0, 6.0)])

@@ -158,6 +158,13 @@ def test_a_camera_that_falls_silent_is_told_and_left_alone(plant: Plant, frame: 
         cameras.close()
 
 
+def test_no_camera_is_awake_for_a_target_that_none_looks_at(plant: Plant, frame: Frame) -> None:
+    cameras = RealCameras(plant, Path(), SystemClock(), sources=Scripted(frame))
+    name = plant.targets[0].name
+    assert (cameras.sees(name), cameras.awake(name)) == (True, True)
+    assert (cameras.sees("roof"), cameras.awake("roof")) == (False, False)
+
+
 def test_a_frame_from_before_is_no_photograph(plant: Plant, frame: Frame) -> None:
     script = Scripted(frame, late=60.0)
     cameras = RealCameras(plant, Path(), SystemClock(), patience=0.3, sources=script)
