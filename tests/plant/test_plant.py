@@ -205,6 +205,7 @@ def test_defocus_and_stow_are_taken_from_anybody(tmp_path: Path) -> None:
         ("JOG", (0, 0.5), "cannot be sent"),
         ("JOG", (0, 2**31), "cannot be sent"),
         ("SEARCH", (float("nan"), 1.0), "give finite numbers"),
+        ("SEARCH", (1e-3, float("inf")), "give finite numbers"),
         ("SEARCH", (1e300, 1.0), "cannot be sent"),
     ],
 )
