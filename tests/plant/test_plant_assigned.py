@@ -247,6 +247,24 @@ def test_after_a_restart_the_plant_knows_which_points_were_not_taken(tmp_path: P
     run_virtual(after)
 
 
+def test_the_store_knows_after_each_assignment_what_the_plant_knows(tmp_path: Path) -> None:
+    store, row = AssignedFile(tmp_path / "assigned.json"), np.arange(1)
+    points = Points(("A",), store)
+    for east in range(1, 9):
+        new = np.array([[float(east), 0.0, 9.0]])
+        points.storing("AIM", row, new)[0]()
+        points.assign("AIM", row, new)
+        if east == 1:
+            points.taken("AIM", row)
+            settle = points.settling()
+            assert settle is not None
+            settle()
+        again = Points(("A",), store)
+        np.testing.assert_array_equal(again.aims, points.aims)
+        np.testing.assert_array_equal(again.earlier["AIM"], points.earlier["AIM"])
+    assert points.earlier["AIM"][:, 0, 0].tolist() == [7.0, 6.0, 5.0, 1.0]
+
+
 def test_a_point_taken_late_is_taken_and_one_replaced_meanwhile_is_not(tmp_path: Path) -> None:
     store = AssignedFile(tmp_path / "assigned.json")
     points = Points(("A", "B"), store)
