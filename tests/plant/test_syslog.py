@@ -135,6 +135,7 @@ def test_a_receiver_gets_whole_messages(
     sender.close(PATIENCE)
     until(lambda: len(heard.messages) == 3)
     assert (sender.problem, sender.lost) == ("", 0)
+    assert len(heard._connections) == (scheme != "udp"), "one that stands is kept"
     first, second, third = (LINE.fullmatch(message) for message in heard.messages)
     assert first
     assert second
