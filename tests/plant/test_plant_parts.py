@@ -21,7 +21,7 @@ from heliotrope.field.example import example_plant
 from heliotrope.field.target import Receiver
 from heliotrope.lcu import drives, states
 from heliotrope.lcu.config import Config
-from heliotrope.links.clock import VirtualClock
+from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import NODE, ClusterStatus, ProtocolError, Stage
 from heliotrope.mechanism.board_items import (
     Wanted,
@@ -288,6 +288,21 @@ def test_a_refusal_without_a_reason_is_told_all_the_same() -> None:
     ticket.advance(("B",), Stage.FAILED)
     ticket.advance(("C",), Stage.DONE)
     assert ticket.refusals == {"A": "refused", "B": "failed"}
+
+
+def test_a_record_is_waited_for_no_longer_than_it_takes() -> None:
+    async def main(clock: VirtualClock) -> None:
+        good, failed, late = (Ticket(each, "TRACK", ("A",), clock, 60.0) for each in "123")
+        good.record()
+        failed.advance(("A",), Stage.FAILED)
+        begin = clock.monotonic()
+        assert await good.written(10.0)
+        assert not await failed.written(10.0)
+        assert clock.monotonic() == begin
+        assert not await late.written(10.0)
+        assert clock.monotonic() == pytest.approx(begin + 10.0)
+
+    run_virtual(main)
 
 
 def test_who_waits_too_long_to_join_is_given_up() -> None:
