@@ -718,6 +718,7 @@ def test_a_sensor_is_read_when_its_file_is_written_anew(tmp_path: Path) -> None:
         os.utime(file, (second, second))
         return sensors.read().values
 
+    opened = len(list(Path("/proc/self/fd").iterdir()))
     # What lay there at the start may be of long ago.
     assert write("12.5\n", 1) == {}
     assert sensors.read().values == {}
@@ -725,6 +726,7 @@ def test_a_sensor_is_read_when_its_file_is_written_anew(tmp_path: Path) -> None:
     assert write("nan", 3) == {}
     assert write("calm", 4) == {}
     assert write("9.0", 5) == {"wind_gust": 9.0}
+    assert len(list(Path("/proc/self/fd").iterdir())) == opened, "a plant reads for years"
     assert sensors.names <= FED
 
 
