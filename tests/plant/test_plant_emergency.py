@@ -101,6 +101,22 @@ def test_an_order_is_proven_or_the_nodes_are_named(tmp_path: Path) -> None:
     assert (records[0].who, records[0].what, records[0].note) == ("a visitor", "DEFOCUS", "smoke")
 
 
+def test_the_order_ends_for_one_that_is_seen_at_stow_although_it_did_not_answer(
+    tmp_path: Path,
+) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, cluster = bench.plant, bench.cluster_of("P3B")
+        cluster.deaf.add("P3B")
+        order = plant.raise_emergency("Olga", Act.STOW)
+        await bench.wait(2.0)
+        assert order.ticket.waiting(plant.field.names) == ("P3B",)
+        cluster.set(states.STOWED, "P3B")
+        await bench.wait(2.0)
+        assert order.ticket.text == "STOW: 18 done"
+
+    play(tmp_path, scene)
+
+
 def test_where_nobody_measures_the_flux_the_proof_rests_on_the_mirrors(tmp_path: Path) -> None:
     """No row about a value that nobody measures trips or latches."""
 
