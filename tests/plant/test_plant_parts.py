@@ -272,6 +272,8 @@ def test_stages_never_go_back_and_nothing_follows_the_end() -> None:
     clock.advance(10.0)
     ticket.expire(clock.monotonic())
     assert ticket.refusals == {"B": "no", "C": "no answer before it expired"}
+    # What is told again gives it no more time.
+    ticket.advance(("A",), Stage.ACKNOWLEDGED)
     clock.advance(49.0)
     ticket.expire(clock.monotonic())
     assert not ticket.finished
