@@ -15,16 +15,18 @@ from typing import Any, cast
 import httpx
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
-from heliotrope.errors import HeliotropeError, UnknownNameError
+from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.lcu import states
 from heliotrope.local import EMERGENCY, ORDINARY, CallError, LocalConnection, ask_once
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.interface import CALLS, frame_of, frame_parts, kind_of, plain, remade
 from heliotrope.plant.interface.console_process import Patience
 from heliotrope.plant.interface.desk import SAME, Desk
-from heliotrope.plant.interface.orders import EmergencyCall
+from heliotrope.plant.interface.orders import AimOrder, EmergencyCall
 from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.operations.views import CameraView
 from heliotrope.twin.field.field_bus import FieldBus
 from support.live_console import ROLES, LiveConsole
 
@@ -387,6 +389,60 @@ def test_every_urgent_call_takes_beams_away() -> None:
     assert {name for name, call in CALLS.items() if call.urgent} == {
         "order_emergency", "stow", "defocus"
     }  # fmt: skip
+
+
+def test_only_a_console_may_take_its_picture_of_the_plant_or_note_sign_ins() -> None:
+    assert {name for name, call in CALLS.items() if call.console} == {"live", "note"}
+
+
+OLGA = Person("Olga", Role.OPERATOR)
+
+
+def _done(operations: dict[str, Any], name: str, given: dict[str, Any], blob: bytes = b"") -> Any:
+    """Return what a call of an operator who has the command does with these operations."""
+    grant = SimpleNamespace(holder=OLGA, token=7)
+    plant = SimpleNamespace(authority=SimpleNamespace(grant=grant))
+    here = SimpleNamespace(plant=plant, logbook=None, **operations)
+    call = CALLS[name]
+    return call.work(Desk(cast("Operations", here)), OLGA, call.arguments(**given), blob)
+
+
+def test_an_emergency_is_withdrawn_in_the_name_of_who_asks() -> None:
+    by = list[Person]()
+    here = {"withdraw": by.append, "emergency_view": lambda: not by}
+    assert _done(here, "withdraw_emergency", {}) is False
+    assert by == [OLGA]
+
+
+def test_a_photograph_that_is_known_is_not_sent_again() -> None:
+    here = {"camera": lambda name: CameraView(name, 3, 0.0, b"jpeg")}
+    for known, sent in ((-1, b"jpeg"), (2, b"jpeg"), (3, b"")):
+        found = _done(here, "photograph", {"name": "left", "known": known})
+        assert (found.value, found.blob) == ({"version": 3}, sent)
+
+
+def test_an_aim_is_a_place_or_points_and_never_both() -> None:
+    here = {
+        "aim_at": lambda who, token, heliostats, where: (token, heliostats, where),
+        "aim": lambda who, token, points: (token, {n: p.tolist() for n, p in points.items()}),
+    }
+    point = np.array([1.0, 2.0, 3.0])
+    place = {"heliostats": ["A"], "where": "left"}
+    assert _done(here, "aim", place) == (7, ["A"], "left")
+    assert _done(here, "aim", {"points": ["A"]}, point.tobytes()) == (7, {"A": [1.0, 2.0, 3.0]})
+    for given, blob in ((place | {"points": ["A"]}, point.tobytes()), ({"heliostats": ["A"]}, b"")):
+        with pytest.raises(InputError, match="give either where"):
+            _done(here, "aim", given, blob)
+
+
+@pytest.mark.parametrize(
+    "point", [[1.0, 2.0], [1.0, 2.0, 3.0, 4.0], [1.0, 2.0, 100_001.0], [1.0, 2.0, "3"], []]
+)
+def test_a_point_that_is_none_is_refused_by_its_name(point: list[Any]) -> None:
+    good = {"A": [1.0, 2.0, -100_000.0]}
+    assert AimOrder(points=good).points == good
+    with pytest.raises(ValidationError, match="B: give east, north and up, m"):
+        AimOrder(points=good | {"B": point})
 
 
 def test_a_word_orders_one_emergency_however_often_it_is_sent(
