@@ -2,8 +2,10 @@
 
 import base64
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -11,11 +13,17 @@ import httpx
 import numpy as np
 import pytest
 
-from heliotrope.field.camera import project
+from heliotrope.field.camera import Camera, project
 from heliotrope.field.formats.plant_edit import versions
-from heliotrope.field.formats.plant_file import read_plant
+from heliotrope.field.formats.plant_file import read_plant, write_plant
+from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
 from heliotrope.imaging.targets.teaching import known_points, with_camera
+from heliotrope.links.clock import VirtualClock
+from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking
 from support.live_console import ROLES, LiveConsole
 from support.pages import NEEDS_BROWSER, entering, orders_counted, said
@@ -59,6 +67,23 @@ class Standing:
     """A controller that does nothing but have a design."""
 
     design: Plant
+
+
+@dataclass(frozen=True)
+class Held:
+    """A camera with an empty frame, and the taught pictures that it was given."""
+
+    camera: Camera
+    pictures: list[set[str]] = field(default_factory=list)
+
+    def eye(self, target: str) -> Camera:
+        return self.camera
+
+    def frame(self, target: str) -> SimpleNamespace:
+        return SimpleNamespace(size=self.camera.size)
+
+    def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
+        self.pictures.append(set(pictures))
 
 
 def pixels(console: LiveConsole) -> dict[str, list[float]]:
@@ -129,6 +154,59 @@ def test_marks_are_tried_saved_used_and_kept(rendered: LiveConsole, asking: Ask)
         rendered.call(again.resume)
         position = rendered.call(lambda: cameras.eye(TARGET)).position
         assert np.allclose(position, eye.position) == resumed
+
+
+def test_taught_pictures_beside_the_kept_file_are_taken_again(tmp_path: Path) -> None:
+    """Those that were taught before lie beside the plant's own file, and are not missed."""
+    design = malan_plant(1)
+    left, others = design.targets[0], design.targets[1:]
+    codes = {"upper_left": "plant-left-1.png", "upper_right": "own.png"}
+    marks = tuple(
+        replace(m, kind="picture", code=codes[m.name]) if m.name in codes else m for m in left.marks
+    )
+    assert {m.code for m in marks} >= set(codes.values())
+    write_plant(design, tmp_path / "before.toml")
+    taught = replace(design, targets=(replace(left, marks=marks), *others))
+    write_plant(taught, tmp_path / "plant.toml")
+    cv2.imwrite(str(tmp_path / "plant-left-1.png"), np.full((24, 24), 200, np.uint8))
+    cameras = Held(design.cameras[0])
+    Marking(
+        cameras,  # type: ignore[arg-type]
+        Standing(design),  # type: ignore[arg-type]
+        Logbook(VirtualClock()),
+        tmp_path / "plant.toml",
+    ).resume()
+    assert {"plant-left-1.png"} in cameras.pictures
+    assert not any("own.png" in each for each in cameras.pictures)
+
+
+@pytest.mark.parametrize(
+    ("pixel", "shown"),
+    [
+        ((-0.4, 500.0), True),
+        ((-0.6, 500.0), False),
+        ((1599.4, 500.0), True),
+        ((1599.6, 500.0), False),
+        ((800.0, -0.4), True),
+        ((800.0, -0.6), False),
+        ((800.0, 1199.4), True),
+        ((800.0, 1199.6), False),
+    ],
+)
+def test_a_point_is_expected_only_on_the_pixels_of_a_picture(
+    pixel: tuple[float, float], shown: bool
+) -> None:
+    design = malan_plant(1)
+    name, point = next(iter(known_points(design.targets[0]).items()))
+    camera = design.cameras[0]
+    assert camera.size == (1600, 1200)
+    matrix = camera.matrix.copy()
+    matrix[:2, 2] += pixel - project(camera, point)
+    cameras = Held(replace(camera, matrix=matrix))
+    marking = Marking(cameras, Standing(design), Logbook(VirtualClock()))  # type: ignore[arg-type]
+    opened = marking.begin(Person("Egon", Role.ENGINEER), TARGET)
+    expected = {p.name: p.expected for p in opened.points}[name]
+    assert expected == (pytest.approx(pixel, abs=1e-6) if shown else None)
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,12 @@ import asyncio
 import contextlib
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -22,16 +24,20 @@ from heliotrope.lcu import states
 from heliotrope.local import EMERGENCY, ORDINARY, CallError, LocalConnection, ask_once
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.interface import CALLS, frame_of, frame_parts, kind_of, plain, remade
-from heliotrope.plant.interface.console_process import Patience
+from heliotrope.plant.interface.calls import Call
+from heliotrope.plant.interface.console_process import CONSOLE, ConsoleProcess, Patience
 from heliotrope.plant.interface.desk import SAME, Desk
 from heliotrope.plant.interface.orders import AimOrder, EmergencyCall
+from heliotrope.plant.interface.service import PlantInterface, _Turns
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.views import CameraView
+from heliotrope.safety import Alarm
 from heliotrope.twin.field.field_bus import FieldBus
 from support.live_console import ROLES, LiveConsole
 
 #: At the receiver or at the standby point, or on the way between them.
 UP = (states.APPROACHING, states.IDLE, states.TRACKING)
+OLGA = Person("Olga", Role.OPERATOR)
 #: A client that opens connections, says nonsense, and never stops.
 FLOOD = """
 import socket, sys, time
@@ -196,6 +202,37 @@ def test_a_console_that_floods_waits_for_itself(
 
     asyncio.run(main())
     undisturbed()
+
+
+def test_a_call_leaves_the_plant_its_share_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a call, three times as long, but never more than a second."""
+    clock, waited = SimpleNamespace(now=100.0), list[float]()
+
+    async def sleep(seconds: float) -> None:
+        waited.append(seconds)
+        clock.now += seconds
+
+    def work(desk: object, who: object, took: float, blob: bytes) -> None:
+        clock.now += took
+
+    def in_plant(timed: Callable[[], Any]) -> "Future[Any]":
+        done: Future[Any] = Future()
+        done.set_result(timed())
+        return done
+
+    module, now = "heliotrope.plant.interface.service", lambda: clock.now
+    patched = SimpleNamespace(Lock=asyncio.Lock, wrap_future=asyncio.wrap_future, sleep=sleep)
+    monkeypatch.setattr(f"{module}.asyncio", patched)
+    monkeypatch.setattr(f"{module}.time", SimpleNamespace(monotonic=now, perf_counter=now))
+    turns = _Turns(cast("PlantInterface", SimpleNamespace(in_plant=in_plant)), 0.25)
+    call, desk = cast("Call", SimpleNamespace(work=work)), cast("Desk", None)
+
+    async def main() -> None:
+        for took in (0.01, 0.2, 5.0, 0.0):
+            await turns.do(call, desk, OLGA, took, b"")
+
+    asyncio.run(main())
+    assert waited == pytest.approx([0.0, 0.03, 0.6, 1.0])
 
 
 def test_a_wrong_key_is_refused_and_noted(plant: LiveConsole) -> None:
@@ -391,11 +428,34 @@ def test_every_urgent_call_takes_beams_away() -> None:
     }  # fmt: skip
 
 
+def test_a_console_that_cannot_begin_is_tried_again_after_pauses_that_double(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pauses, told = list[float](), list[Alarm]()
+
+    async def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+        if len(pauses) == 8:
+            raise asyncio.CancelledError
+
+    def listen() -> tuple[socket.socket, dict[str, Any]]:
+        raise InputError("address 192.0.2.1 is not available")
+
+    monkeypatch.setattr(
+        "heliotrope.plant.interface.console_process.asyncio",
+        SimpleNamespace(sleep=sleep, to_thread=asyncio.to_thread),
+    )
+    interface = cast("PlantInterface", SimpleNamespace(in_plant=lambda work: work()))
+    process = ConsoleProcess(interface, CONSOLE, listen, told.append, lambda _: None, Patience())
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(process.run())
+    assert pauses == [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
+    assert len(told) == 8
+    assert all(one.active and "192.0.2.1 is not available" in one.text for one in told)
+
+
 def test_only_a_console_may_take_its_picture_of_the_plant_or_note_sign_ins() -> None:
     assert {name for name, call in CALLS.items() if call.console} == {"live", "note"}
-
-
-OLGA = Person("Olga", Role.OPERATOR)
 
 
 def _done(operations: dict[str, Any], name: str, given: dict[str, Any], blob: bytes = b"") -> Any:
