@@ -218,6 +218,8 @@ def test_a_book_keeps_packets_but_of_steady_ones_the_last() -> None:
             await links["C1"].send(encode(Lease(7)))
             await links["C1"].receive()
             clock.advance(1.0)
+        await links["C2"].send(encode(Lease(7)))
+        clock.advance(1.0)
         await links["C2"].send(encode(Ask("a-1", "statistics")))
 
     asyncio.run(main())
@@ -225,6 +227,7 @@ def test_a_book_keeps_packets_but_of_steady_ones_the_last() -> None:
     of_one = book.packets(9, "C1")
     assert sorted((p.way, p.kind) for p in of_one) == [("from", "status"), ("to", "lease")]
     assert '"token":7' in next(p.text for p in of_one if p.kind == "lease")
+    assert [p.kind for p in book.packets(9, "C2")] == ["ask", "lease"], "newest first"
 
 
 class _Full:

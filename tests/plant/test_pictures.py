@@ -95,8 +95,9 @@ def test_they_are_thinned_by_age(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("*.jpg"))) == len(ages)
 
 
-def test_the_folder_is_bounded_and_the_oldest_go_first(tmp_path: Path) -> None:
-    pictures = Pictures(tmp_path, PictureSettings(most=1000.0))
+@pytest.mark.parametrize("most", [900.0, 1000.0])
+def test_the_folder_is_bounded_and_the_oldest_go_first(tmp_path: Path, most: float) -> None:
+    pictures = Pictures(tmp_path, PictureSettings(most=most))
     for k in range(12):
         visit(pictures, "AB"[k % 2], NOW + 60.0 * k, (150,))
     kept = sorted(row.at for name in "AB" for row in listed(pictures, name))

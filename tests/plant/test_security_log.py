@@ -3,9 +3,11 @@
 import asyncio
 from collections.abc import Callable
 
+import pytest
+
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.operations import Logbook, SecurityEvent, SecurityLog, SecurityNote
-from heliotrope.plant.operations.security import MOST, ORDERS, QUIET, SPAN
+from heliotrope.plant.operations.security import MOST, ORDERS, ORDERS_SPAN, QUIET, SPAN
 
 
 def within(work: Callable[[Logbook, SecurityLog], object]) -> Logbook:
@@ -63,6 +65,18 @@ def test_a_few_refused_orders_raise_none() -> None:
             log.note(SecurityEvent.ORDER_REFUSED, "ben", "10.0.0.3")
 
     assert within(work).alarms() == ()
+
+
+@pytest.mark.parametrize(("span", "raised"), [(ORDERS_SPAN, True), (ORDERS_SPAN + 4.0, False)])
+def test_five_refused_orders_within_five_minutes_raise_an_alarm(span: float, raised: bool) -> None:
+    async def work(_: Logbook, log: SecurityLog) -> None:
+        log.note(SecurityEvent.ORDER_REFUSED, "ben", "10.0.0.3")
+        for _ in range(4):
+            await asyncio.sleep(span / 4.0)
+            log.note(SecurityEvent.ORDER_REFUSED, "ben", "10.0.0.3")
+
+    assert (ORDERS, ORDERS_SPAN) == (5, 300.0)
+    assert [row.condition for row in within(work).alarms()] == ["orders_refused"] * raised
 
 
 def test_a_refused_link_is_noted_once() -> None:
