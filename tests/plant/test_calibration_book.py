@@ -96,6 +96,19 @@ def test_the_last_predictions_stay_over_the_night() -> None:
     np.testing.assert_array_equal(book.error, before)
 
 
+def test_the_error_before_a_calibration_is_that_under_the_sun_as_it_stands() -> None:
+    """At night it is that under a sun overhead."""
+    scene, up = Scene(), direction(0.0, np.radians(90.0))
+    installed = []
+    for sun in (direction(np.radians(100.0), np.radians(10.0)), up, -up):
+        scene.sun = sun
+        installed.append(CalibrationBook(cast("PlantController", scene), "malan8").installed())
+    low, overhead, night = (each / MRAD for each in installed)
+    assert night == pytest.approx(overhead)
+    assert low == pytest.approx(14.3, abs=0.1)
+    assert overhead == pytest.approx(16.9, abs=0.1)
+
+
 def test_the_predicted_error_is_that_of_the_pose_that_the_mirror_takes() -> None:
     """Without stops a mirror reaches its aim in two poses, whose errors differ."""
     world = scene_of((), 1, 60.0, 3)

@@ -20,6 +20,7 @@ from heliotrope.geometry import MRAD, direction
 from heliotrope.lcu import states
 from heliotrope.plant.schedule import scheduler as schedule
 from heliotrope.plant.schedule.choice import Sight, hidden
+from heliotrope.plant.schedule.knowledge import neighbours
 from heliotrope.plant.schedule.scheduler import (
     Assignment,
     Finished,
@@ -173,6 +174,11 @@ def test_a_neighbour_hides_what_it_overlaps_from_however_near_in_front() -> None
     for height, share in ((0.5, 0.5), (5.0, 0.5), (-0.5, 0.0)):
         offsets = np.array([[[1.0, 0.0, height]]])
         assert hidden(offsets, up, size, up[0]) == pytest.approx(share)
+
+
+def test_a_mirror_alone_is_hidden_by_nobody() -> None:
+    assert neighbours(np.zeros((1, 3))).tolist() == [[]]
+    assert neighbours(np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])).tolist() == [[1], [0]]
 
 
 def test_far_drives_are_a_cost() -> None:
