@@ -23,6 +23,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.operations.calibrating import Calibrating
 from heliotrope.plant.operations.parties import Parties
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import PictureRow, Planned
@@ -545,6 +546,41 @@ def test_who_was_disproved_goes_alone_and_has_an_alarm_until_it_is_seen() -> Non
     made.concluded(faint, joint=True)
     assert len(told) == 2, "light that is missing is no fault of the mirror"
     assert "C" not in asyncio.run(made.chosen("left", ready, follow))
+
+
+def test_what_a_joint_visit_disproves_is_an_alarm_when_it_ends() -> None:
+    made, alarms, ready = parties(1e-3, first=0)
+    results = (
+        CycleResult("A", _CALIBRATED, "calibrated", new=3),
+        CycleResult("B", CalibrationOutcome.NOT_PROVEN, "unchanged: x", verdict=Verdict.STUCK),
+        CycleResult("C", CalibrationOutcome.NOT_PROVEN, "unchanged: x", verdict=Verdict.CLOUD),
+    )
+
+    async def run(*_: object) -> tuple[CycleResult, ...]:
+        return results
+
+    made.cycle.run = run  # type: ignore[method-assign]
+    plant, done = made._plant, list[str]()
+    plant.clock = SimpleNamespace(utc=lambda: START)  # type: ignore[misc]
+    plant.beliefs = SimpleNamespace(count=lambda name: 0)  # type: ignore[assignment]
+    silent = SimpleNamespace(event=lambda *_: None, keep=lambda *_: None)
+    book = SimpleNamespace(error=np.full(6, 1e-3), conclude=lambda entry: None)
+    calibrating = Calibrating(
+        plant,
+        silent,  # type: ignore[arg-type]
+        made.cycle,  # type: ignore[arg-type]
+        SimpleNamespace(done=lambda entry: done.append(entry.heliostat)),  # type: ignore[arg-type]
+        book,  # type: ignore[arg-type]
+        silent,  # type: ignore[arg-type]
+        SimpleNamespace(now=lambda row: np.nan),  # type: ignore[arg-type]
+        lambda: (),
+        parties=made,
+    )
+    calibrating.ask_together(("A", "B", "C"), "left")
+    assert asyncio.run(calibrating.visit("left", ready, ENGINEER, 1)) == ("A", "B", "C")
+    assert alarms.active() == [("B", True)]
+    assert made.alone(ready).tolist() == [False, True, False, False, False, False]
+    assert done == ["A", "B", "C"]
 
 
 def test_persons_wait_until_all_are_ready_and_can_withdraw() -> None:
