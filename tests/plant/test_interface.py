@@ -422,6 +422,15 @@ def test_an_error_comes_back_as_the_same_class(error: HeliotropeError) -> None:
     assert str(again) == str(error)
 
 
+def test_an_aim_names_at_most_200_000_heliostats() -> None:
+    points = {f"P{k:06d}A": [0.0, 0.0, 60.0] for k in range(200_001)}
+    for given in ({"heliostats": list(points)}, {"points": points}):
+        with pytest.raises(ValidationError, match="at most 200000 items"):
+            AimOrder(**given)
+    points.popitem()
+    assert len(AimOrder(points=points).points) == 200_000
+
+
 def test_every_urgent_call_takes_beams_away() -> None:
     assert {name for name, call in CALLS.items() if call.urgent} == {
         "order_emergency", "stow", "defocus"

@@ -7,7 +7,7 @@ import pytest
 
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.operations import Logbook, SecurityEvent, SecurityLog, SecurityNote
-from heliotrope.plant.operations.security import MOST, ORDERS, ORDERS_SPAN, QUIET, SPAN
+from heliotrope.plant.operations.security import MOST, ORDERS, ORDERS_SPAN, QUIET, SPAN, plain
 
 
 def within(work: Callable[[Logbook, SecurityLog], object]) -> Logbook:
@@ -97,6 +97,12 @@ def test_what_strangers_type_is_one_short_line() -> None:
     (text,) = texts(within(work))
     assert text.startswith("request for an unknown host name refused: a??bxxx")
     assert len(text) < 200
+
+
+@pytest.mark.parametrize("length", [99, 100, 101, 1000])
+def test_a_text_of_a_stranger_has_at_most_a_hundred_characters(length: int) -> None:
+    shown = plain("x" * length)
+    assert shown == ("x" * length if length <= 100 else "x" * 99 + "…")
 
 
 def test_notes_are_sent_on() -> None:
