@@ -3,10 +3,12 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from heliotrope.geometry import direction
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
@@ -169,6 +171,30 @@ def test_what_is_found_up_at_dusk_is_stowed_unless_a_person_commands(tmp_path: P
         await asyncio.gather(running, return_exceptions=True)
 
     play(tmp_path, scene, start=DUSK)
+
+
+def test_the_field_is_raised_again_once_the_sun_is_a_degree_above_where_it_was_stowed(
+    tmp_path: Path,
+) -> None:
+    async def scene(bench: Bench) -> None:
+        logbook, count = Logbook(bench.clock), len(bench.plant.field.names)
+        settings = AutomaticSettings(wanted=True, calibrate=False)
+        control = AutomaticControl(
+            bench.plant, logbook, None, scheduler=None, records=None, truth=None, settings=settings
+        )
+        running = asyncio.create_task(control.run())
+        for elevation, stowed in ((7.9, count), (8.9, count), (9.1, 0)):
+            sun = direction(np.radians(180.0), np.radians(elevation))
+            bench.plant.sun_vector = partial(np.copy, sun)  # type: ignore[method-assign]
+            await bench.wait(15.0)
+            await bench.until(lambda stowed=stowed: bench.count(states.STOWED) == stowed)
+            told = [each.text for each in logbook.events(1000)]
+            assert told.count(f"the sun is low: {count} heliostats go to stow") == 1
+            assert told.count("the sun is high enough") == (elevation > 9.0)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    play(tmp_path, scene)
 
 
 def test_a_mirror_that_is_locked_at_dusk_is_stowed_soon_after(tmp_path: Path) -> None:
