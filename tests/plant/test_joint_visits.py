@@ -467,6 +467,17 @@ def test_parties_leave_every_second_visit_to_those_without_a_calibration() -> No
     assert asyncio.run(made.chosen("left", ready, follow)) == ("A", "B", "C", "D", "E")
 
 
+def test_a_party_is_chosen_while_the_target_waits_for_nothing() -> None:
+    made, _, ready = parties(2e-3, first=0)
+
+    async def main(clock: VirtualClock) -> None:
+        begin = clock.monotonic()
+        assert await made.chosen("left", ready, follow) == ("A", "B", "C", "D", "E")
+        assert clock.monotonic() == begin
+
+    run_virtual(main)
+
+
 def test_the_error_on_the_target_decides_who_shares_codes() -> None:
     """With what is drawn anew at each visit it may be 3.8 mrad; on the receiver it may be more."""
     sure, _, ready = parties(3.7e-3, first=0)
