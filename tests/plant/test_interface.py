@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -20,6 +21,7 @@ import pytest
 from pydantic import ValidationError
 
 from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
+from heliotrope.field.example import example_plant
 from heliotrope.lcu import states
 from heliotrope.local import EMERGENCY, ORDINARY, CallError, LocalConnection, ask_once
 from heliotrope.plant.authority import Person, RefusedError, Role
@@ -410,6 +412,21 @@ def test_a_frame_of_the_field_there_and_back(plant: LiveConsole) -> None:
     assert again.number == frame.number
     for name in ("state", "age", "counts", "calibrated_at", "held", "truth_error"):
         np.testing.assert_array_equal(getattr(again, name), getattr(frame, name))
+
+
+def test_the_tower_is_shown_between_its_receivers_or_in_the_middle_of_the_site() -> None:
+    (receiver,) = example_plant().receivers
+    beside = replace(receiver, name="other", center=receiver.center + [4.0, 0.0, -6.0])
+    field = SimpleNamespace(cluster=(0,))
+    plant = SimpleNamespace(field=field, beams=SimpleNamespace(volumes=()))
+    here = SimpleNamespace(
+        plant=plant, logbook=None, names=("A",), positions=np.zeros((1, 3)), clusters=("C1",),
+        sizes=np.ones((1, 2)), receivers=(), targets=(), aim_names=(),
+    )  # fmt: skip
+    middle = (receiver.center + [2.0, 0.0, -3.0]).tolist()
+    for receivers, tower in (((receiver, beside), middle), ((), [0.0, 0.0, 0.0])):
+        here.design = replace(example_plant(), receivers=receivers)
+        assert Desk(cast("Operations", here)).field()["tower"] == pytest.approx(tower)
 
 
 @pytest.mark.parametrize(
