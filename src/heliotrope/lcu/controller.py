@@ -13,7 +13,6 @@ BEFORE_STEPS  counts now (2) and after (2): ``Journal.before_steps``, before the
 AT_REST       counts (2): ``Journal.at_rest``
 NOTE          state, aim as bytes or None: ``Journal.note``
 ZEROED        counts (2): ``Journal.zero``
-HALT          stop the step timer at once; then call ``halted``
 FEED          the watchdog may be fed
 DRIVERS       on: switch the motors' drivers on, before segments, or off
 """
@@ -45,9 +44,7 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
 
     from .wire import Frame, Gate
 
-(SEGMENT, ANSWER, STORE, RECALL, BEFORE_STEPS, AT_REST, NOTE, ZEROED, HALT, FEED, DRIVERS) = range(
-    11
-)
+(SEGMENT, ANSWER, STORE, RECALL, BEFORE_STEPS, AT_REST, NOTE, ZEROED, FEED, DRIVERS) = range(10)
 
 #: Faults; their texts, and the names of the flags' bits, are in ``names``.
 (
@@ -317,7 +314,6 @@ class Controller:
         self._present |= 1 << number
         if halt:
             self.motion.hold()
-            self.out.append((HALT,))
         return self.out
 
     def _latch(self, number: int) -> None:
@@ -330,7 +326,7 @@ class Controller:
         self._present &= ~(1 << number)
 
     def halted(self, primary: int, secondary: int) -> "list[tuple[Any, ...]]":
-        """After HALT: take back signed steps that were emitted and not made."""
+        """After a fault with ``halt``: take back signed steps that were emitted and not made."""
         self.out.clear()
         self.motion.halted(primary, secondary)
         self._moving = False

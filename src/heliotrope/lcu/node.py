@@ -284,7 +284,7 @@ class Node:
             elif kind == controller.RECALL:
                 data = self.journal.items.get(item_name(action[1]), b"")
                 self._send(self._address, self._sequence, STORED, (action[1], data))
-            elif kind != controller.HALT:  # who calls for HALT has stopped the timer before
+            else:
                 kept = self._keep(kind, action) and kept
         if self.trouble and not before:
             self.on_fault(controller.JOURNAL, now_ms, False)

@@ -212,11 +212,11 @@ class AutomaticControl:
     def calibrate(
         self,
         heliostat: str,
-        target: str = "",
+        target: str,
         *,
-        search: bool = False,
-        together: Sequence[str] = (),
-        receiver: bool = False,
+        search: bool,
+        together: Sequence[str],
+        receiver: bool,
     ) -> None:
         """Calibrate a heliostat before all others; see `Operations.calibrate`."""
         if target:

@@ -11,7 +11,6 @@ import numpy.typing as npt
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.errors import HeliotropeError
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.coded import Verdict
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
@@ -362,7 +361,7 @@ class Calibrating:
             0 if record is None else record.version,
         )
         lit = target == self.receiver
-        if self._parties is not None and not (lit and result.verdict is Verdict.CLOUD):
+        if self._parties is not None:
             self._parties.concluded(result, joint=joint)
         self._book.conclude(entry)
         # The schedule plans visits to targets: one in production that brings nothing is no failure,
