@@ -19,8 +19,8 @@ _OPERATOR, _SUPERVISOR = AcknowledgeRole
 PLANT_LEASE, SUN_LEASE = 3.0, 6.0
 #: Time from a defocus to STOW, unless the defocus is lifted, s.
 _PATIENCE = 30.0
-#: The same where the plant is gone: no tier below it knows keep-out volumes, and a beam that DEFOCUS
-#: has turned into one is out again within `_PATIENCE`.
+#: The same where the plant is gone: no tier below it knows keep-out volumes, and a beam that
+#: DEFOCUS has turned into one is out again within `_PATIENCE`.
 _ALONE = 20.0
 
 
