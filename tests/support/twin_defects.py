@@ -406,7 +406,7 @@ DEFECTS = (
     Defect((12,), "new parameters are not verified", plant_defects.unverified, faults=(),
            worlds=("lights",)),
     Defect((12,), "every sighting counts ten times", plant_defects.counted_often, faults=(),
-           first=5, worlds=("visits",)),
+           first=20, worlds=("visits",)),
     Defect((12,), "a calibration is surer than it is", plant_defects.surer_than_it_is, faults=(),
            first=5, slow=True, worlds=("visits",)),
     Defect((12, 16), "sightings with the sun of later", plant_defects.sun_of_later, faults=(),

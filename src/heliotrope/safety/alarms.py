@@ -280,7 +280,7 @@ RESUME_NEEDED = AlarmKind(
     _PLANT,
     Severity.ALARM,
     "More heliostats than the setting `losses` left the receiver within 30 s without an order, or "
-    "an emergency was ordered while automatic control had heliostats.",
+    "an emergency held when the last program ended.",
     "{what} at {since} UTC",
     "Automatic control waits and raises nothing.",
     "Find the cause, make sure that nobody is in the field, then press Resume.",

@@ -379,22 +379,14 @@ class AutomaticControl:
     async def _govern(self) -> None:
         """Hold the authority while nobody else wants it; give up in an emergency and at night."""
         plant, wanted = self._plant, self._raising.wanted
-        self._give_up_in_emergency()
+        if plant.emergency_on:
+            self._raising.give_up()
         grant, since = plant.authority.grant, plant.now() - self._gave_way_at
         if self._has_authority():
             plant.authority.keep(AUTOMATIC, self._token)
         elif grant is None and since > _COURTESY and (wanted.any() or self._on):
             self._token = plant.take_authority(AUTOMATIC).token
         self._night()
-
-    def _give_up_in_emergency(self) -> None:
-        """Give all heliostats up in an emergency; then a person resumes and gives them back."""
-        order = self._plant.emergency
-        if order is not None and self._plant.emergency_on:
-            # A new program would want them all again.
-            if self._settings.wanted or self._raising.wanted.any():
-                self._losses.emergency(order.act.name)
-            self._raising.give_up()
 
     def _night(self) -> None:
         """Stow the wanted heliostats before the sun is low, and any found up afterwards."""
@@ -429,7 +421,8 @@ class AutomaticControl:
 
     async def _raise(self) -> None:
         self.service.park()
-        self._give_up_in_emergency()
+        if self._plant.emergency_on:
+            self._raising.give_up()
         self._raising.lose(self._losses.look(self._raising.wanted))
         if not self._why_idle():
             resting = self._losses.settling() | self.service.rows()

@@ -16,7 +16,7 @@ from heliotrope.errors import HeliotropeError
 from heliotrope.lcu import states
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.logbook import Logbook
-from heliotrope.safety import alarms
+from heliotrope.safety import Severity, alarms
 from heliotrope.store.records import Records
 
 #: Losses within this span count together; until it is over, none is raised again, s.
@@ -39,7 +39,8 @@ class Losses:
     most
         Heliostats that may be lost within `SPAN` without a person.
     records
-        Store of alarms: a wait outlasts a restart; None: it does not.
+        Store of alarms: a wait outlasts a restart, and an emergency that held when the last
+        program ended begins one; None: neither.
     stop
         Called when a wait begins.
 
@@ -96,10 +97,6 @@ class Losses:
         """Note that automatic control itself takes heliostats down: they are not lost."""
         self._up[rows], self._ordered[rows] = False, True
 
-    def emergency(self, what: str) -> None:
-        """Wait for a person after an emergency (``what``: DEFOCUS or STOW), over a restart too."""
-        self._wait_for(f"{what} was ordered for the whole field")
-
     def resume(self) -> None:
         """End the wait: a person has looked into the field."""
         self._lost_at[:] = -math.inf
@@ -127,5 +124,15 @@ def _standing(records: Records | None) -> list[str]:
         known = records.alarms(standing=True)
     except HeliotropeError:
         return []  # the logbook names a store that fails
+    standing = [alarm for alarm in known if alarm.cleared is None]
     name = alarms.RESUME_NEEDED.name
-    return [alarm.text for alarm in known if alarm.condition == name and alarm.cleared is None][:1]
+    waits = [alarm.text for alarm in standing if alarm.condition == name]
+    ended = [a for a in standing if a.severity is Severity.EMERGENCY and not a.subject]
+    texts = [
+        alarms.RESUME_NEEDED.line(
+            what=f"{alarm.condition} held when the last program ended; raised",
+            since=f"{datetime.fromtimestamp(alarm.raised, UTC):%H:%M:%S}",
+        )
+        for alarm in ended
+    ]
+    return [*waits, *texts][:1]
