@@ -662,8 +662,11 @@ def test_stow_from_before_a_lockout_does_not_park(tmp_path: Path) -> None:
             await bench.until(lambda: ticket.stage(name) is not None, 5.0)
             await bench.until(lambda: cluster.rows["state"][0] == states.IDLE, 5.0)
             bench.lines[cluster.name].cut()
+            assert plant.field.of(name, plant.now()).state == "STOWED"
             shown.hold(OPERATOR, (name,), "washing")
-            await bench.wait(4.0)
+            await bench.wait(2.5)
+            assert name in shown.automatic.service._unparked
+            await bench.wait(1.5)
             bench.lines[cluster.name].heal()
             await bench.until(lambda: cluster.rows["state"][0] == states.STOWED, 60.0)
             await shown.close()
