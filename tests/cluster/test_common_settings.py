@@ -27,7 +27,7 @@ def test_it_is_the_checksum_of_the_documented_text(monkeypatch: pytest.MonkeyPat
         "plant_link_lost.releases=2.0\n"
         "plant_link_lost.scope=1.0\n"
         "plant_link_lost.stale_after=5.0\n"
-        "plant_link_lost.then_stow=30.0\n"
+        "plant_link_lost.then_stow=20.0\n"
         "plant_link_lost.trips=3.0\n"
         "silence_s=10.0\n"
         "steps_every_s=1.0\n"

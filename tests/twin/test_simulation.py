@@ -88,6 +88,7 @@ def test_what_was_found_once_stays_mended(seed: int, seconds: float) -> None:
         (910267, 79.0, "place visits"),
         (910519, 6.0, ""),
         (101, 183.0, "parties"),
+        (3000986, 126.0, "calm frozen disk place sensors parameters calibrations visits"),
     ],
 )
 def test_what_any_world_found_once_stays_mended(seed: int, seconds: float, worlds: str) -> None:
@@ -95,7 +96,7 @@ def test_what_any_world_found_once_stays_mended(seed: int, seconds: float, world
     a defocus onto the receiver; an approach by the other pose; leases of one moment in any order;
     SUN of a second in which the cluster stood still; a defocus from a target onto the receiver; a
     jump of the time before the first second; a photograph that confirmed the step counts of a later
-    boot.
+    boot; a beam left in a keep-out volume while the plant stood still.
     """
     outcome = run(RunPlan(seed, seconds, 4, pause=12.0, worlds=tuple(worlds.split())))
     assert outcome.good, f"{outcome.text}; {outcome.command}"

@@ -19,6 +19,9 @@ _OPERATOR, _SUPERVISOR = AcknowledgeRole
 PLANT_LEASE, SUN_LEASE = 3.0, 6.0
 #: Time from a defocus to STOW, unless the defocus is lifted, s.
 _PATIENCE = 30.0
+#: The same where only a cluster is left. It knows no keep-out volumes, and its DEFOCUS may have
+#: turned a beam into one, which must not stay there for 30 s.
+_ALONE = 20.0
 
 
 def conditions(autonomy: float = 0.0) -> tuple[Condition, ...]:
@@ -168,7 +171,7 @@ def _links(autonomy: float) -> tuple[Condition, ...]:
             "plant_link_lost", _CLUSTER, "plant_silence", "s",
             "time since the plant renewed its lease", "no lease from the plant for {value}",
             PLANT_LEASE + autonomy, 2.0, _DEFOCUS, _BUS, _SERIOUS, 30.0 + autonomy,
-            then_stow=_PATIENCE, ages=True, release="leases of the plant arrive again",
+            then_stow=_ALONE, ages=True, release="leases of the plant arrive again",
             remedy="Check the plant, the network and the broker.",
         ),
         Condition(
