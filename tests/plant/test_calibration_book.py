@@ -20,7 +20,7 @@ from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.twin.boards.outfit import outfits
-from heliotrope.twin.invariants.visits import slope_of
+from heliotrope.twin.invariants.visits import across, slope_of
 from heliotrope.twin.world.design import design_of
 from heliotrope.twin.world.scene import scene_of
 
@@ -121,7 +121,7 @@ def test_the_predicted_error_is_that_of_the_pose_that_the_mirror_takes() -> None
     zeros, at = np.zeros(len(model)), scene.at.timestamp()
     record = HeliostatCalibration(names[0], at, model, zeros, 1e-6 * np.eye(len(model)), zeros + 1)
     # One combination of parameters is left open, which moves the beam in the other pose only.
-    slope = slope_of(record, nominal, poses[0], scene.sun)
+    slope = slope_of(record, nominal, poses[0], scene.sun, aim)
     free = np.linalg.svd(slope.T)[2][-1]
     covariance = 1e-6 * np.outer(free, free) + 1e-12 * np.eye(len(model))
     scene.beliefs.take(replace(record, covariance=covariance))
@@ -131,3 +131,29 @@ def test_the_predicted_error_is_that_of_the_pose_that_the_mirror_takes() -> None
         found.append(CalibrationBook(cast("PlantController", scene), "malan8").error[0])
     assert 0.0 < found[0] < 1e-5
     assert found[1] > 1e-4
+
+
+def test_the_simulation_expects_the_error_that_the_plant_shows() -> None:
+    """By differences of true beams: a mirror that stands elsewhere moves its beam, too."""
+    world = scene_of((), 1, 60.0, 3)
+    fits = outfits(3, 1, world.places)
+    name = fits[0].name
+    scene = Scene(design_of(fits, {"C1": [fit.name for fit in fits]}, world))
+    nominal, aim = scene.beliefs.nominal(name)[0], scene.design.receivers[0].center
+    counts = track(nominal, scene.sun, aim, branch=0).best_counts
+    scene.field.heard[0] = counts
+    model = ("position_east", "position_north", "position_up", "tilt_north", "tilt_east")
+    zeros, at = np.zeros(len(model)), scene.at.timestamp()
+    record = HeliostatCalibration(name, at, model, zeros, np.eye(len(model)), zeros + 1)
+    sideways = across(aim - nominal.pose(counts).vertex)
+    slope = slope_of(record, nominal, counts, scene.sun, aim) @ sideways.T
+    # A photograph has shown where the beam goes, so what is not known of the place and of the tilt
+    # hides each other.
+    covariance = np.linalg.inv(
+        np.diag([0.05**-2] * 3 + [0.01**-2] * 2) + slope @ slope.T / 0.2e-3**2
+    )
+    scene.beliefs.take(replace(record, covariance=covariance))
+    shown = CalibrationBook(cast("PlantController", scene), model).error[0]
+    expected = 0.5 * np.sqrt(np.trace(slope.T @ covariance @ slope))
+    assert shown == pytest.approx(expected, rel=1e-3)
+    assert shown == pytest.approx(0.5 * np.sqrt(2.0) * 0.2e-3, rel=0.01)

@@ -121,6 +121,7 @@ class HeliostatAccount:
         self._leg = 0  # leaving stow: 0 no, 1 azimuth expected, 2 azimuth moved, 3 elevation moves
         self._stowing_since: float | None = None
         self._on_since: float | None = None
+        self._stays_since: float | None = None
 
     # -- states ----------------------------------------------------------------------------
 
@@ -288,6 +289,15 @@ class HeliostatAccount:
         if self._on_since is None:
             self._on_since = now
         return now - self._on_since
+
+    def stays(self, on: bool, now: float) -> float:
+        """Note where the beam of a mirror that is DEFOCUSED is; return for how long it is on, s."""
+        if not on:
+            self._stays_since = None
+            return 0.0
+        begun = max(self._stays_since or now, self.changed_at)
+        self._stays_since = begun
+        return now - begun
 
     def must(self, name: str, now: float) -> None:
         """Note an order to DEFOCUS or STOW."""

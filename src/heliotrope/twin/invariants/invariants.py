@@ -86,8 +86,8 @@ LEASE, LOOK = 6.0, 0.15
 PLANT_LEASE, SUN_AFTER = 3.0, 1.2
 #: Time limits to be off the receiver and at stow, s.
 DEFOCUS_WITHIN, STOW_WITHIN = 30.0, 300.0
-#: A heliostat that has turned away has its beam off the receiver after this, s, long before
-#: anything stows it: a beam 4 m wide takes less than a second to leave.
+#: A heliostat that has turned away has its beam on the receiver for no longer than this, s: before
+#: anything stows it, since a beam takes less than a second to leave.
 TURNED_WITHIN = 15.0
 #: A beam this far from the middle of the receiver is off it, m.
 OFF = 4.0
@@ -642,11 +642,10 @@ class Observer:
         # Unknown counts tell nothing of the pose: there the true beam counts, with its error.
         known = board.node.controller.motion.known
         on_way = board.state in (states.APPROACHING, states.IDLE) and account.from_stow
-        turned = now - account.changed_at
-        if known and board.state == account.state == states.DEFOCUSED and turned > TURNED_WITHIN:
-            miss = board.miss(sun, RECEIVER, believed=True)
-            saw = f"DEFOCUSED for {turned:.1f} s, its beam passes the receiver at {miss:.1f} m"
-            self.check(2, miss > OFF, now, name, saw)
+        if known and board.state == states.DEFOCUSED:
+            stays = account.stays(board.miss(sun, RECEIVER, believed=True) <= OFF, now)
+            saw = f"DEFOCUSED, its beam within {OFF:g} m of the receiver's middle for {stays:.1f} s"
+            self.check(2, stays <= TURNED_WITHIN, now, name, saw)
         for why, begin in account.deadlines(now):
             passed = now - begin
             state = states.STATES[board.state]

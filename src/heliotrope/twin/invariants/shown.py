@@ -23,7 +23,7 @@ from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import RECEIVER
 from heliotrope.twin.invariants.invariants import InvariantError, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
-from heliotrope.twin.invariants.visits import slope_of
+from heliotrope.twin.invariants.visits import across, slope_of
 
 #: Time between two looks, s.
 EVERY = 2.0
@@ -339,5 +339,7 @@ def _expected(operations: Operations, name: str, here: FloatArray, sun: FloatArr
     counts = track(record.mechanism(nominal), sun, np.asarray(aim), current=here).best_counts
     if not np.isfinite(counts).all():
         return inf
-    slope = slope_of(record, nominal, counts, sun)
+    # Only what leads away from the aim counts; a mirror may stand along its beam without error.
+    way = np.asarray(aim) - record.mechanism(nominal).pose(counts).vertex
+    slope = slope_of(record, nominal, counts, sun, np.asarray(aim)) @ across(way).T
     return 0.5 * float(np.sqrt(np.trace(slope.T @ record.covariance @ slope)))

@@ -129,10 +129,10 @@ class VisitObserver:
             pose = truth.pose(counts + slip)
             ray = reflect(sun, pose.normal)
             miss = _passes(pose.vertex, ray, aim)
-            across = _across(aim - pose.vertex)
-            slope = slope_of(record, nominal, counts, sun) @ across.T
+            sideways = across(aim - pose.vertex)
+            slope = slope_of(record, nominal, counts, sun, aim) @ sideways.T
             spread = slope.T @ record.covariance @ slope + FLOOR**2 * np.eye(2)
-            off = across @ ray
+            off = sideways @ ray
             deviations = float(np.sqrt(off @ np.linalg.solve(spread, off)))
             saw = f"by the calibration that the plant believes its beam is {miss:.1f} m astray"
             self._check(12, miss <= ASTRAY, now, name, saw)
@@ -157,7 +157,7 @@ class VisitObserver:
             self._check(16, miss <= FOREIGN, now, board.outfit.name, saw)
 
 
-def _across(way: FloatArray) -> FloatArray:
+def across(way: FloatArray) -> FloatArray:
     """Return unit vectors to the right of and above a direction (3,), (2, 3)."""
     right = np.cross(way, (0.0, 0.0, 1.0))
     above = np.cross(right, way)
@@ -165,18 +165,28 @@ def _across(way: FloatArray) -> FloatArray:
 
 
 def slope_of(
-    record: HeliostatCalibration, nominal: Mechanism, counts: FloatArray, sun: FloatArray
+    record: HeliostatCalibration,
+    nominal: Mechanism,
+    counts: FloatArray,
+    sun: FloatArray,
+    aim: FloatArray,
 ) -> FloatArray:
-    """Return by how much the beam turns with each parameter of a calibration, (P, 3)."""
+    """Return by how much the beam moves at an aim with each parameter of a calibration, (P, 3).
+
+    As an angle at the mirror: the beam turns, and a mirror that stands elsewhere moves it too.
+    """
     found = []
+    way = aim - record.mechanism(nominal).pose(counts).vertex
     for name, value, sigma in zip(record.names, record.values, record.sigma, strict=True):
         step = max(1e-3 * float(sigma), 1e-9)
         one, two = (
             nominal.with_parameters({**record.parameters, name: float(value) + way * step})
             for way in (-1.0, 1.0)
         )
-        turned = reflect(sun, two.pose(counts).normal) - reflect(sun, one.pose(counts).normal)
-        found.append(turned / (2.0 * step))
+        before, after = one.pose(counts), two.pose(counts)
+        turned = reflect(sun, after.normal) - reflect(sun, before.normal)
+        moved = (after.vertex - before.vertex) / np.linalg.norm(way)
+        found.append((turned + moved) / (2.0 * step))
     return np.array(found)
 
 
