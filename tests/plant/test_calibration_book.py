@@ -13,7 +13,7 @@ from heliotrope.calibration.learn import drift
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.field.example import example_plant
 from heliotrope.field.plant import Plant
-from heliotrope.geometry import MRAD, FloatArray, direction
+from heliotrope.geometry import MRAD, FloatArray, as_float, direction
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant.beliefs import Beliefs
@@ -149,9 +149,8 @@ def test_the_simulation_expects_the_error_that_the_plant_shows() -> None:
     slope = slope_of(record, nominal, counts, scene.sun, aim) @ sideways.T
     # A photograph has shown where the beam goes, so what is not known of the place and of the tilt
     # hides each other.
-    covariance = np.linalg.inv(
-        np.diag([0.05**-2] * 3 + [0.01**-2] * 2) + slope @ slope.T / 0.2e-3**2
-    )
+    known = np.diag([0.05**-2] * 3 + [0.01**-2] * 2) + slope @ slope.T / 0.2e-3**2
+    covariance = as_float(np.linalg.inv(known))
     scene.beliefs.take(replace(record, covariance=covariance))
     shown = CalibrationBook(cast("PlantController", scene), model).error[0]
     expected = 0.5 * np.sqrt(np.trace(slope.T @ covariance @ slope))
