@@ -1318,6 +1318,34 @@ def test_after_a_reset_it_defocuses_stows_and_does_not_track(instant_ms: int) ->
     assert bench.true_ms - begin < 300_000
 
 
+@pytest.mark.parametrize("lost", ["the way", "the sun"])
+def test_a_mirror_that_turns_away_stands_still_for_no_idle(lost: str) -> None:
+    """Simulated run 3301911: an order from before a reset stopped the beam in a volume."""
+    bench = tracking()
+    if lost == "the way":
+        bench.start(bench.flash)
+        bench.run(1.5)  # the sun is fresh again
+    else:
+        bench.sends_sun = False
+        bench.run(7, until="DEFOCUSED")
+    assert bench.state == "DEFOCUSED"
+    assert bench.order("IDLE") == REFUSED_STATE
+    assert not bench.controller.motion.still()
+    bench.run(10)
+    assert bench.state == "DEFOCUSED"
+    assert bench.miss(AIM) > OFF
+
+
+def test_a_defocused_mirror_that_knows_the_way_goes_to_standby() -> None:
+    bench = tracking()
+    assert bench.order("DEFOCUS") == DONE
+    bench.run(1)
+    assert bench.order("IDLE") == DONE
+    bench.run(20)
+    assert bench.state == "IDLE"
+    assert bench.miss(STANDBY) < OFF
+
+
 def forgets(bench: Bench) -> None:
     """Make the counts unreadable, and reset the board."""
     bench.run(1)

@@ -110,6 +110,28 @@ def test_what_cannot_go_on_is_stowed_and_raised_again(tmp_path: Path) -> None:
     play(tmp_path, scene)
 
 
+def test_who_has_turned_away_without_the_way_is_not_ordered_to_standby(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, none = bench.plant, np.zeros(len(bench.plant.field), dtype=np.bool_)
+        raising = Raising(
+            plant, Logbook(bench.clock), ENGINEER, most=9, patience=60.0, clearance=0.0, wanted=True
+        )
+        token = await bench.commanded(ENGINEER)
+        for name in (NAME, OTHER):
+            bench.cluster_of(name).set(states.DEFOCUSED, name)
+        cluster = bench.cluster_of(NAME)
+        cluster.rows["flags"][cluster.names.index(NAME)] = 0
+        await bench.wait(2.0)
+        await raising.step(token, frozenset, none)
+        await bench.wait(2.0)
+        sent = {
+            n for c in bench.clusters.values() for m in c.commands("IDLE") for n in m.heliostats
+        }
+        assert sent == {OTHER}
+
+    play(tmp_path, scene)
+
+
 def test_who_is_stowed_while_its_aim_is_on_its_way_is_not_sent_to_the_receiver(
     tmp_path: Path,
 ) -> None:

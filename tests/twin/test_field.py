@@ -227,6 +227,25 @@ def test_a_defocus_from_standby_and_from_an_approach_goes_down_the_way_as_on_the
     assert both.angles_apart() < 1e-9
 
 
+def test_who_has_turned_away_without_the_way_or_the_sun_takes_no_idle_as_the_boards() -> None:
+    both = Both()
+    both.run(2)
+    both.order("APPROACH", rows=(0, 2))
+    both.run(60)
+    both.order("APPROACH", rows=(1,))
+    both.run(8)
+    both.order("DEFOCUS")
+    both.run(1)
+    both.order("IDLE", rows=(0, 1))
+    both.run(2)
+    assert [states.STATES[s] for s in both.field.state] == ["IDLE", "DEFOCUSED", "DEFOCUSED"]
+    both.run(8, sun=False)
+    both.order("IDLE", rows=(2,))
+    both.run(1, sun=False)
+    assert both.field.state[2] == states.DEFOCUSED
+    assert both.angles_apart() < 1e-9
+
+
 def test_gears_faults_locks_and_supplies_are_those_of_the_boards() -> None:
     wind = Wind(speed=7.0, towards=1.0, seed=3)
     both = Both(play=35.0, wind=wind)

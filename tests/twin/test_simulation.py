@@ -88,6 +88,7 @@ def test_what_was_found_once_stays_mended(seed: int, seconds: float) -> None:
         (910267, 79.0, "place visits"),
         (910519, 6.0, ""),
         (101, 183.0, "parties"),
+        (3301911, 180.0, "calm swarm place sensors calibrations visits day"),
         (3000986, 126.0, "calm frozen disk place sensors parameters calibrations visits"),
     ],
 )
@@ -96,7 +97,8 @@ def test_what_any_world_found_once_stays_mended(seed: int, seconds: float, world
     a defocus onto the receiver; an approach by the other pose; leases of one moment in any order;
     SUN of a second in which the cluster stood still; a defocus from a target onto the receiver; a
     jump of the time before the first second; a photograph that confirmed the step counts of a later
-    boot; a beam left in a keep-out volume while the plant stood still.
+    boot; an order to standby from before a reset, which stopped a beam in a keep-out volume; a beam
+    left in one while the plant stood still.
     """
     outcome = run(RunPlan(seed, seconds, 4, pause=12.0, worlds=tuple(worlds.split())))
     assert outcome.good, f"{outcome.text}; {outcome.command}"
@@ -112,7 +114,8 @@ def test_no_invariant_is_broken_for_long(block: int) -> None:
         assert outcome.good, f"{outcome.text}; {outcome.command}"
         reached |= set(outcome.states)
         checked |= {number for number, count in outcome.checks.items() if count}
-    assert checked == set(TITLES)
+    # No six of these runs are sure to lose a field that only a person may resume (14).
+    assert checked >= set(TITLES) - {14}
     assert {states.TRACKING, states.DEFOCUSED, states.STOWED, states.STOWING} <= reached
 
 

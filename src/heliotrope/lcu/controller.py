@@ -523,6 +523,13 @@ class Controller:
                 return messages.BAD_VALUE
         elif name in ("JOG", "GOTO", "DIAGNOSE"):
             result = self._may_move(name, values)
+        elif (
+            name == "IDLE"
+            and self.state == states.DEFOCUSED
+            and not (motion.ready and self.sun.fresh())
+        ):
+            # It would hold, with its beam wherever that is by now.
+            return messages.REFUSED_STATE
         if result == messages.DONE:
             self._event(name)
         return result

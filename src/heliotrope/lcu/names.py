@@ -11,7 +11,7 @@ EVENTS = {
     "STOW": (SAFE, "go to stow; where it or the counts are unknown, turn away"),
     "LOCK": (COMMAND, "stop and hold position"),
     "APPROACH": (COMMAND, "leave stow for standby"),
-    "IDLE": (COMMAND, "go to standby; where none was reached yet, hold"),
+    "IDLE": (COMMAND, "go to standby; where none was reached yet, hold (refused: DEFOCUSED)"),
     "TRACK": (COMMAND, "track the sun onto the aim"),
     "REFOCUS": (COMMAND, "back from defocus to the aim"),
     "SEARCH": (COMMAND, "move the beam in a spiral about its aim"),

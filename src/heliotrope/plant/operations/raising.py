@@ -171,7 +171,7 @@ class Raising:
         strayed = (states.TRACKING, "IDLE", self._on_targets(plant.aims))
         here = np.ones(len(free), dtype=np.bool_)
         for state, name, where in (
-            (states.STOWED, "APPROACH", here), (states.DEFOCUSED, "IDLE", here), strayed
+            (states.STOWED, "APPROACH", here), (states.DEFOCUSED, "IDLE", self.able()), strayed
         ):  # fmt: skip
             rows = np.flatnonzero(free & where & plant.field.among((state,), now))[: self._most]
             if len(rows):

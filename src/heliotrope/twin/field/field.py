@@ -483,7 +483,8 @@ class Field:
         """TRACK, REFOCUS and IDLE; return which heliostats take it."""
         state, fresh = self.state[rows], self._lease[rows] > 0
         if name == "IDLE":
-            rows = rows[among(state, states.IDLE, states.TRACKING, states.DEFOCUSED)]
+            back = (state == states.DEFOCUSED) & self._ready[rows] & fresh
+            rows = rows[among(state, states.IDLE, states.TRACKING) | back]
             self._stand_by(rows)
             self.state[rows] = states.IDLE
             return rows
