@@ -212,6 +212,8 @@ class QuietObserver:
             may = mirror.state in begins and self._commands(message, now)
             if message.name in _BY_WAY:
                 may &= mirror.account.by_way and mirror.aim is not None
+            if message.name == "IDLE" and mirror.state == states.DEFOCUSED:
+                may &= mirror.account.by_way  # it would hold wherever its beam is: refused
             mirror.elsewhere |= message.name in _ELSEWHERE
             # What is refused by the state table leaves an approach alone.
             if mirror.state == states.APPROACHING and message.name in ("APPROACH", *_BY_WAY):
