@@ -266,6 +266,8 @@ class BeamObserver:
         self._released_at = now
         for mirror in self._mirrors.values():
             mirror.resumed_at = now
+            if mirror.board.state not in _UP:  # it has left since the last look: lost before
+                mirror.seen_up = False
 
     def reported(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
         """Note a report that has come to the plant: what automatic control can know by it.
