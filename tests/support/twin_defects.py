@@ -374,7 +374,7 @@ DEFECTS = (
     Defect((14,), "the field resumes by itself", plant_defects.resumes_by_itself, seconds=180.0,
            faults=tuple(Fault("line_cut", at, 9.0, 0, 0.5) for at in (80.0, 120.0, 150.0)),
            worlds=("calm",)),
-    Defect((13,), "a mirror stays where it was after a boot", _stays_after_boot,
+    Defect((2,), "a mirror stays where it was after a boot", _stays_after_boot,
            # The plant sends off a beam that nobody sent, so it must not reach the boards.
            faults=tuple(Fault(kind, at, long, i, 0.5) for i in range(3) for kind, at, long in
                         (("power_cut", 150.0, 2.0), ("bus_unplugged", 151.0, 60.0))),
