@@ -92,6 +92,7 @@ class Permission:
             wrong |= self._untaken(names)
         elif name in _TO_STANDBY:
             wrong |= self._sentinel.barred(self._off(names), ASTRAY)
+            wrong |= self._sentinel.unshown(names)
         elif name in _STILL:
             for row in _SENT_OFF:
                 wrong |= self._sentinel.barred(names, row)

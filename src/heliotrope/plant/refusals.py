@@ -183,6 +183,12 @@ AIM_NOT_TAKEN = Refusal(
     "its last aim was not taken ({reason}), so its beam would go to an earlier one",
     "Give the aim again.",
 )
+JUST_SENT_OFF = Refusal(
+    "just sent off",
+    "A heliostat is ordered to standby within a second or two of its DEFOCUS or STOW.",
+    "it has just been sent off, and no state since then is known: its way is not proven",
+    "Try again in two seconds.",
+)
 SEEN_ASTRAY = Refusal(
     "seen astray from the air",
     "A heliostat is sent to the receiver that a flight of a drone sees far from where its "

@@ -113,6 +113,9 @@ class PlantObserver:
         self._posted: deque[tuple[float, int]] = deque(maxlen=400)
         self._joined: deque[tuple[float, int]] = deque(maxlen=400)
         self._on: set[str] = set()
+        self._true_counts: dict[str, deque[tuple[float, tuple[int, int]]]] = {
+            name: deque(maxlen=64) for name in self._accounts
+        }
         self._heard: dict[str, deque[tuple[float, int]]] = {
             name: deque(maxlen=64) for name in self._accounts
         }
@@ -368,6 +371,14 @@ class PlantObserver:
     def reports(self, name: str, since: float) -> set[int]:
         """Return the states that a heliostat has reported to its cluster since a time, s."""
         return {state for at, state in self._heard[name] if at >= since}
+
+    def counted(self, name: str, steps: tuple[int, int], now: float) -> None:
+        """Note the true step counts of a heliostat that answers its cluster."""
+        self._true_counts[name].append((now, steps))
+
+    def true_counts(self, name: str, since: float) -> list[tuple[int, int]]:
+        """Return the true step counts with which a heliostat has answered since a time, s."""
+        return [steps for at, steps in self._true_counts[name] if at >= since]
 
     def look(self, plant: PlantController | None, now: float) -> None:
         """Judge everything that must have happened by now; None: the plant does not run."""

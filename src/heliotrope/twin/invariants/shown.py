@@ -220,6 +220,8 @@ class ShownObserver:
         some = [c for when, c in self._counts[name] if when >= at - COUNTED]
         if self._boards[name].node is None or len(some) < 2 or any(self._boards[name].slip):
             return np.full(2, -inf), np.full(2, inf)
+        # Between two looks it may have begun a motion, answered, and been called back.
+        some += [np.array([s, s], dtype=float) for s in self._plant.true_counts(name, at - COUNTED)]
         low, high = np.min(some, axis=(0, 1)), np.max(some, axis=(0, 1))
         room = STEPS + AHEAD * (high - low)
         return low - room, high + room

@@ -208,7 +208,7 @@ class Pod:
         self.answers.heard(how, now)
 
     def answered(self, data: bytes, how: str, now: float) -> None:
-        """Pass on an answer to the cluster, and keep the states that it reports."""
+        """Pass on an answer to the cluster; keep its states, and the true step counts with it."""
         self.observer.answered(data, how, now)
         self.answers.answered(data, how, now)
         if self.plant is None:
@@ -218,6 +218,10 @@ class Pod:
             values = frame.values()
             if name is not None and frame.name == "STATUS" and values:
                 self.plant.heard(name, int(values[0]), now)
+            if name is not None and frame.name == "STEPS":
+                board = next(board for board in self.boards if board.outfit.name == name)
+                one, two = (a.emitted - s for a, s in zip(board.axes, board.slip, strict=True))
+                self.plant.counted(name, (one, two), now)
 
 
 class _ClusterEar:
