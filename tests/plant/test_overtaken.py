@@ -8,8 +8,6 @@ import pytest
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency, Stage
-from heliotrope.plant import refusals
-from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.settings import PlantSettings
 from support.plant_bench import OPERATOR, Bench, running
 
@@ -155,29 +153,5 @@ def test_who_comes_back_in_an_emergency_is_no_longer_done_and_is_sent_off_again(
             assert name in order.report(plant.now()).not_done
             again = cluster.of(Emergency)[sent:]
             assert {(m.name, m.heliostats) for m in again} == {("DEFOCUS", (name,))}
-
-    run_virtual(main)
-
-
-def test_no_mirror_comes_to_standby_before_it_shows_where_it_is_since_its_defocus(
-    tmp_path: Path,
-) -> None:
-    """Simulated run 3700096: the way was proven from the aim, which the mirror had just left."""
-
-    async def main(clock: VirtualClock) -> None:
-        async with running(Bench(clock, tmp_path)) as bench:
-            plant, cluster = bench.plant, next(iter(bench.clusters.values()))
-            token = await bench.commanded()
-            cluster.set(states.TRACKING)
-            first, second = cluster.names[:2]
-            await bench.wait(2.0)
-            plant.defocus("a visit", [first])
-            await bench.wait(0.5)
-            ticket = plant.command(OPERATOR, token, "IDLE", (first, second))
-            assert ticket.blocked == {first: refusals.JUST_SENT_OFF.text}
-            with pytest.raises(BeamError, match="just been sent off"):
-                plant.command(OPERATOR, token, "IDLE", (first,))
-            await bench.wait(2.5)
-            assert not plant.command(OPERATOR, token, "IDLE", (first,)).blocked
 
     run_virtual(main)

@@ -21,17 +21,17 @@ from heliotrope.lcu import names, states
 from heliotrope.lcu.diagnosis import NUDGE
 from heliotrope.lcu.stepper import BOTH, PRIMARY_FIRST, Axis, Stepper
 from heliotrope.links.clock import VirtualClock, gps_seconds, run_virtual
-from heliotrope.links.messages import Emergency
+from heliotrope.links.messages import Emergency, Stage
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.mechanism.tracking import track
 from heliotrope.optics import MirrorOptics, beams, find_entries
-from heliotrope.plant import joining
+from heliotrope.plant import joining, refusals
 from heliotrope.plant.aims import BeamCheck, _disc
 from heliotrope.plant.assigned import rest_on
 from heliotrope.plant.authority import RefusedError
-from heliotrope.plant.beam_watch import BeamWatch
+from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.leaving import defocused, turned_away, way_out
 from heliotrope.plant.operations.automatic import AutomaticSettings
@@ -113,6 +113,144 @@ def test_a_move_by_counts_through_a_volume_is_refused(tmp_path: Path) -> None:
 
     bench = play(tmp_path, scene)
     assert [m.heliostats for m in bench.cluster_of("P5A").commands("GOTO")] == [("P5B",)]
+
+
+#: Far from the walkway, and on the same side of it.
+BESIDE, FURTHER = (8.0, 0.0, 16.5), (9.0, 0.0, 17.0)
+
+
+@pytest.mark.parametrize("last", ["DEFOCUS", "TRACK", "AIM", "STANDBY"])
+def test_no_mirror_comes_to_standby_before_it_shows_where_it_is_since_its_last_order(
+    last: str, tmp_path: Path
+) -> None:
+    """Simulated runs 3700096 and 3800145: the way was proven from where it had been before."""
+
+    async def scene(bench: Bench) -> None:
+        plant, token = bench.plant, await bench.commanded(ENGINEER)
+        await plant.standby(ENGINEER, token, {"P5A": BESIDE, "P5B": BESIDE}).end(5.0)
+        await plant.aim(ENGINEER, token, {"P5A": BESIDE, "P5B": BESIDE}).end(5.0)
+        state = states.IDLE if last in ("TRACK", "STANDBY") else states.TRACKING
+        for name in ("P5A", "P5B"):
+            await stands(bench, name, state, counts(plant, name, BESIDE))
+        if last == "DEFOCUS":
+            plant.defocus("a visit", ["P5A"])
+        elif last in ("AIM", "STANDBY"):
+            (plant.aim if last == "AIM" else plant.standby)(ENGINEER, token, {"P5A": FURTHER})
+        else:
+            plant.command(ENGINEER, token, last, ("P5A",))
+        await bench.wait(0.5)
+        ticket = plant.command(ENGINEER, token, "IDLE", ("P5A", "P5B"))
+        assert ticket.blocked == {"P5A": refusals.PLACE_UNKNOWN.text}
+        with pytest.raises(BeamError, match="no report tells where it is now"):
+            plant.command(ENGINEER, token, "IDLE", ("P5A",))
+        await bench.wait(2.5)
+        assert not plant.command(ENGINEER, token, "IDLE", ("P5A",)).blocked
+
+    play(tmp_path, scene)
+
+
+def test_an_order_that_was_long_under_way_counts_from_its_acknowledgement(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, token = bench.plant, await bench.commanded(ENGINEER)
+        for give in (plant.standby, plant.aim):
+            await give(ENGINEER, token, {"P5A": BESIDE}).end(5.0)
+        await stands(bench, "P5A", states.IDLE, counts(plant, "P5A", BESIDE))
+        cluster = bench.cluster_of("P5A")
+        obey, row = cluster._obey, plant.field.place("P5A")
+
+        async def late(identity: str, name: str, heliostats: tuple[str, ...]) -> None:
+            await asyncio.sleep(2.55)
+            await obey(identity, name, heliostats)
+
+        cluster._obey = late
+        ticket = plant.command(ENGINEER, token, "TRACK", ("P5A",))
+        await bench.until(lambda: ticket.stage("P5A") is Stage.DONE, 10.0)
+        taken = plant.now()
+        refused = plant._ways.ordered.unshown(np.array([row]), taken)
+        assert refused == {"P5A": refusals.PLACE_UNKNOWN.text}
+        await bench.until(lambda: bool(plant.field.heard[row] > taken), 5.0)
+        assert not plant._ways.ordered.unshown(np.array([row]), plant.now())
+
+    play(tmp_path, scene)
+
+
+def test_a_mirror_that_moves_or_is_silent_does_not_come_to_standby(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, token = bench.plant, await bench.commanded(ENGINEER)
+        for give in (plant.standby, plant.aim):
+            await give(ENGINEER, token, {"P5A": BESIDE}).end(5.0)
+        here = counts(plant, "P5A", BESIDE)
+        await stands(bench, "P5A", states.TRACKING, here)
+        cluster = bench.cluster_of("P5A")
+        goal = cluster.rows["primary_goal"]
+        goal[cluster.names.index("P5A")] = here[0] + 5000
+        await bench.wait(2.0)
+        with pytest.raises(BeamError, match="still moving"):
+            plant.command(ENGINEER, token, "IDLE", ("P5A",))
+        goal[cluster.names.index("P5A")] = here[0]
+        await bench.wait(2.0)
+        ages = cluster.age_ms
+        ages[cluster.names.index("P5A")] = 5000
+        await bench.wait(2.0)
+        with pytest.raises(BeamError, match="no report tells where it is now"):
+            plant._ways.clear("IDLE", (), ("P5A",), plant.now())
+        wrong = plant._ways.joining("TRACK", (), ("P5A",), plant.now())
+        assert wrong["P5A"] == refusals.PLACE_UNKNOWN.text
+        ages[:] = 0
+        await bench.wait(2.0)
+        assert plant._ways.clear("IDLE", (), ("P5A",), plant.now()) == (("P5A",), {})
+
+    play(tmp_path, scene)
+
+
+@pytest.mark.parametrize("state", [states.LOCKED, states.FAULT])
+def test_the_way_of_a_mirror_that_has_just_been_unlocked_is_proven(
+    state: int, tmp_path: Path
+) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, token = bench.plant, await bench.commanded(ENGINEER)
+        await plant.standby(ENGINEER, token, {"P5A": EAST}).end(5.0)
+        await stands(bench, "P5A", state, counts(plant, "P5A", WEST))
+        with pytest.raises(BeamError, match=r"P5A: the beam enters walkway"):
+            plant.command(ENGINEER, token, "IDLE", ("P5A",))
+
+    play(tmp_path, scene)
+
+
+def test_no_mirror_joins_before_it_shows_where_it_is_since_its_defocus(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, token = bench.plant, await bench.commanded(ENGINEER)
+        await plant.aim(ENGINEER, token, {"P5A": BESIDE}).end(5.0)
+        await stands(bench, "P5A", states.TRACKING, counts(plant, "P5A", BESIDE))
+        plant.defocus("a visit", ["P5A"])
+        await bench.wait(0.5)
+        ticket = plant.command(ENGINEER, token, "REFOCUS", ("P5A",))
+        await bench.wait(1.0)
+        assert ticket.blocked == {"P5A": refusals.PLACE_UNKNOWN.text}
+        await bench.wait(2.5)
+        again = plant.command(ENGINEER, token, "REFOCUS", ("P5A",))
+        await bench.wait(1.0)
+        assert not again.blocked
+
+    play(tmp_path, scene)
+
+
+def test_one_that_moves_joins_only_if_its_way_is_free_from_wherever_it_is(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, ways = bench.plant, bench.plant._ways
+        row = plant.field.place("P5A")
+        west, east = counts(plant, "P5A", WEST), counts(plant, "P5A", EAST)
+        await stands(bench, "P5A", states.IDLE, east)
+        plant.aims[row] = EAST
+        assert not ways.joining("TRACK", (), ("P5A",), plant.now())
+        cluster = bench.cluster_of("P5A")
+        for end, value in zip(("primary_goal", "secondary_goal"), west, strict=True):
+            cluster.rows[end][cluster.names.index("P5A")] = value
+        await bench.wait(2.0)
+        wrong = ways.joining("TRACK", (), ("P5A",), plant.now())
+        assert "the beam enters walkway" in wrong["P5A"]
+
+    play(tmp_path, scene)
 
 
 def test_a_diagnosis_beside_a_volume_is_refused(tmp_path: Path) -> None:
@@ -888,8 +1026,8 @@ def test_unverified_parameters_lead_no_beam_into_a_volume_if_the_earlier_are_rig
 
         def why() -> dict[str, str]:
             if name == "TRACK":
-                return ways.joining("TRACK", (), ("P5A",))
-            return ways._back_to_standby(np.array([place]))
+                return ways.joining("TRACK", (), ("P5A",), plant.now())
+            return ways._back_to_standby(np.array([place]), plant.now())
 
         group, row = DESIGN.find("P5A")
         nominal, seen = group.mechanism[row], {True: 0, False: 0}

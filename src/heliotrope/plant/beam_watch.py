@@ -19,8 +19,9 @@ from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import BEFORE, KINDS, Points
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.leaving import way_out
+from heliotrope.plant.ordered import Ordered
 from heliotrope.plant.parameters import Tables
-from heliotrope.plant.refusals import BEAM_REFUSED, RefusedError
+from heliotrope.plant.refusals import BEAM_REFUSED, STILL_MOVING, RefusedError
 from heliotrope.plant.unsent import TURNS, UnsentBeams
 from heliotrope.plant.ways import Ways
 from heliotrope.safety import Act, Reading
@@ -38,8 +39,16 @@ _COMMANDED = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING
 _FROM_STOW = 0.15
 #: Commands whose whole motion is proven before they are sent.
 _PROVEN = ("APPROACH", "IDLE", "JOG", "GOTO", "DIAGNOSE")
-#: States from which IDLE moves a heliostat straight to its standby point.
-_TO_STANDBY = (states.TRACKING, states.SEARCHING, states.DEFOCUSED, states.IDLE)
+#: States from which IDLE moves a heliostat straight to its standby point; from the last two it
+#: does so once the heliostat has been unlocked, or its fault cleared, which no report may show yet.
+_TO_STANDBY = (
+    states.TRACKING,
+    states.SEARCHING,
+    states.DEFOCUSED,
+    states.IDLE,
+    states.LOCKED,
+    states.FAULT,
+)
 
 
 class BeamError(RefusedError):
@@ -88,6 +97,8 @@ class BeamWatch:
         As given.
     unsent
         Watch over beams on a receiver that were not sent there.
+    ordered
+        The last orders that moved heliostats, to be noted by others.
     """
 
     def __init__(
@@ -99,6 +110,7 @@ class BeamWatch:
         machines: Mapping[str, Machine],
     ) -> None:
         self._check, self._field, self.points, self._sun = check, field, points, sun
+        self.ordered = Ordered(field)
         self._machines = machines
         self._ways = Ways(check, machines)
         self.unsent = UnsentBeams(check, field, points, sun, machines)
@@ -165,9 +177,10 @@ class BeamWatch:
         # A heliostat without known counts is left to its local controller.
         rows = rows[np.isfinite(self._field.counted_at[rows])]
         if name == "APPROACH":
-            wrong = self._from_stow(rows)
+            wrong = self._from_stow(rows, now)
         elif name == "IDLE":
-            wrong = self._back_to_standby(rows[self._field.among(_TO_STANDBY, now)[rows]])
+            mine = np.isin(self._field.rows["state"][rows], _TO_STANDBY)
+            wrong = self._back_to_standby(rows[mine], now)
         else:
             path = self._by_counts(name, values, rows)
             wrong = self._check.moving(rows, path, self._sun(0.0))
@@ -175,8 +188,9 @@ class BeamWatch:
             raise BeamError(name, wrong)
         return tuple(n for n in heliostats if n not in wrong), wrong
 
-    def _from_stow(self, rows: Rows) -> dict[str, str]:
+    def _from_stow(self, rows: Rows, now: float) -> dict[str, str]:
         """Return which heliostats have no free way from stow to standby, and why."""
+        early = self.ordered.unshown(rows, now, off=True)
         rows, wrong = self._resting(rows)
         if not self._check.volumes:
             wrong = {}  # a way to a point that is not known here is not proven
@@ -185,17 +199,24 @@ class BeamWatch:
         for some, standbys in self.points.possible("STANDBY", rows):
             here = np.array([begin[row] for row in some.tolist()])
             wrong |= self._ways.approach(some, here, standbys, self._sun)
-        return wrong
+        return wrong | early
 
-    def _back_to_standby(self, rows: Rows) -> dict[str, str]:
-        """Return which heliostats may not go straight to their standby points, and why."""
+    def _back_to_standby(self, rows: Rows, now: float) -> dict[str, str]:
+        """Return which heliostats may not go straight to their standby points, and why.
+
+        A way is proven from where a heliostat stands. One that moves is no longer there, and does
+        not turn at once.
+        """
+        moving = [row for row in rows.tolist() if not self._stands(row)]
+        early = {self._field.names[row]: STILL_MOVING.text for row in moving}
+        early |= self.ordered.unshown(rows, now)
         rows, wrong = self._resting(rows)
         light = self._sun(0.0)
         for some, standbys in self.points.possible("STANDBY", rows):
             wrong |= self._by_earlier(some, standbys)
             good, path = self._to_standby(some, standbys, light)
             wrong |= self._check.moving(good, path, light)
-        return wrong
+        return wrong | early
 
     def _resting(self, rows: Rows) -> tuple[Rows, dict[str, str]]:
         """Return the heliostats whose standby points are known, and why the others do not go."""
@@ -300,7 +321,7 @@ class BeamWatch:
         return wrong | self._check.moving(good, path, light)
 
     def joining(
-        self, name: str, values: Sequence[float], heliostats: tuple[str, ...]
+        self, name: str, values: Sequence[float], heliostats: tuple[str, ...], now: float
     ) -> dict[str, str]:
         """Return which heliostats may not join their aims now, and why."""
         if not self._check.volumes:
@@ -314,14 +335,30 @@ class BeamWatch:
         }
         if not unknown.all():
             light = self._sun(0.0)
+            found |= self.ordered.unshown(rows, now, off=True)
             # AIM itself brings the new one; TRACK may come before it, and leads to one before.
             possible = self.points.possible("AIM", rows[~unknown])
             for known, places in possible[:1] if name == "AIM" else possible:
-                counts = self._field.counts(known)
                 found |= self._by_earlier(known, places)
-                found |= self._check.on_the_way(known, counts, places, light, self._ways.motion)
+                for some, begin in self._begins(known):
+                    to = known[some], begin, places[some], light, self._ways.motion
+                    found |= self._check.on_the_way(*to)
                 if name == "SEARCH":
                     found |= self._check.around(known, places, values[1], light)
+        return found
+
+    def _begins(self, rows: Rows) -> list[tuple[npt.NDArray[np.bool_], FloatArray]]:
+        """Return where motions of heliostats (K,) may begin: which, (K,), and their counts (M, 2).
+
+        One that moves may be anywhere between its counts and its goals.
+        """
+        counts, goals = self._field.counts(rows), self._field.goals(rows)
+        moving = np.asarray((np.abs(goals - counts) > _MOVES).any(axis=-1))
+        found = [(np.ones(len(rows), dtype=np.bool_), counts)]
+        if moving.any():
+            found += [
+                (moving, counts[moving] + share * (goals - counts)[moving]) for share in (0.5, 1.0)
+            ]
         return found
 
     def _to_standby(

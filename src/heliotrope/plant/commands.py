@@ -21,8 +21,9 @@ from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.given import Given
 from heliotrope.plant.joining import JoiningJob, JoinQueue, in_slices
 from heliotrope.plant.movements import Movements
+from heliotrope.plant.ordered import JOINING
 from heliotrope.plant.orders import PlantOrders, whole
-from heliotrope.plant.permission import JOINING, Permission
+from heliotrope.plant.permission import Permission
 from heliotrope.plant.tickets import Ticket
 
 #: Commands that move nothing.

@@ -190,7 +190,7 @@ class PlantController:
             self.settings.lifetime,
             self.settings.patience,
             self.settings.stow_rate,
-            self._agreement.sent,
+            self._sent,
         )
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
         self._sync = ParameterSync(
@@ -346,10 +346,18 @@ class PlantController:
                     f"{type(message).__name__.lower()}: a cluster must not send this kind"
                 )
 
+    def _sent(
+        self, name: str, values: tuple[float, ...], heliostats: tuple[str, ...], now: float
+    ) -> None:
+        """Note what has been sent to heliostats."""
+        self._agreement.sent(name, values, heliostats, now)
+        self._ways.ordered.sent(name, heliostats, now)
+
     def _obeyed(self, ticket: Ticket, part: Sequence[str], stage: Stage, now: float) -> None:
         """Note what some heliostats of a ticket have acknowledged or done."""
         if stage is Stage.ACKNOWLEDGED:
             self._agreement.obeyed(ticket.name, ticket.accepted_at, part, now)
+            self._ways.ordered.taken(ticket.name, part, now)
         elif stage is Stage.DONE and ticket.name in KINDS:
             self._given.done(ticket, part)
             for name in self.wanted.missing.keys() & part:

@@ -143,15 +143,16 @@ class JoinDispatcher:
     def beat(self, now: float, token: int, *, held: bool) -> None:
         """Send the heliostats whose turn it is, unless no new motion may begin (``held``)."""
         for job, part in self._queue.admit(now, token, held=held):
-            wrong = self._wrong(job, part)
+            wrong = self._wrong(job, part, now)
             job.ticket.block(wrong)
             clear = [name for name in part if name not in wrong]
             self._orders.command(job.ticket, job.name, job.values, clear, token, self._life)
 
-    def _wrong(self, job: JoiningJob, part: tuple[str, ...]) -> dict[str, str]:
+    def _wrong(self, job: JoiningJob, part: tuple[str, ...], now: float) -> dict[str, str]:
         """Return which heliostats whose turn has come may not go, and why."""
         if job.name != SLICED:
-            return self._beams.joining(job.name, job.values, part) | self._barred(job.name, part)
+            wrong = self._beams.joining(job.name, job.values, part, now)
+            return wrong | self._barred(job.name, part)
         try:
             return self._examine(job.name, job.values, part)[1]
         except BeamError as error:

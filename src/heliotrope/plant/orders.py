@@ -93,7 +93,8 @@ class PlantOrders:
     stow_rate
         Heliostats a second that `stow_in_turn` sends; 0: all at once.
     sent
-        Called with name, values and heliostats of each command that is sent, and the time.
+        Called with name, values and heliostats of each command that is sent, DEFOCUS and STOW
+        among them, and the time.
 
     Attributes
     ----------
@@ -364,6 +365,7 @@ class PlantOrders:
             self._supersede(ticket, frozenset(heliostats))
         # Further portions of a STOW must not put off the repetition of the first.
         self._sent_at.setdefault(ticket.identity, self._clock.monotonic())
+        self._sent(act.name, (), tuple(heliostats), self._clock.monotonic())
         for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part, again=again)
             named = () if len(part) == len(end.members) else part

@@ -15,15 +15,12 @@ from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.given import Given
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.lockouts import Lockout, locked_out
+from heliotrope.plant.ordered import JOINING, MOTIONS
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.parameters import ParameterSync
 from heliotrope.plant.rivals import Rivals
 from heliotrope.plant.tickets import Ticket
 
-#: Commands that bring beams to the receiver or move them across it.
-JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
-#: Commands that move heliostats by their parameters.
-MOTIONS = JOINING | {"APPROACH", "IDLE", "JOG", "GOTO", "DIAGNOSE"}
 #: Commands that bring beams to standby.
 _TO_STANDBY = ("APPROACH", "IDLE")
 #: States in which beams are off.
@@ -92,7 +89,6 @@ class Permission:
             wrong |= self._untaken(names)
         elif name in _TO_STANDBY:
             wrong |= self._sentinel.barred(self._off(names), ASTRAY)
-            wrong |= self._sentinel.unshown(names)
         elif name in _STILL:
             for row in _SENT_OFF:
                 wrong |= self._sentinel.barred(names, row)

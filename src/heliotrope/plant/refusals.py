@@ -183,11 +183,19 @@ AIM_NOT_TAKEN = Refusal(
     "its last aim was not taken ({reason}), so its beam would go to an earlier one",
     "Give the aim again.",
 )
-JUST_SENT_OFF = Refusal(
-    "just sent off",
-    "A heliostat is ordered to standby within a second or two of its DEFOCUS or STOW.",
-    "it has just been sent off, and no state since then is known: its way is not proven",
-    "Try again in two seconds.",
+PLACE_UNKNOWN = Refusal(
+    "place unknown",
+    "Where there are keep-out volumes: a heliostat is ordered to standby that has told nothing "
+    "since the last order that moved it, or to its aim since its DEFOCUS or STOW; or it is silent.",
+    "no report tells where it is now, so its way is not proven",
+    "Try again in two seconds; if it stays silent, see to its cluster or its supply. DEFOCUS and "
+    "STOW are accepted at once.",
+)
+STILL_MOVING = Refusal(
+    "still moving",
+    "Where there are keep-out volumes: a heliostat on its way is ordered to standby.",
+    "it is still moving, so its way to standby is not proven",
+    "Wait until it stands, then order it again. DEFOCUS and STOW are accepted at once.",
 )
 SEEN_ASTRAY = Refusal(
     "seen astray from the air",

@@ -15,7 +15,6 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
 from heliotrope.links.messages import Progress, Stage
 from heliotrope.mechanism.drives import Drive
-from heliotrope.plant import refusals
 from heliotrope.plant.beam_watch import BeamWatch
 from heliotrope.plant.emergency.order import (
     COUNTS_UNKNOWN,
@@ -35,8 +34,6 @@ from heliotrope.safety import FLUX_READING, Act, Alarm
 OFF_SHOWS = 10.0
 #: Longest pause between two orders to one heliostat that does not show them, s.
 LONGEST_PAUSE = 60.0
-#: From DEFOCUS or STOW to a state that the board may have answered before it took the order, s.
-_TAKEN_WITHIN = 1.0
 #: Name and role of the safety table in a record.
 _TABLE = ("safety table", "plant")
 
@@ -301,15 +298,6 @@ class Sentinel:
         """
         stowed = self._field.rows["state"][rows] == states.STOWED
         return np.asarray(self._ways.unsent.lit(rows) & ~stowed)
-
-    def unshown(self, heliostats: Iterable[str]) -> dict[str, str]:
-        """Return which heliostats were sent off and have told no state since, and why they wait."""
-        heard, index = self._field.heard, self._field.index
-        return {
-            name: refusals.JUST_SENT_OFF.text
-            for name in heliostats
-            if name in self._sent_off and heard[index[name]] < self._sent_off[name] + _TAKEN_WITHIN
-        }
 
     def barred(self, heliostats: Iterable[str], condition: str = "") -> dict[str, str]:
         """Return which heliostats one row, or any, keeps from their aims, and why."""

@@ -19,7 +19,12 @@ from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import alarms
 
 #: Refusals that end by themselves within seconds: the heliostat is tried again at the next turn.
-_SOON = (refusals.NOT_HEARD.text, refusals.NOT_COMPARED.text, refusals.JUST_SENT_OFF.text)
+_SOON = (
+    refusals.NOT_HEARD.text,
+    refusals.NOT_COMPARED.text,
+    refusals.PLACE_UNKNOWN.text,
+    refusals.STILL_MOVING.text,
+)
 #: Time before a heliostat whose beam has no clear way is tried again, s.
 _BLOCKED = 300.0
 #: Time after which a heliostat that can only go on from stow is sent there, s.
