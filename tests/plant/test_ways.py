@@ -166,10 +166,10 @@ def test_an_order_that_was_long_under_way_counts_from_its_acknowledgement(tmp_pa
         ticket = plant.command(ENGINEER, token, "TRACK", ("P5A",))
         await bench.until(lambda: ticket.stage("P5A") is Stage.DONE, 10.0)
         taken = plant.now()
-        refused = plant._ways.ordered.unshown(np.array([row]), taken)
+        refused = plant._ways.ordered.unshown(np.array([row]))
         assert refused == {"P5A": refusals.PLACE_UNKNOWN.text}
         await bench.until(lambda: bool(plant.field.heard[row] > taken), 5.0)
-        assert not plant._ways.ordered.unshown(np.array([row]), plant.now())
+        assert not plant._ways.ordered.unshown(np.array([row]))
 
     play(tmp_path, scene)
 
@@ -199,6 +199,36 @@ def test_a_mirror_that_moves_or_is_silent_does_not_come_to_standby(tmp_path: Pat
         ages[:] = 0
         await bench.wait(2.0)
         assert plant._ways.clear("IDLE", (), ("P5A",), plant.now()) == (("P5A",), {})
+
+    play(tmp_path, scene)
+
+
+def test_no_new_point_is_given_to_a_mirror_whose_place_is_not_known(tmp_path: Path) -> None:
+    """The way is proven from the point before, which the mirror has left or not yet reached."""
+
+    async def scene(bench: Bench) -> None:
+        plant, token = bench.plant, await bench.commanded(ENGINEER)
+        for give in (plant.standby, plant.aim):
+            await give(ENGINEER, token, {"P5A": BESIDE, "P5B": BESIDE}).end(5.0)
+        for name in ("P5A", "P5B"):
+            await stands(bench, name, states.IDLE, counts(plant, name, BESIDE))
+        await bench.wait(1.0)
+        plant.command(ENGINEER, token, "TRACK", ("P5A",))
+        await bench.wait(0.5)
+        for give in (plant.standby, plant.aim):
+            with pytest.raises(BeamError, match="no report tells where it is now"):
+                give(ENGINEER, token, {"P5A": FURTHER})
+            assert not give(ENGINEER, token, {"P5B": BESIDE}).blocked
+        await bench.wait(2.5)
+        for give in (plant.standby, plant.aim):
+            assert not give(ENGINEER, token, {"P5A": FURTHER}).blocked
+        # On its way back to standby by an order that is known.
+        cluster = bench.cluster_of("P5A")
+        cluster.set(states.IDLE, "P5A")
+        cluster.rows["primary_goal"][cluster.names.index("P5A")] += 5000
+        await bench.wait(2.0)
+        with pytest.raises(BeamError, match="still moving"):
+            plant.standby(ENGINEER, token, {"P5A": BESIDE})
 
     play(tmp_path, scene)
 

@@ -19,7 +19,7 @@ from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import BEFORE, KINDS, Points
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.leaving import way_out
-from heliotrope.plant.ordered import Ordered
+from heliotrope.plant.ordered import JOINING, OFF, Ordered
 from heliotrope.plant.parameters import Tables
 from heliotrope.plant.refusals import BEAM_REFUSED, STILL_MOVING, RefusedError
 from heliotrope.plant.unsent import TURNS, UnsentBeams
@@ -132,7 +132,8 @@ class BeamWatch:
         BeamError
             If one of the beams may not go there.
         """
-        stopped, light, wrong = name == "AIM", self._sun(0.0), dict[str, str]()
+        stopped, light = name == "AIM", self._sun(0.0)
+        wrong = self._early(name, rows)
         for start, among in self._starts(rows, tracking):
             of = rows[among], wanted[among], light
             wrong |= self._check.problems(*of, start=start, stopped=stopped)
@@ -141,6 +142,20 @@ class BeamWatch:
             wrong |= self._check.glare(rows, wanted, every, light)
         if wrong:
             raise BeamError(name, wrong)
+
+    def _early(self, name: str, rows: Rows) -> dict[str, str]:
+        """Return which heliostats may not have a new point before they are heard again, and why.
+
+        The way to it is proven from the point before. One that is on its way there, or may be by
+        an order that no report shows yet, would go to the new point from elsewhere.
+        """
+        if not self._check.volumes:
+            return {}
+        if name == "AIM":  # those that track join it, and are examined then
+            return self.ordered.unshown(rows, JOINING)
+        state = self._field.rows["state"][rows]
+        found = self.ordered.unshown(rows[np.isin(state, _TO_STANDBY)])
+        return found | self._unsettled(rows[state == states.IDLE])
 
     def _starts(
         self, rows: Rows, tracking: npt.NDArray[np.bool_]
@@ -177,7 +192,7 @@ class BeamWatch:
         # A heliostat without known counts is left to its local controller.
         rows = rows[np.isfinite(self._field.counted_at[rows])]
         if name == "APPROACH":
-            wrong = self._from_stow(rows, now)
+            wrong = self._from_stow(rows)
         elif name == "IDLE":
             mine = np.isin(self._field.rows["state"][rows], _TO_STANDBY)
             wrong = self._back_to_standby(rows[mine], now)
@@ -188,9 +203,9 @@ class BeamWatch:
             raise BeamError(name, wrong)
         return tuple(n for n in heliostats if n not in wrong), wrong
 
-    def _from_stow(self, rows: Rows, now: float) -> dict[str, str]:
+    def _from_stow(self, rows: Rows) -> dict[str, str]:
         """Return which heliostats have no free way from stow to standby, and why."""
-        early = self.ordered.unshown(rows, now, off=True)
+        early = self.ordered.unshown(rows, OFF)
         rows, wrong = self._resting(rows)
         if not self._check.volumes:
             wrong = {}  # a way to a point that is not known here is not proven
@@ -207,9 +222,7 @@ class BeamWatch:
         A way is proven from where a heliostat stands. One that moves is no longer there, and does
         not turn at once.
         """
-        moving = [row for row in rows.tolist() if not self._stands(row)]
-        early = {self._field.names[row]: STILL_MOVING.text for row in moving}
-        early |= self.ordered.unshown(rows, now)
+        early = self._unsettled(rows) | self.ordered.silent(rows, now)
         rows, wrong = self._resting(rows)
         light = self._sun(0.0)
         for some, standbys in self.points.possible("STANDBY", rows):
@@ -217,6 +230,11 @@ class BeamWatch:
             good, path = self._to_standby(some, standbys, light)
             wrong |= self._check.moving(good, path, light)
         return wrong | early
+
+    def _unsettled(self, rows: Rows) -> dict[str, str]:
+        """Return which heliostats move, or have told nothing since they were ordered to."""
+        found = {self._field.names[row]: STILL_MOVING.text for row in rows[self._moving(rows)]}
+        return found | self.ordered.unshown(rows)
 
     def _resting(self, rows: Rows) -> tuple[Rows, dict[str, str]]:
         """Return the heliostats whose standby points are known, and why the others do not go."""
@@ -335,7 +353,7 @@ class BeamWatch:
         }
         if not unknown.all():
             light = self._sun(0.0)
-            found |= self.ordered.unshown(rows, now, off=True)
+            found |= self.ordered.unshown(rows, OFF) | self.ordered.silent(rows, now)
             # AIM itself brings the new one; TRACK may come before it, and leads to one before.
             possible = self.points.possible("AIM", rows[~unknown])
             for known, places in possible[:1] if name == "AIM" else possible:
@@ -353,7 +371,7 @@ class BeamWatch:
         One that moves may be anywhere between its counts and its goals.
         """
         counts, goals = self._field.counts(rows), self._field.goals(rows)
-        moving = np.asarray((np.abs(goals - counts) > _MOVES).any(axis=-1))
+        moving = self._moving(rows)
         found = [(np.ones(len(rows), dtype=np.bool_), counts)]
         if moving.any():
             found += [
@@ -447,8 +465,12 @@ class BeamWatch:
         return bool(off and self._stands(row))
 
     def _stands(self, row: int) -> bool:
-        ends = self._field.goals(np.array([row]))[0]
-        return not (np.abs(ends - self._field.posed[row]) > _MOVES).any()
+        return not self._moving(np.array([row])).any()
+
+    def _moving(self, rows: Rows) -> npt.NDArray[np.bool_]:
+        """Return which heliostats are on their way to their goals, (K,)."""
+        left = np.abs(self._field.goals(rows) - self._field.posed[rows])
+        return np.asarray((left > _MOVES).any(axis=-1))
 
     def _look(self, now: float) -> None:
         field = self._field

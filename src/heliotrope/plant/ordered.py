@@ -18,9 +18,11 @@ JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
 #: Commands that move heliostats by their parameters.
 MOTIONS = JOINING | {"APPROACH", "IDLE", "JOG", "GOTO", "DIAGNOSE"}
 #: Orders that send heliostats off.
-_OFF = frozenset({"DEFOCUS", "STOW"})
+OFF = frozenset({"DEFOCUS", "STOW"})
 #: States in which a new point moves a heliostat.
 _POINTS = {"AIM": (states.TRACKING, states.SEARCHING), "STANDBY": (states.IDLE,)}
+#: Orders that move.
+MOVING = MOTIONS | OFF | frozenset(_POINTS)
 #: From an order to a report that the board may have made before it took the order, s.
 _TAKEN_WITHIN = 1.0
 
@@ -38,8 +40,8 @@ class Ordered:
 
     def __init__(self, field: FieldState) -> None:
         self._field = field
-        #: Times from which a report shows the last motion, and the last DEFOCUS or STOW, (N,).
-        self._moved, self._off = np.full((2, len(field)), -np.inf)
+        #: Times from which a report shows the last order of each kind, (N,).
+        self._shown = {kind: np.full(len(field), -np.inf) for kind in (MOVING, OFF, JOINING)}
 
     def sent(self, name: str, heliostats: Sequence[str], now: float) -> None:
         """Note an order that has been sent."""
@@ -50,23 +52,24 @@ class Ordered:
         self._note(name, heliostats, now)
 
     def _note(self, name: str, heliostats: Sequence[str], shown: float) -> None:
-        off = name in _OFF
-        if not (off or name in MOTIONS or name in _POINTS):
+        if name not in MOVING:
             return
         rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
         if name in _POINTS:
             rows = rows[np.isin(self._field.rows["state"][rows], _POINTS[name])]
-        for times in (self._moved, self._off)[: 1 + off]:
-            times[rows] = np.maximum(times[rows], shown)
+        for kind, times in self._shown.items():
+            if name in kind:
+                times[rows] = np.maximum(times[rows], shown)
 
-    def unshown(self, rows: Rows, now: float, *, off: bool = False) -> dict[str, str]:
-        """Return which heliostats (K,) have not told where they are now, and why they wait.
+    def unshown(self, rows: Rows, kind: frozenset[str] = MOVING) -> dict[str, str]:
+        """Return which heliostats (K,) have told nothing since an order, and why others wait.
 
-        They are silent, or have told nothing since the last order that moved them; with ``off``
-        since their last DEFOCUS or STOW.
+        ``kind`` is what counts: MOVING, OFF or JOINING.
         """
-        shown = np.maximum((self._off if off else self._moved)[rows], now - self._field.limit)
-        return {
-            self._field.names[row]: refusals.PLACE_UNKNOWN.text
-            for row in rows[self._field.heard[rows] < shown]
-        }
+        late = self._field.heard[rows] < self._shown[kind][rows]
+        return {self._field.names[row]: refusals.PLACE_UNKNOWN.text for row in rows[late]}
+
+    def silent(self, rows: Rows, now: float) -> dict[str, str]:
+        """Return which heliostats (K,) are not live, and why others wait."""
+        late = ~self._field.live(now)[rows]
+        return {self._field.names[row]: refusals.PLACE_UNKNOWN.text for row in rows[late]}

@@ -185,15 +185,17 @@ AIM_NOT_TAKEN = Refusal(
 )
 PLACE_UNKNOWN = Refusal(
     "place unknown",
-    "Where there are keep-out volumes: a heliostat is ordered to standby that has told nothing "
-    "since the last order that moved it, or to its aim since its DEFOCUS or STOW; or it is silent.",
+    "Where there are keep-out volumes: a heliostat is ordered to standby, or given a standby "
+    "point, that has told nothing since the last order that moved it; or is sent to its aim and "
+    "has told nothing since its DEFOCUS or STOW; or is silent.",
     "no report tells where it is now, so its way is not proven",
     "Try again in two seconds; if it stays silent, see to its cluster or its supply. DEFOCUS and "
     "STOW are accepted at once.",
 )
 STILL_MOVING = Refusal(
     "still moving",
-    "Where there are keep-out volumes: a heliostat on its way is ordered to standby.",
+    "Where there are keep-out volumes: a heliostat on its way is ordered to standby, or given "
+    "another standby point on its way there.",
     "it is still moving, so its way to standby is not proven",
     "Wait until it stands, then order it again. DEFOCUS and STOW are accepted at once.",
 )
