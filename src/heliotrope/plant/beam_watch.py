@@ -198,7 +198,7 @@ class BeamWatch:
             wrong = self._back_to_standby(rows[mine], now)
         else:
             path = self._by_counts(name, values, rows)
-            wrong = self._check.moving(rows, path, self._sun(0.0))
+            wrong = self._check.moving(rows, path, self._sun(0.0)) | self.ordered.unshown(rows)
         if wrong and len(wrong) == len(heliostats):
             raise BeamError(name, wrong)
         return tuple(n for n in heliostats if n not in wrong), wrong

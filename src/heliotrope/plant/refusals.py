@@ -185,9 +185,9 @@ AIM_NOT_TAKEN = Refusal(
 )
 PLACE_UNKNOWN = Refusal(
     "place unknown",
-    "Where there are keep-out volumes: a heliostat is ordered to standby, or given a standby "
-    "point, that has told nothing since the last order that moved it; or is sent to its aim and "
-    "has told nothing since its DEFOCUS or STOW; or is silent.",
+    "Where there are keep-out volumes: a heliostat is ordered to standby, moved by counts (JOG, "
+    "GOTO, DIAGNOSE) or given a standby point, and has told nothing since the last order that "
+    "moved it; or is sent to its aim and has told nothing since its DEFOCUS or STOW; or is silent.",
     "no report tells where it is now, so its way is not proven",
     "Try again in two seconds; if it stays silent, see to its cluster or its supply. DEFOCUS and "
     "STOW are accepted at once.",
