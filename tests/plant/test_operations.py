@@ -26,6 +26,7 @@ from heliotrope.optics import air_loss, intercept_rectangle, predict_flux
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.photographs import Shot, seen, spiral
@@ -671,6 +672,44 @@ def test_stow_from_before_a_lockout_does_not_park(tmp_path: Path) -> None:
             await bench.until(lambda: cluster.rows["state"][0] == states.STOWED, 60.0)
             await shown.close()
             await work
+
+    run_virtual(main)
+
+
+@pytest.mark.parametrize("waited", [20.0, 300.0])
+def test_a_loss_that_was_not_heard_counts_from_when_it_may_have_been(
+    tmp_path: Path, waited: float
+) -> None:
+    """Simulated run 3900863: a mirror was lost seconds after another, and heard 46 s later."""
+
+    async def main(clock: VirtualClock) -> None:
+        async with running(Bench(clock, tmp_path)) as bench:
+            plant = bench.plant
+            log = Logbook(clock)
+            losses = Losses(plant, log, 1, None, lambda: None)
+            wanted = np.ones(len(plant.field), dtype=np.bool_)
+            one, other = (cluster.names[0] for cluster in list(bench.clusters.values())[:2])
+            for name in (one, other):
+                bench.cluster_of(name).set(states.TRACKING, name)
+            await bench.wait(2.0)
+            assert not losses.look(wanted).any()
+            bench.cluster_of(one).set(states.DEFOCUSED, one)
+            cluster = bench.cluster_of(other)
+            if waited < 100.0:
+                cluster.mute = True  # while the first is lost
+            await bench.wait(4.0)
+            assert losses.look(wanted).sum() == 1
+            for _ in range(int(waited)):
+                await bench.wait(1.0)
+                losses.look(wanted)
+            cluster.mute = True
+            await bench.wait(30.0)
+            assert not losses.look(wanted).any()
+            cluster.set(states.DEFOCUSED, other)
+            cluster.mute = False
+            await bench.wait(2.0)
+            assert losses.look(wanted).sum() == 1
+            assert bool(losses.reason) == (waited < 100.0)
 
     run_virtual(main)
 

@@ -19,7 +19,7 @@ from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.safety import Severity, alarms
 from heliotrope.store.records import Records
 
-#: Losses within this span count together; until it is over, none is raised again, s.
+#: Losses that may lie within this span count together; until it is over, none is raised again, s.
 SPAN = 30.0
 #: States in which a beam is at the receiver or at its standby point, or on its way there.
 _UP = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)
@@ -65,6 +65,7 @@ class Losses:
         #: Those that automatic control has ordered down, until they are seen to have left.
         self._ordered: Mask = np.zeros(count, dtype=np.bool_)
         self._lost_at = np.full(count, -math.inf)
+        self._live_at = np.full(count, plant.now())
         self.reason = ""
         for alarm in _standing(records):
             self._wait(alarm)
@@ -83,10 +84,14 @@ class Losses:
         self._up = np.where(live & ~held, up, self._up)
         self._seen |= live
         self._lost_at[lost] = now
-        # Those that are left to people by now count too.
-        together = int(self.settling().sum())
-        if together > self._most:
-            self._wait_for(f"{together} heliostats left the receiver without an order, seen")
+        if lost.any():
+            # One that was silent may have been lost at any time since it was last live. Those that
+            # are left to people by now count too.
+            since = float(self._live_at[lost].min())
+            together = int((self._lost_at > since - SPAN).sum())
+            if together > self._most:
+                self._wait_for(f"{together} heliostats left the receiver without an order, seen")
+        self._live_at[live] = now
         return lost
 
     def settling(self) -> Mask:
