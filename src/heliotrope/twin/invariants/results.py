@@ -97,6 +97,7 @@ class ResultObserver:
         self._accounts = {name: _Account() for name in self._boards}
         self._results: set[tuple[str, float]] = set()
         self._program: Operations | None = None
+        self._looked = start
 
     def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
         self.checks[16] += 1
@@ -121,7 +122,12 @@ class ResultObserver:
         new = [each for each in results if (each.heliostat, each.at) not in self._results]
         for entry in reversed(new):
             self._results.add((entry.heliostat, entry.at))
+            # One from just before the program stood still is seen once it goes on.
+            old = max(self._looked, self._start) - (entry.at - self._zero)
+            saw = f"a result that was not there {now - self._looked:.1f} s ago is {old:.1f} s older"
+            self._check(old <= SHOWN_WITHIN, now, entry.heliostat, saw)
             self._concluded(operations, entry, now)
+        self._looked = now
 
     # -- sightings ---------------------------------------------------------------------------
 
@@ -172,8 +178,7 @@ class ResultObserver:
         name, account = entry.heliostat, self._accounts[entry.heliostat]
         plant, at = operations.plant, entry.at - self._zero
         record, seen = plant.beliefs.record(name), plant.beliefs.seen(name)
-        saw = f"a result is dated {now - at:.1f} s ago"
-        self._check(-SAME <= now - at <= SHOWN_WITHIN, now, name, saw)
+        self._check(at <= now + SAME, now, name, f"a result is dated {at - now:.1f} s ahead")
         brought = account.kept - account.last
         new, version = account.version != account.told, account.version
         before = account.before

@@ -42,6 +42,9 @@ STEPS, AHEAD = 100.0, 0.3
 #: A beam that is shown on a surface has its point this near to it by the steps made, m, after it
 #: was sent there for this long, s.
 NEAR, SETTLED = 6.0, 20.0
+#: One that has turned by more steps than this within a time, s, is still on its way there; the
+#: longest way takes less than this, s.
+FOLLOWS, SLEW, LONGEST = 1000.0, 1.0, 60.0
 #: The predicted error of a row agrees with the observer's own to within this share.
 SHARE = 0.25
 #: An act of a person is an event within this, s.
@@ -237,11 +240,20 @@ class ShownObserver:
         works = state in (states.TRACKING, states.SEARCHING)
         saw = f"{states.STATES[state]}, and its beam is shown on {place or 'nothing'}"
         self._check(works == (place != NOWHERE), now, name, saw)
-        if state == states.TRACKING and place in self._middles:
+        if state == states.TRACKING and place in self._middles and self._came(name, now):
             x, y, z = (float(each) for each in self._middles[place])
             miss = self._boards[name].miss(sun, (x, y, z), believed=True)
             saw += f", {miss:.1f} m from its middle"
             self._check(miss <= NEAR, now, name, saw)
+
+    def _came(self, name: str, now: float) -> bool:
+        """Whether a mirror follows its aim by now, or has had the time of the longest way.
+
+        Near the keyhole an axis turns far for a small way of the beam, longer than others turn.
+        """
+        some = [counts for at, counts in self._counts[name] if at >= now - SLEW]
+        turned = float(np.ptp(np.stack(some), axis=0).max())
+        return turned <= FOLLOWS or now - self._states[name][1] >= LONGEST
 
     def _learnt(
         self,
