@@ -250,7 +250,9 @@ class AnswerObserver:
         inside = all(low <= each <= high for each, (low, high) in zip(goals, RANGES, strict=True))
         self._check(inside, now, account.name, f"STEPS says goals {goals} beyond its range")
         held = account.state in (states.STOWED, states.LOCKED, states.FAULT) and goals != place
-        before = board.off_since if goals == board.goals else inf
+        # A boot ends the motion; what has the same goals afterwards is another one.
+        goes_on = goals == board.goals and board.off_since > account.booted_at
+        before = board.off_since if goes_on else inf
         board.goals, board.off_since = goals, min(before, now) if held else inf
         rests = now - max(account.stepped_at, account.changed_at, board.off_since)
         saw = f"it rests at {place}, and STEPS says goals {goals}"
