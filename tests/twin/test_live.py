@@ -205,6 +205,31 @@ def test_what_is_stored_is_what_the_mirror_then_does() -> None:
     assert errors[6:].min() > 1 * MRAD
 
 
+@pytest.mark.parametrize(
+    ("at", "longitude"),
+    [
+        (datetime(2012, 9, 2, 10, tzinfo=UTC), 18.9),
+        # A leap second comes ten seconds later, at noon of a site in the Pacific.
+        (datetime(2012, 6, 30, 23, 59, 50, tzinfo=UTC), 180.0),
+        (datetime(2099, 6, 21, 10, tzinfo=UTC), 18.9),
+    ],
+    ids=["malans-day", "leap-second", "2099"],
+)
+def test_a_simulated_plant_tracks_at_any_time(at: datetime, longitude: float) -> None:
+    design = malan_plant(3)
+    design = replace(design, site=replace(design.site, longitude_deg=longitude))
+    work = AutomaticSettings(wanted=True, calibrate=False)
+
+    async def main(clock: VirtualClock) -> None:
+        async with LivePlant(design, clock, replace(EXACT, work=work)).running() as plant:
+            await asyncio.sleep(60.0)
+            assert plant.operations.summary().states == {"TRACKING": 3}
+            assert not plant.operations.alarms()
+            await plant.end()
+
+    run_virtual(main, start=at)
+
+
 #: Photographs of a visit: one to find the beam, those of the fit, and one that confirms the new
 #: parameters.
 PHOTOGRAPHS = 1 + CYCLE.shots + 1

@@ -36,7 +36,7 @@ function head(box) {
     const now = store.head;
     if (!now) return;
     time.textContent = `${now.at.slice(0, 10)} ${now.at.slice(11, 19)} UTC`;
-    speed.textContent = now.extra?.speed && now.extra.speed !== 1 ? `×${now.extra.speed}` : now.lag > 2 ? `${span(now.lag)} behind` : "";
+    speed.textContent = now.extra?.speed && now.extra.speed !== 1 ? `×${now.extra.speed}` : now.lag > 2 ? `simulated time ${span(now.lag)} late` : "";
     sun.textContent = `☀ ${degrees(now.sun.azimuth, 0)}° ↑${degrees(now.sun.elevation, 0)}°`;
   };
   const mark = () => { live.textContent = store.live ? "● live" : "✕ NOT LIVE"; live.classList.toggle("bad", !store.live); document.body.classList.toggle("hx-dead", !store.live); };

@@ -19,7 +19,6 @@ import numpy as np
 from heliotrope import sun
 from heliotrope.cluster.config import ClusterConfig, Member, spread_phase
 from heliotrope.cluster.controller import Cluster
-from heliotrope.cluster.timekeeping import SystemTime
 from heliotrope.errors import InputError
 from heliotrope.field.example import roughly_installed
 from heliotrope.field.heliostats import Heliostats
@@ -44,6 +43,7 @@ from heliotrope.plant.ports import Ports
 from heliotrope.plant.settings import clusters_of
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import Records
+from heliotrope.twin.boards.clocks import SimulatedTime
 from heliotrope.twin.cameras import ExactCamera, FieldSnapshot, RenderedCamera
 from heliotrope.twin.drawing import Optics
 from heliotrope.twin.field.field import Field
@@ -200,7 +200,8 @@ class World:
         )
         every = 1 if len(self.names) <= _SMALL else _STEPS_EVERY
         config = ClusterConfig(name, self.design.site, members, steps_every=every, phase=phase)
-        time = SystemTime(self.clock)
+        # A computer's clock before its programs were written was never set; simulated time may be.
+        time = SimulatedTime(self.clock)
         ring = KeyRing(key) if key else None
         self._clusters.append(Cluster(config, bus, far, self.clock, time, bus_keys=ring))
         self._parts += [near, far, bus, time]
