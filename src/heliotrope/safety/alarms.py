@@ -147,9 +147,9 @@ SETTINGS_DIFFER = AlarmKind(
     "expects, or where it expects none, from those of most other clusters.",
     "cluster {subject}: its settings differ from those of {others}",
     "It goes on with its own settings.",
-    "Compare [polling] of its cluster file with that of the plant's links file, delta_t_s with "
-    "that of the plant file, and the versions of the two programs; correct the wrong one and "
-    "restart its program.",
+    "Compare [polling] of its cluster file with that of the plant's links file, delta_t_s and "
+    "[safety] with those of the plant file, and the versions of the two programs; correct the "
+    "wrong one and restart its program.",
     over="cluster {subject}: its settings are no longer known to differ",
 )
 CONSOLE = AlarmKind(

@@ -385,28 +385,3 @@ def decision(actions: Iterable[Action], cluster: str = "", heliostat: str = "") 
 def watched_by(table: Iterable[Condition], watcher: Watcher) -> tuple[Condition, ...]:
     """Return the rows that a tier evaluates."""
     return tuple(row for row in table if row.watcher is watcher)
-
-
-def adjusted(table: Iterable[Condition], name: str, **changes: float) -> tuple[Condition, ...]:
-    """Return the table with some numbers of one row changed, such as ``trips`` and ``releases``.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such row, or a row has no such number.
-    InputError
-        If the changed row contradicts itself.
-    """
-    rows = tuple(table)
-    numbers = ("trips", "releases", "budget", "then_stow", "delay", "clear_for", "stale_after")
-    for change in changes:
-        if change not in numbers:
-            raise UnknownNameError("number of a condition", change, numbers)
-    names = [row.name for row in rows]
-    if name not in names:
-        raise UnknownNameError("condition", name, names)
-    k = names.index(name)
-    numeric: dict[str, float] = {key: float(value) for key, value in changes.items()}
-    # dataclasses.replace takes fields of several types; these are all floats.
-    changed = replace(rows[k], **numeric)  # type: ignore[arg-type]
-    return (*rows[:k], changed, *rows[k + 1 :])

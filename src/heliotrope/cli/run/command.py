@@ -289,18 +289,7 @@ def run(
         return
     if field is None:
         raise InputError("run: --clusters needs the plant file; give it before")
-    simulated = {
-        "--speed": speed != 1.0,
-        "--start": start != "morning",
-        "--seed": bool(seed),
-        "--exact": exact,
-    }
-    if any(simulated.values()):
-        raise InputError(
-            f"run: {', '.join(name for name, given in simulated.items() if given)}: only in "
-            "simulation; real clusters follow the sun of now, by the clocks of their computers: "
-            "leave it out, or leave out --clusters to simulate this plant"
-        )
+    _only_real(speed=speed != 1.0, start=start != "morning", seed=bool(seed), exact=exact)
     design = open_plant(field)
     from heliotrope.cli.run.real import RealChoice, run_real
 
@@ -323,6 +312,18 @@ def _one_plant(
         )
     if field is not None and heliostats is not None:
         raise InputError("run: --heliostats is for the default plant; leave it out with a field")
+
+
+def _only_real(**simulated: bool) -> None:
+    """Refuse options of a simulation, by name, for a real plant."""
+    from heliotrope.errors import InputError
+
+    given = ", ".join(f"--{name}" for name, there in simulated.items() if there)
+    if given:
+        raise InputError(
+            f"run: {given}: only in simulation; real clusters follow the sun of now, by the clocks "
+            "of their computers: leave it out, or leave out --clusters to simulate this plant"
+        )
 
 
 def _design(field: Path | None, heliostats: int | None, *, prototype: bool) -> "Plant":
