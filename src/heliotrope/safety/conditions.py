@@ -72,8 +72,8 @@ def _orders() -> tuple[Condition, ...]:
         Condition(
             "nodes_unacknowledged", _PLANT, "nodes_unacknowledged", "count",
             "number of heliostats that have not acknowledged the emergency order",
-            "{value} heliostats have not acknowledged the emergency order", 1.0, 0.0, _DEFOCUS,
-            _FIELD, _EMERGENCY, 30.0, then_stow=_PATIENCE, role=_OPERATOR,
+            "heliostats that have not acknowledged the emergency order: {value}", 1.0, 0.0,
+            _DEFOCUS, _FIELD, _EMERGENCY, 30.0, then_stow=_PATIENCE, role=_OPERATOR,
             release="every heliostat has acknowledged, or the emergency is over",
             remedy="The EMERGENCY banner names them. Assume that their beams have not moved; keep"
             " people away, and inspect each of them.",
@@ -303,7 +303,7 @@ def _mirrors() -> tuple[Condition, ...]:
             "beam in or heading for a keep-out volume",
             "its beam is in a keep-out volume or heading for one", 0.5, 0.4, _DEFOCUS, _HELIOSTAT,
             _SERIOUS, 30.0, then_stow=_PATIENCE, or_stow=True,
-            release="the beam and its way are clear",
+            release="the beam and its path are clear",
             remedy="Keep people out of the volume until the alarm is over; then give it another aim"
             " point.", site=(0.5, 0.5),
         ),

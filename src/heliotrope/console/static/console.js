@@ -16,8 +16,8 @@ function map(box) {
   const all = h("button", { className: "hx-button", title: "Show the whole field (0)", onclick: () => store.emit("fit") }, "Whole");
   const none = h("button", { className: "hx-button", title: "Clear (Escape)", onclick: () => store.select([], -1) }, "Clear");
   const query = h("input", { type: "search", className: "hx-query", spellcheck: false, "aria-label": "Query",
-    placeholder: "state = TRACKING and error > 1", title: "Fields: state, error, measured (mrad), age (h), sightings, fault, cluster, name, on, east, north. Operators: = != < > <= >= ~ (pattern with *). Press / to type here." });
-  const run = () => { try { const rows = rowsWhere(query.value); store.select(rows, rows.length === 1 ? rows[0] : -1); say(`${count(rows.length)} heliostats match`); } catch (error) { say(error.message, true); } };
+    placeholder: "P0097A, or state = TRACKING and error > 1", title: "Names of heliostats (* for any letters), or conditions. Fields: state, error, measured (mrad), age (h), sightings, fault, cluster, name, on, east, north. Operators: = != < > <= >= ~ (pattern with *). Press / to type here." });
+  const run = () => { try { const rows = rowsWhere(query.value); store.select(rows, rows.length === 1 ? rows[0] : -1); say(rows.length === 1 ? `${store.field.names[rows[0]]} is selected` : `${count(rows.length)} heliostats match`); } catch (error) { say(error.message, true); } };
   query.addEventListener("keydown", (event) => { if (event.key === "Enter") run(); event.stopPropagation(); });
   const field = h("div", { className: "hx-map-field" });
   box.append(h("div", { className: "hx-tools" }, view, lasso, all, none, query, h("button", { className: "hx-button", onclick: run }, "Select")), field);
