@@ -18,7 +18,9 @@ from the table. The handbook says what each alarm means and what
 the operator should do.
 
 The numbers are defaults. Before a plant runs with them, replace the wind limits by those of the
-heliostat's maker and the receiver limits by those of the receiver's maker.
+heliostat's maker and the receiver limits by those of the receiver's maker, in the tables
+[`[safety.CONDITION]` of the plant file](../reference/plant-format.md#limits-of-the-site).
+`heliotrope field safety PLANT` shows what is in force.
 
 ## Rules for every row
 

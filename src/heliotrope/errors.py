@@ -14,6 +14,7 @@ to do. The outcome of a solver (unreachable, not converged) is a value with a te
 never an exception.
 """
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -32,6 +33,15 @@ def kind_of(value: object) -> str:
     package, name = type(value).__module__.partition(".")[0], type(value).__name__
     text = name if package == "builtins" else f"{package} {name}"
     return f"{'an' if text[0].lower() in 'aeiou' else 'a'} {text}"
+
+
+#: Kinds of things that are often named after their kind.
+_DOUBLED = re.compile(r"\b(receiver|target|camera|cluster|sensor|heliostat|group) \1\b")
+
+
+def once(text: str) -> str:
+    """Return a text in which a kind that its name repeats stands once: no "receiver receiver"."""
+    return _DOUBLED.sub(r"\1", text)
 
 
 class HeliotropeError(Exception):

@@ -170,6 +170,27 @@ def test_field_check(call: Any, plant_file: Path) -> None:
     assert "no problems found" in call("field", "check", plant_file)
 
 
+def test_field_safety_shows_the_numbers_in_force(call: Any, plant_file: Path) -> None:
+    limits = "\n[safety.wind_gust_stow]\ntrips_m_s = 18\n"
+    plant_file.write_text(plant_file.read_text(encoding="utf-8") + limits, encoding="utf-8")
+    text = call("field", "safety", plant_file)
+    assert "wind_gust_stow.trips_m_s*" in text
+    assert "wind_gust_stow.releases_m_s " in text
+    found = json.loads(call("field", "safety", plant_file, "--json"))
+    rows = {f"{one['condition']}.{one['key']}": one for one in found}
+    assert rows["wind_gust_stow.trips_m_s"] == {
+        "condition": "wind_gust_stow",
+        "key": "trips_m_s",
+        "value": 18.0,
+        "default": 20.0,
+        "low": 5.0,
+        "high": 30.0,
+        "changed": True,
+    }
+    assert not rows["sun_below_horizon.trips_deg"]["changed"]
+    assert "cluster_silent.trips_s" not in rows
+
+
 def test_track_reads_heliok(call: Any) -> None:
     scene = Path(__file__).parents[1] / "files" / "heliok-scene.xml"
     found = json.loads(

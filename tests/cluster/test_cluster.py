@@ -180,12 +180,22 @@ def test_a_jump_before_the_first_second_is_seen_though_the_keeper_hides_it() -> 
     """Simulated run 910519: the time was only compared from one second to the next."""
     clock = VirtualClock(lambda: 100.0, datetime(2026, 6, 21, 12, tzinfo=UTC))
     before = SimulatedTime(clock).time()
-    watch = Watch("C", 0.0, Reports(), 100.0, before)
+    watch = Watch("C", 0.0, Reports(), 100.0, before, {})
     keeper = SimulatedTime(clock)
     keeper.detects = False
     keeper.jump(-3600.0)
     watch.second(keeper.time(), 0.0, 100.7)
     assert watch.verdict.dark
+
+
+def test_a_cluster_goes_by_the_limits_of_the_site() -> None:
+    clock = VirtualClock(lambda: 100.0, datetime(2026, 6, 21, 12, tzinfo=UTC))
+    time = SimulatedTime(clock, error=0.4).time()
+    tight = {"holdover_exhausted": {"trips_s": 0.3, "releases_s": 0.2}}
+    for limits in ({}, tight):
+        watch = Watch("C", 0.0, Reports(), 100.0, time, limits)
+        acts = watch.second(time, 0.0, 100.7).acts
+        assert ("DEFOCUS holdover_exhausted" in acts) == (limits is tight)
 
 
 def test_a_time_without_a_source_sends_no_sun() -> None:

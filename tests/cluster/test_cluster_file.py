@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 import tomli_w
 
+from heliotrope import safety
 from heliotrope.cli.cluster import _link
 from heliotrope.cluster import timekeeping
 from heliotrope.cluster._nodes import NODE, STATUS, STEPS, Nodes
 from heliotrope.cluster.config import ClusterConfig, Member, spread_phase
-from heliotrope.cluster.config_file import TABLES, read_cluster
+from heliotrope.cluster.config_file import TABLES, SafetyTable, read_cluster
 from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.program import line_of, time_of
 from heliotrope.errors import FormatError, InputError, UnknownNameError
@@ -161,6 +162,29 @@ def test_the_key_of_the_bus_is_read_and_read_again(folder: Path) -> None:
     found.take_bus_keys()
     assert found.bus_keys.keys == file.keys
     assert len(file.keys) == 2
+
+
+def test_limits_of_the_site_are_those_of_the_rows_that_a_cluster_watches(folder: Path) -> None:
+    path = folder / "C1.toml"
+    document = tomllib.loads(path.read_text())
+    usual = read_cluster(path).config
+    assert usual.limits == {}
+    given = {"bus_errors": {"trips_percent": 30.0}, "clock_jump": {"trips_s": 0.3}}
+    path.write_text(tomli_w.dumps({**document, "safety": {**given, "longest_autonomy_s": 5.0}}))
+    assert read_cluster(path).config.limits == given
+    watched = safety.watched_by(safety.CONDITIONS, safety.Watcher.CLUSTER)
+    fixed = {"emergency_line", "longest_autonomy_s"}
+    settable = {row.name for row in watched if safety.settings_of(row)}
+    assert set(SafetyTable.model_fields) == settable | fixed
+    for name, key, text in (
+        ("bus_errors", "trips_percent", "bus_errors.trips_percent 90 is not within 2 to"),
+        ("bus_errors", "trips", "bus_errors.trips is not known; it takes trips_percent, rel"),
+        ("wind_gust_stow", "trips_m_s", "safety.wind_gust_stow: 'wind_gust_stow' is not known"),
+    ):
+        path.write_text(tomli_w.dumps({**document, "safety": {name: {key: 90.0}}}))
+        with pytest.raises(FormatError) as caught:
+            read_cluster(path)
+        assert text in str(caught.value)
 
 
 def test_the_reference_names_every_setting() -> None:

@@ -42,6 +42,7 @@ def test_it_is_the_checksum_of_the_documented_text(monkeypatch: pytest.MonkeyPat
         {"silence": 11.0},
         {"steps_every": 2},
         {"site": replace(SITE, delta_t=69.0)},
+        {"limits": {"bus_errors": {"trips_percent": 30.0}}},
     ],
 )
 def test_each_common_setting_changes_it(change: dict[str, Any]) -> None:
@@ -77,6 +78,14 @@ def test_a_threshold_changes_it_where_the_cluster_watches(
     assert settings_checksum(CONFIG.common) == before
     rows[place] = replace(rows[place], clear_for=rows[place].clear_for + 1.0)
     assert (settings_checksum(CONFIG.common) != before) == (watcher is Watcher.CLUSTER)
+
+
+def test_of_a_plants_limits_those_count_that_clusters_watch() -> None:
+    gust = {"wind_gust_stow": {"trips_m_s": 18.0}}
+    assert settings_checksum(CommonSettings(limits=gust)) == settings_checksum(CONFIG.common)
+    bus = {"bus_errors": {"trips_percent": 30.0}}
+    expected = settings_checksum(CommonSettings(limits=gust | bus))
+    assert expected == settings_checksum(replace(CONFIG, limits=bus).common)
 
 
 def test_the_status_of_a_running_cluster_carries_it() -> None:

@@ -126,8 +126,9 @@ def test_query_and_detail(field: LiveConsole, enter: Callable[[str], Any]) -> No
     page = enter("viewer")
     name = field.live.names[20]
     page.keyboard.press("/")
-    page.keyboard.type(f"name = {name}")
+    page.keyboard.type(name.lower())
     page.keyboard.press("Enter")
+    said(page, f"{name} is selected")
     page.click(".hx-tabs >> text=Heliostat")
     page.wait_for_function(
         "name => document.querySelector('.hx-heliostat h2')?.textContent.startsWith(name)", arg=name
@@ -135,6 +136,15 @@ def test_query_and_detail(field: LiveConsole, enter: Callable[[str], Any]) -> No
     page.fill(".hx-query", "speed > 3")
     page.keyboard.press("Enter")
     said(page, 'no field "speed"')
+    page.fill(".hx-query", f"{name}B")
+    page.keyboard.press("Enter")
+    said(page, f'there is no heliostat "{name}B"; did you mean {name}')
+    page.fill(".hx-query", f"{name}, {field.live.names[21]}")
+    page.keyboard.press("Enter")
+    page.wait_for_function("heliotrope.store.selection.size === 2")
+    page.fill(".hx-query", f"name = {name}")
+    page.keyboard.press("Enter")
+    page.wait_for_function("heliotrope.store.selection.size === 1")
     page.fill(".hx-query", "cluster = C001 or cluster = C002 and east < 1e9")
     page.keyboard.press("Enter")
     page.wait_for_function("heliotrope.store.selection.size === 64")

@@ -164,7 +164,34 @@ def test_a_refused_acknowledgement_is_not_shown_as_done(enter: Callable[..., Any
     )
     page.click(".hx-tabs >> text=Alarms")
     page.click(".hx-alarms >> text=Acknowledge all")
-    said(page, "1 of 1 refused: wind_gust_stow: its cause has not gone")
+    said(page, "wind_gust_stow: its cause has not gone")
+
+
+def test_alarms_that_say_the_same_of_many_are_one_line(enter: Callable[..., Any]) -> None:
+    page, asked = enter("operator"), list[str]()
+    alarm = {"at": 1.0, "condition": "node_silent", "severity": "alarm", "active": True}
+    alarm |= {"acknowledged_by": "", "count": 1}
+    rows = [
+        {**alarm, "subject": f"P{k:04d}", "text": f"P{k:04d}: no answer for 10 s"}
+        for k in range(57)
+    ]
+    rows.append({**alarm, "subject": "P0900", "text": "P0900: no answer for 20 s"})
+    page.route("**/api/v1/alarms", lambda route: route.fulfill(json=rows))
+
+    def acknowledge(route: Any) -> None:
+        asked.append(route.request.post_data_json["subject"])
+        route.fulfill(json={})
+
+    page.route("**/api/v1/alarms/acknowledge", acknowledge)
+    page.click(".hx-tabs >> text=Alarms")
+    page.wait_for_selector(".hx-alarms >> text=58 not acknowledged, 58 active")
+    assert page.locator(".hx-alarms tbody tr").count() == 2
+    line = page.locator(".hx-alarms tbody tr").first
+    assert "P0000, P0001, P0002 and 54 more" in line.inner_text()
+    assert "each: no answer for 10 s" in line.inner_text()
+    line.locator("text=Acknowledge").click()
+    said(page, "acknowledge: done")
+    assert sorted(asked) == [row["subject"] for row in rows[:57]]
 
 
 # -- out of service ----------------------------------------------------------------------------

@@ -444,6 +444,53 @@ def test_joint_visits_that_cannot_be_are_one_line(
     assert "\n" not in str(caught.value)
 
 
+SAFETY = """
+[safety.wind_gust_stow]
+trips_m_s = 18
+releases_m_s = 14.5
+
+[safety.pointing_disagrees]
+trips_mrad = 2.5
+"""
+
+
+def test_limits_of_the_site_are_read_checked_and_survive(tmp_path: Path) -> None:
+    path = with_machine(tmp_path, MACHINE + SAFETY)
+    plant = plant_file.read_plant(path)
+    given = {
+        "wind_gust_stow": {"trips_m_s": 18.0, "releases_m_s": 14.5},
+        "pointing_disagrees": {"trips_mrad": 2.5},
+    }
+    assert plant.safety == given
+    assert not [f for f in plant_file.check_plant(path) if f.severity == "error"]
+    plant_file.write_plant(plant, tmp_path / "again.toml")
+    assert plant_file.read_plant(tmp_path / "again.toml").safety == given
+    with pytest.raises(InputError, match=r"trips_m_s 45 is not within 5 to 30"):
+        replace(plant, safety={"wind_gust_stow": {"trips_m_s": 45.0}})
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "text"),
+    [
+        ("trips_m_s = 18", "trips_m_s = 45", "safety: wind_gust_stow.trips_m_s 45 is not within 5"),
+        ("trips_m_s = 18", "trips = 18", "wind_gust_stow.trips is not known; did you mean trips_m"),
+        ("trips_m_s = 18", "trips_m_s = 14", "which must be below its trip at 14 m/s; set trips"),
+        ("trips_m_s = 18", 'trips_m_s = "a"', "safety.wind_gust_stow.trips_m_s: 'a': input should"),
+        ("wind_gust_stow", "wind_gust", "safety: wind_gust: there is no such condition here; did "),
+        ("wind_gust_stow", "cluster_silent", "cluster_silent: no plant sets its numbers, because"),
+    ],
+)
+def test_limits_of_the_site_that_cannot_be_are_one_line(
+    before: str, after: str, text: str, tmp_path: Path
+) -> None:
+    path = with_machine(tmp_path, MACHINE + SAFETY.replace(before, after))
+    with pytest.raises(FormatError) as caught:
+        plant_file.read_plant(path)
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert [f.text for f in plant_file.check_plant(path)] == [str(caught.value)]
+
+
 def test_warnings_of_check(tmp_path: Path) -> None:
     near = kinds.azimuth_elevation(np.array([[0.0, -30, 0], [0.5, -30, 0], [0, 40, 0]]))
     heliostats = Heliostats(("A", "B", "C"), near, np.full(3, 2.0), np.full(3, 2.0))

@@ -26,7 +26,7 @@ from heliotrope.local import (
     pack,
 )
 from heliotrope.local.frames import HELLO_HEAD, MARK, head_of, lengths
-from heliotrope.local.sockets import connect, is_ours, listen, make_folder
+from heliotrope.local.sockets import connect, listen, make_folder, user_of
 
 HELLO = {"token": "good"}
 SHORT = LocalLimits(strangers=4, callers=4, under_way=4, hello_s=0.5, answer_s=0.5, pace_s=0.001)
@@ -45,7 +45,8 @@ class _Echo:
     def __init__(self) -> None:
         self.most = self.now = self.held = 0
 
-    async def caller(self, hello: dict[str, Any]) -> _Caller | None:
+    async def caller(self, hello: dict[str, Any], user: int) -> _Caller | None:
+        assert user == os.getuid()
         if hello.get("key") == "console":
             return _Caller(reserved=True)
         return _Caller(reserved=False) if hello.get("token") == "good" else None
@@ -199,7 +200,7 @@ def test_only_this_user_may_enter(tmp_path: Path) -> None:
         assert path.stat().st_mode & 0o777 == 0o600
         assert path.parent.stat().st_mode & 0o777 == 0o700
         with connect(path, 1.0) as raw:
-            assert is_ours(raw)
+            assert user_of(raw) == os.getuid()
         assert await _ask(path) == {}
 
     _run(tmp_path, work)
@@ -338,7 +339,7 @@ def test_a_socket_of_another_user_is_given_no_token(
     """Whoever made the folder that --data names could otherwise collect tokens."""
     listener = listen(tmp_path / "a.sock")
     monkeypatch.setattr("heliotrope.local.sockets.os.getuid", lambda: 12345)
-    monkeypatch.setattr("heliotrope.local.sockets.is_ours", lambda _: False)
+    monkeypatch.setattr("heliotrope.local.sockets.user_of", lambda _: None)
     with pytest.raises(AwayError, match="another user listens there"):
         ask_once(tmp_path / "a.sock", HELLO, "echo", {})
     connection, _ = listener.accept()

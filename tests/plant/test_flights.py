@@ -396,7 +396,7 @@ def test_what_is_refused(play: Play) -> None:
             row.model_copy(update={"place_m": good.rows[-k - 1].place_m})
             for k, row in enumerate(good.rows)
         ]
-        refused(good.model_copy(update={"rows": wrong}), "mirrors cannot stand so, first")
+        refused(good.model_copy(update={"rows": wrong}), "mirrors cannot stand like that, f")
         assert len(site.plant.beliefs.flights) == 0
         assert site.keeper.flights() == []
         site.take(good)

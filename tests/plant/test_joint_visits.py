@@ -5,6 +5,7 @@ test's cameras, from where the mirrors truly stand.
 """
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant import refusals
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.operations.calibrating import Calibrating
 from heliotrope.plant.operations.parties import Parties
@@ -559,6 +561,26 @@ def test_who_was_disproved_goes_alone_and_has_an_alarm_until_it_is_seen() -> Non
     assert "C" not in asyncio.run(made.chosen("left", ready, follow))
 
 
+def calibrating_of(made: Parties, event: Callable[..., None], done: list[str]) -> Calibrating:
+    """Automatic control of joint visits whose outcome a test writes."""
+    plant = made._plant
+    plant.clock = SimpleNamespace(utc=lambda: START)  # type: ignore[misc]
+    plant.beliefs = SimpleNamespace(count=lambda name: 0)  # type: ignore[assignment]
+    silent = SimpleNamespace(event=event, keep=lambda *_: None)
+    book = SimpleNamespace(error=np.full(6, 1e-3), conclude=lambda entry: None)
+    return Calibrating(
+        plant,
+        silent,  # type: ignore[arg-type]
+        made.cycle,  # type: ignore[arg-type]
+        SimpleNamespace(done=lambda entry: done.append(entry.heliostat)),  # type: ignore[arg-type]
+        book,  # type: ignore[arg-type]
+        silent,  # type: ignore[arg-type]
+        SimpleNamespace(now=lambda row: np.nan),  # type: ignore[arg-type]
+        lambda: (),
+        parties=made,
+    )
+
+
 def test_what_a_joint_visit_disproves_is_an_alarm_when_it_ends() -> None:
     made, alarms, ready = parties(1e-3, first=0)
     results = (
@@ -571,26 +593,31 @@ def test_what_a_joint_visit_disproves_is_an_alarm_when_it_ends() -> None:
         return results
 
     made.cycle.run = run  # type: ignore[method-assign]
-    plant, done = made._plant, list[str]()
-    plant.clock = SimpleNamespace(utc=lambda: START)  # type: ignore[misc]
-    plant.beliefs = SimpleNamespace(count=lambda name: 0)  # type: ignore[assignment]
-    silent = SimpleNamespace(event=lambda *_: None, keep=lambda *_: None)
-    book = SimpleNamespace(error=np.full(6, 1e-3), conclude=lambda entry: None)
-    calibrating = Calibrating(
-        plant,
-        silent,  # type: ignore[arg-type]
-        made.cycle,  # type: ignore[arg-type]
-        SimpleNamespace(done=lambda entry: done.append(entry.heliostat)),  # type: ignore[arg-type]
-        book,  # type: ignore[arg-type]
-        silent,  # type: ignore[arg-type]
-        SimpleNamespace(now=lambda row: np.nan),  # type: ignore[arg-type]
-        lambda: (),
-        parties=made,
-    )
+    done = list[str]()
+    calibrating = calibrating_of(made, lambda *_: None, done)
     calibrating.ask_together(("A", "B", "C"), "left")
     assert asyncio.run(calibrating.visit("left", ready, ENGINEER, 1)) == ("A", "B", "C")
     assert alarms.active() == [("B", True)]
     assert made.alone(ready).tolist() == [False, True, False, False, False, False]
+    assert done == ["A", "B", "C"]
+
+
+def test_a_joint_visit_that_is_refused_is_one_event_and_not_one_of_each() -> None:
+    made, _, ready = parties(1e-3, first=0)
+
+    async def run(*_: object) -> tuple[CycleResult, ...]:
+        raise refusals.OTHER_AUTHORITY.error(holder="Egon", person="automatic control")
+
+    made.cycle.run = run  # type: ignore[method-assign]
+    noted, done = list[tuple[str, ...]](), list[str]()
+    calibrating = calibrating_of(made, lambda *words: noted.append(words), done)
+    calibrating.ask_together(("A", "B", "C"), "left")
+    assert asyncio.run(calibrating.visit("left", ready, ENGINEER, 1)) == ("A", "B", "C")
+    text = (
+        "joint visit: 0 of 3 heliostats proven together; command authority: Egon has it, so "
+        "nothing was sent for automatic control; take command first"
+    )
+    assert noted == [("calibration", "left", text)]
     assert done == ["A", "B", "C"]
 
 

@@ -142,7 +142,7 @@ def test_only_the_one_authority_commands(tmp_path: Path) -> None:
         token = await bench.commanded()
         with pytest.raises(RefusedError, match="Olga has it and renewed it 0 s ago"):
             plant.take_authority(ENGINEER)
-        with pytest.raises(RefusedError, match="Olga has it, not Olga with this token"):
+        with pytest.raises(RefusedError, match="Olga has it, so nothing was sent for Olga; take"):
             plant.command(OPERATOR, token + 1, "APPROACH")
         with pytest.raises(RefusedError, match="JOG: Olga is operator; it needs engineer"):
             plant.command(OPERATOR, token, "JOG", ("P1A",), (0, 10))

@@ -21,7 +21,7 @@ from heliotrope.plant.emergency import carried_out
 from heliotrope.plant.operations.given_readings import GivenReadings
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.safety import FLUX_READING, Act, FluxProof, adjusted, conditions
+from heliotrope.safety import FLUX_READING, Act, FluxProof, conditions, limited
 from heliotrope.twin.wind import Wind
 from support.plant_bench import ENGINEER, LEADS, OPERATOR, VIEWER, Bench, running
 
@@ -240,9 +240,8 @@ def test_wind_defocuses_and_stows_with_hysteresis(tmp_path: Path) -> None:
         assert set(told[2:]) == {("wind_gust_defocus", False), ("wind_gust_stow", False)}
 
     # Ten minutes of calm are long in a test: here one does.
-    table = conditions()
-    for row in ("wind_gust_defocus", "wind_gust_stow"):
-        table = adjusted(table, row, clear_for=60.0)
+    rows = ("wind_gust_defocus", "wind_gust_stow")
+    table = limited(conditions(), {row: {"clear_for_s": 60.0} for row in rows})
     bench = play(tmp_path, scene, settings=WINDY, table=table)
     assert orders(bench) == [("DEFOCUS", ()), ("STOW", ())]
 

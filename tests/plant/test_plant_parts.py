@@ -284,6 +284,20 @@ def test_stages_never_go_back_and_nothing_follows_the_end() -> None:
     assert "1 refused" in repr(ticket)
 
 
+def test_one_reason_of_many_heliostats_stands_once() -> None:
+    names = [f"P{k:04d}" for k in range(64)]
+    ticket = Ticket("1", "TRACK", names, VirtualClock(), 60.0)
+    ticket.advance(names[:57], Stage.REFUSED, "it has not been heard")
+    ticket.advance(names[57:59], Stage.REFUSED, "it is out of service")
+    for name, text in zip(names[59:62], ("a", "b", "c"), strict=True):
+        ticket.advance((name,), Stage.FAILED, text)
+    ticket.advance(names[62:], Stage.DONE)
+    assert ticket.text == (
+        "TRACK: 2 done, 59 refused, 3 failed (57 heliostats: it has not been heard; P0057, P0058: "
+        "it is out of service; P0059: a; 2 more for other reasons)"
+    )
+
+
 def test_a_refusal_without_a_reason_is_told_all_the_same() -> None:
     ticket = Ticket("1", "TRACK", ("A", "B", "C"), VirtualClock(), 60.0)
     ticket.advance(("A",), Stage.REFUSED)

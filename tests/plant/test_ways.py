@@ -104,7 +104,7 @@ def test_a_move_by_counts_through_a_volume_is_refused(tmp_path: Path) -> None:
             for steps in (-10_000, 1_000):
                 assert await plant.command(ENGINEER, token, "JOG", ("P5A",), (axis, steps)).end(5.0)
                 # The next one starts from its end, which no report has shown yet.
-                with pytest.raises(RefusedError, match="no report tells where it is now"):
+                with pytest.raises(RefusedError, match="no report shows where it is now"):
                     plant.command(ENGINEER, token, "JOG", ("P5A",), (axis, steps))
                 await bench.wait(2.5)
         await stands(bench, "P5A", states.IDLE, west)
@@ -145,7 +145,7 @@ def test_no_mirror_comes_to_standby_before_it_shows_where_it_is_since_its_last_o
         await bench.wait(0.5)
         ticket = plant.command(ENGINEER, token, "IDLE", ("P5A", "P5B"))
         assert ticket.blocked == {"P5A": refusals.PLACE_UNKNOWN.text}
-        with pytest.raises(BeamError, match="no report tells where it is now"):
+        with pytest.raises(BeamError, match="no report shows where it is now"):
             plant.command(ENGINEER, token, "IDLE", ("P5A",))
         await bench.wait(2.5)
         assert not plant.command(ENGINEER, token, "IDLE", ("P5A",)).blocked
@@ -196,7 +196,7 @@ def test_a_mirror_that_moves_or_is_silent_does_not_come_to_standby(tmp_path: Pat
         ages = cluster.age_ms
         ages[cluster.names.index("P5A")] = 5000
         await bench.wait(2.0)
-        with pytest.raises(BeamError, match="no report tells where it is now"):
+        with pytest.raises(BeamError, match="no report shows where it is now"):
             plant._ways.clear("IDLE", (), ("P5A",), plant.now())
         wrong = plant._ways.joining("TRACK", (), ("P5A",), plant.now())
         assert wrong["P5A"] == refusals.PLACE_UNKNOWN.text
@@ -220,7 +220,7 @@ def test_no_new_point_is_given_to_a_mirror_whose_place_is_not_known(tmp_path: Pa
         plant.command(ENGINEER, token, "TRACK", ("P5A",))
         await bench.wait(0.5)
         for give in (plant.standby, plant.aim):
-            with pytest.raises(BeamError, match="no report tells where it is now"):
+            with pytest.raises(BeamError, match="no report shows where it is now"):
                 give(ENGINEER, token, {"P5A": FURTHER})
             assert not give(ENGINEER, token, {"P5B": BESIDE}).blocked
         await bench.wait(2.5)
@@ -459,7 +459,7 @@ def test_a_beam_in_a_volume_or_heading_for_one_is_sent_off(commanded: bool, tmp_
         assert told == {"P5A", "P5B"}
         alarms = [a for a in plant.alarms if a.condition == "keep_out_predicted"]
         texts = [a.text for a in alarms if a.active]
-        assert all("DEFOCUS or STOW heliostat" in text for text in texts)
+        assert all("DEFOCUS or STOW of heliostat" in text for text in texts)
         # P5A is defocused and does not go on; P5B has obeyed too, but its beam is where it was.
         reports(bench, "P5A", states.DEFOCUSED, west, west)
         await bench.wait(60.0)
@@ -814,7 +814,7 @@ def test_who_would_cross_the_receiver_on_the_way_from_stow_is_known_beforehand()
     check, rows = BeamCheck(design, design.names), np.arange(96)
     stow, standby = (np.tile(np.array(x, dtype=float), (96, 1)) for x in _rest(machine))
     found = Ways(check, dict.fromkeys(design.names, machine)).approach(rows, stow, standby, sun)
-    text = "the beam crosses receiver receiver on its way from stow to standby; try again"
+    text = "the beam crosses the receiver on its way from stow to standby; try again"
     assert all(text in each for each in found.values())
     refused = np.array([name in found for name in design.names])
     nearest = np.full(96, np.inf)

@@ -2,6 +2,7 @@
 
 import asyncio
 import hashlib
+import re
 import struct
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
@@ -24,9 +25,12 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import LinkClosedError, SendOutcome
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.kept_audit import KeptAudit
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.safety import FluxProof
+from heliotrope.store.audit import entries
 from heliotrope.store.keeper import Keeper
 from heliotrope.twin.cameras import ExactCamera, FieldSnapshot, RenderedCamera
 from heliotrope.twin.field import Field, FieldBus
@@ -205,6 +209,31 @@ def test_what_is_stored_is_what_the_mirror_then_does() -> None:
     assert errors[6:].min() > 1 * MRAD
 
 
+@pytest.mark.parametrize(
+    ("at", "longitude"),
+    [
+        (datetime(2012, 9, 2, 10, tzinfo=UTC), 18.9),
+        # A leap second comes ten seconds later, at noon of a site in the Pacific.
+        (datetime(2012, 6, 30, 23, 59, 50, tzinfo=UTC), 180.0),
+        (datetime(2099, 6, 21, 10, tzinfo=UTC), 18.9),
+    ],
+    ids=["malans-day", "leap-second", "2099"],
+)
+def test_a_simulated_plant_tracks_at_any_time(at: datetime, longitude: float) -> None:
+    design = malan_plant(3)
+    design = replace(design, site=replace(design.site, longitude_deg=longitude))
+    work = AutomaticSettings(wanted=True, calibrate=False)
+
+    async def main(clock: VirtualClock) -> None:
+        async with LivePlant(design, clock, replace(EXACT, work=work)).running() as plant:
+            await asyncio.sleep(60.0)
+            assert plant.operations.summary().states == {"TRACKING": 3}
+            assert not plant.operations.alarms()
+            await plant.end()
+
+    run_virtual(main, start=at)
+
+
 #: Photographs of a visit: one to find the beam, those of the fit, and one that confirms the new
 #: parameters.
 PHOTOGRAPHS = 1 + CYCLE.shots + 1
@@ -363,6 +392,46 @@ def test_what_was_learnt_outlasts_the_program(tmp_path: Path) -> None:
 
     run_virtual(main, start=START)
     assert 0.0 < errors[0] < 6 * MRAD
+
+
+def test_the_limits_of_the_site_hold_and_their_change_is_recorded(tmp_path: Path) -> None:
+    """Four runs: with the defaults, with limits, with the same, and with the defaults again."""
+    limits = {
+        "wind_gust_defocus": {"trips_m_s": 10.0, "releases_m_s": 8.0},
+        "wind_gust_stow": {"trips_m_s": 12.0, "releases_m_s": 9.0},
+        "bus_errors": {"trips_percent": 30.0},
+    }
+    there = {
+        "wind_gust_defocus.trips_m_s: 15 → 10",
+        "wind_gust_defocus.releases_m_s: 12 → 8",
+        "wind_gust_stow.trips_m_s: 20 → 12",
+        "wind_gust_stow.releases_m_s: 15 → 9",
+        "bus_errors.trips_percent: 20 → 30",
+    }
+    back = {re.sub(r"(\S+) → (\S+)", r"\2 → \1", line) for line in there}
+    feeding = replace(EXACT, plant=PlantSettings(sensors=frozenset({"wind_gust"})))
+
+    async def main(clock: VirtualClock) -> None:
+        keeper = Keeper(tmp_path, inline=True)
+        for safety, changes in (({}, set()), (limits, there), (limits, set()), ({}, back)):
+            design = replace(lay_out("radial", 3), safety=safety)
+            audit = KeptAudit(keeper, clock, START)
+            plant = LivePlant(design, clock, feeding, records=keeper, audit=audit)
+            events = plant.operations.events(50)
+            assert {event.text for event in events if event.kind == "safety"} == changes
+            async with plant.running():
+                await asyncio.sleep(5.0)
+                plant.plant.put("wind_gust", 13.0)
+                await asyncio.sleep(1.0)
+                active = [alarm.condition for alarm in plant.operations.alarms() if alarm.active]
+                assert ("wind_gust_stow" in active) == bool(safety)
+                await plant.end()
+        with keeper.database.reading() as connection:
+            noted = [one for one in entries(connection, 1000) if one.what == "LIMITS"]
+        assert {(one.who, one.note) for one in noted} == {("plant file", n) for n in there | back}
+        keeper.close()
+
+    run_virtual(main, start=START)
 
 
 def test_a_live_camera_shows_what_it_saw() -> None:

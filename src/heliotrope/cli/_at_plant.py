@@ -1,7 +1,7 @@
 """`heliotrope ctl` at the plant itself: the API's requests as calls of the local interface.
 
-It needs no console, and EMERGENCY, DEFOCUS and STOW take the plant's own socket for them. Nothing
-heavy is imported: an emergency starts at once.
+It needs no console, and EMERGENCY, DEFOCUS and STOW take the plant's own socket for them, with no
+valid token either. Nothing heavy is imported: an emergency starts at once.
 """
 
 import json
@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import parse_qsl, unquote
 
 from heliotrope.errors import InputError
-from heliotrope.local import EMERGENCY, ORDINARY, ask_once, socket_folder
+from heliotrope.local import EMERGENCY, ORDINARY, CallError, ask_once, socket_folder
 
 _VIEWS = (
     "alarms", "authority", "calibration", "clusters", "emergency", "events", "field", "flights",
@@ -21,6 +21,8 @@ _VIEWS = (
 )  # fmt: skip
 #: Calls of the socket for emergencies.
 _URGENT = ("order_emergency", "stow", "defocus")
+#: First frame of a caller without a token.
+_USER: dict[str, Any] = {"user": True}
 #: Calls by the method and the path of their request.
 _CALLS = {
     **{("GET", view): view for view in _VIEWS},
@@ -60,13 +62,15 @@ class AtPlant:
     Parameters
     ----------
     token
-        API token.
+        API token; "": none, which the plant's own user and root need not have to see the plant and
+        to give EMERGENCY, DEFOCUS and STOW.
     data
         Data folder of the plant.
     """
 
     def __init__(self, token: str, data: Path) -> None:
-        self._hello, self._folder = {"token": token}, socket_folder(data)
+        self._hello: dict[str, Any] = {"token": token} if token else _USER
+        self._folder = socket_folder(data)
 
     def __enter__(self) -> "AtPlant":
         return self
@@ -101,8 +105,13 @@ class AtPlant:
             blob = array("d", [x for point in points.values() for x in point]).tobytes()
         if call == "take_flight":
             given, blob = {}, json.dumps(given).encode()
-        socket = EMERGENCY if call in _URGENT else ORDINARY
-        return ask_once(self._folder / socket, self._hello, call, given, blob)
+        if call not in _URGENT:
+            return ask_once(self._folder / ORDINARY, self._hello, call, given, blob)
+        try:
+            return ask_once(self._folder / EMERGENCY, self._hello, call, given)
+        except CallError:
+            # A token that has expired, or of a viewer, must not stop an emergency.
+            return ask_once(self._folder / EMERGENCY, _USER, call, given)
 
     def get(self, path: str) -> Any:
         """Return the view of a path."""

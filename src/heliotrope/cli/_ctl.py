@@ -40,7 +40,8 @@ def _where(
         typer.Option(
             envvar="HELIOTROPE_PLANT",
             help="Data folder of a plant on this machine: speak to the plant itself, without its "
-            "console, as the plant's user or root.",
+            "console, as the plant's user or root; EMERGENCY, DEFOCUS, STOW and views need no "
+            "token.",
             show_default=False,
         ),
     ] = None,
@@ -76,15 +77,16 @@ def _client(context: typer.Context) -> "Client | AtPlant":
             secret = file.read_text(encoding="utf-8").strip()
         except OSError as error:
             raise InputError(f"token file {file}: {error.strerror}") from None
-    if not secret:
-        raise InputError(
-            "ctl: no token; make one with `heliotrope ctl token LABEL`, then set HELIOTROPE_TOKEN "
-            "or give --token-file"
-        )
     if data is not None:
         from heliotrope.cli._at_plant import AtPlant
 
         return AtPlant(secret, data)
+    if not secret:
+        raise InputError(
+            "ctl: no token; make one with `heliotrope ctl token LABEL`, then set HELIOTROPE_TOKEN "
+            "or give --token-file; on the plant's computer EMERGENCY, DEFOCUS and STOW need none: "
+            "give --data with its data folder"
+        )
     from heliotrope.console.client import Client
 
     return Client(secret, url)

@@ -40,6 +40,48 @@ def check(
         raise typer.Exit(2)
 
 
+@app.command()
+def safety(
+    file: Annotated[Path, typer.Argument(help="Plant file (TOML).")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Print the numbers of the safety table that a plant may set, with defaults and ranges.
+
+    An asterisk marks those that the tables [safety.CONDITION] of its file change.
+    """
+    from heliotrope.field.formats import plant_file
+    from heliotrope.safety import CONDITIONS, limited, settings_of
+
+    given = plant_file.read_plant(file).safety
+    found = [
+        {
+            "condition": row.name,
+            "key": key,
+            "value": one.shown(row),
+            "default": one.shown(usual),
+            "low": one.low,
+            "high": one.high,
+            "changed": getattr(row, one.number) != getattr(usual, one.number),
+        }
+        for row, usual in zip(limited(CONDITIONS, given), CONDITIONS, strict=True)
+        for key, one in settings_of(usual).items()
+        if one.main
+    ]
+    if as_json:
+        print_json(found)
+        return
+    rows = [
+        (
+            f"{one['condition']}.{one['key']}{'*' if one['changed'] else ''}",
+            f"{one['value']:g}",
+            f"{one['default']:g}",
+            f"{one['low']:g} to {one['high']:g}",
+        )
+        for one in found
+    ]
+    print_table(("number", "in force", "default", "range"), rows)
+
+
 Plant = Annotated[Path, typer.Argument(help="Plant file (TOML).")]
 Note = Annotated[str, typer.Option(help="Reason, kept with the stored version.")]
 _RUNNING = (

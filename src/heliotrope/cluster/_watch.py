@@ -14,6 +14,7 @@ from heliotrope.safety import (
     Action,
     Alarm,
     Condition,
+    Limits,
     Reading,
     SafetyState,
     Watcher,
@@ -22,6 +23,7 @@ from heliotrope.safety import (
     conditions,
     decision,
     evaluate,
+    limited,
     start,
     watched_by,
 )
@@ -75,6 +77,8 @@ class Watch:
         Where alarms go.
     now, present
         Monotonic time, s, and the time that the next second's is compared with.
+    limits
+        Numbers of the safety table that the plant sets.
     line
         Returns whether current flows in the emergency line; None: there is no line.
 
@@ -95,10 +99,11 @@ class Watch:
         reports: Reports,
         now: float,
         present: Time,
+        limits: Limits,
         line: Callable[[], bool] | None = None,
     ) -> None:
         self._cluster, self._longest, self._line = cluster, longest_autonomy, line
-        self._reports = reports
+        self._reports, self._limits = reports, limits
         self._autonomy = 0.0
         self._state: SafetyState = start(self._table(), now)
         self._lease: Reading | None = None
@@ -110,7 +115,7 @@ class Watch:
         self.runs = Runs()
 
     def _table(self) -> tuple[Condition, ...]:
-        rows = watched_by(conditions(self._autonomy), Watcher.CLUSTER)
+        rows = watched_by(limited(conditions(self._autonomy), self._limits), Watcher.CLUSTER)
         return tuple(row for row in rows if self._line is not None or row.name != _LINE)
 
     # -- the lease -------------------------------------------------------------------------

@@ -1,11 +1,12 @@
 """Configuration of a cluster controller: site, heliostats, limits. Read by `config_file`."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.lcu import wire
 from heliotrope.links.common_settings import CommonSettings
+from heliotrope.safety import CONDITIONS, Limits, Watcher, limited, watched_by
 from heliotrope.sun import Site
 
 #: The number of unit loads that RS485 carries.
@@ -75,6 +76,8 @@ class ClusterConfig:
     longest_autonomy
         Longest autonomy that the plant may grant, in s. Above 0 only where a hard-wired emergency
         line reaches this cluster.
+    limits
+        Numbers of the safety table that this plant sets for the rows that clusters watch.
     phase
         Delay of each second after that of GPS, in s, 0 to below 1. Where one process runs
         many clusters, see `spread_phase`.
@@ -94,9 +97,11 @@ class ClusterConfig:
     silence: float = CommonSettings.silence
     longest_autonomy: float = 0.0
     phase: float = 0.0
+    limits: Limits = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         at = f"cluster {self.name!r}"
+        limited(watched_by(CONDITIONS, Watcher.CLUSTER), self.limits)
         if not self.name:
             raise InputError(f"{at}: it has no name; give one")
         if not 1 <= len(self.heliostats) <= MOST_MEMBERS:
@@ -125,7 +130,7 @@ class ClusterConfig:
     @property
     def common(self) -> CommonSettings:
         """The settings that all clusters should share."""
-        return CommonSettings(self.steps_every, self.silence, self.site.delta_t)
+        return CommonSettings(self.steps_every, self.silence, self.site.delta_t, self.limits)
 
     def member(self, name: str) -> Member:
         """Return a heliostat by its name.

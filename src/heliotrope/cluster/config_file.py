@@ -16,6 +16,7 @@ from heliotrope.links.addresses import Table, check_encryption, url_parts
 from heliotrope.links.bus_key_file import read_bus_keys
 from heliotrope.links.common_settings import CommonSettings
 from heliotrope.links.keys import HELIOSTATS, BrokerPassword, KeyRing, Keys
+from heliotrope.safety import Limits
 from heliotrope.sun import Site
 
 _CHRONY = "chronyd now keeps the computer's clock"
@@ -128,6 +129,19 @@ class SafetyTable(Table):
     emergency_line: str = Field(
         "", description="File whose first byte is 1 while current flows in the line (GPIO)."
     )
+    bus_errors: dict[str, float] = Field(
+        default_factory=dict, description="Numbers of this condition, as in the plant file."
+    )
+    bus_failed: dict[str, float] = Field(default_factory=dict, description="The same.")
+    clock_jump: dict[str, float] = Field(default_factory=dict, description="The same.")
+    time_source_lost: dict[str, float] = Field(default_factory=dict, description="The same.")
+    holdover_exhausted: dict[str, float] = Field(default_factory=dict, description="The same.")
+
+    @property
+    def limits(self) -> Limits:
+        """The numbers by condition."""
+        given = ("emergency_line", "longest_autonomy_s")
+        return self.model_dump(exclude_defaults=True, exclude=set(given))
 
 
 class MemberTable(Table):
@@ -299,6 +313,7 @@ def _install(
         silence=polling.silence_s,
         phase=polling.phase_s,
         longest_autonomy=document.safety.longest_autonomy_s,
+        limits=document.safety.limits,
     )
     bus_key_file = path.parent / document.bus_key if document.bus_key else None
     line = document.safety.emergency_line

@@ -102,7 +102,9 @@ class Cluster:
         goals = Goals(reports)
         recorded = RecordedBus(bus, clock)
         self._exchange = Exchange(recorded, clock, config.answer, config.stored_answer)
-        self._watch = Watch(config.name, config.longest_autonomy, reports, now, present, line)
+        self._watch = Watch(
+            config.name, config.longest_autonomy, reports, now, present, config.limits, line
+        )
         epoch = Epoch(kept, self._exchange, reports, present)
         emergencies = Emergencies(self.nodes, self._exchange, goals, reports, clock.monotonic)
         self._bus_keys = BusKeys(

@@ -21,6 +21,7 @@ from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Calibrated, Mechanism, join_mechanisms
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
+from heliotrope.safety import CONDITIONS, Limits, limited
 from heliotrope.sun import Site, check_site
 from heliotrope.values import Card, Value, amount, dots
 
@@ -55,6 +56,8 @@ class Plant(Value, Framed):
         alone.
     receiver_visits
         How heliostats in production are measured on the receiver; None: they are not.
+    safety
+        Numbers of the safety table that this plant sets; see `safety.limits`.
     """
 
     name: str
@@ -68,9 +71,11 @@ class Plant(Value, Framed):
     eyes: Mapping[str, FloatArray] = field(default_factory=dict)
     joint_visits: JointSettings | None = field(default_factory=JointSettings)
     receiver_visits: ReceiverSettings | None = None
+    safety: Limits = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_site(self.site)
+        limited(CONDITIONS, self.safety)
         seen: dict[str, str] = {}
         for group, heliostats in self.groups.items():
             for name in heliostats.names:

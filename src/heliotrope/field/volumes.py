@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import InputError
+from heliotrope.errors import InputError, once
 from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray, as_float, as_vectors
 
@@ -122,7 +122,8 @@ def around(receiver: Receiver, room: float) -> Volume:
 
     An external cylinder is held by a cylinder, every other aperture by the ball about its centre.
     """
-    name = f"receiver {receiver.name}"
+    name = once(f"receiver {receiver.name}")
+    name = "the receiver" if name == "receiver" else name
     if receiver.kind == "external_cylinder":
         half = np.array([0.0, 0.0, 0.5 * receiver.height + room])
         ends = receiver.center - half, receiver.center + half

@@ -4,10 +4,10 @@ The plant computes the same checksum from what it is told, and compares.
 """
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from zlib import crc32
 
-from heliotrope.safety import Watcher, conditions, watched_by
+from heliotrope.safety import Limits, Watcher, conditions, limited, watched_by
 
 #: What a row of the safety table does; its texts may differ between editions of the program.
 _ROW = ("trips", "releases", "delay", "clear_for", "stale_after", "then_stow", "act", "scope")
@@ -25,11 +25,14 @@ class CommonSettings:
         Time without an answer after which a heliostat is reported, in s.
     delta_t
         TT − UT1, in s; None: from the date.
+    limits
+        Numbers of the safety table that the plant sets; only rows that clusters watch count.
     """
 
     steps_every: int = 1
     silence: float = 10.0
     delta_t: float | None = None
+    limits: Limits = field(default_factory=dict)
 
 
 def settings_checksum(common: CommonSettings) -> str:
@@ -50,9 +53,9 @@ def settings_checksum(common: CommonSettings) -> str:
         "silence_s": common.silence,
         "steps_every_s": common.steps_every,
     }
-    for row in watched_by(conditions(), Watcher.CLUSTER):
+    for row in watched_by(limited(conditions(), common.limits), Watcher.CLUSTER):
         fields = dataclasses.asdict(row)
-        values |= {f"{row.name}.{field}": fields[field] for field in _ROW}
+        values |= {f"{row.name}.{name}": fields[name] for name in _ROW}
     lines = (f"{name}={_text(value)}\n" for name, value in sorted(values.items()))
     return f"{crc32(''.join(lines).encode('ascii')):08x}"
 

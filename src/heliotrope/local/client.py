@@ -56,7 +56,8 @@ class LocalConnection:
     path
         Socket of the plant.
     hello
-        First frame: ``{"key": ...}`` or ``{"token": ...}``.
+        First frame: ``{"key": ...}``, ``{"token": ...}``, or ``{"user": True}``, which rests on the
+        user of this process alone.
     timeout
         Limit for connecting and for each answer, s.
     """
@@ -180,7 +181,10 @@ def ask_once(
             return value_of(_receive(raw))
     except (OSError, EOFError, FrameError) as error:
         why = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise AwayError(f"the plant at {path} does not answer ({why}); is it running?") from None
+        raise AwayError(
+            f"the plant at {path} does not answer ({why}); is it running, and is this its own user "
+            "or root?"
+        ) from None
 
 
 def _receive(raw: socket.socket) -> Frame:

@@ -28,7 +28,7 @@ from heliotrope.local.frames import (
     pack,
     read_frame,
 )
-from heliotrope.local.sockets import is_ours, listen
+from heliotrope.local.sockets import listen, user_of
 
 _LOG = logging.getLogger(__name__)
 #: Bytes of answers that wait in a connection before its requests do.
@@ -106,7 +106,8 @@ class LocalServer(Generic[C]):
     path
         Socket, in a folder made by `sockets.make_folder`.
     caller
-        Returns who sends the first frame of a connection; None refuses it.
+        Returns who sends the first frame of a connection, given that frame and the user of the
+        process, which is the plant's or root; None refuses it.
     answer
         Returns value and blob of the answer to a request.
     kinds
@@ -120,7 +121,7 @@ class LocalServer(Generic[C]):
     def __init__(
         self,
         path: Path,
-        caller: Callable[[dict[str, Any]], Awaitable[C | None]],
+        caller: Callable[[dict[str, Any], int], Awaitable[C | None]],
         answer: Callable[[C, Frame], Awaitable[tuple[Any, bytes]]],
         kinds: Callable[[HeliotropeError], Problem],
         blob: Callable[[C, dict[str, Any]], bool],
@@ -156,11 +157,12 @@ class LocalServer(Generic[C]):
                     await asyncio.sleep(self._limits.pace_s)
                     with contextlib.suppress(OSError):  # too many open files: it waits
                         peer, _ = await loop.sock_accept(self._listener)
-                        if is_ours(peer):
-                            self._taken.add(peer)
-                            group.create_task(self._serve(peer))
-                        else:
+                        user = user_of(peer)
+                        if user is None:
                             peer.close()
+                        else:
+                            self._taken.add(peer)
+                            group.create_task(self._serve(peer, user))
         finally:
             self.close()
 
@@ -173,13 +175,13 @@ class LocalServer(Generic[C]):
         while self._taken:
             self._taken.pop().close()
 
-    async def _serve(self, connection: socket.socket) -> None:
+    async def _serve(self, connection: socket.socket, user: int) -> None:
         self._taken.discard(connection)
         reader, writer = await asyncio.open_unix_connection(sock=connection, limit=_BUFFER)
         peer = _Peer(writer)
         _place(self._strangers, peer, self._limits.strangers)
         try:
-            caller = await self._known(reader, peer)
+            caller = await self._known(reader, peer, user)
             if caller is not None:
                 await self._talk(reader, peer, caller)
         except (HeliotropeError, EOFError, OSError, TimeoutError):
@@ -193,11 +195,11 @@ class LocalServer(Generic[C]):
                     pool.remove(peer)
             peer.cut()
 
-    async def _known(self, reader: asyncio.StreamReader, peer: _Peer) -> C | None:
+    async def _known(self, reader: asyncio.StreamReader, peer: _Peer, user: int) -> C | None:
         """Return the caller, None if the connection is refused."""
         async with asyncio.timeout(self._limits.hello_s):
             hello = await read_frame(reader, HELLO_HEAD, 0)
-            caller = await self._caller(hello.head)
+            caller = await self._caller(hello.head, user)
         if caller is None:
             refusal = {"id": 0, "error": "refused", "text": "the key or token is not valid"}
             await peer.write(pack(refusal), self._limits.answer_s)

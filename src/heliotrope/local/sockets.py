@@ -103,7 +103,7 @@ def connect(path: Path, timeout: float) -> socket.socket:
                     if time.monotonic() > until:
                         raise
                     time.sleep(_AGAIN)
-        if os.getuid() and not is_ours(made):
+        if os.getuid() and user_of(made) is None:
             raise PermissionError(errno.EACCES, "another user listens there")
     except BaseException:
         made.close()
@@ -111,11 +111,14 @@ def connect(path: Path, timeout: float) -> socket.socket:
     return made
 
 
-def is_ours(peer: socket.socket) -> bool:
-    """Whether the process at the other end belongs to this user or to root."""
+def user_of(peer: socket.socket) -> int | None:
+    """Return the user of the process at the other end: this one or root; None for any other.
+
+    The kernel vouches for it (SO_PEERCRED).
+    """
     try:
         data = peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     except OSError:
-        return False
-    _, user, _ = _CREDENTIALS.unpack(data)
-    return user in (os.getuid(), 0)
+        return None
+    user = int(_CREDENTIALS.unpack(data)[1])
+    return user if user in (os.getuid(), 0) else None

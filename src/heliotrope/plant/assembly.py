@@ -20,6 +20,7 @@ from heliotrope.lcu import states
 from heliotrope.links.link import running
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.assigned import rest_on
+from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
@@ -39,7 +40,8 @@ from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.neighbours import Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.settings import Centring, CycleSettings
-from heliotrope.safety import alarms
+from heliotrope.safety import CONDITIONS, Severity, alarms, differences, limited, numbers
+from heliotrope.store.records import StoreError
 
 #: A calibration that removes the errors of a quick installation.
 CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model="auto")
@@ -47,6 +49,8 @@ CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model="auto")
 SILENT = 10.0
 #: Period of reading the sensors, s.
 _SENSED = 0.5
+#: The audit has changed limits in this name.
+_PLANT_FILE = Person("plant file", Role.ENGINEER)
 #: States from which no order leads to stow: people have to see to the heliostat.
 _STUCK = (states.FAULT, states.LOCKED, states.UNCONFIGURED)
 
@@ -155,6 +159,7 @@ class PlantAssembly:
             joint=joint,
             receiver=receiver,
         )
+        self._record_limits()
         if chosen.machines is not MachineTables.UNKNOWN:
             self._rest_on_machines()
         if chosen.machines is MachineTables.WRITTEN:
@@ -164,6 +169,23 @@ class PlantAssembly:
     def names(self) -> tuple[str, ...]:
         """The heliostats, in the order of the plant's field."""
         return self.plant.field.names
+
+    def _record_limits(self) -> None:
+        """Record which numbers of the safety table differ from those of the run before.
+
+        At the first run they are compared with the defaults.
+        """
+        if self.ports.records is None:
+            return
+        now = numbers(limited(CONDITIONS, self.design.safety))
+        try:
+            before = self.ports.records.exchange_limits(now) or numbers(CONDITIONS)
+        except StoreError as error:
+            self.logbook.take_alarm(alarms.RECORDS.raised(problem=error))
+            return
+        for line in differences(before, now):
+            self.logbook.event("safety", "limits", line, Severity.WARNING)
+            self.plant.note(_PLANT_FILE, "LIMITS", line)
 
     def _seen(self, cameras: Cameras) -> list[str]:
         return [target.name for target in self.design.targets if cameras.sees(target.name)]

@@ -67,7 +67,7 @@ from heliotrope.plant.rivals import Rivals
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.told_alarms import ToldAlarms
-from heliotrope.safety import Act, Alarm, Condition, alarms, conditions
+from heliotrope.safety import Act, Alarm, Condition, alarms, conditions, limited
 from heliotrope.sun import fast_vector
 
 #: An equal safe order of the same person within this time joins the one before, s.
@@ -102,7 +102,7 @@ class PlantController:
     assigned
         Store of aims and standby points that outlives a restart; None: they are not kept.
     table
-        Rows of the safety table; None: the defaults at the autonomy of the settings.
+        Rows of the safety table; None: those of the design at the autonomy of the settings.
     entropy
         Source of random bytes for tokens and identities.
     on_alarm
@@ -213,7 +213,8 @@ class PlantController:
 
     def _guarded(self, table: Iterable[Condition] | None) -> Sentinel:
         """Return the sentinel, with the plant's own readings of the safety table."""
-        rows = conditions(self.settings.autonomy) if table is None else table
+        if table is None:
+            table = limited(conditions(self.settings.autonomy), self.design.safety)
         readings = PlantReadings(
             self.field,
             self.authority,
@@ -225,7 +226,7 @@ class PlantController:
         return Sentinel(
             self.clock,
             TableWatch(
-                rows,
+                table,
                 readings,
                 self.field.clusters,
                 self.settings.sensors | self.settings.given,

@@ -9,13 +9,41 @@
     └── RefusedError          a command that is not accepted; nothing was sent
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from heliotrope.errors import HeliotropeError
+from heliotrope.errors import HeliotropeError, once
+
+#: Heliostats with one reason that are named; of more, their number is.
+_NAMED = 3
 
 
 class RefusedError(HeliotropeError):
     """A command that is not accepted; nothing was sent and nothing moves."""
+
+
+def by_reason(reasons: Mapping[str, str], most: int = 3) -> str:
+    """Return the reasons of heliostats in one line, each once, with the number that it stops.
+
+    Parameters
+    ----------
+    reasons
+        By heliostat.
+    most
+        Reasons that are written out, those of most heliostats first.
+    """
+    groups: dict[str, list[str]] = {}
+    for name, text in reasons.items():
+        groups.setdefault(text, []).append(name)
+    ordered = sorted(groups.items(), key=lambda group: -len(group[1]))
+    parts = [f"{_several(names)}: {text}" for text, names in ordered[:most]]
+    if left := sum(len(names) for _, names in ordered[most:]):
+        parts.append(f"{left} more for other reasons")
+    return "; ".join(parts)
+
+
+def _several(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) <= _NAMED else f"{len(names):,} heliostats"
 
 
 @dataclass(frozen=True)
@@ -41,7 +69,7 @@ class Refusal:
 
     def error(self, **fields: object) -> RefusedError:
         """Return the error to be raised; ``fields`` complete its text."""
-        return RefusedError(self.text.format(**fields))
+        return RefusedError(once(self.text.format(**fields)))
 
 
 ROLE_TOO_LOW = Refusal(
@@ -59,7 +87,7 @@ NO_AUTHORITY = Refusal(
 OTHER_AUTHORITY = Refusal(
     "another's command authority",
     "Another person has the command authority, or the token is of an earlier grant.",
-    "command authority: {holder} has it, not {person} with this token; take it first",
+    "command authority: {holder} has it, so nothing was sent for {person}; take command first",
     "Ask the holder to give it back, or break it with a reason.",
 )
 AUTHORITY_HELD = Refusal(
@@ -186,9 +214,10 @@ AIM_NOT_TAKEN = Refusal(
 PLACE_UNKNOWN = Refusal(
     "place unknown",
     "Where there are keep-out volumes: a heliostat is ordered to standby, moved by counts (JOG, "
-    "GOTO, DIAGNOSE) or given a standby point, and has told nothing since the last order that "
-    "moved it; or is sent to its aim and has told nothing since its DEFOCUS or STOW; or is silent.",
-    "no report tells where it is now, so its way is not proven",
+    "GOTO, DIAGNOSE) or given a standby point, and has reported nothing since the last order "
+    "that moved it; or is sent to its aim and has reported nothing since its DEFOCUS or STOW; or "
+    "is silent.",
+    "no report shows where it is now, so its path is not proven",
     "Try again in two seconds; if it stays silent, see to its cluster or its supply. DEFOCUS and "
     "STOW are accepted at once.",
 )
@@ -196,7 +225,7 @@ STILL_MOVING = Refusal(
     "still moving",
     "Where there are keep-out volumes: a heliostat on its way is ordered to standby, or given "
     "another standby point on its way there.",
-    "it is still moving, so its way to standby is not proven",
+    "it is still moving, so its path to standby is not proven",
     "Wait until it stands, then order it again. DEFOCUS and STOW are accepted at once.",
 )
 SEEN_ASTRAY = Refusal(
@@ -240,7 +269,8 @@ FLIGHT_KNOWN = Refusal(
 FLIGHT_CONTRADICTS = Refusal(
     "flight contradicts the field",
     "The orientations of most mirrors of a flight cannot be theirs.",
-    "flight {name}: {wrong} of {all} mirrors cannot stand so, first {first}; nothing was taken",
+    "flight {name}: {wrong} of {all} mirrors cannot stand like that, first {first}; nothing was "
+    "taken",
     "Check that the flight is of this field, its times and counts, and the position of the RTK "
     "base.",
 )

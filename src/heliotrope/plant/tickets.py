@@ -8,6 +8,7 @@ import numpy as np
 
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.messages import Stage
+from heliotrope.plant.refusals import by_reason
 
 #: Waiting in the plant, then the stages in order; from FINAL on a stage is final.
 WAITING = 0
@@ -136,11 +137,10 @@ class Ticket:
 
     @property
     def text(self) -> str:
-        """One line: the number at each stage, and the first reasons."""
+        """One line: the number at each stage, and the reasons of most heliostats."""
         parts = ", ".join(f"{n} {word}" for word, n in self.counted().items())
-        why = "; ".join(f"{name}: {text}" for name, text in list(self.refusals.items())[:3])
-        more = f"; and {len(self.refusals) - 3} more" if len(self.refusals) > 3 else ""
-        return f"{self.name}: {parts}" + (f" ({why}{more})" if why else "")
+        why = by_reason(self.refusals)
+        return f"{self.name}: {parts}" + (f" ({why})" if why else "")
 
     async def reached(self, stage: Stage, timeout: float = math.inf) -> bool:
         """Wait until every heliostat is at a stage or has ended; False if one did not get there.

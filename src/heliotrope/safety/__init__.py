@@ -2,6 +2,7 @@
 
 Begin with `CONDITIONS`, the rows of the table, and `evaluate`, which turns readings and time into
 the actions that are demanded. `Proof` records that every heliostat obeyed an emergency order.
+`limited` gives the table with the numbers that a plant sets for its site.
 `JoinLimiter` bounds the rate at which heliostats join the receiver. `Alarm` is a message to people,
 and `heliotrope.safety.alarms` lists every kind of alarm beside the rows.
 
@@ -23,7 +24,6 @@ from heliotrope.safety.evaluation import (
     Action,
     SafetyState,
     acknowledge,
-    adjusted,
     decision,
     evaluate,
     narrowed,
@@ -31,6 +31,7 @@ from heliotrope.safety.evaluation import (
     watched_by,
 )
 from heliotrope.safety.joining import JoinLimiter
+from heliotrope.safety.limits import Limits, differences, limited, numbers, settings_of
 from heliotrope.safety.proof import (
     DEFOCUS_BUDGET,
     FLUX_READING,
@@ -56,6 +57,7 @@ __all__ = [
     "Condition",
     "FluxProof",
     "JoinLimiter",
+    "Limits",
     "Proof",
     "ProofReport",
     "Reading",
@@ -64,12 +66,15 @@ __all__ = [
     "Severity",
     "Watcher",
     "acknowledge",
-    "adjusted",
     "conditions",
     "decision",
+    "differences",
     "evaluate",
+    "limited",
     "narrowed",
+    "numbers",
     "proof_readings",
+    "settings_of",
     "start",
     "watched_by",
 ]

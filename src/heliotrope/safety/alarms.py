@@ -8,6 +8,7 @@ table and the rows of `safety.conditions`.
 from dataclasses import dataclass
 from typing import ClassVar
 
+from heliotrope.errors import once
 from heliotrope.safety.condition import Severity, Watcher
 
 _PLANT, _CLUSTER = Watcher.PLANT, Watcher.CLUSTER
@@ -72,7 +73,7 @@ class AlarmKind:
 
     def line(self, **fields: object) -> str:
         """Return the whole text: what is wrong, what happens by itself, what to do."""
-        return f"{self.text.format(**fields)}. {self.consequence} {self.remedy}"
+        return f"{once(self.text.format(**fields))}. {self.consequence} {self.remedy}"
 
     def raised(self, subject: str = "", *, worse: bool = False, **fields: object) -> Alarm:
         """Return the alarm about a subject; ``fields`` complete its text."""
@@ -84,7 +85,7 @@ class AlarmKind:
         text = (self.over or "{subject} {name}: over").format(
             subject=subject, name=self.name, **fields
         )
-        return Alarm(self.name, subject, self.severity, text.strip(), active=False)
+        return Alarm(self.name, subject, self.severity, once(text.strip()), active=False)
 
 
 TIME_WENT_BACK = AlarmKind(
@@ -147,9 +148,9 @@ SETTINGS_DIFFER = AlarmKind(
     "expects, or where it expects none, from those of most other clusters.",
     "cluster {subject}: its settings differ from those of {others}",
     "It goes on with its own settings.",
-    "Compare [polling] of its cluster file with that of the plant's links file, delta_t_s with "
-    "that of the plant file, and the versions of the two programs; correct the wrong one and "
-    "restart its program.",
+    "Compare [polling] of its cluster file with that of the plant's links file, delta_t_s and "
+    "[safety] with those of the plant file, and the versions of the two programs; correct the "
+    "wrong one and restart its program.",
     over="cluster {subject}: its settings are no longer known to differ",
 )
 CONSOLE = AlarmKind(
@@ -379,7 +380,7 @@ SUN_JUMPED = AlarmKind(
     "{subject}: its cluster sent a sun that cannot follow from the one before",
     "It refused that sun, or took it after a lapse; if it was tracking, it has turned away.",
     "Check the clock, the time source and the site of the cluster.",
-    over="{subject}: a minute ago; another jump shows only after its local controller is restarted",
+    over="{subject}: no jump for a minute; another shows only once its local controller restarts",
 )
 PLANT_UNINTELLIGIBLE = AlarmKind(
     "plant_unintelligible",

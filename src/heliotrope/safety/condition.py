@@ -136,6 +136,9 @@ class Condition:
         Condition of its end, in words.
     remedy
         What the operator should do: a sentence.
+    site
+        Lowest and highest ``trips`` that a plant may set, in the reading's unit; None: no number of
+        the row is a plant's. See `limits`.
     """
 
     name: str
@@ -159,6 +162,7 @@ class Condition:
     role: AcknowledgeRole | None = None
     release: str = ""
     remedy: str = ""
+    site: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         at = f"condition {self.name}"

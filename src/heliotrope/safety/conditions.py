@@ -1,7 +1,8 @@
 """The rows of the safety table.
 
-The numbers are defaults, to be adjusted to the receiver, the mirrors and the weather of a plant.
-The wind limits are common for heliostats of tens of square metres; replace them by the maker's.
+The numbers are defaults. A plant sets those of a row with ``site`` for its receiver, its mirrors
+and its weather (`limits`); the ranges are ours. The wind limits are common for heliostats of tens
+of square metres; replace them by the maker's.
 """
 
 import math
@@ -71,8 +72,8 @@ def _orders() -> tuple[Condition, ...]:
         Condition(
             "nodes_unacknowledged", _PLANT, "nodes_unacknowledged", "count",
             "number of heliostats that have not acknowledged the emergency order",
-            "{value} heliostats have not acknowledged the emergency order", 1.0, 0.0, _DEFOCUS,
-            _FIELD, _EMERGENCY, 30.0, then_stow=_PATIENCE, role=_OPERATOR,
+            "heliostats that have not acknowledged the emergency order: {value}", 1.0, 0.0,
+            _DEFOCUS, _FIELD, _EMERGENCY, 30.0, then_stow=_PATIENCE, role=_OPERATOR,
             release="every heliostat has acknowledged, or the emergency is over",
             remedy="The EMERGENCY banner names them. Assume that their beams have not moved; keep"
             " people away, and inspect each of them.",
@@ -84,7 +85,7 @@ def _orders() -> tuple[Condition, ...]:
             0.10, 0.08, _STOW, _FIELD, _EMERGENCY, 300.0, role=_SUPERVISOR,
             release="the flux is gone, or the emergency is over",
             remedy="Look at the receiver from a safe place; find the heliostats whose beams are"
-            " still on it.",
+            " still on it.", site=(0.01, 0.10),
         ),
         Condition(
             "authority_lost", _PLANT, "authority_silence", "s",
@@ -105,6 +106,7 @@ def _receiver() -> tuple[Condition, ...]:
             1.0, 0.9, _DEFOCUS, _FIELD, _EMERGENCY, 30.0, delay=1.0, stale_after=5.0,
             clear_for=10.0, role=_OPERATOR, release="the flux is well below its limit",
             remedy="Let the receiver cool; return with fewer heliostats or other aim points.",
+            site=(0.5, 1.0),
         ),
         Condition(
             "receiver_temperature_high", _PLANT, "receiver_temperature", "share",
@@ -112,7 +114,7 @@ def _receiver() -> tuple[Condition, ...]:
             "temperature of the receiver is {value} of its limit", 1.0, 0.95, _DEFOCUS, _FIELD,
             _EMERGENCY, 30.0, delay=1.0, stale_after=5.0, clear_for=60.0, role=_OPERATOR,
             release="the temperature is well below its limit",
-            remedy="Check the flow first, then the aim points.",
+            remedy="Check the flow first, then the aim points.", site=(0.5, 1.0),
         ),
         Condition(
             "receiver_flow_low", _PLANT, "receiver_flow", "share",
@@ -120,7 +122,7 @@ def _receiver() -> tuple[Condition, ...]:
             "flow through the receiver is {value} of demand",
             0.8, 0.9, _DEFOCUS, _FIELD, _EMERGENCY, 30.0, delay=1.0, stale_after=3.0,
             clear_for=30.0, role=_OPERATOR, release="the flow is back",
-            remedy="Check pumps and valves before the field returns.",
+            remedy="Check pumps and valves before the field returns.", site=(0.5, 1.0),
         ),
         Condition(
             "receiver_camera_lost", _PLANT, "receiver_camera_silence", "s",
@@ -128,6 +130,7 @@ def _receiver() -> tuple[Condition, ...]:
             "no picture from the receiver camera for {value}",
             10.0, 5.0, _REFUSE, _FIELD, _SERIOUS, 15.0, ages=True, clear_for=10.0,
             release="pictures arrive again", remedy="Check the camera and its network.",
+            site=(6.0, 15.0),
         ),
     )  # fmt: skip
 
@@ -138,29 +141,31 @@ def _weather() -> tuple[Condition, ...]:
             "wind_gust_stow", _PLANT, "wind_gust", "m/s", "wind gust (3 s)",
             "wind gust of {value}", 20.0, 15.0, _STOW, _FIELD, _SERIOUS, 300.0, clear_for=600.0,
             release="gusts have dropped",
-            remedy="Wait; walk the field before heliostats leave stow.",
+            remedy="Wait; walk the field before heliostats leave stow.", site=(5.0, 30.0),
         ),
         Condition(
             "wind_gust_defocus", _PLANT, "wind_gust", "m/s", "wind gust (3 s)",
             "wind gust of {value}", 15.0, 12.0, _DEFOCUS, _FIELD, _WARNING, 30.0, delay=3.0,
             clear_for=600.0, release="gusts have dropped", remedy="Wait for the wind to drop.",
+            site=(4.0, 25.0),
         ),
         Condition(
             "wind_mean_stow", _PLANT, "wind_mean", "m/s", "mean wind (600 s)",
             "mean wind of {value}", 14.0, 11.0, _STOW, _FIELD, _SERIOUS, 300.0, clear_for=600.0,
             release="the wind has dropped",
-            remedy="Wait; walk the field before heliostats leave stow.",
+            remedy="Wait; walk the field before heliostats leave stow.", site=(4.0, 22.0),
         ),
         Condition(
             "wind_mean_defocus", _PLANT, "wind_mean", "m/s", "mean wind (600 s)",
             "mean wind of {value}", 11.0, 9.0, _DEFOCUS, _FIELD, _WARNING, 30.0,
             clear_for=600.0, release="the wind has dropped", remedy="Wait for the wind to drop.",
+            site=(3.0, 20.0),
         ),
         Condition(
             "sun_below_horizon", _PLANT, "sun_elevation", "rad", "elevation of the sun",
             "the sun is down: its elevation is {value}", 0.0, 0.035, _STOW, _FIELD, _INFO, 300.0,
             clear_for=60.0, stale_after=10.0, release="the sun is up",
-            remedy="Nothing to do.",
+            remedy="Nothing to do.", site=(0.0, math.radians(20.0)),
         ),
     )  # fmt: skip
 
@@ -195,6 +200,7 @@ def _links(autonomy: float) -> tuple[Condition, ...]:
             0.2, 0.05, _REFUSE, _BUS, _WARNING, 20.0, delay=5.0, clear_for=30.0,
             release="the bus is sound again",
             remedy="Check cable and termination; look for one controller that talks out of turn.",
+            site=(0.02, 0.5),
         ),
         Condition(
             "bus_failed", _CLUSTER, "bus_errors", "share", "bad frames on the bus within 10 s",
@@ -202,7 +208,7 @@ def _links(autonomy: float) -> tuple[Condition, ...]:
             0.9, 0.2, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=2.0,
             clear_for=30.0, release="the bus works again",
             remedy="Check the bus adapter and the cable; without the bus each heliostat defocuses"
-            " by itself within 6 s.",
+            " by itself within 6 s.", site=(0.3, 0.95),
         ),
         Condition(
             "sun_stale", _NODE, "sun_age", "s", "age of the sun vector",
@@ -223,7 +229,7 @@ def _time() -> tuple[Condition, ...]:
             2.0, 1.0, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=3.0,
             clear_for=10.0, release="the two times agree again",
             remedy="Check the clocks of both machines; if every cluster differs, the plant's is"
-            " wrong.",
+            " wrong.", site=(0.2, 2.0),
         ),
         Condition(
             "cluster_site_differs", _PLANT, "cluster_sun_off", "rad",
@@ -232,6 +238,7 @@ def _time() -> tuple[Condition, ...]:
             1e-3, 5e-4, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=3.0,
             clear_for=10.0, release="the two sites have the same sun",
             remedy="Correct the table [site] of the cluster file, or the site in the plant file.",
+            site=(1e-4, 1e-3),
         ),
         Condition(
             "clock_jump", _CLUSTER, "clock_step", "s",
@@ -240,6 +247,7 @@ def _time() -> tuple[Condition, ...]:
             0.5, 0.1, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, clear_for=10.0,
             role=_OPERATOR, release="the time agrees again",
             remedy="Check the time receiver and the clock; acknowledge when the time is right.",
+            site=(0.2, 0.5),
         ),
         Condition(
             "time_source_lost", _CLUSTER, "time_source_silence", "s",
@@ -247,6 +255,7 @@ def _time() -> tuple[Condition, ...]:
             60.0, 10.0, _ALARM, _BUS, _WARNING, 65.0, ages=True, clear_for=10.0,
             release="the time source is back; until then the cluster runs on its own clock",
             remedy="Check the antenna and the receiver before the holdover ends.",
+            site=(15.0, 65.0),
         ),
         Condition(
             "holdover_exhausted", _CLUSTER, "time_uncertainty", "s",
@@ -254,6 +263,7 @@ def _time() -> tuple[Condition, ...]:
             "the cluster's time is uncertain by {value}",
             1.0, 0.5, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, clear_for=10.0,
             release="the time is known again", remedy="Check the antenna and the receiver.",
+            site=(0.1, 1.0),
         ),
     )  # fmt: skip
 
@@ -265,12 +275,14 @@ def _power_and_records() -> tuple[Condition, ...]:
             "the UPS runs on battery: mains power is lost",
             0.5, 0.4, _DEFOCUS, _FIELD, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=5.0,
             clear_for=60.0, release="mains power is back", remedy="Check the mains supply.",
+            site=(0.5, 0.5),
         ),
         Condition(
             "ups_charge_low", _PLANT, "ups_charge", "share", "charge of the UPS",
             "charge of the UPS is {value}",
             0.5, 0.8, _STOW, _FIELD, _SERIOUS, 300.0, clear_for=60.0, stale_after=30.0,
             release="the UPS is charged", remedy="Restore the mains supply at once.",
+            site=(0.2, 0.9),
         ),
         Condition(
             "database_unwritable", _PLANT, "audit_silence", "s",
@@ -279,6 +291,7 @@ def _power_and_records() -> tuple[Condition, ...]:
             5.0, 2.0, _REFUSE, _FIELD, _SERIOUS, 10.0, ages=True, clear_for=5.0,
             release="writes are confirmed",
             remedy="Check the disk or the database; the alarm records gives the reason.",
+            site=(3.0, 10.0),
         ),
     )  # fmt: skip
 
@@ -290,9 +303,9 @@ def _mirrors() -> tuple[Condition, ...]:
             "beam in or heading for a keep-out volume",
             "its beam is in a keep-out volume or heading for one", 0.5, 0.4, _DEFOCUS, _HELIOSTAT,
             _SERIOUS, 30.0, then_stow=_PATIENCE, or_stow=True,
-            release="the beam and its way are clear",
+            release="the beam and its path are clear",
             remedy="Keep people out of the volume until the alarm is over; then give it another aim"
-            " point.",
+            " point.", site=(0.5, 0.5),
         ),
         Condition(
             "beam_unsent", _PLANT, "beam_unsent", "yes/no",
@@ -301,6 +314,7 @@ def _mirrors() -> tuple[Condition, ...]:
             _SERIOUS, 30.0, then_stow=10.0, or_stow=True, delay=5.0,
             release="the beam is off the receiver",
             remedy="If it stays, inspect the heliostat; to hold it, lock it at stow.",
+            site=(0.5, 0.5),
         ),
         Condition(
             "pointing_disagrees", _PLANT, "pointing_error", "rad",
@@ -309,7 +323,7 @@ def _mirrors() -> tuple[Condition, ...]:
             _HELIOSTAT, _SERIOUS, 30.0, delay=3.0, role=_OPERATOR,
             release="its step counts agree with its aim or standby point, or its beam is off",
             remedy="Check the parameters and the address of its local controller, and the time and"
-            " the site of its cluster; then acknowledge.",
+            " the site of its cluster; then acknowledge.", site=(1e-3, 5e-3),
         ),
         Condition(
             "pointing_disagrees_many", _PLANT, "pointing_errors", "count",
@@ -318,6 +332,7 @@ def _mirrors() -> tuple[Condition, ...]:
             _DEFOCUS, _FIELD, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=3.0, role=_OPERATOR,
             release="few heliostats disagree",
             remedy="Check the clock of the plant's machine and its site first, then the clusters.",
+            site=(1.0, 200.0),
         ),
         Condition(
             "node_faults", _PLANT, "node_fault_share", "share",
@@ -325,6 +340,7 @@ def _mirrors() -> tuple[Condition, ...]:
             "{value} of the heliostats failed within 600 s", 0.02, 0.01, _REFUSE, _FIELD,
             _WARNING, 20.0, delay=5.0, clear_for=60.0, role=_OPERATOR, release="few faults",
             remedy="Find what they share: a cluster, a supply, a firmware version.",
+            site=(0.002, 0.2),
         ),
         Condition(
             "node_faults_many", _PLANT, "node_fault_share", "share",
@@ -332,6 +348,7 @@ def _mirrors() -> tuple[Condition, ...]:
             "{value} of the heliostats failed within 600 s", 0.10, 0.05, _DEFOCUS, _FIELD,
             _SERIOUS, 30.0, delay=5.0, clear_for=60.0, role=_SUPERVISOR, release="few faults",
             remedy="Find at once what they share: a cluster, a supply, a firmware version.",
+            site=(0.01, 0.3),
         ),
     )  # fmt: skip
 

@@ -282,9 +282,15 @@ def _action(
     text = f"{row.name}{f' {subject}' if subject else ''}: {_said(row, after, now)}"
     if now - since >= 1.0 and not (row.ages or waits):
         text += f", for {now - since:.0f} s"
+    kind = row.scope.name.lower()
+    place = f"{kind} {subject}" if subject else f"the {kind}"
+    doing = {
+        Act.ALARM: f"nothing moves or stops in {place}",
+        Act.REFUSE_NEW: f"new motions of {place} are refused",
+    }.get(act, f"{row.ordered(act)} of {place}")
     if waits and row.role is not None:
-        text += f"; the cause has gone, {row.role.title} to acknowledge"
-    text += f"; {row.ordered(act)} {row.scope.name.lower()}{f' {subject}' if subject else ''}"
+        doing = f"the cause has gone; {doing} holds until an {row.role.title} acknowledges"
+    text += f"; {doing}"
     return Action(
         act,
         row.scope,
@@ -313,7 +319,8 @@ def _said(row: Condition, track: Track, now: float) -> str:
         return row.wrong.format(value=row.shown(counts)) + row.limit
     back = row.shown(row.releases)
     if row.safe(counts):
-        return f"{row.release}: {row.what} is {row.shown(counts)}, released at {back}"
+        level = f": {row.what} is {row.shown(counts)}, released at {back}"
+        return row.release + ("" if row.unit == "yes/no" else level)
     return f"{row.what} is {row.shown(counts)}, not yet back at {back}"
 
 
@@ -365,11 +372,22 @@ def acknowledge(
     if role < row.role:
         return state, f"{label}: {row.role.title} must acknowledge, not {role.title}"
     if not track.cleared:
-        return state, f"{label}: the cause has not gone: {_said(row, track, state.now)}"
+        return state, f"{label}: {_remains(row, track, state.now)}"
     released = replace(
         track, tripped_at=None, cleared=False, beyond_since=None, acknowledged_by=who.strip()
     )
     return replace(state, tracks={**state.tracks, (condition, subject): released}), ""
+
+
+def _remains(row: Condition, track: Track, now: float) -> str:
+    """Return why a row whose cause has not gone for long enough cannot be acknowledged."""
+    if not row.safe(_counting(row, track.value, track.seen, now)):
+        return f"the cause has not gone: {_said(row, track, now)}. {row.remedy}"
+    safe = 0.0 if track.safe_since is None else track.seen - track.safe_since
+    return (
+        f"{row.release}, and must stay so for {row.clear_for:g} s; acknowledge again in "
+        f"{math.ceil(max(row.clear_for - safe, 1.0))} s"
+    )
 
 
 def decision(actions: Iterable[Action], cluster: str = "", heliostat: str = "") -> Act | None:
@@ -385,28 +403,3 @@ def decision(actions: Iterable[Action], cluster: str = "", heliostat: str = "") 
 def watched_by(table: Iterable[Condition], watcher: Watcher) -> tuple[Condition, ...]:
     """Return the rows that a tier evaluates."""
     return tuple(row for row in table if row.watcher is watcher)
-
-
-def adjusted(table: Iterable[Condition], name: str, **changes: float) -> tuple[Condition, ...]:
-    """Return the table with some numbers of one row changed, such as ``trips`` and ``releases``.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such row, or a row has no such number.
-    InputError
-        If the changed row contradicts itself.
-    """
-    rows = tuple(table)
-    numbers = ("trips", "releases", "budget", "then_stow", "delay", "clear_for", "stale_after")
-    for change in changes:
-        if change not in numbers:
-            raise UnknownNameError("number of a condition", change, numbers)
-    names = [row.name for row in rows]
-    if name not in names:
-        raise UnknownNameError("condition", name, names)
-    k = names.index(name)
-    numeric: dict[str, float] = {key: float(value) for key, value in changes.items()}
-    # dataclasses.replace takes fields of several types; these are all floats.
-    changed = replace(rows[k], **numeric)  # type: ignore[arg-type]
-    return (*rows[:k], changed, *rows[k + 1 :])

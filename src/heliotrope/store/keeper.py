@@ -6,8 +6,9 @@ open for writing.
 """
 
 import asyncio
+import json
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -42,6 +43,8 @@ T = TypeVar("T")
 _NUMBERED = (tables.sighting, tables.visit, tables.hold, tables.event, tables.alarm)
 #: With more names than this a query reads all rows, which are then filtered.
 _MANY = 500
+#: Row of the table ``about`` with the numbers of the safety table in force.
+_LIMITS = "safety limits"
 
 
 class Keeper:
@@ -455,6 +458,19 @@ class Keeper:
     def holds(self, at: float) -> dict[str, Hold]:
         """Return the holds at a time, by heliostat."""
         return {n: h for n, h in self._holds.items() if h.until is None or at < h.until}
+
+    def exchange_limits(self, numbers: Mapping[str, float]) -> dict[str, float]:
+        """Keep the numbers of the safety table in force; return those of the run before, or {}."""
+        about = tables.about
+
+        def work(connection: Connection) -> str | None:
+            query = select(about.c.value).where(about.c.name == _LIMITS)
+            before: str | None = connection.scalar(query)
+            rows.replace(connection, about, [{"name": _LIMITS, "value": json.dumps(dict(numbers))}])
+            return before
+
+        before = self.do(work)
+        return {} if before is None else dict(json.loads(before))
 
     def do(self, work: Work[Any], timeout: float = 5.0) -> Any:
         """Do work in the writer and return its result; see `Writer.do`."""

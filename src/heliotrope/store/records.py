@@ -434,6 +434,10 @@ class Records(Protocol):
         """Return the holds at a time, by heliostat."""
         ...
 
+    def exchange_limits(self, numbers: Mapping[str, float]) -> dict[str, float]:
+        """Keep the numbers of the safety table in force; return those of the run before, or {}."""
+        ...
+
     async def confirm(self) -> None:
         """Wait until all earlier records are safe.
 

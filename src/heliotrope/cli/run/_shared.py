@@ -363,7 +363,7 @@ def line(live: PlantAssembly) -> str:
     if summary.alarms:
         parts.append(f"{summary.alarms} alarms")
     if summary.lag > 1.0:
-        parts.append(f"{summary.lag:.0f} s behind")
+        parts.append(f"simulated time {summary.lag:.0f} s late: this machine is too slow")
     return " | ".join(parts)
 
 

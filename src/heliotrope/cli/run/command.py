@@ -59,7 +59,8 @@ def run(
     start: Annotated[
         str,
         typer.Option(
-            help='Simulated start: ISO 8601, "now", or "morning" at the site.',
+            help="Simulated start: a day (its morning at the site), ISO 8601 with a time zone, "
+            '"now", or "morning" (of today).',
             rich_help_panel=_TWIN,
         ),
     ] = "morning",
@@ -288,11 +289,7 @@ def run(
         return
     if field is None:
         raise InputError("run: --clusters needs the plant file; give it before")
-    if speed != 1.0 or start != "morning" or seed or exact:
-        raise InputError(
-            "run: --speed, --start, --seed and --exact belong to the simulation; leave them out "
-            "with --clusters"
-        )
+    _only_real(speed=speed != 1.0, start=start != "morning", seed=bool(seed), exact=exact)
     design = open_plant(field)
     from heliotrope.cli.run.real import RealChoice, run_real
 
@@ -317,6 +314,18 @@ def _one_plant(
         raise InputError("run: --heliostats is for the default plant; leave it out with a field")
 
 
+def _only_real(**simulated: bool) -> None:
+    """Refuse options of a simulation, by name, for a real plant."""
+    from heliotrope.errors import InputError
+
+    given = ", ".join(f"--{name}" for name, there in simulated.items() if there)
+    if given:
+        raise InputError(
+            f"run: {given}: only in simulation; real clusters follow the sun of now, by the clocks "
+            "of their computers: leave it out, or leave out --clusters to simulate this plant"
+        )
+
+
 def _design(field: Path | None, heliostats: int | None, *, prototype: bool) -> "Plant":
     if field is not None:
         return open_plant(field)
@@ -330,10 +339,24 @@ def _design(field: Path | None, heliostats: int | None, *, prototype: bool) -> "
 
 
 def _start(text: str, design: "Plant") -> "datetime":
-    """Return the simulated start; "morning": three hours before noon at the site, today."""
-    from datetime import UTC, datetime, timedelta
+    """Return the simulated start; "morning", or of a day: three hours before noon at the site.
 
-    if text != "morning":
-        return parse_time(text).astimezone(UTC)
-    noon = datetime.now(UTC).replace(hour=12, minute=0, second=0, microsecond=0)
-    return noon - timedelta(hours=design.site.longitude_deg / 15.0 + 3.0)
+    Raises
+    ------
+    TimeError
+        No time, or one that local controllers cannot count: 32 bits of GPS seconds, from 1980.
+    """
+    from datetime import UTC, date, datetime, timedelta
+    from datetime import time as hour
+
+    from heliotrope.errors import TimeError
+
+    try:
+        day = datetime.now(UTC).date() if text == "morning" else date.fromisoformat(text)
+    except ValueError:
+        start, shift = parse_time(text), 0.0
+    else:
+        start, shift = datetime.combine(day, hour(12), UTC), design.site.longitude_deg / 15.0 + 3.0
+    if not 1981 <= start.year < 2100:
+        raise TimeError(f"run: --start {text}: give a time in the years 1981 to 2099")
+    return start.astimezone(UTC) - timedelta(hours=shift)

@@ -98,7 +98,7 @@ def _papers(outside: "_Outside", shown: Shown) -> "Papers":
 def _settings(
     design: Plant, choice: RealChoice, shown: Shown, outside: "_Outside"
 ) -> AssemblySettings:
-    common = replace(outside.links.common, delta_t=design.site.delta_t)
+    common = replace(outside.links.common, delta_t=design.site.delta_t, limits=design.safety)
     return AssemblySettings(
         plant=replace(shown.plant, given=outside.links.given, common=common),
         # A heliostat that a person gives to automatic control is calibrated too.

@@ -16,8 +16,8 @@ function map(box) {
   const all = h("button", { className: "hx-button", title: "Show the whole field (0)", onclick: () => store.emit("fit") }, "Whole");
   const none = h("button", { className: "hx-button", title: "Clear (Escape)", onclick: () => store.select([], -1) }, "Clear");
   const query = h("input", { type: "search", className: "hx-query", spellcheck: false, "aria-label": "Query",
-    placeholder: "state = TRACKING and error > 1", title: "Fields: state, error, measured (mrad), age (h), sightings, fault, cluster, name, on, east, north. Operators: = != < > <= >= ~ (pattern with *). Press / to type here." });
-  const run = () => { try { const rows = rowsWhere(query.value); store.select(rows, rows.length === 1 ? rows[0] : -1); say(`${count(rows.length)} heliostats match`); } catch (error) { say(error.message, true); } };
+    placeholder: "P0097A, or state = TRACKING and error > 1", title: "Names of heliostats (* for any letters), or conditions. Fields: state, error, measured (mrad), age (h), sightings, fault, cluster, name, on, east, north. Operators: = != < > <= >= ~ (pattern with *). Press / to type here." });
+  const run = () => { try { const rows = rowsWhere(query.value); store.select(rows, rows.length === 1 ? rows[0] : -1); say(rows.length === 1 ? `${store.field.names[rows[0]]} is selected` : `${count(rows.length)} heliostats match`); } catch (error) { say(error.message, true); } };
   query.addEventListener("keydown", (event) => { if (event.key === "Enter") run(); event.stopPropagation(); });
   const field = h("div", { className: "hx-map-field" });
   box.append(h("div", { className: "hx-tools" }, view, lasso, all, none, query, h("button", { className: "hx-button", onclick: run }, "Select")), field);
@@ -36,7 +36,7 @@ function head(box) {
     const now = store.head;
     if (!now) return;
     time.textContent = `${now.at.slice(0, 10)} ${now.at.slice(11, 19)} UTC`;
-    speed.textContent = now.extra?.speed && now.extra.speed !== 1 ? `×${now.extra.speed}` : now.lag > 2 ? `${span(now.lag)} behind` : "";
+    speed.textContent = now.extra?.speed && now.extra.speed !== 1 ? `×${now.extra.speed}` : now.lag > 2 ? `simulated time ${span(now.lag)} late` : "";
     sun.textContent = `☀ ${degrees(now.sun.azimuth, 0)}° ↑${degrees(now.sun.elevation, 0)}°`;
   };
   const mark = () => { live.textContent = store.live ? "● live" : "✕ NOT LIVE"; live.classList.toggle("bad", !store.live); document.body.classList.toggle("hx-dead", !store.live); };

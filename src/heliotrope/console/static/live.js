@@ -176,7 +176,38 @@ export function parseQuery(text) {
   return (row) => either.some((all) => all.every((holds) => holds(row)));
 }
 
+// Names, with * for any letters: rows, or null if the text is a query.
+function rowsNamed(text) {
+  const words = text.toUpperCase().split(/[\s,;]+/).filter(Boolean);
+  if (!words.length || /[=<>]|\s~/.test(text)) return null;
+  const names = store.field.names.map((name) => name.toUpperCase());
+  return [...new Set(words.flatMap((word) => {
+    const rows = names.flatMap((name, row) => (OPERATORS["~"](name, word) ? [row] : []));
+    if (!rows.length) throw new Error(`there is no heliostat "${word}"${nearest(word, names)}; write its name, or: state = TRACKING and error > 1`);
+    return rows;
+  }))];
+}
+
+function nearest(word, names) {
+  const far = names.map((name) => edits(word, name)), least = far.reduce((a, b) => Math.min(a, b), Infinity);
+  const close = names.flatMap((_, row) => (far[row] === least && least <= 2 ? [store.field.names[row]] : [])).slice(0, 3);
+  return close.length ? `; did you mean ${close.join(", ")}?` : "";
+}
+
+// Letters to add, leave out or change.
+function edits(a, b) {
+  let before = [...Array(b.length + 1).keys()];
+  for (let i = 1; i <= a.length; i++) {
+    const now = [i];
+    for (let j = 1; j <= b.length; j++) now.push(Math.min(before[j] + 1, now[j - 1] + 1, before[j - 1] + (a[i - 1] === b[j - 1] ? 0 : 1)));
+    before = now;
+  }
+  return before[b.length];
+}
+
 export function rowsWhere(text) {
+  const named = rowsNamed(text);
+  if (named) return named;
   const holds = parseQuery(text);
   return store.field.names.map((_, row) => row).filter(holds);
 }

@@ -275,24 +275,36 @@ export function clusters(box) {
   }, { every: 3 });
 }
 
+// One line for the alarms of many subjects that say the same of each.
+function alike(rows) {
+  const groups = new Map();
+  for (const r of rows) {
+    const text = r.subject ? r.text.replaceAll(r.subject, "each") : r.text;
+    const like = [r.condition, r.active, r.acknowledged_by, text].join("\n");
+    const group = groups.get(like);
+    if (group) { group.rows.push(r); group.said = text; } else groups.set(like, { ...r, like, said: r.text, rows: [r] });
+  }
+  return [...groups.values()];
+}
+
 export function alarms(box) {
-  const body = h("div");
+  const body = h("div"), shown = new Set();
   box.append(body);
   return refreshed(async () => {
     const rows = await api("GET", "alarms");
     const open = rows.filter((r) => !r.acknowledged_by);
-    const all = async () => {
+    const acknowledge = async (those) => {
       const refused = [];
-      for (const r of open) await api("POST", "alarms/acknowledge", { condition: r.condition, subject: r.subject }).catch((error) => refused.push(error.message));
-      if (refused.length) throw new Error(`${refused.length} of ${open.length} refused: ${refused[0]}`);
+      for (const r of those) await api("POST", "alarms/acknowledge", { condition: r.condition, subject: r.subject }).catch((error) => refused.push(error.message));
+      if (refused.length) throw new Error(those.length === 1 ? refused[0] : `${refused.length} of ${those.length} refused: ${refused[0]}`);
     };
     body.replaceChildren(h("div", { className: "hx-row" }, h("b", {}, `${open.length} not acknowledged, ${rows.filter((r) => r.active).length} active`),
-      canCommand() && open.length ? h("button", { className: "hx-button", onclick: () => act(all, "acknowledge all") }, "Acknowledge all") : ""),
+      canCommand() && open.length ? h("button", { className: "hx-button", onclick: () => act(() => acknowledge(open), "acknowledge all") }, "Acknowledge all") : ""),
     rows.length ? table([["", (r) => h("span", { className: r.active ? (severe[r.severity] ?? "warn") : "" }, r.active ? (severe[r.severity] === "bad" ? "✕" : "▲") : "○")],
-      ["Time", (r) => clock(r.at)], ["What", (r) => h("div", {}, h("b", {}, r.condition, r.subject ? ` · ${r.subject}` : ""), h("div", { className: "hx-hint" }, r.text))],
+      ["Time", (r) => clock(r.at)], ["What", (r) => h("div", {}, h("b", {}, r.condition, r.subject ? " · " : ""), r.subject ? several(r.rows.map((one) => one.subject), r.like, shown) : "", h("div", { className: "hx-hint" }, r.said))],
       ["", (r) => (r.active ? "active" : "over")],
-      ["", (r) => (r.acknowledged_by ? `✓ ${r.acknowledged_by}` : canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("POST", "alarms/acknowledge", { condition: r.condition, subject: r.subject }), "acknowledge") }, "Acknowledge") : "not acknowledged")],
-      ["×", (r) => r.count, "num"]], rows) : h("p", { className: "hx-hint" }, "No alarms."));
+      ["", (r) => (r.acknowledged_by ? `✓ ${r.acknowledged_by}` : canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => acknowledge(r.rows), "acknowledge") }, "Acknowledge") : "not acknowledged")],
+      ["×", (r) => r.rows.reduce((sum, one) => sum + one.count, 0), "num"]], alike(rows)) : h("p", { className: "hx-hint" }, "No alarms."));
   }, { key: () => store.head?.alarms, every: 4 });
 }
 

@@ -2,7 +2,10 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema, create_model
+
+from heliotrope.safety import CONDITIONS
+from heliotrope.safety.limits import schema
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -430,3 +433,12 @@ class PlantDocument(StrictTable):
     receiver_visits: ReceiverVisitsTable | None = Field(
         None, description="Without: no heliostat in production is measured."
     )
+    safety: Annotated[
+        dict[str, dict[str, Number]],
+        WithJsonSchema(
+            {
+                **schema(CONDITIONS),
+                "description": "Numbers of the safety table that this plant sets, by condition.",
+            }
+        ),
+    ] = Field(default_factory=dict)

@@ -34,6 +34,7 @@ from heliotrope.field.target import Receiver, Target
 from heliotrope.files import write_text
 from heliotrope.files.documents import read_document
 from heliotrope.geometry import FloatArray, direction
+from heliotrope.safety import CONDITIONS, limited
 from heliotrope.sun import Site
 
 Table = TypeVar("Table")
@@ -135,6 +136,7 @@ def _assemble(
     joint = _one(path, "joint_visits", document.joint_visits, build_joint, problems)
     given = document.receiver_visits
     receiver_visits = _one(path, "receiver_visits", given, build_receiver_visits, problems)
+    _one(path, "safety", document.safety, lambda given: limited(CONDITIONS, given or {}), problems)
     if problems:
         return None
     try:
@@ -149,6 +151,7 @@ def _assemble(
             eyes=eyes,
             joint_visits=joint,
             receiver_visits=receiver_visits,
+            safety=document.safety,
         )
     except InputError as error:
         problems.append(FormatError(path, str(error)))
@@ -291,6 +294,7 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
         "eyes_m": {name: np.asarray(point).tolist() for name, point in plant.eyes.items()},
         **joint_document(plant.joint_visits),
         **receiver_visits_document(plant.receiver_visits),
+        **({"safety": {k: dict(v) for k, v in plant.safety.items()}} if plant.safety else {}),
         "groups": groups,
     }
     write_text(place, tomli_w.dumps(document))

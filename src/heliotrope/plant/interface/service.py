@@ -12,6 +12,7 @@ import hashlib
 import hmac
 import logging
 import math
+import pwd
 import secrets
 import threading
 import time
@@ -43,6 +44,8 @@ T = TypeVar("T")
 _LOG = logging.getLogger(__name__)
 #: Share of the plant's loop that the calls of the two sockets may take.
 _SHARE = {ORDINARY: 0.25, EMERGENCY: 0.5}
+#: Role at the two sockets of the plant's user and of root, who need no token.
+_WITHOUT = {ORDINARY: Role.VIEWER, EMERGENCY: Role.OPERATOR}
 #: Longest pause after a call, s.
 _PAUSE = 1.0
 #: Time for the store to find a token, and how long one that it found is good if it cannot, s.
@@ -157,9 +160,15 @@ class PlantInterface:
 
     # -- who is calling --------------------------------------------------------------------
 
-    async def _caller(self, hello: dict[str, Any]) -> LocalCaller | None:
-        """Return the caller of a first frame, None if key or token is not valid."""
+    async def _caller(self, socket: str, hello: dict[str, Any], user: int) -> LocalCaller | None:
+        """Return the caller of a first frame, None if key or token is not valid.
+
+        The plant's own user and root need none: they could stop the plant, or read its store.
+        They may give EMERGENCY, DEFOCUS and STOW, and see all.
+        """
         key, token = hello.get("key"), hello.get("token")
+        if hello == {"user": True}:
+            return LocalCaller(Person(f"{_user_name(user)} on this machine", _WITHOUT[socket]))
         if isinstance(key, str) and hmac.compare_digest(key.encode(), self.key.encode()):
             return LocalCaller(None)
         person = await self._person(token) if isinstance(token, str) else None
@@ -207,7 +216,14 @@ class PlantInterface:
             person = caller.person
             return call is not None and call.blob and (person is None or person.role >= call.role)
 
-        return LocalServer(self.folder / name, self._caller, answer, kind_of, blob, _LIMITS)
+        return LocalServer(
+            self.folder / name,
+            functools.partial(self._caller, name),
+            answer,
+            kind_of,
+            blob,
+            _LIMITS,
+        )
 
     async def _answer(
         self, calls: dict[str, Call], turns: "_Turns", caller: LocalCaller, frame: Frame
@@ -360,6 +376,14 @@ def _checked(model: Any, given: dict[str, Any]) -> Any:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ".".join(map(str, first["loc"]))
         raise InputError(f"{place}: {first['msg']}") from None
+
+
+def _user_name(user: int) -> str:
+    """Return the name of a user of this machine; its number if it has none."""
+    try:
+        return pwd.getpwuid(user).pw_name
+    except KeyError:
+        return f"user {user}"
 
 
 def _on_behalf(given: Any) -> Person:

@@ -298,7 +298,8 @@ class Calibrating:
         if said:
             results = tuple(CycleResult(name, outcome, said) for name in names)
         entries = [
-            self._conclude(place, result, true, begun, expected, joint=True)
+            # A visit that was refused as a whole is one event, below.
+            self._conclude(place, result, true, begun, expected, joint=True, noted=not said)
             for result, true, expected in zip(results, truth, sigma, strict=True)
         ]
         if self._pictures is not None:
@@ -341,6 +342,7 @@ class Calibrating:
         sigma: float,
         *,
         joint: bool = False,
+        noted: bool = True,
     ) -> CalibrationEntry:
         row, good = self._plant.field.place(result.heliostat), result.outcome.calibrated
         record = result.record
@@ -369,7 +371,8 @@ class Calibrating:
         looked = joint and self._parties is not None and self._parties.again(result)
         if good or not (lit or looked):
             self._scheduler.done(entry)
-        self._log.event("calibration", entry.heliostat, f"at {target}: {entry.text}")
+        if noted:
+            self._log.event("calibration", entry.heliostat, f"at {target}: {entry.text}")
         self._keeping.keep(entry, begun, sigma)
         if self._pictures is not None:
             self._pictures.conclude(entry)

@@ -19,7 +19,7 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray, reflect
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.operations import Operations
-from heliotrope.plant.operations.views import CalibrationEntry
+from heliotrope.plant.operations.views import CalibrationEntry, EventRow
 from heliotrope.store.records import Records
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.invariants.invariants import InvariantError, Violation
@@ -227,7 +227,8 @@ class ResultObserver:
         name, start = entry.heliostat, f"at {entry.target}: {entry.text}"
         events = operations.events(200)
         there = any(
-            each.kind == "calibration" and each.who == name and each.text == start
+            each.kind == "calibration"
+            and ((each.who, each.text) == (name, start) or _of_all(each, entry))
             for each in events
             if abs(each.at - entry.at) < SHOWN_WITHIN
         )
@@ -248,6 +249,11 @@ class ResultObserver:
         known = self._accounts[name].kept
         saw = f"the store has {count} sightings; the plant knows {known}"
         self._check(count >= known, now, name, saw)
+
+
+def _of_all(event: EventRow, entry: CalibrationEntry) -> bool:
+    """Whether an event is that of a visit of several that was refused as a whole."""
+    return event.who == entry.target and event.text.endswith(f" proven together; {entry.text}")
 
 
 def _misses(by: Mechanism, seen: Sightings) -> FloatArray:

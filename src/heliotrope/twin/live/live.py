@@ -19,7 +19,6 @@ import numpy as np
 from heliotrope import sun
 from heliotrope.cluster.config import ClusterConfig, Member, spread_phase
 from heliotrope.cluster.controller import Cluster
-from heliotrope.cluster.timekeeping import SystemTime
 from heliotrope.errors import InputError
 from heliotrope.field.example import roughly_installed
 from heliotrope.field.heliostats import Heliostats
@@ -43,7 +42,9 @@ from heliotrope.plant.audit import Audit, Forgetful
 from heliotrope.plant.ports import Ports
 from heliotrope.plant.settings import clusters_of
 from heliotrope.plant.visits.settings import CycleSettings
+from heliotrope.safety import CONDITIONS, Watcher, watched_by
 from heliotrope.store.records import Records
+from heliotrope.twin.boards.clocks import SimulatedTime
 from heliotrope.twin.cameras import ExactCamera, FieldSnapshot, RenderedCamera
 from heliotrope.twin.drawing import Optics
 from heliotrope.twin.field.field import Field
@@ -53,6 +54,8 @@ from heliotrope.twin.live.near_link import NearLink, near_pair
 from heliotrope.twin.sensors import FluxSensor
 from heliotrope.twin.true_mirrors import TrueMirror, mirrors_near
 
+#: Rows of the safety table that clusters watch.
+_OF_CLUSTERS = frozenset(row.name for row in watched_by(CONDITIONS, Watcher.CLUSTER))
 #: Tick of the field, and period at which the true sun is computed, s.
 _TICK, _SUN_EVERY = 0.05, 5.0
 #: Largest number of ticks made up at once after a pause.
@@ -199,8 +202,16 @@ class World:
             for i, row in enumerate(rows)
         )
         every = 1 if len(self.names) <= _SMALL else _STEPS_EVERY
-        config = ClusterConfig(name, self.design.site, members, steps_every=every, phase=phase)
-        time = SystemTime(self.clock)
+        config = ClusterConfig(
+            name,
+            self.design.site,
+            members,
+            steps_every=every,
+            phase=phase,
+            limits={k: v for k, v in self.design.safety.items() if k in _OF_CLUSTERS},
+        )
+        # A computer's clock before its programs were written was never set; simulated time may be.
+        time = SimulatedTime(self.clock)
         ring = KeyRing(key) if key else None
         self._clusters.append(Cluster(config, bus, far, self.clock, time, bus_keys=ring))
         self._parts += [near, far, bus, time]

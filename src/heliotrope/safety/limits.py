@@ -1,0 +1,220 @@
+"""Limits of a site: the numbers of the safety table that a plant sets for itself.
+
+A plant file, and for its own rows a cluster file, gives them by condition, each key with its unit:
+``[safety.wind_gust_stow] trips_m_s = 18``. `limited` checks them and returns the table with them. A
+number that would loosen an invariant (how soon a fault is noticed, how soon a beam is off) is
+refused, and so is every number of a row that rests on leases or on people's orders
+(`Condition.site` is None).
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from typing import Any
+
+from heliotrope.errors import InputError
+from heliotrope.safety.condition import Act, Condition
+
+#: Numbers by condition and key, as a file gives them.
+Limits = Mapping[str, Mapping[str, float]]
+#: Ends of the keys of `trips` and `releases` by the unit of the reading, and their size in it.
+_UNITS: dict[str, dict[str, float]] = {
+    "s": {"_s": 1.0},
+    "m/s": {"_m_s": 1.0},
+    "rad": {"_deg": math.pi / 180.0, "_mrad": 1e-3},
+    "share": {"_percent": 0.01},
+    "count": {"": 1.0},
+    "yes/no": {},
+}
+#: Safest value of a reading that is bad when it is small.
+_SAFEST = {"share": 1.0, "rad": math.pi / 4.0}
+#: Angles below this are shown in mrad, rad.
+_SMALL = 0.05
+#: Shortest and longest time of a key, s. A longer ``then_stow`` than the row's own is refused too.
+_TIMES = {
+    "delay": (0.0, 60.0),
+    "clear_for": (2.0, 86400.0),
+    "stale_after": (1.0, 60.0),
+    "then_stow": (0.0, 120.0),
+}
+#: Latest time from a fault until a row with this act trips, s. Of the 30 s of a DEFOCUS 20 remain
+#: for the motion, of the 300 s of a STOW 270.
+NOTICED = {Act.DEFOCUS: 10.0, Act.STOW: 30.0}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A number of a row that a plant may set.
+
+    Attributes
+    ----------
+    key, number
+        Key in a file, with its unit; field of `Condition`.
+    size
+        Size of the file's unit in that of the field.
+    low, high
+        Permitted range, in the file's unit.
+    main
+        False for a second unit of the same number.
+    """
+
+    key: str
+    number: str
+    size: float
+    low: float
+    high: float
+    main: bool = True
+
+    def shown(self, row: Condition) -> float:
+        """Return the row's number in the file's unit."""
+        return float(f"{getattr(row, self.number) / self.size:.9g}")
+
+
+def settings_of(row: Condition) -> dict[str, Setting]:
+    """Return the numbers of a row that a plant may set, by key; none if the row has no range."""
+    if row.site is None:
+        return {}
+    found: list[Setting] = []
+    for end, size in _UNITS[row.unit].items():
+        # Small angles read best in mrad, elevations in degrees.
+        main = row.unit != "rad" or (row.site[1] < _SMALL) == (end == "_mrad")
+        low, high = (float(f"{value / size:.4g}") for value in row.site)
+        # The release lies on the safe side of the trip.
+        free = (0.0, high) if row.above else (low, float(f"{_SAFEST[row.unit] / size:.4g}"))
+        found += [
+            Setting(f"trips{end}", "trips", size, low, high, main),
+            Setting(f"releases{end}", "releases", size, *free, main),
+        ]
+    for number, (low, high) in _TIMES.items():
+        idle = row.ages if number == "stale_after" else row.act is not Act.DEFOCUS
+        if number in ("stale_after", "then_stow") and idle:
+            continue
+        most = min(high, row.then_stow) if number == "then_stow" else high
+        found.append(Setting(f"{number}_s", number, 1.0, low, most))
+    return {setting.key: setting for setting in found}
+
+
+def limited(table: Iterable[Condition], limits: Limits) -> tuple[Condition, ...]:
+    """Return the table with the limits of a site.
+
+    Raises
+    ------
+    InputError
+        An unknown row or key, a number out of its range, one that no file may set, or rows that
+        contradict themselves or each other; the text begins with the row and the key.
+    """
+    rows = {row.name: row for row in table}
+    for name, given in limits.items():
+        rows[name] = _changed(_known(rows, name), given)
+    for row in rows.values():
+        if row.name in limits:
+            _ordered(row, rows.values())
+    return tuple(rows.values())
+
+
+def numbers(table: Iterable[Condition]) -> dict[str, float]:
+    """Return all numbers that plants may set, by condition and key ("wind_gust_stow.trips_m_s")."""
+    return {
+        f"{row.name}.{setting.key}": setting.shown(row)
+        for row in table
+        for setting in settings_of(row).values()
+        if setting.main
+    }
+
+
+def differences(before: Mapping[str, float], after: Mapping[str, float]) -> list[str]:
+    """Return what differs between two results of `numbers`, a line each: old, then new."""
+    return [
+        f"{key}: {before[key]:g} → {value:g}"
+        for key, value in after.items()
+        if key in before and before[key] != value
+    ]
+
+
+def schema(table: Iterable[Condition]) -> dict[str, Any]:
+    """Return the JSON schema of the limits of a site."""
+    tables = {}
+    for row in table:
+        keys = {key: _schema_of(row, setting) for key, setting in settings_of(row).items()}
+        if keys:
+            tables[row.name] = {
+                "type": "object",
+                "description": f"{row.what}: {row.consequence}",
+                "additionalProperties": False,
+                "properties": keys,
+            }
+    return {"type": "object", "additionalProperties": False, "properties": tables}
+
+
+def _schema_of(row: Condition, setting: Setting) -> dict[str, Any]:
+    known = {"default": setting.shown(row), "minimum": setting.low, "maximum": setting.high}
+    return {"type": "number", **{k: value for k, value in known.items() if math.isfinite(value)}}
+
+
+def _known(rows: Mapping[str, Condition], name: str) -> Condition:
+    row = rows.get(name)
+    if row is None:
+        raise InputError(f"{name}: there is no such condition here{_near(name, rows)}")
+    if row.site is None:
+        raise InputError(
+            f"{name}: no plant sets its numbers, because leases or people's orders rest on them; "
+            "remove it"
+        )
+    return row
+
+
+def _near(name: str, known: Iterable[str]) -> str:
+    close = get_close_matches(name, list(known), n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _changed(row: Condition, given: Mapping[str, float]) -> Condition:
+    """Return a row with its numbers in a file."""
+    settings, found = settings_of(row), dict[str, float]()
+    for key, value in given.items():
+        setting = settings.get(key)
+        if setting is None:
+            known = f"; it takes {', '.join(settings)}"
+            raise InputError(f"{row.name}.{key} is not known{_near(key, settings) or known}")
+        if not setting.low <= value <= setting.high or math.isinf(value):
+            raise InputError(
+                f"{row.name}.{key} {value:g} is not within {setting.low:g} to {setting.high:g}"
+            )
+        if setting.number in found:
+            raise InputError(f"{row.name}.{key}: {setting.number} is given twice")
+        found[setting.number] = value * setting.size
+    trips, releases = found.get("trips", row.trips), found.get("releases", row.releases)
+    if not (releases < trips if row.above else releases > trips):
+        side = "below" if row.above else "above"
+        raise InputError(
+            f"{row.name}: it releases at {row.shown(releases)}, which must be {side} its trip at "
+            f"{row.shown(trips)}; set trips and releases together"
+        )
+    try:
+        # dataclasses.replace takes fields of several types; these are all floats.
+        changed = replace(row, **found)  # type: ignore[arg-type]
+    except InputError as error:
+        raise InputError(str(error).removeprefix("condition ")) from None
+    latest = NOTICED.get(row.act, row.budget)
+    if changed.detection > latest:
+        raise InputError(
+            f"{row.name}: it would be noticed after {changed.detection:g} s, and {row.act.name} "
+            f"needs {latest:g} s at most; shorten delay_s or stale_after_s"
+        )
+    return changed
+
+
+def _ordered(row: Condition, rows: Iterable[Condition]) -> None:
+    """Refuse a weaker act that comes after a stronger one of the same reading."""
+    for other in rows:
+        if other.reading != row.reading or other.act == row.act:
+            continue
+        weak, strong = (row, other) if row.act < other.act else (other, row)
+        late = weak.trips > strong.trips if row.above else weak.trips < strong.trips
+        if late:
+            raise InputError(
+                f"{row.name}: {weak.act.name} at {weak.shown(weak.trips)} would come after "
+                f"{strong.act.name} at {strong.shown(strong.trips)} ({weak.name}, {strong.name}); "
+                "set both"
+            )
