@@ -25,6 +25,7 @@ from heliotrope.plant.visits import (
     JointCycle,
     Unhidden,
 )
+from heliotrope.plant.workers import at_once
 from support.live import LiveOptions, LivePlant
 from support.visit_scene import CYCLE, ENGINEER, START, VisitScene, believe, in_command, raised
 
@@ -82,7 +83,7 @@ def joint(
                 await raised(live)
                 if installed is None:
                     believe(live, 3e-4)
-                unhidden = Unhidden(plant, live.cameras.beside)
+                unhidden = Unhidden(plant, at_once)
                 whole = CalibrationCycle(plant, live.cameras, cycle, Centring(), unhidden)
                 token = plant.take_authority(ENGINEER).token
                 joint_cycle = JointCycle(plant, live.cameras, whole)

@@ -132,8 +132,10 @@ class PlantAssembly:
         cycle = joint = receiver = None
         if cameras is not None:
             eye = cameras if ports.pictures is None else KeptCamera(cameras, ports.pictures)
-            unhidden = Unhidden(self.plant, cameras.beside)
-            cycle = CalibrationCycle(self.plant, eye, chosen.cycle, Centring(), unhidden)
+            unhidden = Unhidden(self.plant, ports.worker)
+            cycle = CalibrationCycle(
+                self.plant, eye, chosen.cycle, Centring(), unhidden, ports.worker
+            )
             if design.joint_visits is not None:
                 joint = JointCycle(self.plant, eye, cycle, design.joint_visits)
             if design.receiver_visits is not None:

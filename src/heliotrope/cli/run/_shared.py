@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from heliotrope import warm
 from heliotrope.cli.run._evidence import Evidence, leaving
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.field.plant import Plant
@@ -28,6 +29,7 @@ from heliotrope.plant.assembly import PlantAssembly
 from heliotrope.plant.interface import PlantInterface
 from heliotrope.plant.operations.pictures import Pictures, PictureSettings
 from heliotrope.plant.settings import PlantSettings
+from heliotrope.plant.workers import WorkerProcesses
 from heliotrope.store.database import make_private, tighten
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry
@@ -149,6 +151,15 @@ def _missing(error: ImportError) -> InputError:
         f"run: {error.name} is not installed; say pip install 'heliotrope[console]', or give "
         "--no-console"
     )
+
+
+@contextlib.contextmanager
+def computing() -> Iterator[WorkerProcesses]:
+    """Begin the processes that compute for a plant, and load what the plant itself computes."""
+    with contextlib.closing(WorkerProcesses()) as worker:
+        worker.start()
+        warm.controlling()
+        yield worker
 
 
 @contextlib.contextmanager
