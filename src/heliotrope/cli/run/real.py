@@ -230,4 +230,4 @@ async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outsid
                 name = f"key of the bus of {each.installation.config.name}"
                 papers.renew(name, [file], each.installation.take_bus_keys)
         async with papers.watched(live.logbook.take_alarm):
-            await at_work(live, keeper, shown, folder, ending)
+            await at_work(live, keeper, shown, folder, ending, stows=True)

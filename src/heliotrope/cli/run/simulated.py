@@ -37,7 +37,7 @@ class SimulationOptions:
 
 
 def run_plant(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
-    """Run until Ctrl-C, or until the time is over; the field is stowed at the end."""
+    """Run until Ctrl-C, or until the time is over."""
     with one_error(), asyncio.Runner(loop_factory=lambda: PacedLoop(choice.speed)) as runner:
         runner.run(_run(design, choice, shown))
 
@@ -69,4 +69,4 @@ async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
         kept = pictures(shown, folder, waits=choice.speed > 1.0)
         ports = replace(ports, pictures=kept, marks=shown.marks, learner=LearnerProcess())
         live = PlantAssembly(design, ports, settings)
-        await at_work(live, keeper, shown, folder, ending, choice.speed)
+        await at_work(live, keeper, shown, folder, ending, stows=False, speed=choice.speed)
