@@ -205,9 +205,10 @@ class Ending:
         self.asked, self.at_once = asyncio.Event(), asyncio.Event()
         self._loop = asyncio.get_running_loop()
         for number in _SIGNALS:
-            self._loop.add_signal_handler(number, self._ask)
+            self._loop.add_signal_handler(number, self.ask)
 
-    def _ask(self) -> None:
+    def ask(self) -> None:
+        """End in order; from now on a signal asks to end at once."""
         self.asked.set()
         for number in _SIGNALS:
             self._loop.remove_signal_handler(number)
@@ -474,6 +475,7 @@ async def at_work(
             interface(live, keeper, shown, folder, password, lines),
         ):
             await watch(live, shown, ending.asked, lines, speed=speed)
+            ending.ask()  # or the time was over
             if not stows:
                 await live.operations.automatic.halt(_HALTED)
             elif not await stow(live, ending.at_once, lines):
