@@ -100,13 +100,7 @@ class DriftingDays(Days):
         constants = super().learnt(nominal, seen)
         if not self.follows:
             return constants
-        steps = fitting_present(nominal, seen, constants, self.hyper)
-        while True:
-            try:
-                next(steps)
-            except StopIteration as end:
-                found: FieldFit = end.value
-                return found
+        return fitting_present(nominal, seen, constants, self.hyper)
 
     def evenings(self, days: int) -> Iterator[Truth]:
         """Yield the truth before each next day: what was learnt holds until it is over."""

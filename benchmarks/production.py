@@ -38,6 +38,7 @@ from heliotrope.plant.visits.neighbours import Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.receiver_layout import caught, production
 from heliotrope.plant.visits.settings import Centring, CycleSettings
+from heliotrope.plant.workers import at_once
 from heliotrope.twin.live import World, WorldOptions
 from heliotrope.twin.true_mirrors import mirrors_near
 
@@ -131,7 +132,7 @@ async def _stay(built: PlantAssembly, token: int) -> None:
 async def _measured(built: PlantAssembly, world: World, token: int, most: int) -> Row:
     plant, settings = built.plant, built.design.receiver_visits
     assert settings is not None
-    unhidden = Unhidden(plant, world.cameras.beside)
+    unhidden = Unhidden(plant, at_once)
     whole = CalibrationCycle(plant, world.cameras, CYCLE, Centring(), unhidden)
     cycle = ReceiverCycle(plant, world.cameras, whole, settings)
     light = Light(world, cycle.face)

@@ -30,6 +30,7 @@ def main() -> None:
         return
     with compiling():
         following()
+        guarding()
     for part in (searching, breaking, tracking, fitting):
         part()
 
@@ -55,6 +56,12 @@ def compiling() -> Iterator[None]:
         breaking()
         tracking()
         yield
+
+
+def controlling() -> None:
+    """Compile or load what the loop of a plant computes, which would hold it up for seconds."""
+    for part in (tracking, following, guarding):
+        part()
 
 
 def tracking() -> None:
@@ -102,6 +109,23 @@ def following() -> None:
     mechanism.drives.radians_per_count(seen.counts)
     hyper, data = _drifting()
     stream.update(stream.begin(hyper), data.jacobian[0], data.value[0], 0.0)
+
+
+def guarding() -> None:
+    """Prove of a beam that it stays clear of one volume, and find it in another."""
+    import numpy as np
+
+    from heliotrope.field.volumes import Box
+    from heliotrope.optics.beam import MirrorOptics
+    from heliotrope.optics.keep_out import sweep
+
+    mechanism, _ = _case()
+    path = np.array([[0.0, 0.7], [0.3, 0.9]])
+    volumes = [
+        Box("around", (0.0, 50.0, 0.0), (9.0, 9.0, 9.0)),
+        Box("far", (900.0, 0.0, 0.0), (1.0,) * 3),
+    ]
+    sweep(mechanism.armature, path, (0.0, -0.6, 0.8), MirrorOptics.of([2.0], [2.0]), volumes)
 
 
 def _case() -> "tuple[Mechanism, Sightings]":

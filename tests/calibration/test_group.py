@@ -15,7 +15,7 @@ from heliotrope.calibration.learn.group import GroupHistory, LearntGroup
 from heliotrope.errors import InputError
 from heliotrope.field.layouts import malan_plant
 from heliotrope.mechanism import parameters
-from support.drifting import DAY, SIZE, TAU, finished, history
+from support.drifting import DAY, SIZE, TAU, history
 
 PLANT = malan_plant(6)
 NOMINAL = next(iter(PLANT.groups.values())).mechanism
@@ -56,7 +56,7 @@ def test_a_replay_by_what_was_learnt_misses_less_tomorrow(found: LearntGroup) ->
         constants = fit(nominal, known, MODEL)
         for learnt in (False, True):
             hyper = found.hyper if learnt else None
-            now = finished(present.fitting_present(nominal, known, constants, hyper))
+            now = present.fitting_present(nominal, known, constants, hyper)
             moved_so = nominal.with_parameters(now.parameters)
             missed[learnt].append(float(np.mean(beam_errors(moved_so, next_one).beam ** 2)))
     assert np.mean(missed[True]) < 0.95 * np.mean(missed[False])

@@ -16,7 +16,6 @@ from heliotrope.mechanism import parameters
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
 from heliotrope.sun import vector
-from support.drifting import finished
 
 PLANT = malan_plant(4)
 NOMINAL = next(iter(PLANT.groups.values())).mechanism[:1]
@@ -46,16 +45,10 @@ def daylight(zero: FloatArray, times: FloatArray) -> Sightings:
     return replace(photographs(zero, 2, suns), time=times)
 
 
-def followed(seen: Sightings) -> tuple[FieldFit, FieldFit, int]:
-    """The fit of constants, the one that follows the drift, and the number of its steps."""
+def followed(seen: Sightings) -> tuple[FieldFit, FieldFit]:
+    """The fit of constants, and the one that follows the drift."""
     constants = fit(NOMINAL, seen, "malan8")
-    steps, count = present.fitting_present(NOMINAL, seen, constants), 0
-    while True:
-        try:
-            next(steps)
-            count += 1
-        except StopIteration as end:
-            return constants, end.value, count
+    return constants, present.fitting_present(NOMINAL, seen, constants)
 
 
 def miss(fitted: FieldFit, seen: Sightings) -> float:
@@ -67,21 +60,21 @@ def miss(fitted: FieldFit, seen: Sightings) -> float:
 
 def test_a_zero_that_drifts_is_followed() -> None:
     exact = photographs(np.linspace(0.0, 2 * MRAD, len(TIMES)))
-    constants, now, _ = followed(exact)
+    constants, now = followed(exact)
     assert miss(constants, exact) > 1.2 * MRAD
     assert miss(now, exact) < 0.5 * MRAD
 
 
 def test_a_step_is_followed_at_once() -> None:
     seen = photographs(np.where(np.arange(len(TIMES)) < 54, 0.0, 3 * MRAD))
-    constants, now, _ = followed(seen)
+    constants, now = followed(seen)
     assert miss(constants, seen) > 3 * MRAD
     assert miss(now, seen) < 1 * MRAD
 
 
 def test_where_nothing_moves_it_agrees_with_the_constants() -> None:
     seen = photographs(np.zeros(len(TIMES)))
-    constants, now, _ = followed(seen)
+    constants, now = followed(seen)
     assert abs(miss(now, seen) - miss(constants, seen)) < 0.1 * MRAD
     # The zeros may drift, so they are known less well than constants would be.
     place = now.names.index(ZEROS[0])
@@ -92,32 +85,23 @@ def test_one_photograph_of_another_light_moves_nothing() -> None:
     seen = photographs(np.zeros(len(TIMES)))
     wrong = seen.destination.copy()
     wrong[-1, 0] += 3.0
-    _, good, _ = followed(seen)
-    _, now, _ = followed(replace(seen, destination=wrong))
+    _, good = followed(seen)
+    _, now = followed(replace(seen, destination=wrong))
     assert abs(miss(now, seen) - miss(good, seen)) < 0.2 * MRAD
 
 
 def test_the_order_of_the_rows_does_not_matter() -> None:
     seen = photographs(np.linspace(0.0, 2 * MRAD, len(TIMES)))
     mixed = seen.take(np.random.default_rng(3).permutation(len(seen)))
-    _, now, _ = followed(seen)
-    _, same, _ = followed(mixed)
+    _, now = followed(seen)
+    _, same = followed(mixed)
     np.testing.assert_allclose(same.values, now.values, atol=1e-6 * MRAD)
-
-
-def test_many_sightings_are_taken_in_steps() -> None:
-    seen = photographs(np.zeros(len(TIMES)))
-    many = seen.take(np.tile(np.arange(len(seen)), 6))
-    assert followed(seen)[2] == 0
-    assert followed(many)[2] == (len(many) - 1) // present.AT_ONCE
 
 
 def test_a_fit_that_has_failed_is_returned_as_it_is() -> None:
     seen = photographs(np.zeros(len(TIMES)))
     failed = replace(fit(NOMINAL, seen, "malan8"), outcome=np.array([FitOutcome.FAILED], np.int8))
-    with pytest.raises(StopIteration) as end:
-        next(present.fitting_present(NOMINAL, seen, failed))
-    assert end.value.value is failed
+    assert present.fitting_present(NOMINAL, seen, failed) is failed
 
 
 @pytest.mark.parametrize(("shots", "visits"), [(3, 1), (1, 2)])
@@ -153,8 +137,8 @@ def test_constants_and_models_are_of_the_last_thousand_photographs() -> None:
     assert np.isfinite(own_model.latest(unknown).time).sum() == 199
     assert own_model.latest(recent) is recent
     model = own_model.OwnModel("malan8", parameters.model("malan8", NOMINAL.parameters))
-    still, moving = finished(model.fitting(NOMINAL, mixed))
-    same, other = finished(model.fitting(NOMINAL, recent))
+    still, moving = model.fitting(NOMINAL, mixed)
+    same, other = model.fitting(NOMINAL, recent)
     np.testing.assert_allclose(still.values, same.values, atol=1e-9)
     # The replay takes them all.
     assert np.abs(moving.covariance - other.covariance).max() > 0.0
@@ -162,8 +146,7 @@ def test_constants_and_models_are_of_the_last_thousand_photographs() -> None:
 
 def test_linearised_in_blocks_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = photographs(np.linspace(0.0, 2 * MRAD, len(TIMES)))
-    _, whole, _ = followed(seen)
+    _, whole = followed(seen)
     monkeypatch.setattr(present, "BLOCK", 7)
-    _, blocks, steps = followed(seen)
-    assert steps == 8
+    _, blocks = followed(seen)
     np.testing.assert_allclose(blocks.values, whole.values, rtol=1e-9, atol=1e-12)

@@ -21,7 +21,7 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
 from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.plant.beliefs import Beliefs
-from heliotrope.plant.visits.fitting import JudgedFit, fit_heliostat, surprise_of
+from heliotrope.plant.visits.fitting import Believed, JudgedFit, fit_heliostat, surprise_of
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.plant.visits.swings import swung
 from heliotrope.sun import vector
@@ -47,7 +47,9 @@ def photographs(times: FloatArray, zero: FloatArray) -> Sightings:
 
 def fitted(beliefs: Beliefs, seen: Sightings) -> JudgedFit:
     names = parameters.model("malan8", beliefs.nominal(NAME).parameters)
-    return fit_heliostat(beliefs, CycleSettings(), OwnModel("malan8", names), NAME, seen)
+    return fit_heliostat(
+        Believed.of(beliefs, NAME), CycleSettings(), OwnModel("malan8", names), seen
+    )
 
 
 def believed(beliefs: Beliefs, found: JudgedFit, at: float) -> HeliostatCalibration:
@@ -85,7 +87,7 @@ def test_what_came_within_the_hour_is_proposed_as_constants_explain_it() -> None
     names = parameters.model("malan8", beliefs.nominal(NAME).parameters)
     model = OwnModel("malan8", names)
     constants = fit(beliefs.nominal(NAME), seen, names)
-    found = fit_heliostat(beliefs, CycleSettings(left=1.0), model, NAME, seen)
+    found = fit_heliostat(Believed.of(beliefs, NAME), CycleSettings(left=1.0), model, seen)
     np.testing.assert_array_equal(found.fitted.values, constants.values)
 
 
@@ -144,7 +146,7 @@ def test_a_field_freshly_commissioned_knows_its_errors(case: str) -> None:
     for i in rng.permutation(len(group))[:40]:
         here, name = truth[np.array([i])], group.names[i]
         seen = first_visit(here, BEGIN, rng, 0.63 * MRAD if swings else 0.0)
-        found = fit_heliostat(beliefs, settings, OwnModel(MODEL, names), name, seen)
+        found = fit_heliostat(Believed.of(beliefs, name), settings, OwnModel(MODEL, names), seen)
         for later in (0.0, HOUR, DAY):
             sun = vector(np.array([BEGIN + later]), PLANT.site)
             spread = beliefs.growth(name).grown(
@@ -191,7 +193,9 @@ def test_a_photograph_in_a_swing_leaves_a_mirror_that_knows_its_error() -> None:
             covariance = seen.destination_covariance + told * wider
             made = replace(seen, destination=moved, destination_covariance=covariance)
             beliefs = Beliefs(plant)
-            found = fit_heliostat(beliefs, settings, OwnModel(MODEL, names), name, made)
+            found = fit_heliostat(
+                Believed.of(beliefs, name), settings, OwnModel(MODEL, names), made
+            )
             expected = expected_error(
                 found.mechanism, found.fitted.names, found.fitted.covariance[0], sun, aim
             )

@@ -25,7 +25,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.operations.flights import FlightIntake
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
-from heliotrope.plant.visits.fitting import fit_flights, fit_heliostat, follow_flights
+from heliotrope.plant.visits.fitting import Believed, fit_flights, fit_heliostat, follow_flights
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.keeper import Keeper
 from support.plant_bench import ENGINEER, OPERATOR, Bench
@@ -94,7 +94,7 @@ class Site:
         beliefs.note(name, "target", made)
         seen = beliefs.seen(name)
         assert seen is not None
-        fit = fit_heliostat(beliefs, SETTINGS, FOUR, name, seen.sightings)
+        fit = fit_heliostat(Believed.of(beliefs, name), SETTINGS, FOUR, seen.sightings)
         beliefs.take(fit.record(beliefs, at + 100.0, person="Egon"))
 
     def flight(
@@ -206,7 +206,8 @@ def test_a_flight_improves_the_field_and_its_offset_is_not_the_mirrors(play: Pla
             replace(next(iter(beliefs.flights)), flight=blind)
         )
         trusted = {
-            n: fit_heliostat(beliefs, SETTINGS, FOUR, n, photos(site, n)).mechanism for n in KNOWN
+            n: fit_heliostat(Believed.of(beliefs, n), SETTINGS, FOUR, photos(site, n)).mechanism
+            for n in KNOWN
         }
         assert np.linalg.norm(mean_turn(site, trusted)) > 0.15 * MRAD
 

@@ -31,10 +31,10 @@ from heliotrope.plant.operations.learning import EVERY, Learning
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.schedule.scheduler import Scheduler
 from heliotrope.plant.schedule.settings import Settings
-from heliotrope.plant.visits.fitting import fit_heliostat
+from heliotrope.plant.visits.fitting import Believed, fit_heliostat
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.keeper import Keeper
-from support.drifting import BEGIN, DAY, finished, history
+from support.drifting import BEGIN, DAY, history
 from support.live import LiveOptions, LivePlant
 from support.plant_bench import ENGINEER, OPERATOR, Bench
 
@@ -98,7 +98,9 @@ class Night:
         seen = beliefs.seen(name)
         assert seen is not None
         settings = CycleSettings(left=1.0, most=50.0)
-        fit = fit_heliostat(beliefs, settings, OwnModel("malan8", MODEL), name, seen.sightings)
+        fit = fit_heliostat(
+            Believed.of(beliefs, name), settings, OwnModel("malan8", MODEL), seen.sightings
+        )
         beliefs.take(fit.record(beliefs, float(seen.sightings.time[-1]), person="Egon"))
 
 
@@ -167,7 +169,7 @@ def test_visits_follow_the_drift_as_it_was_learnt(tmp_path: Path) -> None:
     assert learnt is not None
     assert hyper is not None
     constants = fit(beliefs.nominal(NAMES[0]), seen, MODEL)
-    now = finished(present.fitting_present(beliefs.nominal(NAMES[0]), seen, constants, hyper))
+    now = present.fitting_present(beliefs.nominal(NAMES[0]), seen, constants, hyper)
     np.testing.assert_allclose(learnt.values, now.values[0])
     assert np.abs(learnt.values - default.values).max() > 1e-5
     night.close()

@@ -46,9 +46,9 @@ class Counted:
     def __init__(self) -> None:
         self.count = 0
 
-    async def __call__(self, work: Callable[[], T]) -> T:
+    async def __call__(self, work: Callable[..., Any], *given: Any) -> Any:
         self.count += 1
-        return work()
+        return work(*given)
 
 
 def early(scene: Callable[[LivePlant, int], Awaitable[None]]) -> None:

@@ -34,6 +34,7 @@ from heliotrope.plant.schedule.scheduler import (
     compare,
 )
 from heliotrope.plant.schedule.settings import Settings
+from heliotrope.plant.workers import at_once
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import OutlookEntry
 
@@ -267,7 +268,7 @@ class Scene:
 
     def foresight(self, keeper: Keeper | None = None, every: float = 1800.0) -> Foresight:
         keeping = Keeping(PLANT.names, Beliefs(PLANT), keeper)
-        made = Foresight(cast("PlantController", self), keeping, self, every)
+        made = Foresight(cast("PlantController", self), keeping, self, every, at_once)
         made.recall()
         return made
 

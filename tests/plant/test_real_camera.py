@@ -289,7 +289,6 @@ def test_the_light_on_a_target_is_seen_from_its_front(plant: Plant, frame: Frame
         assert again.view is light.view
         np.testing.assert_array_equal(again.values, light.values)
         assert "joint visit" in cameras.view(target.name).reading[0]
-        assert asyncio.run(cameras.beside(threading.get_ident)) != threading.get_ident()
         script.deviation = 2.0
         with pytest.raises(FetchError, match="is known within 2 s only"):
             asyncio.run(light_on(cameras, target))

@@ -27,6 +27,7 @@ from heliotrope.plant.cameras import RealCameras
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.twin.drawing import PEAK
 from heliotrope.twin.live import World
+from support.live import in_thread
 
 #: Heliostats that must have learnt, and the time for it, s.
 LEARNT, PATIENCE = 2, 200.0
@@ -63,10 +64,17 @@ def test_a_real_plant_learns_from_its_cameras(tmp_path: Path) -> None:
     async def main() -> dict[str, tuple[float, float]]:
         clock, design = SystemClock(), at_noon()
         world = World(design, clock)
-        cameras = RealCameras(design, tmp_path, clock, memory=tmp_path / "m", sources=drawn(world))
+        cameras = RealCameras(
+            design,
+            tmp_path,
+            clock,
+            memory=tmp_path / "m",
+            sources=drawn(world),
+            worker=in_thread,
+        )
         # As in simulation, but for its cameras, and nobody knows the truth.
         audit = JsonLines(tmp_path / "audit.jsonl", clock.utc())
-        ports = replace(world.ports(audit=audit), cameras=cameras, truth=None)
+        ports = replace(world.ports(audit=audit), cameras=cameras, truth=None, worker=in_thread)
         settings = AssemblySettings(AutomaticSettings(wanted=True))
         async with PlantAssembly(design, ports, settings).running() as plant:
             before = world.errors()

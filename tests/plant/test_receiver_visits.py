@@ -35,6 +35,7 @@ from heliotrope.plant.operations.views import PictureRow
 from heliotrope.plant.visits import CalibrationCycle, Centring, CycleResult, Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle, judged
 from heliotrope.plant.visits.receiver_layout import caught
+from heliotrope.plant.workers import at_once
 from support.live import LiveOptions, LivePlant
 from support.visit_scene import CYCLE, ENGINEER, START, VisitScene, believe, in_command
 
@@ -94,7 +95,7 @@ def production(
         plant = live.plant
         async with live.running():
             try:
-                unhidden = Unhidden(plant, live.cameras.beside)
+                unhidden = Unhidden(plant, at_once)
                 whole = CalibrationCycle(plant, live.cameras, CYCLE, Centring(), unhidden)
                 assert live.design.receiver_visits is not None
                 cycle = ReceiverCycle(plant, live.cameras, whole, live.design.receiver_visits)

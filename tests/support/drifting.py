@@ -1,8 +1,6 @@
 """Photographs of mirrors whose zeros wander otherwise than a learner assumes by default."""
 
-from collections.abc import Generator
 from datetime import UTC, datetime
-from typing import TypeVar, cast
 
 import numpy as np
 
@@ -13,7 +11,6 @@ from heliotrope.geometry import MRAD, FloatArray, reflect
 from heliotrope.mechanism.tracking import track
 from heliotrope.sun import vector
 
-Result = TypeVar("Result")
 DAY = 86400.0
 BEGIN = datetime(2026, 6, 1, tzinfo=UTC).timestamp()
 #: The wandering of the zeros: three times as far as by default, fifteen times as fast.
@@ -47,12 +44,3 @@ def history(plant: Plant, name: str, days: int, seed: int) -> Sightings:
     light = reflect(suns, pose.normal) + NOISE * rng.standard_normal((len(times), 3))
     seen, mine = pose.vertex + away * light, np.zeros(len(times), np.intp)
     return sightings(mine, counts, suns, seen, time=times, sigma=5e-4)
-
-
-def finished(steps: Generator[None, None, Result]) -> Result:
-    """The result of work in steps."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return cast("Result", end.value)

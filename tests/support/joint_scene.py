@@ -25,6 +25,7 @@ from heliotrope.plant.visits import (
     JointCycle,
     Unhidden,
 )
+from heliotrope.plant.workers import Worker, at_once
 from support.live import LiveOptions, LivePlant
 from support.visit_scene import CYCLE, ENGINEER, START, VisitScene, believe, in_command, raised
 
@@ -57,6 +58,7 @@ def joint(
     installed: float | None = None,
     cycle: CycleSettings = CYCLE,
     pictures: Pictures | None = None,
+    worker: Worker = at_once,
 ) -> None:
     """Play a scene in virtual time.
 
@@ -82,8 +84,8 @@ def joint(
                 await raised(live)
                 if installed is None:
                     believe(live, 3e-4)
-                unhidden = Unhidden(plant, live.cameras.beside)
-                whole = CalibrationCycle(plant, live.cameras, cycle, Centring(), unhidden)
+                unhidden = Unhidden(plant, worker)
+                whole = CalibrationCycle(plant, live.cameras, cycle, Centring(), unhidden, worker)
                 token = plant.take_authority(ENGINEER).token
                 joint_cycle = JointCycle(plant, live.cameras, whole)
                 made = Scene(live=live, token=token, cycle=joint_cycle)

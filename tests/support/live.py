@@ -1,5 +1,6 @@
 """A simulated plant at work, for tests: the plant's assembly and the world around it."""
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -21,6 +22,11 @@ from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import Records
 from heliotrope.twin.live import CYCLE, World, WorldOptions
+
+
+async def in_thread(work: Callable[..., Any], *given: Any) -> Any:
+    """Compute in a thread: tests wait for no process."""
+    return await asyncio.to_thread(work, *given)
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,7 @@ class LiveOptions:
         return WorldOptions(
             self.seed,
             self.rendered,
-            self.threads,
+            in_thread if self.threads else None,
             self.installed,
             self.boards,
             self.centroid,

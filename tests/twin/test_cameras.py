@@ -21,6 +21,7 @@ from heliotrope.twin.boards.outfit import RECEIVER
 from heliotrope.twin.cameras import ExactCamera, FieldSnapshot, RenderedCamera
 from heliotrope.twin.drawing import Drawer, Exposure, Optics
 from heliotrope.twin.true_mirrors import TrueMirror, mirrors_of
+from support.live import in_thread
 from support.whole_plant import ENGINEER, WholePlant
 
 MRAD = 1e-3
@@ -186,7 +187,7 @@ def test_a_joint_photograph_is_read_after_it_is_taken() -> None:
         camera = RenderedCamera(
             FieldSnapshot(clock, lambda: tuple(there), lambda: SUN, latency=0.0),
             [SCENE],
-            threads=1,
+            worker=in_thread,
         )
         camera.start(lambda alarm: None)
         try:

@@ -445,7 +445,7 @@ def test_a_live_camera_shows_what_it_saw() -> None:
 
     async def main(clock: VirtualClock) -> None:
         sight = FieldSnapshot(clock, lambda: tuple(there), lambda: light)
-        eye = RenderedCamera(sight, [Scene(camera, (target,))], threads=0)
+        eye = RenderedCamera(sight, [Scene(camera, (target,))])
         assert eye.view(target.name).version == 0
         await eye.look(target.name)
         there.append(mirror)
@@ -479,8 +479,8 @@ def test_what_a_live_plant_refuses() -> None:
         homeless = replace(group, machines=(replace(slow, standby=None),) * 6)
         with pytest.raises(InputError, match="R001-001 has no standby point; give standby_m"):
             LivePlant(replace(design, groups={"a": homeless}), clock, EXACT)
-        with pytest.raises(InputError, match="-1 threads"):
-            WorldOptions(threads=-1)
+        with pytest.raises(InputError, match=r"centroid variance -1\.0 m²"):
+            WorldOptions(centroid=-1.0)
 
     run_virtual(main)
 

@@ -1,5 +1,7 @@
 """The HTTP API, version 1: reading the plant."""
 
+import asyncio
+import contextlib
 import gzip
 import math
 import time
@@ -276,9 +278,15 @@ async def live(socket: WebSocket) -> None:
         checked = console.now()
         return await find_caller(console, socket) is not None
 
-    try:
-        await console.stream.follow(socket.send_bytes, allowed)
-        await socket.close(4401, "the session has ended")
-    except (WebSocketDisconnect, RuntimeError, OSError):
-        # The viewer has left: a closed socket cannot be written to.
-        return
+    async def follow() -> None:
+        # A viewer that has left is noticed below: a closed socket cannot be written to.
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError, OSError):
+            await console.stream.follow(socket.send_bytes, allowed)
+            await socket.close(4401, "the session has ended")
+
+    async with asyncio.TaskGroup() as group:
+        following = group.create_task(follow())
+        # The viewer leaves, the console ends, or `follow` has closed the socket.
+        while (await socket.receive())["type"] != "websocket.disconnect":
+            pass
+        following.cancel()

@@ -24,7 +24,7 @@ from heliotrope.errors import HeliotropeError
 #: Time between two signs of life, s.
 BEAT = 1.0
 #: Time for the server to end, s.
-_END = 3.0
+_END = 1.0
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ class Server(uvicorn.Server):
             ws="websockets-sansio" if page else "none",
             ws_per_message_deflate=False,
             ws_max_size=1 << 16,
-            timeout_graceful_shutdown=2,
+            timeout_graceful_shutdown=1,
             ssl_certfile=settings.certificate,
             ssl_keyfile=settings.key,
         )

@@ -7,6 +7,7 @@ with the others.
 
 import asyncio
 import contextlib
+import math
 from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -136,8 +137,10 @@ class PlantAssembly:
         cycle = joint = receiver = None
         if cameras is not None:
             eye = cameras if ports.pictures is None else KeptCamera(cameras, ports.pictures)
-            unhidden = Unhidden(self.plant, cameras.beside)
-            cycle = CalibrationCycle(self.plant, eye, chosen.cycle, Centring(), unhidden)
+            unhidden = Unhidden(self.plant, ports.worker)
+            cycle = CalibrationCycle(
+                self.plant, eye, chosen.cycle, Centring(), unhidden, ports.worker
+            )
             if design.joint_visits is not None:
                 joint = JointCycle(self.plant, eye, cycle, design.joint_visits)
             if design.receiver_visits is not None:
@@ -303,6 +306,25 @@ class PlantAssembly:
         rows = self.plant.field
         silent = rows.age(now) > SILENT
         return np.asarray(silent | rows.among(_STUCK, now))
+
+    def to_stow(self) -> tuple[int, float]:
+        """Return how many heliostats are not stowed, and about how long they take to stow.
+
+        Returns
+        -------
+            Heliostats that can be stowed by an order, and s: both axes of the furthest one turn, in
+            turn, after those that are sent before it. NaN if their positions are unknown.
+        """
+        rows, now = self.plant.field, self.clock.monotonic()
+        away = np.flatnonzero(~(rows.among((states.STOWED,), now) | self._hopeless(now)))
+        machines, turns = self.plant.beams.machines, [math.nan]
+        for row in away:
+            machine = machines.get(rows.names[row])
+            if machine is not None and np.isfinite(rows.posed_at[row]):
+                way = np.abs(rows.posed[row] - machine.stow)
+                turns.append(float((way / [axis.rate for axis in machine.axes]).sum()))
+        rate = self.plant.settings.stow_rate
+        return len(away), float(np.fmax.reduce(turns)) + (len(away) / rate if rate else 0.0)
 
     def left(self) -> str:
         """Return which heliostats are not stowed, in words; "" if all are."""

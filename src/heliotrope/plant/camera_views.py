@@ -11,7 +11,7 @@ from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
 from heliotrope.imaging.annotate import annotate
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.photograph import Photograph, PhotographSettings
+from heliotrope.imaging.photograph import Photograph, PhotographSettings, read_photograph
 from heliotrope.imaging.targets.finding import FoundTarget, find_targets
 from heliotrope.imaging.targets.rectify import LEAST_RIM, rectify, rim_of
 from heliotrope.imaging.targets.view import FaceView
@@ -35,9 +35,8 @@ class Views:
         """Return the last photograph of a target."""
         return self._views.get(target, CameraView(target, 0, 0.0, b""))
 
-    def show(self, name: str, at: float, frame: Frame, line: str) -> None:
-        """Keep a frame that is not read by itself, at a time (POSIX s), with a line about it."""
-        jpeg = picture_of(Photograph(frame, ()))
+    def show(self, name: str, at: float, jpeg: bytes, line: str) -> None:
+        """Keep a picture that is not read by itself, at a time (POSIX s), with a line about it."""
         self._views[name] = CameraView(name, self.view(name).version + 1, at, jpeg, (line,))
 
     def keep(self, name: str, at: float, seen: Photograph, jpeg: bytes) -> None:
@@ -83,6 +82,18 @@ def light_of(
     rim = max(LEAST_RIM, rim_of(found))
     picture = rectify(linear, view, rim=rim)
     return TargetLight.of(picture, target, frame.exposure * frame.gain, at)
+
+
+def beam_of(
+    frame: Frame,
+    targets: Sequence[Target],
+    camera: Camera,
+    settings: PhotographSettings,
+    without: Frame | None = None,
+) -> tuple[Photograph, bytes]:
+    """Return a frame as it is read, see `read_photograph`, and its picture for people."""
+    seen = read_photograph(frame, targets, camera, settings=settings, without=without)
+    return seen, picture_of(seen)
 
 
 def shot_of(seen: Photograph, target: str, at: float) -> Shot:

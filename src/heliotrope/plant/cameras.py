@@ -13,11 +13,9 @@ import asyncio
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import TypeVar
 
 from heliotrope.errors import FetchError, HeliotropeError, InputError, UnknownNameError
 from heliotrope.field.camera import Camera
@@ -26,18 +24,18 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.memory import Memory
-from heliotrope.imaging.photograph import Photograph, PhotographSettings, read_photograph
+from heliotrope.imaging.photograph import Photograph, PhotographSettings
 from heliotrope.imaging.sources import FolderSource, Source, VideoSource, open_source
 from heliotrope.imaging.targets.teaching import read_pictures
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.links.clock import Clock
-from heliotrope.plant.camera_views import SEVERAL, Views, light_of, picture_of, shot_of
+from heliotrope.plant.camera_views import SEVERAL, Views, beam_of, light_of, picture_of, shot_of
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.stacks import Exposed, TargetLight
+from heliotrope.plant.workers import Worker, at_once
 from heliotrope.safety import Alarm, alarms
 
-T = TypeVar("T")
 #: Longest wait for a photograph, and the time between checks for its frame, s.
 PATIENCE, _LOOK = 15.0, 0.05
 #: Time until a source that failed is opened again, s.
@@ -156,6 +154,8 @@ class RealCameras:
         Longest wait for a frame, s.
     sources
         Makes the source of a camera.
+    worker
+        Reads photographs.
 
     Attributes
     ----------
@@ -178,11 +178,13 @@ class RealCameras:
         memory: Path | None = None,
         patience: float = PATIENCE,
         sources: Callable[[Camera, Path, threading.Event], Source] = source_of,
+        worker: Worker = at_once,
     ) -> None:
         self._clock, self._patience = clock, patience
         self._on_alarm: Callable[[Alarm], None] = lambda _: None
         self._stop = threading.Event()
-        self._pool = ThreadPoolExecutor(1, "camera")
+        # Each photograph is read with what those before it have taught of the empty targets.
+        self._worker, self._reading = worker, asyncio.Lock()
         self._memory = Memory() if memory is None else Memory.load(memory)
         self._folder, self._views, self._taken = memory, Views(), 0
         self.silent: set[str] = set()
@@ -219,7 +221,6 @@ class RealCameras:
         self._stop.set()
         for eye in self._eyes.values():
             eye.feed.close()
-        self._pool.shutdown(wait=True, cancel_futures=True)
         if self._folder is not None:
             self._memory.save(self._folder)
 
@@ -286,8 +287,7 @@ class RealCameras:
         """Photograph a target; see `photograph`."""
         eye = self._eye(target)
         frame = await self._frame(eye, target)
-        loop = asyncio.get_running_loop()
-        seen, jpeg = await loop.run_in_executor(self._pool, self._read, eye, frame)
+        seen, jpeg = await self._read(eye, frame)
         assert frame.time is not None
         self._views.keep(target, frame.time.timestamp(), seen, jpeg)
         age = (self._clock.utc() - frame.time).total_seconds()
@@ -317,17 +317,16 @@ class RealCameras:
         assert frame.time is not None
         taken = frame.time.timestamp()
         at = self._clock.monotonic() - (self._clock.utc().timestamp() - taken)
-        settings, loop = self._settings, asyncio.get_running_loop()
+        settings = self._settings
 
-        def work() -> TargetLight:
-            self._views.show(target.name, taken, frame, SEVERAL)
-            return light_of(frame, target, eye.targets, eye.camera, settings, view, at)
+        async def read() -> TargetLight:
+            jpeg = await self._worker(picture_of, Photograph(frame, ()))
+            self._views.show(target.name, taken, jpeg, SEVERAL)
+            return await self._worker(
+                light_of, frame, target, eye.targets, eye.camera, settings, view, at
+            )
 
-        return Exposed(at, loop.run_in_executor(self._pool, work))
-
-    async def beside(self, work: Callable[[], T]) -> T:
-        """Return the result of a computation made in a thread."""
-        return await asyncio.to_thread(work)
+        return Exposed(at, asyncio.create_task(read()))
 
     async def _frame(self, eye: _Eye, target: str) -> Frame:
         """Wait for a frame that is exposed from now on."""
@@ -350,14 +349,28 @@ class RealCameras:
         kind = alarms.CAMERA
         self._on_alarm(kind.raised(target, problem=problem) if problem else kind.ended(target))
 
-    def _read(self, eye: _Eye, frame: Frame) -> tuple[Photograph, bytes]:
-        settings = replace(self._settings, empty=self._memory.models)
-        seen = read_photograph(frame, eye.targets, eye.camera, settings=settings)
-        self._memory.learn(seen.faces)
-        self._taken += 1
-        if self._folder is not None and self._taken % _OFTEN == 0:
-            self._memory.save(self._folder)
-        return seen, picture_of(seen)
+    async def _read(self, eye: _Eye, frame: Frame) -> tuple[Photograph, bytes]:
+        async with self._reading:
+            seen, jpeg, self._memory = await self._worker(
+                _learning, frame, eye.targets, eye.camera, self._settings, self._memory
+            )
+            self._taken += 1
+            if self._folder is not None and self._taken % _OFTEN == 0:
+                await asyncio.to_thread(self._memory.save, self._folder)
+        return seen, jpeg
+
+
+def _learning(
+    frame: Frame,
+    targets: Sequence[Target],
+    camera: Camera,
+    settings: PhotographSettings,
+    memory: Memory,
+) -> tuple[Photograph, bytes, Memory]:
+    """Return a frame as it is read, its picture, and what is known of empty targets after it."""
+    seen, jpeg = beam_of(frame, targets, camera, replace(settings, empty=memory.models))
+    memory.learn(seen.faces)
+    return replace(seen, faces=()), jpeg, memory
 
 
 def _watching(

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
@@ -27,10 +27,9 @@ from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.sensors import Sensors
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.stacks import Exposed
+from heliotrope.plant.workers import Worker, at_once
 from heliotrope.safety import Alarm
 from heliotrope.store.records import Records
-
-T = TypeVar("T")
 
 
 class Cameras(Protocol):
@@ -74,10 +73,6 @@ class Cameras(Protocol):
         FetchError, InputError
             No photograph; or, as its light is awaited, no usable one.
         """
-        ...
-
-    async def beside(self, work: Callable[[], T]) -> T:
-        """Return the result of a computation that must not hold up the loop."""
         ...
 
     def view(self, target: str) -> CameraView:
@@ -145,6 +140,8 @@ class Ports:
         field; None where it is unknown, as in every real plant.
     learner
         Learns groups of mirrors at night; None: nothing is learnt, as in virtual time.
+    worker
+        Computes what takes long, beside the plant's loop; in virtual time in it.
     facts
         Returns further rows of the summary, by name.
     """
@@ -164,4 +161,5 @@ class Ports:
     )
     truth: Callable[[], FloatArray] | None = field(default=None, kw_only=True)
     learner: Learner | None = field(default=None, kw_only=True)
+    worker: Worker = field(default=at_once, kw_only=True)
     facts: Callable[[], Mapping[str, Any]] = field(default=dict, kw_only=True)

@@ -8,11 +8,7 @@ Neither knows more about the measured heliostat than a real camera could.
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from datetime import datetime
-from functools import partial
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -22,15 +18,16 @@ from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.photograph import Photograph, PhotographSettings, read_photograph
+from heliotrope.imaging.photograph import Photograph, PhotographSettings
 from heliotrope.imaging.synthetic.scenes import Scene, Thrown
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.links.clock import Clock, sleep_until
-from heliotrope.plant.camera_views import SEVERAL, Views, light_of, picture_of, shot_of
+from heliotrope.plant.camera_views import SEVERAL, Views, beam_of, light_of, picture_of, shot_of
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.joint_layout import moments_on
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.stacks import Exposed, TargetLight
+from heliotrope.plant.workers import Worker, at_once
 from heliotrope.safety import Alarm
 from heliotrope.twin.drawing import Drawer, Exposure, Optics, thrown
 from heliotrope.twin.true_mirrors import NEAR, TrueMirror, within
@@ -39,8 +36,6 @@ from heliotrope.twin.true_mirrors import NEAR, TrueMirror, within
 _FLAT = 0.7
 #: Pictures of exact beams: pixels across, brightness of the paint and of a sun, and its noise.
 _ACROSS, _PAINT, _SUN, _GRAIN = 96, 0.05, 0.1, 0.0005
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -191,10 +186,6 @@ class ExactCamera:
         first = np.array([x[0], y[0]])
         return TargetLight(values.astype(np.float32), step, first, seen, 1.0, at)
 
-    async def beside(self, work: Callable[[], T]) -> T:
-        """Return the result of a computation."""
-        return work()
-
     def _keep(self, target: Target, point: FloatArray, lines: tuple[str, ...]) -> None:
         centroid = None
         if np.isfinite(point).all():
@@ -208,8 +199,8 @@ class ExactCamera:
 class RenderedCamera:
     """Draws photographs and reads them.
 
-    A photograph takes a second of a processor. With ``threads`` it is drawn in a process of its own
-    and read in a thread, beside the event loop; without, at once, as virtual time needs it.
+    A photograph takes a second of a processor. With a ``worker`` it is drawn in a process of its
+    own and read by the worker, beside the event loop; without, at once, as virtual time needs it.
 
     Parameters
     ----------
@@ -223,8 +214,8 @@ class RenderedCamera:
         How photographs are read.
     seed
         Seed of the sensor's noise.
-    threads
-        Photographs that are read at a time; 0: drawn and read in the event loop itself.
+    worker
+        Reads photographs; None: they are drawn and read in the event loop itself.
 
     Attributes
     ----------
@@ -247,7 +238,7 @@ class RenderedCamera:
         optics: Optics | None = None,
         settings: PhotographSettings | None = None,
         seed: int = 0,
-        threads: int = 0,
+        worker: Worker | None = None,
     ) -> None:
         for scene in scenes:
             names = ", ".join(target.name for target in scene.targets)
@@ -259,8 +250,7 @@ class RenderedCamera:
         self._sight, self._scenes = sight, {s.targets[0].name: s for s in scenes}
         self._optics, self._settings = optics or Optics(), settings or PhotographSettings()
         self._chance = np.random.default_rng(seed)
-        self._pool = ThreadPoolExecutor(threads, "camera") if threads else None
-        self._drawer = Drawer() if threads else None
+        self._worker, self._drawer = worker or at_once, None if worker is None else Drawer()
         self._views, self._empty = Views(), dict[str, Frame]()
         #: Frames, and cameras and targets as they are known; the scenes have the true ones.
         self._frames = dict[str, Frame]()
@@ -275,9 +265,7 @@ class RenderedCamera:
             self._drawer.start()
 
     def close(self) -> None:
-        """End threads and process."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+        """End the process."""
         if self._drawer is not None:
             self._drawer.close()
 
@@ -360,24 +348,17 @@ class RenderedCamera:
         """
         name = target.name
         camera, known = self._known_of(name)
-        draw, utc, at = await self._expose(name)
+        shown, at = await self._expose(name)
         settings = self._settings
 
-        def work() -> tuple[TargetLight, Frame]:
-            frame = draw()
-            self._views.show(name, utc.timestamp(), frame, SEVERAL)
-            return light_of(frame, known, (known,), camera, settings, view, at), frame
-
         async def read() -> TargetLight:
-            seen, frame = await self._worked(work)
+            frame = await self._drawn(shown)
+            jpeg = await self._worker(picture_of, Photograph(frame, ()))
+            self._views.show(name, shown.time.timestamp(), jpeg, SEVERAL)
             self.last = self._frames[name] = frame
-            return seen
+            return await self._worker(light_of, frame, known, (known,), camera, settings, view, at)
 
         return Exposed(at, asyncio.create_task(read()))
-
-    async def beside(self, work: Callable[[], T]) -> T:
-        """Return the result of a computation, made in a thread if there are any."""
-        return await asyncio.to_thread(work) if self._pool is not None else work()
 
     def beams(self, target: Target) -> tuple[Thrown, ...]:
         """Return the beams on a target, and those beside it that a frame would show, now."""
@@ -388,10 +369,10 @@ class RenderedCamera:
             raise UnknownNameError("target", name, list(self._scenes))
         return self._known[name]
 
-    async def _expose(self, name: str) -> tuple[Callable[[], Frame], datetime, float]:
-        """Expose a frame: return what draws it, and when it was exposed, UTC and monotonic s."""
+    async def _expose(self, name: str) -> tuple[Exposure, float]:
+        """Expose a frame: return what it shows, and when it was exposed, monotonic s."""
         at = await self._sight.exposure()
-        scene, utc = self._scenes[name], self._sight.clock.utc()
+        scene = self._scenes[name]
         self.taken += 1
         shown = Exposure(
             scene,
@@ -400,34 +381,25 @@ class RenderedCamera:
             self._optics,
             int(self._chance.integers(1 << 32)),
             f"{scene.camera.name} {self.taken}",
-            utc,
+            self._sight.clock.utc(),
         )
-        drawer = self._drawer
-        return (shown.draw if drawer is None else partial(drawer.draw, shown)), utc, at
+        return shown, at
 
-    async def _worked(self, work: Callable[[], T]) -> T:
-        """Return the result of work on a photograph."""
-        if self._pool is None:
-            return work()
-        return await asyncio.get_running_loop().run_in_executor(self._pool, work)
+    async def _drawn(self, shown: Exposure) -> Frame:
+        """Return the frame of an exposure."""
+        if self._drawer is None:
+            return shown.draw()
+        return await asyncio.to_thread(self._drawer.draw, shown)
 
     async def _take(self, name: str) -> tuple[Photograph, float]:
         """Take a photograph; return it as read, and when it was exposed, monotonic s."""
         self._known_of(name)
-        draw, utc, at = await self._expose(name)
+        shown, at = await self._expose(name)
         (camera, target), settings = self._known[name], self._settings
-
-        def work() -> tuple[Photograph, bytes]:
-            seen = read_photograph(
-                draw(),
-                (target,),
-                camera,
-                settings=settings,
-                without=self._empty.get(name),
-            )
-            return seen, picture_of(seen)
-
-        seen, jpeg = await self._worked(work)
-        self.last = self._frames[name] = seen.frame
-        self._views.keep(name, utc.timestamp(), seen, jpeg)
+        frame = await self._drawn(shown)
+        seen, jpeg = await self._worker(
+            beam_of, frame, (target,), camera, settings, self._empty.get(name)
+        )
+        self.last = self._frames[name] = frame
+        self._views.keep(name, shown.time.timestamp(), seen, jpeg)
         return seen, at

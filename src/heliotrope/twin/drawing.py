@@ -31,8 +31,6 @@ LEAST, _COARSE = 0.05, 6
 _STEP = 0.04
 #: Brightest reading after exposure, as a share of full scale.
 PEAK = 0.7
-#: Time in which the process ends, s.
-_ENDS = 5.0
 
 
 @dataclass(frozen=True)
@@ -135,7 +133,9 @@ class Drawer:
         return found
 
     def close(self) -> None:
-        """End the process, when it has drawn what it was asked for."""
+        """End the process at once; who waits for a photograph is refused it."""
+        if (process := self._process) is not None:
+            process.kill()
         with self._mine:
             self._end()
 
@@ -155,9 +155,8 @@ class Drawer:
         if line is None or process is None:
             return
         line.close()
-        process.join(_ENDS)
-        if process.is_alive():
-            process.kill()
+        process.kill()
+        process.join()
 
 
 def _drawing(line: Connection) -> None:

@@ -16,7 +16,6 @@ from threadpoolctl import threadpool_limits
 from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome, fit
 from heliotrope.calibration.learn import drift, learning, present
 from heliotrope.calibration.learn.drift import DAY, Hyperparameters, Process
-from heliotrope.calibration.learn.stream import Belief
 from heliotrope.calibration.sightings import Sightings, join
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
@@ -158,19 +157,10 @@ def density(task: GroupTask, fitted: FieldFit, hyper: Hyperparameters) -> float:
     for row in range(len(task.mechanism)):
         if int(fitted.outcome[row]) == FitOutcome.CONVERGED:
             one, seen = fitted.only(row), task.sightings.of(row)
-            total += _replayed(task.mechanism[row : row + 1], seen, one, hyper).density
+            mechanism = task.mechanism[row : row + 1]
+            own = present.hyper_of(mechanism, one, hyper)
+            total += present.replayed(mechanism, seen, one, own).density
     return total
-
-
-def _replayed(
-    mechanism: Mechanism, seen: Sightings, fitted: FieldFit, hyper: Hyperparameters
-) -> Belief:
-    steps = present.replaying(mechanism, seen, fitted, present.hyper_of(mechanism, fitted, hyper))
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return cast("Belief", end.value)
 
 
 def described(hyper: Hyperparameters) -> str:

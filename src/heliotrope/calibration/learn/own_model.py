@@ -7,9 +7,8 @@ white noise (Rasmussen & Williams 2006, (5.10)-(5.12), for blocks of two). The s
 within one standard error of the best is chosen, as there.
 """
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 
@@ -27,8 +26,8 @@ from heliotrope.mechanism.chain import Mechanism
 FEWEST = 8
 #: Only the last visits are compared: older ones cost time and tell of an older machine.
 MOST = 60
-#: Sightings that constants are fitted to and models are chosen by, the last ones: work for the
-#: plant's loop that does not grow with its age.
+#: Sightings that constants are fitted to and models are chosen by, the last ones: work that
+#: does not grow with the age of the plant.
 RECENT = 1000
 #: Trial sizes of the noise of a visit, in units of the scale of the fit.
 NOISES = np.geomspace(0.2, 2.0, 9)
@@ -60,7 +59,7 @@ class OwnModel:
 
     def fitting(
         self, nominal: Mechanism, sightings: Sightings, group: Hyperparameters | None = None
-    ) -> Generator[None, None, tuple[FieldFit, FieldFit]]:
+    ) -> tuple[FieldFit, FieldFit]:
         """Return the fit of constants and the one that follows the drift of its ``group``.
 
         The constants are those of the `latest` sightings; see `present`. The values are deviations
@@ -68,8 +67,7 @@ class OwnModel:
         """
         some = latest(sightings)
         constants = self.completed(fit(self.start(nominal), some, self.parameters))
-        yield
-        return constants, (yield from self.following(nominal, sightings, constants, group))
+        return constants, self.following(nominal, sightings, constants, group)
 
     def following(
         self,
@@ -78,9 +76,9 @@ class OwnModel:
         constants: FieldFit,
         group: Hyperparameters | None,
         flown: Sequence[Flown] = (),
-    ) -> Generator[None, None, FieldFit]:
+    ) -> FieldFit:
         """Return the fit that follows the drift, beside a fit of constants; see `present`."""
-        found = yield from fitting_present(
+        found = fitting_present(
             self.start(nominal), sightings, self._searched(constants), group, flown
         )
         return self.completed(found)
@@ -140,18 +138,6 @@ def choose_own_model(nominal: Mechanism, sightings: Sightings, simple: str) -> O
     simple
         Name of the model that few sightings allow.
     """
-    steps = choosing(nominal, sightings, simple)
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return cast("OwnModel", end.value)
-
-
-def choosing(
-    nominal: Mechanism, sightings: Sightings, simple: str
-) -> Generator[None, None, OwnModel]:
-    """Choose as `choose_own_model`, in steps of some ten ms between which others may work."""
     base, sightings = parameter_table.model(simple, nominal.parameters), latest(sightings)
     mean = periodic.visit_means(nominal, sightings)
     if len(mean) < FEWEST:
@@ -160,21 +146,16 @@ def choosing(
     sightings = sightings.take(recent)
     visits = min(len(mean), MOST)
     errors = tuple(e for e in periodic.search_periodic_errors(nominal, sightings) if e.found)
-    yield
     mechanism = periodic.with_ratios(nominal, errors)
     trials = {simple: base}
     for name, names in models.candidate_models(mechanism).items():
         more = base + tuple(n for n in names if n not in base)
         if more not in trials.values() and 2 * visits >= len(more) + periodic.FREEDOM:
             trials[name] = more
-    yield
     widest = fit(mechanism, sightings, max(trials.values(), key=len))
     sightings = sightings.take(np.flatnonzero(widest.lengths < periodic.OUTLIER))
     mean = periodic.visit_means(nominal, sightings)
-    scores = {}
-    for name, names in trials.items():
-        scores[name] = _left_out(mechanism, sightings, names, mean)
-        yield
+    scores = {name: _left_out(mechanism, sightings, names, mean) for name, names in trials.items()}
     best = models.choose_model(_scored(trials, scores))
     used = tuple(e for e in errors if f"{e.joint}_worm_cos" in best.parameters)
     return OwnModel(best.name, best.parameters, used)

@@ -6,7 +6,7 @@ the drift (`stream`): it forgets what the drive has lost since, and weighs steps
 mistakes. The whole history is replayed, so nothing but the sightings has to be kept.
 """
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,9 +23,7 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 
-#: Sightings that are taken in one step of `replaying`.
-AT_ONCE = 100
-#: Sightings that are linearised in one step.
+#: Sightings that are linearised at a time.
 BLOCK = 1000
 #: The values hold for the days after a visit: motion within hours is at its mean by then, days.
 AHEAD = 1.0
@@ -56,14 +54,14 @@ class Flown:
     turn_sigma: float
 
 
-def replaying(
+def replayed(
     mechanism: Mechanism,
     sightings: Sightings,
     fitted: FieldFit,
     hyper: Hyperparameters,
     flown: Sequence[Flown] = (),
-) -> Generator[None, None, Belief]:
-    """Return the belief of a mirror after its sightings, in steps of some ten ms.
+) -> Belief:
+    """Return the belief of a mirror after its sightings.
 
     Errors that rows of flights share are constants of the state too: each flight's from its first
     row to its last, and the mirror's turn from the first of all.
@@ -90,8 +88,6 @@ def replaying(
     moved = mechanism.with_parameters({n: values[p : p + 1] for p, n in enumerate(hyper.names)})
     blocks = []
     for first in range(0, len(sightings), BLOCK):
-        if first:
-            yield
         some = sightings.take(np.arange(first, min(first + BLOCK, len(sightings))))
         blocks.append(_Rows.of(moved, some, hyper.names, values - centre))
     parts = [
@@ -107,9 +103,7 @@ def replaying(
         belief = stream.with_constants(belief, TURN, turn)
     # Unknown times first: they say nothing about drift, and a belief does not go back.
     order = np.argsort(np.nan_to_num(time, nan=-np.inf), kind="stable")
-    for done, k in enumerate(order):
-        if done and done % AT_ONCE == 0:
-            yield
+    for k in order:
         belief = _updated(belief, which[k], parts[which[k]], int(place[k]))
     return belief
 
@@ -236,8 +230,8 @@ def fitting_present(
     fitted: FieldFit,
     group: Hyperparameters | None = None,
     flown: Sequence[Flown] = (),
-) -> Generator[None, None, FieldFit]:
-    """Return the fit of a mirror as it is after its latest sighting, in steps of some ten ms.
+) -> FieldFit:
+    """Return the fit of a mirror as it is after its latest sighting.
 
     Parameters
     ----------
@@ -257,5 +251,5 @@ def fitting_present(
     if int(fitted.outcome[0]) != FitOutcome.CONVERGED or not len(known):
         return fitted
     hyper = hyper_of(mechanism, fitted, group)
-    belief = yield from replaying(mechanism, sightings, fitted, hyper, flown)
+    belief = replayed(mechanism, sightings, fitted, hyper, flown)
     return at_present(fitted, belief, float(known.max()))

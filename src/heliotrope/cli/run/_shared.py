@@ -4,20 +4,24 @@ import asyncio
 import contextlib
 import gc
 import importlib.util
+import math
 import os
 import shutil
 import signal
 import socket
 import sys
 import tempfile
+import threading
 import webbrowser
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
 
+from heliotrope import warm
 from heliotrope.cli.run._evidence import Evidence, leaving
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.field.plant import Plant
@@ -28,6 +32,7 @@ from heliotrope.plant.assembly import PlantAssembly
 from heliotrope.plant.interface import PlantInterface
 from heliotrope.plant.operations.pictures import Pictures, PictureSettings
 from heliotrope.plant.settings import PlantSettings
+from heliotrope.plant.workers import WorkerProcesses
 from heliotrope.store.database import make_private, tighten
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry
@@ -42,6 +47,11 @@ FIRST_FILE = "first-password"
 EVERY, _ARCHIVED = 10.0, 5.0
 #: Time between predictions of the field's errors, s.
 FORESEE = 1800.0
+#: Time in which a program ends after a second Ctrl-C, s, and its exit code if it had to be killed.
+AT_ONCE, _INTERRUPTED = 2.0, 130
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+#: Time between lines while the field goes to stow, and for visits to a simulated field to end, s.
+_SAID, _HALTED = 10.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -152,6 +162,15 @@ def _missing(error: ImportError) -> InputError:
 
 
 @contextlib.contextmanager
+def computing() -> Iterator[WorkerProcesses]:
+    """Begin the processes that compute for a plant, and load what the plant itself computes."""
+    with contextlib.closing(WorkerProcesses()) as worker:
+        worker.start()
+        warm.controlling()
+        yield worker
+
+
+@contextlib.contextmanager
 def one_error() -> Iterator[None]:
     """Raise the first error of Heliotrope or the system in place of the group that holds it."""
     try:
@@ -170,12 +189,38 @@ def _leaves(error: BaseException) -> list[BaseException]:
     return [error]
 
 
-def ending_at_signals() -> asyncio.Event:
-    """Return an event that is set by Ctrl-C and SIGTERM."""
-    ending, loop = asyncio.Event(), asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, ending.set)
-    return ending
+class Ending:
+    """What Ctrl-C and SIGTERM ask for; it is made in the loop of the plant.
+
+    Attributes
+    ----------
+    asked
+        Set by the first: the plant ends in order.
+    at_once
+        Set by the second: nothing is waited for. If the program still runs after `AT_ONCE`, it is
+        ended where it stands; the store is then as after a power cut.
+    """
+
+    def __init__(self) -> None:
+        self.asked, self.at_once = asyncio.Event(), asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+        for number in _SIGNALS:
+            self._loop.add_signal_handler(number, self.ask)
+
+    def ask(self) -> None:
+        """End in order; from now on a signal asks to end at once."""
+        self.asked.set()
+        for number in _SIGNALS:
+            self._loop.remove_signal_handler(number)
+            # Not in the loop, which may be what hangs.
+            signal.signal(number, self._hurry)
+
+    def _hurry(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        last = threading.Timer(AT_ONCE, os._exit, [_INTERRUPTED])
+        last.daemon = True
+        last.start()
+        self._loop.call_soon_threadsafe(self.at_once.set)
 
 
 @contextlib.contextmanager
@@ -312,27 +357,31 @@ def first_account(live: PlantAssembly, keeper: Keeper, shown: Shown, folder: Pat
 
 
 async def watch(
-    live: PlantAssembly, shown: Shown, ending: asyncio.Event, lines: Lines, *, speed: float = 1.0
+    live: PlantAssembly, shown: Shown, asked: asyncio.Event, lines: Lines, *, speed: float = 1.0
 ) -> None:
     """Print a line at intervals until the end."""
     loop = asyncio.get_running_loop()
     pause = speed * shown.every * (_SELDOM if shown.console and shown.every == EVERY else 1.0)
     until = None if shown.minutes is None else loop.time() + 60.0 * shown.minutes
-    while not ending.is_set() and (until is None or loop.time() < until):
+    while not asked.is_set() and (until is None or loop.time() < until):
         left = pause if until is None else min(pause, until - loop.time())
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(max(left, 0.01)):
-                await ending.wait()
+                await asked.wait()
         lines.print(line(live))
 
 
-async def stow(live: PlantAssembly, ending: asyncio.Event, lines: Lines) -> bool:
-    """Stow the field, or give up at a second signal; return whether all of it is stowed."""
-    lines.print("stowing; Ctrl-C again ends at once")
-    ending.clear()
+async def stow(live: PlantAssembly, at_once: asyncio.Event, lines: Lines) -> bool:
+    """Stow the field, and say how long that takes; return whether all of it is stowed.
+
+    It is given up when ``at_once`` is set.
+    """
     stowing = asyncio.ensure_future(live.stowed())
-    waiting = asyncio.ensure_future(ending.wait())
-    await asyncio.wait({stowing, waiting}, return_when=asyncio.FIRST_COMPLETED)
+    waiting = asyncio.ensure_future(at_once.wait())
+    left: set[asyncio.Future[Any]] = {stowing, waiting}
+    while left == {stowing, waiting}:
+        lines.print(f"stowing {_on_the_way(live)}; Ctrl-C again ends at once")
+        _, left = await asyncio.wait(left, timeout=_SAID, return_when=asyncio.FIRST_COMPLETED)
     waiting.cancel()
     stowing.cancel()
     done = await asyncio.gather(stowing, return_exceptions=True)
@@ -342,6 +391,14 @@ async def stow(live: PlantAssembly, ending: asyncio.Event, lines: Lines) -> bool
     good = list(done) == [True]
     lines.print("the field is stowed" if good else "not every heliostat is stowed")
     return good
+
+
+def _on_the_way(live: PlantAssembly) -> str:
+    """Return how many heliostats are not stowed yet, and how long they take."""
+    count, seconds = live.to_stow()
+    # To ten seconds: the ways round volumes are longer than the axes' turns.
+    about = f"about {max(10.0, 10.0 * math.ceil(0.1 * seconds)):.0f} s"
+    return f"{count:,} heliostats, {about if math.isfinite(seconds) else 'of unknown position'}"
 
 
 def line(live: PlantAssembly) -> str:
@@ -376,15 +433,15 @@ def _silent(live: PlantAssembly) -> str:
     return f"{len(away)} of {len(rows)} clusters silent: {names}{why}"
 
 
-def begin(design: Plant, shown: Shown) -> asyncio.Event:
-    """Print what begins and check the console; return the event that ends it.
+def begin(design: Plant, shown: Shown) -> Ending:
+    """Print what begins and check the console; return what ends it.
 
     Raises
     ------
     InputError
         See `check_console`.
     """
-    ending = ending_at_signals()
+    ending = Ending()
     print(f"{design.name}: {len(design):,} heliostats", flush=True)
     check_console(shown)
     return ending
@@ -395,12 +452,15 @@ async def at_work(
     keeper: Keeper,
     shown: Shown,
     folder: Path,
-    ending: asyncio.Event,
+    ending: Ending,
+    *,
+    stows: bool,
     speed: float = 1.0,
 ) -> None:
-    """Run a plant with interface, console and archive until the end, then stow its field.
+    """Run a plant with interface, console and archive until the end.
 
-    The sockets of the interface stand in ``folder``.
+    The sockets of the interface stand in ``folder``. With ``stows`` the field is stowed before the
+    end, as every real one is.
     """
     password = first_account(live, keeper, shown, folder)
     # Freeze the existing objects: every ten seconds the collector would walk through those of
@@ -414,8 +474,11 @@ async def at_work(
             leaving(live, keeper, shown.evidence),
             interface(live, keeper, shown, folder, password, lines),
         ):
-            await watch(live, shown, ending, lines, speed=speed)
-            if not await stow(live, ending, lines):
+            await watch(live, shown, ending.asked, lines, speed=speed)
+            ending.ask()  # or the time was over
+            if not stows:
+                await live.operations.automatic.halt(_HALTED)
+            elif not await stow(live, ending.at_once, lines):
                 lines.print(live.left())
             await live.end()
         lines.print("ended")

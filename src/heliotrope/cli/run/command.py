@@ -239,7 +239,7 @@ def run(
 
     The field leaves stow some heliostats at a time, the camera of each target calibrates one
     heliostat after another, and every calibration is pushed to its local controller. The console
-    shows it all. Ctrl-C stows the field and ends. With --clusters the heliostats are real.
+    shows it all. Ctrl-C ends it. With --clusters the heliostats are real, and it stows them first.
     """
     from heliotrope.cli.run._evidence import Evidence
     from heliotrope.cli.run._shared import Shown

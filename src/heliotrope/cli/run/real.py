@@ -12,6 +12,7 @@ from heliotrope.cli.run._shared import (
     Shown,
     at_work,
     begin,
+    computing,
     one_error,
     pictures,
     store,
@@ -31,6 +32,7 @@ from heliotrope.plant.ports import Ports
 from heliotrope.plant.receiver_flux import check_reference, flux_by
 from heliotrope.plant.sensors import AllSensors, Sensors
 from heliotrope.plant.settings import clusters_of
+from heliotrope.plant.workers import Worker, at_once
 from heliotrope.store.keeper import Keeper
 
 if TYPE_CHECKING:
@@ -155,10 +157,16 @@ class _Outside:
         return AllSensors([files, flux_by(cameras, clock, light)])
 
     def ports(
-        self, design: Plant, choice: RealChoice, shown: Shown, clock: SystemClock, keeper: Keeper
+        self,
+        design: Plant,
+        choice: RealChoice,
+        shown: Shown,
+        clock: SystemClock,
+        keeper: Keeper,
+        worker: Worker,
     ) -> Ports:
         """Return the ports of the plant."""
-        cameras = _cameras(design, choice, shown, self.links.light, clock)
+        cameras = _cameras(design, choice, shown, self.links.light, clock, worker)
         return Ports(
             self.all_links,
             clock,
@@ -170,6 +178,7 @@ class _Outside:
             assigned=KeptPoints(keeper),
             beside=self.running,
             learner=LearnerProcess(),
+            worker=worker,
             facts=self.links.facts,
         )
 
@@ -194,20 +203,21 @@ def _cameras(
     shown: Shown,
     light: "ReceiverReference | None",
     clock: SystemClock,
+    worker: Worker = at_once,
 ) -> RealCameras | None:
     """Return the cameras; None if the plant has no camera that can work."""
     watched = {} if light is None else {light.sight.receiver: light.sight.camera}
     if not design.cameras or not (design.targets or watched):
         return None
     memory = None if shown.data is None else shown.data / "targets"
-    return RealCameras(design, choice.folder, clock, watched=watched, memory=memory)
+    return RealCameras(design, choice.folder, clock, watched=watched, memory=memory, worker=worker)
 
 
 async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outside) -> None:
     ending = begin(design, shown)
-    with store(shown) as (keeper, folder):
+    with computing() as worker, store(shown) as (keeper, folder):
         clock = SystemClock()
-        ports = outside.ports(design, choice, shown, clock, keeper)
+        ports = outside.ports(design, choice, shown, clock, keeper, worker)
         kept = pictures(shown, folder)
         ports = replace(ports, pictures=kept, marks=shown.marks)
         live = PlantAssembly(design, ports, _settings(design, choice, shown, outside))
@@ -220,4 +230,4 @@ async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outsid
                 name = f"key of the bus of {each.installation.config.name}"
                 papers.renew(name, [file], each.installation.take_bus_keys)
         async with papers.watched(live.logbook.take_alarm):
-            await at_work(live, keeper, shown, folder, ending)
+            await at_work(live, keeper, shown, folder, ending, stows=True)

@@ -9,6 +9,7 @@ from heliotrope.cli.run._shared import (
     Shown,
     at_work,
     begin,
+    computing,
     one_error,
     pictures,
     store,
@@ -36,7 +37,7 @@ class SimulationOptions:
 
 
 def run_plant(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
-    """Run until Ctrl-C, or until the time is over; the field is stowed at the end."""
+    """Run until Ctrl-C, or until the time is over."""
     with one_error(), asyncio.Runner(loop_factory=lambda: PacedLoop(choice.speed)) as runner:
         runner.run(_run(design, choice, shown))
 
@@ -45,7 +46,6 @@ async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, PacedLoop)
     clock = VirtualClock(loop.time, choice.start)
-    options = WorldOptions(choice.seed, rendered=not choice.exact, boards=choice.boards)
     settings = AssemblySettings(
         plant=shown.plant,
         work=AutomaticSettings(wanted=not choice.idle, calibrate=not choice.idle, foresee=FORESEE),
@@ -53,7 +53,10 @@ async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
         machines=MachineTables.HELD,
     )
     ending = begin(design, shown)
-    with store(shown) as (keeper, folder):
+    with computing() as worker, store(shown) as (keeper, folder):
+        options = WorldOptions(
+            choice.seed, rendered=not choice.exact, worker=worker, boards=choice.boards
+        )
         ports = World(design, clock, options).ports(
             audit=KeptAudit(keeper, SystemClock(), clock.utc()),
             # A record takes long in a time that runs faster, so there the loop waits for it.
@@ -66,4 +69,4 @@ async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
         kept = pictures(shown, folder, waits=choice.speed > 1.0)
         ports = replace(ports, pictures=kept, marks=shown.marks, learner=LearnerProcess())
         live = PlantAssembly(design, ports, settings)
-        await at_work(live, keeper, shown, folder, ending, choice.speed)
+        await at_work(live, keeper, shown, folder, ending, stows=False, speed=choice.speed)

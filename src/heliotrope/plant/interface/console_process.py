@@ -24,7 +24,7 @@ _LOG = logging.getLogger(__name__)
 #: Time between two looks at the process, s.
 _LOOK = 0.2
 #: Time for the process to end by itself, s.
-_END = 3.0
+_END = 1.0
 
 
 @dataclass(frozen=True)

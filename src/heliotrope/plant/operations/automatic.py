@@ -188,7 +188,9 @@ class AutomaticControl:
                 None if receiver is None else ProductionVisits(plant, self.book, receiver),
             )
             if settings.foresee > 0.0:
-                self._foresight = Foresight(plant, self._keeping, scheduler, settings.foresee)
+                self._foresight = Foresight(
+                    plant, self._keeping, scheduler, settings.foresee, cycle.worker
+                )
         self._stopped = False
         if cycle is not None:
             self._keeping.recall()

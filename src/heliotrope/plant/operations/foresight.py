@@ -1,10 +1,9 @@
 """Predictions of the field's errors for the rest of the day, and what comes true of them.
 
-A prediction takes seconds for a large field, so it is made in a thread, from a copy of what the
+A prediction takes seconds for a large field, so it is made beside the loop, from a copy of what the
 schedule knows. The first of a day stays beside what comes true; the last one says what is to come.
 """
 
-import asyncio
 from collections import deque
 from collections.abc import Sequence
 from typing import Protocol
@@ -15,6 +14,7 @@ import numpy.typing as npt
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.outlook import FieldPoint, Outlook, day_of
+from heliotrope.plant.workers import Worker
 from heliotrope.store.records import OutlookEntry
 
 #: Time between points of the curve that comes true, s, and number of points that are held.
@@ -26,7 +26,7 @@ _DAY = 86_400.0
 
 
 class Prospect(Protocol):
-    """What is known of the field at one moment; its methods may be called in any thread."""
+    """What is known of the field at one moment; its methods may be called in any process."""
 
     def now(self) -> FieldPoint:
         """Return the errors of the field."""
@@ -64,6 +64,8 @@ class Foresight:
         What is predicted from.
     every
         Time between predictions, s; 0: none is made.
+    worker
+        Computes them.
 
     Attributes
     ----------
@@ -74,9 +76,15 @@ class Foresight:
     """
 
     def __init__(
-        self, plant: PlantController, keeping: Keeping, schedule: Foreseeing, every: float
+        self,
+        plant: PlantController,
+        keeping: Keeping,
+        schedule: Foreseeing,
+        every: float,
+        worker: Worker,
     ) -> None:
         self._plant, self._keeping, self._schedule = plant, keeping, schedule
+        self._worker = worker
         self.every = every
         self.points: deque[FieldPoint] = deque(maxlen=_POINTS)
         self.outlooks: tuple[Outlook, ...] = ()
@@ -106,11 +114,11 @@ class Foresight:
         prospect = self._schedule.foresee(able, self._targets)
         if prospect is None:
             return
-        self.points.append(await asyncio.to_thread(prospect.now))
+        self.points.append(await self._worker(prospect.now))
         up = able.any() and ready.sum() >= _UP * able.sum()
         if not (running and up and self._due()):
             return
-        made = await asyncio.to_thread(prospect.outlook)
+        made = await self._worker(prospect.outlook)
         if made is not None:
             today = [one for one in self.outlooks if self._day(one.made) == self._day(made.made)]
             self.outlooks = (*today[:1], made)

@@ -353,10 +353,6 @@ class KeptCamera:
 
         return Exposed(exposed.at, asyncio.create_task(kept()))
 
-    async def beside(self, work: Callable[[], T]) -> T:
-        """Return the result of a computation that must not hold up the loop."""
-        return await self._camera.beside(work)
-
 
 class ViewedCamera(StackCamera, Protocol):
     """A camera of targets that shows the last photograph of each."""

@@ -140,7 +140,7 @@ def _share(pace: float) -> float:
 
 @dataclass(frozen=True)
 class FieldProspect:
-    """What is known of a field at one moment; nothing in it changes, so any thread may use it.
+    """What is known of a field at one moment; nothing in it changes, so any process may use it.
 
     Attributes
     ----------
@@ -149,8 +149,8 @@ class FieldProspect:
     site, targets
         Place and air, and the targets that may be used.
     fleets
-        Heliostats with the *covariance* of their parameters in place of the information, which the
-        thread computes.
+        Heliostats with the *covariance* of their parameters in place of the information, which is
+        computed beside the plant.
     size
         Larger side of the mirrors, m, (N,), in the order of the fleets as what follows.
     measured, held

@@ -11,7 +11,6 @@ expect are confirmed by one more photograph before they are taken; if it contrad
 parameters are pushed back. The photograph that has confirmed them is learnt from after that.
 """
 
-import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 from datetime import timedelta
@@ -34,8 +33,14 @@ from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.visits.fitting import JudgedFit, change_of, fitting, surprise_of
-from heliotrope.plant.visits.model_of_each import ModelOfEach, stepwise
+from heliotrope.plant.visits.fitting import (
+    Believed,
+    JudgedFit,
+    change_of,
+    fit_heliostat,
+    surprise_of,
+)
+from heliotrope.plant.visits.model_of_each import ModelOfEach
 from heliotrope.plant.visits.neighbours import Standing, Unhidden, UnhiddenCamera
 from heliotrope.plant.visits.photographs import (
     Centred,
@@ -49,6 +54,7 @@ from heliotrope.plant.visits.photographs import (
 from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.plant.visits.verification import Confirming, Verification
 from heliotrope.plant.visits.visit import Visit
+from heliotrope.plant.workers import Worker, at_once
 
 #: Step counts in doubt are confirmed by photographs that miss by no more than this, rad RMS: the
 #: limit at which `pointing_disagrees` trips.
@@ -143,11 +149,15 @@ class CalibrationCycle:
         Search and centring of a beam that misses; None: photographs are taken where it is.
     unhidden
         Corrects centroids for neighbours that shade and block; None: they count as they are.
+    worker
+        Computes fits.
 
     Attributes
     ----------
     settings
         See `CycleSettings`.
+    worker
+        As given.
     unhidden
         As given.
     verification
@@ -161,7 +171,9 @@ class CalibrationCycle:
         settings: CycleSettings | None = None,
         centring: Centring | None = None,
         unhidden: Unhidden | None = None,
+        worker: Worker = at_once,
     ) -> None:
+        self.worker = worker
         self._plant, self.settings, self.unhidden = plant, settings or CycleSettings(), unhidden
         camera = camera if unhidden is None else UnhiddenCamera(camera, unhidden)
         self._camera, self._centring = camera, centring or Centring()
@@ -170,7 +182,7 @@ class CalibrationCycle:
             if centring is None
             else Centred(camera, self.settings, centring)
         )
-        self._models, self._fitting = ModelOfEach(self.settings), asyncio.Lock()
+        self._models = ModelOfEach(self.settings, worker)
         self.verification = Verification(
             camera, self.settings, centring or Centring(), self._sighting
         )
@@ -343,10 +355,10 @@ class CalibrationCycle:
                 len(here),
                 measured,
             )
-        # One fit at a time: the steps of many would hold up the loop together.
-        async with self._fitting:
-            model = await self._models.of(name, beliefs.nominal(name), every)
-            found = await stepwise(fitting(beliefs, self.settings, model, name, every))
+        model = await self._models.of(name, beliefs.nominal(name), every)
+        found = await self.worker(
+            fit_heliostat, Believed.of(beliefs, name), self.settings, model, every
+        )
         pushed: tuple[str, ...] = ()
         if not found.problem and production is not None:
             found = await self._leaving(visit, found, here, production)

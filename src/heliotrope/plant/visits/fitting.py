@@ -4,9 +4,8 @@ One heliostat is fitted after a visit, many after a flight. Both use all that is
 its photographs, and its rows of flights with the errors that they share with other mirrors.
 """
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from heliotrope.calibration.fit.common import CommonFit, fit_common
 from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn import drift
-from heliotrope.calibration.learn.drift import DAY
+from heliotrope.calibration.learn.drift import DAY, Hyperparameters
 from heliotrope.calibration.learn.own_model import OwnModel
 from heliotrope.calibration.record import (
     CalibrationOutcome,
@@ -120,63 +119,74 @@ class JudgedFit:
         )
 
 
+@dataclass(frozen=True)
+class Believed:
+    """What is believed of one heliostat when it is fitted: a copy, which nothing changes.
+
+    Attributes
+    ----------
+    name
+        Of the heliostat.
+    nominal, present
+        The mechanism of the design, and the one that is believed now, batch shape (1,).
+    hyper
+        What was learnt of its group; None: nothing.
+    flights
+        Flights of a drone.
+    """
+
+    name: str
+    nominal: Mechanism
+    present: Mechanism
+    hyper: Hyperparameters | None
+    flights: Flights
+
+    @classmethod
+    def of(cls, beliefs: Beliefs, name: str) -> "Believed":
+        """Return what is believed of a heliostat now, with the flights that saw it."""
+        flights = beliefs.flights if name in beliefs.flights else Flights()
+        return cls(name, beliefs.nominal(name), beliefs.present(name), beliefs.hyper(name), flights)
+
+
 def fit_heliostat(
-    beliefs: Beliefs, settings: CycleSettings, model: OwnModel, name: str, photographed: Sightings
+    believed: Believed, settings: CycleSettings, model: OwnModel, photographed: Sightings
 ) -> JudgedFit:
-    """Return the fit of one heliostat, by a model, to its photographs and its rows of flights."""
-    return _ended(fitting(beliefs, settings, model, name, photographed))
-
-
-def fitting(
-    beliefs: Beliefs, settings: CycleSettings, model: OwnModel, name: str, photographed: Sightings
-) -> Generator[None, None, JudgedFit]:
-    """Fit as `fit_heliostat`, in steps of some ten ms between which others may work.
+    """Return the fit of one heliostat, by a model, to its photographs and its rows of flights.
 
     Photographs and rows of flights are followed through the drift to the latest of them, and the
     last day's must be explained: what the belief takes for mistakes may be a mirror that has moved
     an hour ago. If constants explain them better, these are proposed. Rows of flights share errors
     with other mirrors, of which the joint fit of constants keeps account.
     """
-    nominal, nothing = beliefs.nominal(name), np.zeros(0, np.int64)
-    if name in beliefs.flights:
+    if believed.name in believed.flights:
         (constants,) = _fit_group(
-            beliefs, beliefs.flights, settings, model, (name,), nominal, (photographed,)
+            [believed], believed.flights, settings, model, believed.nominal, [photographed]
         )
-        return (
-            yield from _following(
-                beliefs, beliefs.flights, settings, model, constants, photographed
-            )
-        )
-    still, moving = yield from model.fitting(nominal, photographed, beliefs.hyper(name))
-    return _better(beliefs, settings, model, name, nominal, photographed, nothing, still, moving)
+        return _following(believed, settings, model, constants, photographed)
+    still, moving = model.fitting(believed.nominal, photographed, believed.hyper)
+    nothing = np.zeros(0, np.int64)
+    return _better(believed, settings, model, photographed, nothing, still, moving)
 
 
 def _following(
-    beliefs: Beliefs,
-    flights: Flights,
+    believed: Believed,
     settings: CycleSettings,
     model: OwnModel,
     joint: JudgedFit,
     photographed: Sightings | None,
-) -> Generator[None, None, JudgedFit]:
+) -> JudgedFit:
     """Return the fit that follows the drift of a mirror with rows of flights, or its constants."""
-    name, nominal, seen = joint.name, joint.nominal, joint.seen
+    seen, flown = joint.seen, believed.flights.flown(believed.name)
     photographs = seen.take(np.zeros(0, np.intp)) if photographed is None else photographed
-    moving = yield from model.following(
-        nominal, photographs, joint.fitted, beliefs.hyper(name), flights.flown(name)
-    )
-    found = _better(
-        beliefs, settings, model, name, nominal, seen, joint.flown, joint.fitted, moving
-    )
+    moving = model.following(believed.nominal, photographs, joint.fitted, believed.hyper, flown)
+    found = _better(believed, settings, model, seen, joint.flown, joint.fitted, moving)
     return replace(found, revealed=joint.revealed)
 
 
 def _better(
-    beliefs: Beliefs,
+    believed: Believed,
     settings: CycleSettings,
     model: OwnModel,
-    name: str,
-    nominal: Mechanism,
     seen: Sightings,
     flown: Identities,
     still: FieldFit,
@@ -185,24 +195,16 @@ def _better(
     """Return the fit that follows the drift if it explains the last day, else the constants."""
     recent = seen.take(np.flatnonzero(seen.time >= seen.time.max() - DAY))
     left = [
-        root_mean_square(beam_errors(nominal.with_parameters(one.parameters), recent).beam)
+        root_mean_square(beam_errors(believed.nominal.with_parameters(one.parameters), recent).beam)
         for one in (still, moving)
     ]
     if not left[1] <= max(left[0], EXPLAINED * settings.sigma):
-        return _judged(beliefs, settings, model, name, nominal, still, seen, flown)
-    found = _judged(beliefs, settings, model, name, nominal, moving, recent, flown)
+        return _judged(believed, settings, model, still, seen, flown)
+    found = _judged(believed, settings, model, moving, recent, flown)
     return replace(found, seen=seen)
 
 
-def _ended(steps: Generator[None, None, JudgedFit]) -> JudgedFit:
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return cast("JudgedFit", end.value)
-
-
-def _room(beliefs: Beliefs, settings: CycleSettings, name: str, flown: Identities) -> float:
+def _room(believed: Believed, settings: CycleSettings, flown: Identities) -> float:
     """Return the beam error that motion within hours leaves, which is not followed, rad RMS.
 
     A photograph's own sigma says it well enough; a row of a flight is ten times as precise.
@@ -210,7 +212,7 @@ def _room(beliefs: Beliefs, settings: CycleSettings, name: str, flown: Identitie
     usual = ROOM * settings.sigma
     if not len(flown):
         return usual
-    hyper = beliefs.hyper(name)
+    hyper = believed.hyper
     if hyper is None:
         motion = np.full(2, drift.START_RAD["hours"])
     else:
@@ -263,7 +265,8 @@ def follow_flights(
         known = beliefs.seen(name)
         seen = None if known is None else known.sightings
         model = first_model(settings, joint.nominal)
-        found[name] = _ended(_following(beliefs, flights, settings, model, joint, seen))
+        believed = replace(Believed.of(beliefs, name), flights=flights)
+        found[name] = _following(believed, settings, model, joint, seen)
     return found
 
 
@@ -282,42 +285,33 @@ def _fit_names(
     rows = np.array([group.index(name) for name in names], dtype=np.intp)
     seen = [beliefs.seen(name) for name in names]
     photographed = [None if one is None else one.sightings for one in seen]
-    model = first_model(settings, group.mechanism)
-    return _fit_group(beliefs, flights, settings, model, names, group.mechanism[rows], photographed)
+    model, believed = (
+        first_model(settings, group.mechanism),
+        [Believed.of(beliefs, n) for n in names],
+    )
+    return _fit_group(believed, flights, settings, model, group.mechanism[rows], photographed)
 
 
 def _fit_group(
-    beliefs: Beliefs,
+    believed: Sequence[Believed],
     flights: Flights,
     settings: CycleSettings,
     model: OwnModel,
-    names: Sequence[str],
     mechanism: Mechanism,
     photographed: Sequence[Sightings | None],
 ) -> list[JudgedFit]:
-    seen, common = flights.common(names, photographed)
+    seen, common = flights.common([one.name for one in believed], photographed)
     found = fit_common(model.start(mechanism), seen, model.parameters, common)
     return [
-        _of_one(
-            beliefs,
-            settings,
-            model,
-            name,
-            mechanism[np.array([i])],
-            found,
-            i,
-            flights.identities(name),
-        )
-        for i, name in enumerate(names)
+        _of_one(one, settings, model, found, i, flights.identities(one.name))
+        for i, one in enumerate(believed)
     ]
 
 
 def _of_one(
-    beliefs: Beliefs,
+    believed: Believed,
     settings: CycleSettings,
     model: OwnModel,
-    name: str,
-    nominal: Mechanism,
     found: CommonFit,
     i: int,
     flown: Identities,
@@ -337,28 +331,33 @@ def _of_one(
         centre=whole.centre[here],
     )
     fitted = model.completed(fitted)
-    judged = _judged(beliefs, settings, model, name, nominal, fitted, found.seen.of(i), flown)
+    judged = _judged(believed, settings, model, fitted, found.seen.of(i), flown)
     return replace(judged, revealed=(found.information[i], found.pull[i]))
 
 
 def _judged(
-    beliefs: Beliefs,
+    believed: Believed,
     settings: CycleSettings,
     model: OwnModel,
-    name: str,
-    nominal: Mechanism,
     fitted: FieldFit,
     seen: Sightings,
     flown: Identities,
 ) -> JudgedFit:
-    new = nominal.with_parameters(fitted.parameters)
-    before, after = (
-        _weighted(beam_errors(m, seen).beam, seen) for m in (beliefs.present(name), new)
-    )
-    room = _room(beliefs, settings, name, flown)
+    new = believed.nominal.with_parameters(fitted.parameters)
+    before, after = (_weighted(beam_errors(m, seen).beam, seen) for m in (believed.present, new))
+    room = _room(believed, settings, flown)
     outcome, problem = _judge(settings, fitted, before, after, room)
     return JudgedFit(
-        model.name, fitted, nominal, seen, before, after, outcome, problem, name, flown
+        model.name,
+        fitted,
+        believed.nominal,
+        seen,
+        before,
+        after,
+        outcome,
+        problem,
+        believed.name,
+        flown,
     )
 
 

@@ -25,7 +25,7 @@ from heliotrope.errors import HeliotropeError
 from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.coded import SeparatedBeam, Separation, Verdict, separate
+from heliotrope.imaging.coded import SeparatedBeam, Verdict
 from heliotrope.lcu import states
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
@@ -37,14 +37,14 @@ from heliotrope.plant.visits.joint_layout import Layout, arranged, error_on, ver
 from heliotrope.plant.visits.joint_visit import JointVisit
 from heliotrope.plant.visits.neighbours import Standing
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
-from heliotrope.plant.visits.stack_counts import counts_at_rest
+from heliotrope.plant.visits.stack_counts import CountsHeard, counts_at_rest
 from heliotrope.plant.visits.stacks import (
     Exposed,
     StackCamera,
     TargetLight,
     light_on,
     noting,
-    stack_of,
+    separated,
 )
 from heliotrope.plant.visits.verification import Confirming
 from heliotrope.plant.visits.visit import Visit
@@ -297,24 +297,26 @@ class JointCycle:
         moves = layout.moves[[number for number, _ in pictures]][:, chosen]
         beams = [layout.beams[i] for i in chosen]
         tell("taking the beams apart")
-
-        def work() -> Separation:
-            return separate(stack_of([one for _, one in pictures], empty), moves, beams)
-
-        found = await self._camera.beside(work)
+        lights = [one for _, one in pictures]
+        found = await self._cycle.worker(separated, lights, empty, moves, beams)
+        heard = []
+        for i, beam in zip(chosen, found.beams, strict=True):
+            if beam.verdict is Verdict.PROVEN:
+                still = [
+                    (begin, end, layout.aims[i] + layout.moves[number, i] @ layout.target.axes)
+                    for begin, end, number in taken.still
+                ]
+                visit = joint.visits[beam.heliostat]
+                heard.append(CountsHeard.of(visit, layout.aims[i], still, _middle(pictures)))
+        at_rest = await self._cycle.worker(counts_at_rest, heard)
         results: dict[str, CycleResult] = {}
         proven: dict[str, Photographs] = {}
-        for i, beam in zip(chosen, found.beams, strict=True):
+        for beam in found.beams:
             name = beam.heliostat
             if beam.verdict is not Verdict.PROVEN:
                 results[name] = _not_proven(name, beam)
                 continue
-            still = [
-                (begin, end, layout.aims[i] + layout.moves[number, i] @ layout.target.axes)
-                for begin, end, number in taken.still
-            ]
-            rest = counts_at_rest(joint.visits[name], layout.aims[i], still, _middle(pictures))
-            counts = await self._camera.beside(rest)
+            counts = at_rest[name]
             if isinstance(counts, str):
                 text = f"unchanged: {counts}"
                 results[name] = CycleResult(name, CalibrationOutcome.NOT_PROVEN, text)

@@ -1,16 +1,11 @@
 """The model that each heliostat of a running plant is fitted with."""
 
-import asyncio
-from collections.abc import Generator
-from typing import TypeVar, cast
-
-from heliotrope.calibration.learn.own_model import OwnModel, choosing
+from heliotrope.calibration.learn.own_model import OwnModel, choose_own_model
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.visits.settings import SIMPLE, CycleSettings
-
-Result = TypeVar("Result")
+from heliotrope.plant.workers import Worker
 
 #: The model is chosen again when there are this many times as many sightings.
 MORE = 1.25
@@ -23,10 +18,12 @@ class ModelOfEach:
     ----------
     settings
         Its ``model`` is for all heliostats, unless it is "auto".
+    worker
+        Compares the candidates.
     """
 
-    def __init__(self, settings: CycleSettings) -> None:
-        self._model = settings.model
+    def __init__(self, settings: CycleSettings, worker: Worker) -> None:
+        self._model, self._worker = settings.model, worker
         self._kept: dict[str, tuple[int, OwnModel]] = {}
 
     async def of(self, heliostat: str, nominal: Mechanism, sightings: Sightings) -> OwnModel:
@@ -35,19 +32,9 @@ class ModelOfEach:
             return _given(self._model, nominal)
         count, model = self._kept.get(heliostat, (0, None))
         if model is None or len(sightings) >= MORE * count:
-            model = await stepwise(choosing(nominal, sightings, SIMPLE))
+            model = await self._worker(choose_own_model, nominal, sightings, SIMPLE)
             self._kept[heliostat] = len(sightings), model
         return model
-
-
-async def stepwise(steps: Generator[None, None, Result]) -> Result:
-    """Return the result of work in steps, and let the plant work between them."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return cast("Result", end.value)
-        await asyncio.sleep(0.0)
 
 
 def _given(model: str | tuple[str, ...], nominal: Mechanism) -> OwnModel:

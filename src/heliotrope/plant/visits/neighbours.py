@@ -5,9 +5,8 @@ believed. Most mirrors are clear, which a test of corners tells at once; the shi
 not takes some milliseconds, and is computed where it does not hold up the loop.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from functools import partial
 
 import numpy as np
 
@@ -20,21 +19,12 @@ from heliotrope.optics import Neighbours, nearest
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.visits.photographs import Shot, TargetCamera
+from heliotrope.plant.workers import Worker
 
 #: An axis turns that is further than this from its goal, rad.
 _TURNS = 2e-3
 #: Step counts older than this leave the shift unknown, s.
 _OLD = 30.0
-
-T = TypeVar("T")
-
-
-class Beside(Protocol):
-    """A place for computations that must not hold up the loop."""
-
-    async def __call__(self, work: Callable[[], T]) -> T:
-        """Return the result of a computation."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -67,12 +57,12 @@ class Unhidden:
     ----------
     plant
         Knows the mirrors' places, sizes and step counts.
-    beside
+    worker
         Computes a shift.
     """
 
-    def __init__(self, plant: PlantController, beside: Beside) -> None:
-        self._plant, self._beside = plant, beside
+    def __init__(self, plant: PlantController, worker: Worker) -> None:
+        self._plant, self._worker = plant, worker
         found = [plant.design.find(name) for name in plant.field.names]
         self._size = np.array([(group.width[i], group.height[i]) for group, i in found])
         self._near = nearest(plant.beams.position)
@@ -119,14 +109,16 @@ class Unhidden:
             return shot
         group, place = plant.design.find(heliostat)
         unknown = 1.0 if (unsure & hides).any() else UNKNOWN
-
-        def work() -> tuple[FloatArray, FloatArray, float]:
-            return shift_of(
-                group, place, target, shot.point, sun, vertices[0], beside.of(hides),
-                unknown=unknown,
-            )  # fmt: skip
-
-        shift, spread, hidden = await self._beside(work)
+        shift, spread, hidden = await self._worker(
+            partial(shift_of, unknown=unknown),
+            group,
+            place,
+            target,
+            shot.point,
+            sun,
+            vertices[0],
+            beside.of(hides),
+        )
         if not hidden or not np.isfinite(shift).all():
             return shot
         axes = target.axes

@@ -19,7 +19,14 @@ from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.coded import SeparatedBeam, Separation, Stack, Verdict, separate
+from heliotrope.imaging.coded import (
+    ExpectedBeam,
+    SeparatedBeam,
+    Separation,
+    Stack,
+    Verdict,
+    separate,
+)
 from heliotrope.imaging.targets.view import posed_view
 from heliotrope.lcu import states
 from heliotrope.plant.authority import Person, RefusedError
@@ -30,7 +37,7 @@ from heliotrope.plant.visits.joint_visit import JointVisit
 from heliotrope.plant.visits.neighbours import Standing
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.receiver_layout import ReceiverLayout, arranged_on, production
-from heliotrope.plant.visits.stack_counts import counts_at_rest
+from heliotrope.plant.visits.stack_counts import CountsHeard, counts_at_rest
 from heliotrope.plant.visits.stacks import StackCamera, TargetLight, light_on, noting
 from heliotrope.plant.visits.visit import Visit
 
@@ -240,12 +247,10 @@ class ReceiverCycle:
             return {name: _not_proven(name, Verdict.CLOUD) for name in joint.names}
         chosen = [layout.names.index(name) for name in joint.names]
         tell("taking the beams apart")
-
-        def work() -> Separation:
-            beams = [layout.beams[i] for i in chosen]
-            return separate(_stack_of(taken.pictures), layout.moves[:, chosen], beams)
-
-        found = judged((await self._camera.beside(work)).beams, made.powers[chosen])
+        beams = [layout.beams[i] for i in chosen]
+        moves = layout.moves[:, chosen]
+        separation = await self._cycle.worker(_separated, taken.pictures, moves, beams)
+        found = judged(separation.beams, made.powers[chosen])
         results: dict[str, CycleResult] = {}
         proven: dict[str, Photographs] = {}
         for i, beam in zip(chosen, found, strict=True):
@@ -277,8 +282,8 @@ class ReceiverCycle:
             (begin, end, layout.aims[i] + layout.moves[number, i] @ self.face.axes)
             for begin, end, number in taken.still
         ]
-        rest = counts_at_rest(joint.visits[name], layout.aims[i], still, taken.middle)
-        counts = await self._camera.beside(rest)
+        heard = CountsHeard.of(joint.visits[name], layout.aims[i], still, taken.middle)
+        counts = (await self._cycle.worker(counts_at_rest, [heard]))[name]
         if isinstance(counts, str):
             return CycleResult(name, CalibrationOutcome.NOT_PROVEN, f"unchanged: {counts}")
         axes = self.face.axes
@@ -352,6 +357,13 @@ def judged(beams: Sequence[SeparatedBeam], powers: FloatArray) -> list[Separated
 def _brightness(picture: TargetLight) -> float:
     """Return the mean brightness of the receiver."""
     return float(picture.values[picture.seen].mean()) / picture.exposure
+
+
+def _separated(
+    pictures: Sequence[TargetLight], moves: FloatArray, beams: Sequence[ExpectedBeam]
+) -> Separation:
+    """Return the beams in photographs of a receiver; see `separate`."""
+    return separate(_stack_of(pictures), moves, beams)
 
 
 def _stack_of(pictures: Sequence[TargetLight]) -> Stack:

@@ -10,7 +10,7 @@ import numpy as np
 from heliotrope.errors import HeliotropeError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.coded import Stack
+from heliotrope.imaging.coded import ExpectedBeam, Separation, Stack, separate
 from heliotrope.imaging.frame import Image
 from heliotrope.imaging.targets.rectify import Mask, Rectified
 from heliotrope.imaging.targets.view import FaceView
@@ -88,6 +88,16 @@ def stack_of(pictures: Sequence[TargetLight], empty: TargetLight) -> Stack:
     )
 
 
+def separated(
+    pictures: Sequence[TargetLight],
+    empty: TargetLight,
+    moves: FloatArray,
+    beams: Sequence[ExpectedBeam],
+) -> Separation:
+    """Return the beams in photographs of one target and the empty target; see `separate`."""
+    return separate(stack_of(pictures, empty), moves, beams)
+
+
 @dataclass(frozen=True)
 class Exposed:
     """A photograph that has been taken, and is read while the beams move on.
@@ -112,17 +122,13 @@ class Exposed:
 
 
 class StackCamera(TargetCamera, Protocol):
-    """A camera that gives the light on targets, and a place for computations."""
+    """A camera that gives the light on targets."""
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
         """Photograph a target, and return as soon as the photograph is taken.
 
         With the view of an earlier photograph the target is not searched for.
         """
-        ...
-
-    async def beside(self, work: Callable[[], T]) -> T:
-        """Return the result of a computation that must not hold up the loop."""
         ...
 
 

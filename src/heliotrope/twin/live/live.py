@@ -42,6 +42,7 @@ from heliotrope.plant.audit import Audit, Forgetful
 from heliotrope.plant.ports import Ports
 from heliotrope.plant.settings import clusters_of
 from heliotrope.plant.visits.settings import CycleSettings
+from heliotrope.plant.workers import Worker, at_once
 from heliotrope.safety import CONDITIONS, Watcher, watched_by
 from heliotrope.store.records import Records
 from heliotrope.twin.boards.clocks import SimulatedTime
@@ -78,8 +79,8 @@ class WorldOptions:
         Seed of imperfections and noise.
     rendered
         Whether photographs are drawn and read; else centroids come with noise.
-    threads
-        Threads for photographs; 0 in virtual time.
+    worker
+        Computes beside the event loop; None: nothing does, as in virtual time.
     installed
         Makes the true mechanisms from the nominal ones; None: with errors as large as in Malan's
         field.
@@ -94,17 +95,16 @@ class WorldOptions:
 
     seed: int = 0
     rendered: bool = True
-    threads: int = 2
+    worker: Worker | None = None
     installed: Callable[[Mechanism], Mechanism] | None = None
     boards: bool = False
     centroid: float = 1e-5
     bus_key: bytes = b""
 
     def __post_init__(self) -> None:
-        if self.threads < 0 or not self.centroid >= 0.0:
+        if not self.centroid >= 0.0:
             raise InputError(
-                f"simulated plant: {self.threads} threads, centroid variance {self.centroid} m²; "
-                "give 0 or more for both"
+                f"simulated plant: centroid variance {self.centroid} m²; give 0 or more"
             )
 
 
@@ -234,7 +234,7 @@ class World:
             scenes += [Scene(self.design.camera(visits.camera), (face,)) for face in self._faces]
         # Malan's small mirrors are of one piece.
         optics = Optics(facets=(1, 1))
-        return RenderedCamera(sight, scenes, optics=optics, seed=seed, threads=self.options.threads)
+        return RenderedCamera(sight, scenes, optics=optics, seed=seed, worker=self.options.worker)
 
     def ports(
         self,
@@ -257,6 +257,7 @@ class World:
             assigned=assigned,
             beside=self.running,
             truth=self.errors,
+            worker=self.options.worker or at_once,
             facts=facts,
         )
 

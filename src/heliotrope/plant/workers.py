@@ -1,0 +1,119 @@
+"""Computations of the plant beside its loop, which renews leases and must not wait for them.
+
+A thread would not do: the threads of a process take turns, and one call of a library may keep the
+turn for seconds. So computations are functions of their arguments alone, which processes beside the
+plant compute; in virtual time, and where a computation is as short as a message, at once.
+"""
+
+import asyncio
+import os
+import pickle
+import signal
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor
+from functools import partial
+from typing import Protocol, TypeVar, TypeVarTuple
+
+from heliotrope.errors import HeliotropeError, InputError
+from heliotrope.processes import end, pool
+
+T = TypeVar("T")
+Given = TypeVarTuple("Given")
+#: Processes: while one takes beams apart for seconds, the other reads photographs.
+PROCESSES = 2
+#: Niceness of the processes: they take what the plant leaves of the machine.
+_NICE = 5
+
+
+class Worker(Protocol):
+    """A place for computations."""
+
+    async def __call__(self, work: Callable[[*Given], T], *given: *Given) -> T:
+        """Return what a function returns.
+
+        Parameters
+        ----------
+        work, given
+            A function of a module, and its arguments: all that it needs, to be pickled. It changes
+            nothing that others use.
+
+        Raises
+        ------
+        HeliotropeError
+            As the function raises it, or the process has ended.
+        """
+        ...
+
+
+async def at_once(work: Callable[[*Given], T], *given: *Given) -> T:
+    """Return what a function returns, computed in the loop itself; see `Worker`."""
+    return work(*given)
+
+
+class WorkerProcesses:
+    """Processes that compute for a plant; new ones begin where one has died.
+
+    Parameters
+    ----------
+    count
+        Number of processes.
+    """
+
+    def __init__(self, count: int = PROCESSES) -> None:
+        self._count = count
+        self._pool = pool(count, _begin)
+
+    def start(self) -> None:
+        """Begin the processes, which load their libraries."""
+        for _ in range(self._count):
+            self._pool.submit(_load)
+
+    async def __call__(self, work: Callable[[*Given], T], *given: *Given) -> T:
+        """Return what a function returns; see `Worker`."""
+        used = self._pool
+        try:
+            return await asyncio.get_running_loop().run_in_executor(
+                used, partial(_computed, work, *given)
+            )
+        except BrokenExecutor:
+            if self._pool is used:
+                end(used)
+                self._pool = pool(self._count, _begin)
+            raise InputError(
+                "the process that computes beside the plant has ended; the next computation begins "
+                "another; if it ends again, see whether the machine runs out of memory"
+            ) from None
+
+    def close(self) -> None:
+        """End the processes at once; what they compute is lost."""
+        end(self._pool)
+
+
+def _begin() -> None:
+    """Prepare a process."""
+    # Ctrl-C in the plant's terminal is the plant's.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(_NICE)
+    os.environ["HELIOTROPE_THREADS"] = "1"
+
+
+def _load() -> None:
+    """Load what most computations need."""
+    from heliotrope import warm
+    from heliotrope.imaging import coded, photograph  # noqa: F401 - only loaded
+
+    warm.tracking()
+    warm.fitting()
+
+
+def _computed(work: Callable[[*Given], T], *given: *Given) -> T:
+    """Return what a function returns; its errors are such as reach another process."""
+    try:
+        return work(*given)
+    except HeliotropeError as error:
+        try:
+            pickle.loads(pickle.dumps(error))  # noqa: S301 - our own
+        except TypeError:
+            # The arguments of some errors are not their text.
+            raise InputError(str(error)) from None
+        raise
