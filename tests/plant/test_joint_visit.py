@@ -12,6 +12,7 @@ from heliotrope.geometry import direction
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.aims import BeamCheck
+from heliotrope.plant.authority import Mandate, Person, Role
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.visits.joint_layout import SentBeam, _places, _too_bright, beam_of
 from heliotrope.plant.visits.joint_visit import JointVisit
@@ -62,6 +63,7 @@ def visit_of(clock: VirtualClock, left: dict[str, float]) -> Any:
     found.plant = SimpleNamespace(clock=clock, now=now, field=counted)
     found.visits = {name: Member(row, left[name]) for row, name in enumerate(NAMES)}
     found.lost, found._away = {}, set()
+    found.mandate = Mandate(Person("Egon", Role.ENGINEER), 1, "left", set(NAMES))
     return found
 
 
@@ -136,10 +138,8 @@ def test_who_does_not_go_to_standby_at_the_end_is_taken_off_the_target() -> None
         field, visit._away = visit.plant.field, set(NAMES)
         field.place, field.live = NAMES.index, lambda _: np.ones(len(NAMES), dtype=bool)
         field.rows = {"state": np.full(len(NAMES), states.TRACKING)}
-        visit.plant.waits_to_stow = lambda _: False
         visit.plant.command = lambda *_: Order(("A",), {"C": "not in this state"})
         visit.plant.defocus = lambda _, names: sent.append(names)
-        visit.person, visit.token = SimpleNamespace(name="Egon"), 1
         await visit.home()
 
     play(dict.fromkeys(NAMES, 0.0), scene)

@@ -46,6 +46,7 @@ from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 NAME = "P2A"
 HOME = states.IDLE
+STOPPED = "it has been stopped"
 
 
 class Eye:
@@ -330,9 +331,9 @@ def test_one_whose_verification_was_broken_off_moves_when_the_old_parameters_are
         eye.error = {"azimuth_bias": 9e-3}
         begin = eye.count
         eye.during = lambda: (
-            plant.release_authority(ENGINEER, token) if eye.count >= begin + 6 else None
+            plant.authority.end_mandates(ENGINEER, STOPPED) if eye.count >= begin + 6 else None
         )
-        with pytest.raises(RefusedError, match="nobody has it"):
+        with pytest.raises(RefusedError, match=STOPPED):
             await whole.run(ENGINEER, token, NAME, "target")
         assert cluster.stored[NAME] != old
         again = plant.take_authority(ENGINEER).token
@@ -362,7 +363,7 @@ def test_one_whose_verification_was_broken_off_moves_when_the_old_parameters_are
     cycle(tmp_path, scene, settings, azimuth_bias=1e-3)
 
 
-@pytest.mark.parametrize("why", ["another light", "cloud", "authority"])
+@pytest.mark.parametrize("why", ["another light", "cloud", "stopped"])
 def test_a_large_change_that_no_photograph_confirms_is_withdrawn(tmp_path: Path, why: str) -> None:
     results: list[CycleResult] = []
     refused: list[str] = []
@@ -388,12 +389,12 @@ def test_a_large_change_that_no_photograph_confirms_is_withdrawn(tmp_path: Path,
                 refused.append(why)
             eye.error = {"azimuth_bias": -9e-3} if why == "another light" else eye.error
             eye.reasons = ("cloud",) if why == "cloud" else ()
-            if why == "authority":
-                plant.release_authority(ENGINEER, token)
+            if why == "stopped":
+                plant.authority.end_mandates(ENGINEER, STOPPED)
 
         eye.during = during
-        if why == "authority":
-            with pytest.raises(RefusedError, match="nobody has it"):
+        if why == "stopped":
+            with pytest.raises(RefusedError, match=STOPPED):
                 await whole.run(ENGINEER, token, NAME, "target")
         else:
             results.append(await whole.run(ENGINEER, token, NAME, "target"))
@@ -432,10 +433,10 @@ def test_a_mirror_that_leaves_its_aim_is_not_believed(tmp_path: Path) -> None:
     cycle(tmp_path, scene)
 
 
-def test_without_the_authority_the_beam_is_taken_off_the_target(tmp_path: Path) -> None:
+def test_a_visit_that_is_stopped_takes_the_beam_off_the_target(tmp_path: Path) -> None:
     async def scene(bench: Bench, whole: CalibrationCycle, eye: Eye, token: int) -> None:
-        eye.during = lambda: bench.plant.release_authority(ENGINEER, bench.plant.authority.token)
-        with pytest.raises(RefusedError, match="nobody has it"):
+        eye.during = lambda: bench.plant.authority.end_mandates(ENGINEER, STOPPED)
+        with pytest.raises(RefusedError, match=STOPPED):
             await whole.run(ENGINEER, token, NAME, "target")
         await bench.wait(1.0)
         assert state_of(bench) == states.DEFOCUSED
@@ -462,7 +463,7 @@ def test_who_is_not_at_standby_stays_where_it_is(tmp_path: Path) -> None:
             await whole.run(ENGINEER, token, NAME, "target")
         with pytest.raises(UnknownNameError, match="no target 'wall'"):
             await whole.run(ENGINEER, token, NAME, "wall")
-        with pytest.raises(RefusedError, match="PARAMETERS: Olga is operator"):
+        with pytest.raises(RefusedError, match="visit: Olga is operator"):
             await whole.run(OPERATOR, token, NAME, "target")
         bench.clusters["pod-2"].age_ms[:] = 9000
         await bench.wait(5.0)

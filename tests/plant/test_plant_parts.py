@@ -5,7 +5,7 @@ import itertools
 import json
 import struct
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -42,6 +42,7 @@ from heliotrope.plant.movements import Movements
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.views import CalibrationEntry
+from heliotrope.plant.ordered import Ordered
 from heliotrope.plant.schedule.choice import Assignment
 from heliotrope.plant.schedule.plant_schedule import STEPS, PlantSchedule
 from heliotrope.plant.settings import clusters_of
@@ -324,12 +325,16 @@ def test_a_record_is_waited_for_no_longer_than_it_takes() -> None:
 def test_who_waits_too_long_to_join_is_given_up() -> None:
     clock = VirtualClock()
     queue = JoinQueue(1.0, 1)
+
+    def lost(token: int, heliostats: Iterable[str]) -> frozenset[str]:
+        return frozenset() if token == 7 else frozenset(heliostats)
+
     ticket = Ticket("1", "TRACK", ("A", "B", "C"), clock, 60.0)
     queue.put(JoiningJob(ticket, "TRACK", (), 7, deque(("A", "B", "C")), until=2.0))
-    assert queue.admit(0.0, 7) == []
-    ((job, part),) = queue.admit(1.0, 7)
+    assert queue.admit(0.0, lost) == []
+    ((job, part),) = queue.admit(1.0, lost)
     assert (job.ticket, part) == (ticket, ("A",))
-    assert queue.admit(2.0, 7) == []
+    assert queue.admit(2.0, lost) == []
     assert "waited too long" in ticket.refusals["B"]
     assert len(queue) == 0
 
@@ -371,10 +376,16 @@ def test_a_moved_beam_goes_back_when_its_time_or_its_authority_is_over() -> None
     design, aim = example_plant(), np.array([0.0, -12.0, 8.0])
     movements = Movements((), BeamCheck(design, design.names).armature)
     movements.take(("A",), aim[None], 1, 100.0)
-    assert not movements.due(189.0, 1)
-    assert movements.due(190.0, 1).keys() == {"A"}
-    np.testing.assert_array_equal(movements.due(101.0, 2)["A"], aim)
-    assert not movements.due(190.0, 0), "without a command authority no cluster would obey"
+
+    def kept(*_: object) -> frozenset[str]:
+        return frozenset()
+
+    assert not movements.due(189.0, 1, kept)
+    assert movements.due(190.0, 1, kept).keys() == {"A"}
+    np.testing.assert_array_equal(
+        movements.due(101.0, 2, lambda _, names: frozenset(names))["A"], aim
+    )
+    assert not movements.due(190.0, 0, kept), "without a command authority no cluster would obey"
 
 
 def test_a_field_that_does_not_hold_together_is_refused() -> None:
@@ -511,3 +522,69 @@ def test_a_refused_link_is_told_with_its_count() -> None:
     assert links.facts() == {}
     server.refused, server.last_refusal = 3, "no certificate"
     assert links.facts() == {"refused link": "no certificate (3 so far)"}
+
+
+def test_a_heliostat_that_was_ordered_off_while_it_was_out_and_heard_is_not_lost() -> None:
+    """Those that were silent, or off already, may have left by themselves."""
+    field = FieldState({"K": tuple("ABCDEF")})
+    field.rows["state"] = states.TRACKING
+    field.heard[:] = 10.0
+    ordered, seen = Ordered(field), np.full(6, 10.0)
+    assert not ordered.off(seen, 10.0).any(), "nobody has ordered anything"
+    ordered.sent("DEFOCUS", ("A", "B"), 10.5)
+    ordered.sent("LOCK", ("C",), 10.5)
+    ordered.taken("DEFOCUS", ("A",), 10.6)
+    field.heard[0] = 12.0
+    # B did not acknowledge before it fell silent: its cluster may have turned it away.
+    assert ordered.off(seen, 13.5).tolist() == [True] + 5 * [False]
+    field.heard[:] = 20.0
+    ordered.taken("DEFOCUS", ("B",), 20.0)
+    field.rows["state"][3] = states.DEFOCUSED
+    ordered.sent("STOW", ("D",), 20.0)
+    assert ordered.off(seen, 20.0).tolist() == [True] + 5 * [False], "D had left before"
+    # Sent out again: what was seen out after that is lost if it leaves.
+    ordered.sent("REFOCUS", ("A",), 21.0)
+    assert not ordered.off(np.full(6, 22.0), 22.0).any()
+    ordered.sent("STOW", ("E", "F"), 22.0)
+    ordered.follows_loss(("F",))
+    assert ordered.off(np.full(6, 22.5), 22.5).tolist() == 4 * [False] + [True, False]
+
+
+def test_a_mandate_outlives_its_holder_and_ends_heliostat_by_heliostat() -> None:
+    clock = VirtualClock()
+    authority = Authority(clock, 15.0)
+    egon, vera = Person("Egon", Role.ENGINEER), Person("Vera", Role.OPERATOR)
+    token = authority.take(egon).token
+    with (
+        pytest.raises(RefusedError, match="visit: Vera is operator"),
+        authority.mandate(vera, token, ("A",), "left"),
+    ):
+        pass
+    with authority.mandate(egon, token, ("A", "B"), "left") as mandate:
+        assert authority.present(mandate.token) == token
+        clock.advance(15.0)
+        assert authority.grant is None
+        own = authority.token
+        assert own not in (0, token), "the clusters obey the plant itself"
+        assert authority.present(mandate.token) == own
+        assert authority.silent_for == 0.0
+        taken = authority.take(vera).token
+        assert authority.present(mandate.token) == taken
+        authority.check(egon, mandate.token, "PARAMETERS")
+        with pytest.raises(RefusedError, match="Vera has it"):
+            authority.check(egon, token, "TRACK")
+        with pytest.raises(RefusedError, match="Vera has it"):
+            authority.check(vera, mandate.token, "TRACK")
+        authority.prevail(("B", "C"), "Vera ordered IDLE")
+        assert mandate.refused("AB") == {"B": "it left the visit: Vera ordered IDLE"}
+        assert authority.lost(mandate.token, "AB") == authority.left(mandate.token, "AB") == {"B"}
+        authority.release(vera, taken)
+        assert authority.token not in (0, own, taken)
+        authority.end_mandates(egon, "automatic control has been stopped")
+        assert authority.present(mandate.token) == 0
+        assert authority.lost(mandate.token, "A") == {"A"}
+        assert not authority.left(mandate.token, "A"), "the visit takes its beam off"
+        with pytest.raises(RefusedError, match="TRACK: automatic control has been stopped"):
+            authority.check(egon, mandate.token, "TRACK")
+    assert authority.token == 0
+    assert authority.left(mandate.token, "A") == {"A"}

@@ -8,6 +8,7 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Stage
 from heliotrope.mechanism.board_items import checksums, items_of
 from heliotrope.plant.audit import read
+from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.visits import CalibrationCycle, CycleSettings
 from heliotrope.safety import Act
 from support.whole_plant import ENGINEER, MACHINE, WholePlant
@@ -76,3 +77,32 @@ def test_from_power_on_to_tracking_to_calibration_to_stow(tmp_path: Path, seed: 
     assert all(record.result for record in records)
     assert [r.what for r in records][:4] == ["AUTHORITY", "AIM", "APPROACH", "TRACK"]
     assert {"PARAMETERS", "DEFOCUS", "STOW"} <= {r.what for r in records}
+
+
+def test_real_boards_that_a_visit_has_locked_prove_their_stow_and_are_unlocked_there(
+    tmp_path: Path,
+) -> None:
+    async def main(clock: VirtualClock) -> None:
+        whole = WholePlant(clock, tmp_path, clusters=1)
+        async with whole.alive():
+            plant, token, names = whole.plant, whole.token, tuple(whole.boards)
+            approach = plant.command(ENGINEER, token, "APPROACH")
+            assert await approach.end(400.0), approach.text
+            with plant.authority.mandate(ENGINEER, token, names, "white") as mandate:
+                lock = plant.command(ENGINEER, mandate.token, "LOCK", names)
+                assert await lock.end(10.0), lock.text
+                order = plant.raise_emergency("anybody", Act.STOW)
+                with pytest.raises(RefusedError):
+                    plant.command(ENGINEER, mandate.token, "UNLOCK", names)
+            await whole.wait(1.0)
+            assert not order.report(plant.now()).complete, "they are still on the way"
+            await whole.until(lambda: order.report(plant.now()).complete, 300.0)
+            assert whole.all_are("LOCKED"), "nothing is unlocked in an emergency"
+            assert order.ticket.good, order.ticket.text
+            plant.withdraw_emergency(ENGINEER)
+            await whole.wait(5.0)
+            plant.acknowledge(ENGINEER, "operator_emergency")
+            await whole.until(lambda: whole.all_are("STOWED"), 30.0)
+            await whole.until(lambda: not plant.locks.names, 10.0)
+
+    run_virtual(main)

@@ -9,7 +9,7 @@ from heliotrope.errors import InputError
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency
-from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.visit import Visit
@@ -113,7 +113,7 @@ def test_a_second_order_in_turn_takes_the_place_of_the_first(tmp_path: Path) -> 
     async def scene(bench: Bench) -> None:
         first = bench.plant.stow("anybody")
         await bench.wait(0.5)
-        waits = [name for name in bench.plant.field.names if bench.plant.waits_to_stow(name)]
+        waits = list(bench.plant._orders.to_stow(bench.plant.field.names))
         assert waits
         second = bench.plant.stow("another")
         # At once, and not when their turn comes.
@@ -145,12 +145,15 @@ def test_what_waits_is_not_moved_but_locked(tmp_path: Path) -> None:
 
 def test_a_visit_ends_instead_of_taking_its_mirror_out_of_the_turn(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
-        token = await bench.commanded()
+        engineer = Person("Egon", Role.ENGINEER)
+        token = await bench.commanded(engineer)
         last = bench.plant.field.names[-1]
-        visit = Visit(bench.plant, OPERATOR, token, last, bench.plant.design.targets[0])
-        ticket = bench.plant.stow("anybody")
-        with pytest.raises(RefusedError, match=f"{last}: it waits for its turn to go to stow"):
-            await visit.command("LOCK")
+        plant, target = bench.plant, bench.plant.design.targets[0]
+        with plant.authority.mandate(engineer, token, (last,), target.name) as mandate:
+            visit = Visit(plant, mandate, last, target)
+            ticket = plant.stow("anybody")
+            with pytest.raises(RefusedError, match=f"{last}: it left the visit: anybody ordered"):
+                await visit.command("LOCK")
         assert await ticket.end(20.0), ticket.text
         assert bench.count(states.STOWED) == 18
 

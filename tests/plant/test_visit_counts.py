@@ -12,7 +12,7 @@ from heliotrope.geometry import direction
 from heliotrope.lcu.states import DEFOCUSED, TRACKING
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.aims import BeamCheck
-from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.authority import Mandate, Person, RefusedError, Role
 from heliotrope.plant.visits.photographs import Plain, Shot, measured
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.plant.visits.swings import swung
@@ -34,8 +34,8 @@ def visit(clock: VirtualClock) -> tuple[Visit, Any]:
     plant = SimpleNamespace(
         field=field, now=clock.monotonic, clock=clock, beams=BEAMS, sun_vector=lambda _: SUN
     )
-    person = Person("Egon", Role.ENGINEER)
-    made = Visit(plant, person, 1, DESIGN.names[0], DESIGN.targets[0])  # type: ignore[arg-type]
+    mandate = Mandate(Person("Egon", Role.ENGINEER), 1, "left", {DESIGN.names[0]})
+    made = Visit(plant, mandate, DESIGN.names[0], DESIGN.targets[0])  # type: ignore[arg-type]
     return made, field
 
 

@@ -23,6 +23,7 @@ from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.assigned import rest_on
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.emergency import at_stow
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.foresight import Prospect
@@ -295,7 +296,7 @@ class PlantAssembly:
         until = self.clock.monotonic() + limit
         while self.clock.monotonic() < until:
             now = self.clock.monotonic()
-            there = self.plant.field.among((states.STOWED,), now)
+            there = self.plant.field.live(now) & at_stow(self.plant.field.rows)
             if (there | self._hopeless(now)).all():
                 return bool(there.all())
             await asyncio.sleep(0.25)
@@ -329,7 +330,7 @@ class PlantAssembly:
     def left(self) -> str:
         """Return which heliostats are not stowed, in words; "" if all are."""
         rows, now = self.plant.field, self.clock.monotonic()
-        away = np.flatnonzero(~rows.among((states.STOWED,), now))
+        away = np.flatnonzero(~(rows.live(now) & at_stow(rows.rows)))
         if not len(away):
             return ""
         live, state = rows.live(now), rows.rows["state"]

@@ -6,12 +6,18 @@ token moves nothing. Each change of holder makes a new token, so that no command
 holder that is still under way takes effect. An authority that is not renewed expires; another
 person may break it.
 
+A visit works under a `Mandate`, which the holder gives at its beginning and which is valid until
+the visit ends, whoever takes command meanwhile. It is for the heliostats of the visit only, and a
+person's command to one of them takes that one out. Commands under a mandate go out with the present
+token; while nobody holds the authority and a mandate is open, the plant has a token of its own.
+
 DEFOCUS and STOW need no authority, no role and no token.
 """
 
 import secrets
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 from heliotrope import safety
@@ -20,7 +26,15 @@ from heliotrope.links.clock import Clock
 from heliotrope.plant import refusals
 from heliotrope.plant.refusals import RefusedError
 
-__all__ = ["OPERATOR_COMMANDS", "Authority", "Grant", "Person", "RefusedError", "Role"]
+__all__ = [
+    "OPERATOR_COMMANDS",
+    "Authority",
+    "Grant",
+    "Mandate",
+    "Person",
+    "RefusedError",
+    "Role",
+]
 
 
 class Role(IntEnum):
@@ -59,6 +73,10 @@ OPERATOR_COMMANDS = frozenset(
         "SEARCH",
     }
 )
+
+
+#: Tokens of mandates are above those of the wire, which have 32 bits.
+_MANDATES = 1 << 32
 
 
 @dataclass(frozen=True)
@@ -119,6 +137,49 @@ class Grant:
     kept: float
 
 
+@dataclass(eq=False)
+class Mandate:
+    """The right of a visit to command its heliostats until it ends.
+
+    Attributes
+    ----------
+    person
+        The holder of the authority who gave it; commands are recorded under this name.
+    token
+        Stands for the mandate where a command needs a token; it never goes to a cluster.
+    where
+        Name of the surface that the heliostats visit.
+    heliostats
+        Names of the heliostats that it is for; those that were taken out are missing.
+    taken
+        Why others were taken out, by name.
+    ended
+        Why all commands under it are refused; "" while it is valid.
+    """
+
+    person: Person
+    token: int
+    where: str
+    heliostats: set[str]
+    taken: dict[str, str] = field(default_factory=dict)
+    ended: str = ""
+
+    def take_out(self, heliostats: Iterable[str], why: str) -> tuple[str, ...]:
+        """Take heliostats out, ``why`` saying who ordered what; return those that were in it."""
+        names = tuple(name for name in heliostats if name in self.heliostats)
+        self.heliostats.difference_update(names)
+        self.taken.update(dict.fromkeys(names, f"it left the visit: {why}"))
+        return names
+
+    def refused(self, heliostats: Iterable[str]) -> dict[str, str]:
+        """Return the heliostats that may not be commanded under it, and their reasons."""
+        return {
+            name: self.ended or self.taken.get(name, "it is not in this visit")
+            for name in heliostats
+            if self.ended or name not in self.heliostats
+        }
+
+
 class Authority:
     """The one command authority of a plant.
 
@@ -130,6 +191,13 @@ class Authority:
         Life of the authority without renewal, s.
     entropy
         Source of random bytes for the tokens.
+
+    Attributes
+    ----------
+    lifetime
+        As given.
+    changed_at
+        When `token` last changed, monotonic s: clusters hear of it within a second.
 
     Raises
     ------
@@ -149,27 +217,39 @@ class Authority:
         self._clock = clock
         self._entropy = entropy
         self._grant: Grant | None = None
+        #: Open mandates by their tokens.
+        self._mandates: dict[int, Mandate] = {}
+        self._given = 0
+        #: The plant's own token while nobody holds the authority and a mandate is open.
+        self._own = 0
         self._last_token = 0
         self._last_kept = clock.monotonic()
+        self.changed_at = clock.monotonic()
 
     @property
     def grant(self) -> Grant | None:
         """The present holder's grant, None if nobody has the authority."""
         grant = self._grant
         if grant is not None and not self._clock.monotonic() - grant.kept < self.lifetime:
-            self._grant = grant = None
-        return grant
+            self._give_up()
+        return self._grant
 
     @property
     def token(self) -> int:
-        """The token that clusters accept commands with; 0 while nobody holds the authority."""
+        """The token that clusters accept commands with; 0: they accept none.
+
+        It is 0 while nobody holds the authority and no mandate is open.
+        """
         grant = self.grant
-        return 0 if grant is None else grant.token
+        return self._own if grant is None else grant.token
 
     @property
     def silent_for(self) -> float:
-        """Time since any authority was last renewed, or since the plant began, s."""
-        return self._clock.monotonic() - self._last_kept
+        """Time since any authority was last renewed, or since the plant began, s.
+
+        While a mandate is open the plant commands by itself, and it is 0.
+        """
+        return 0.0 if self._mandates else self._clock.monotonic() - self._last_kept
 
     def take(self, person: Person) -> Grant:
         """Take the authority if nobody has it; its holder renews it.
@@ -231,7 +311,7 @@ class Authority:
             If the person does not have it.
         """
         self._checked(person, token)
-        self._grant = None
+        self._give_up()
 
     def check(self, person: Person, token: int, command: str) -> None:
         """Check that a person may give a command now, and renew the authority.
@@ -239,20 +319,117 @@ class Authority:
         Raises
         ------
         RefusedError
-            If the role is too low, or the person does not have the authority.
+            If the role is too low, or the person has neither the authority nor a mandate.
         """
         needed = Role.OPERATOR if command in OPERATOR_COMMANDS else Role.ENGINEER
         person.must_be(needed, command)
-        self.keep(person, token)
+        mandate = self._mandates.get(token)
+        if mandate is None or mandate.person != person:
+            self.keep(person, token)
+        elif mandate.ended:
+            raise RefusedError(f"{command}: {mandate.ended}")
 
-    def _give(self, person: Person) -> Grant:
+    # -- mandates --------------------------------------------------------------------------
+
+    @contextmanager
+    def mandate(
+        self, person: Person, token: int, heliostats: Sequence[str], where: str
+    ) -> Iterator[Mandate]:
+        """Give a mandate for the time of a visit.
+
+        Parameters
+        ----------
+        person, token
+            An engineer, with the token of the authority.
+        heliostats, where
+            Names of the heliostats of the visit, and of the surface that they visit.
+
+        Raises
+        ------
+        RefusedError
+            If the role is too low, or the person does not have the authority.
+        """
+        person.must_be(Role.ENGINEER, "visit")
+        self.keep(person, token)
+        self._given += 1
+        made = Mandate(person, _MANDATES + self._given, where, set(heliostats))
+        self._mandates[made.token] = made
+        try:
+            yield made
+        finally:
+            made.ended = made.ended or "the visit has ended"
+            del self._mandates[made.token]
+            if not self._mandates:
+                self._own, self._last_kept = 0, self._clock.monotonic()
+
+    def mandate_of(self, token: int) -> Mandate | None:
+        """Return the open mandate that a token stands for, None if there is none."""
+        return self._mandates.get(token)
+
+    def visited(self) -> dict[str, Mandate]:
+        """Return the open mandate of each heliostat that is in a visit, by name."""
+        return {name: each for each in self._mandates.values() for name in each.heliostats}
+
+    def prevail(self, heliostats: Sequence[str], why: str) -> None:
+        """Take heliostats out of the visits that they are in; ``why`` says who ordered what."""
+        for each in self._mandates.values():
+            each.take_out(heliostats, why)
+
+    def end_mandates(self, person: Person, why: str) -> None:
+        """End the mandates that a person gave; their visits take the beams off."""
+        for each in self._mandates.values():
+            if each.person == person:
+                each.ended = why
+
+    def lost(self, token: int, heliostats: Iterable[str]) -> frozenset[str]:
+        """Return the heliostats that may no longer be commanded under a token.
+
+        The token is a holder's or a mandate's.
+        """
+        mandate = self._mandates.get(token)
+        if mandate is not None:
+            return frozenset(mandate.refused(heliostats))
+        return frozenset() if token == self.token else frozenset(heliostats)
+
+    def left(self, token: int, heliostats: Iterable[str]) -> frozenset[str]:
+        """Return the heliostats that nobody looks after any more under a token.
+
+        Those of a visit that is told to end are still its own: it takes their beams off.
+        """
+        mandate = self._mandates.get(token)
+        if mandate is None:
+            return self.lost(token, heliostats)
+        return frozenset(heliostats) - mandate.heliostats
+
+    def present(self, token: int) -> int:
+        """Return the token that goes to the clusters; 0 if a mandate is over.
+
+        A mandate's commands go with the present token.
+        """
+        if token < _MANDATES:
+            return token
+        mandate = self._mandates.get(token)
+        return 0 if mandate is None or mandate.ended else self.token
+
+    def _drawn(self) -> int:
+        """Return a new token of the wire."""
         token = 0
         while token in (0, self._last_token):
             token = int.from_bytes(self._entropy(4), "little")
+        self._last_token = token
+        return token
+
+    def _give(self, person: Person) -> Grant:
         now = self._clock.monotonic()
-        self._last_token, self._last_kept = token, now
-        self._grant = Grant(person, token, now, now)
+        self._last_kept = self.changed_at = now
+        self._grant = Grant(person, self._drawn(), now, now)
+        self._own = 0
         return self._grant
+
+    def _give_up(self) -> None:
+        """End the grant. Open mandates go on under a token of the plant's own."""
+        self._grant, self.changed_at = None, self._clock.monotonic()
+        self._own = self._drawn() if self._mandates else 0
 
     def _checked(self, person: Person, token: int) -> Grant:
         grant = self.grant

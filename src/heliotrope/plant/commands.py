@@ -14,20 +14,18 @@ from heliotrope.lcu import messages as wire
 from heliotrope.lcu import states
 from heliotrope.mechanism.board_items import Wanted
 from heliotrope.plant.assigned import grouped, points_of
-from heliotrope.plant.audit import AuditError
-from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.authority import Authority, Person
 from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.given import Given
 from heliotrope.plant.joining import JoiningJob, JoinQueue, in_slices
+from heliotrope.plant.locks import Locks
 from heliotrope.plant.movements import Movements
 from heliotrope.plant.ordered import JOINING
 from heliotrope.plant.orders import PlantOrders, whole
-from heliotrope.plant.permission import Permission
+from heliotrope.plant.permission import SETTINGS, Permission
 from heliotrope.plant.tickets import Ticket
 
-#: Commands that move nothing.
-SETTINGS = frozenset({"LOCK_AIM", "ROUGH"})
 #: Commands that assign points; `Commands.point` proves their beams.
 POINTS = frozenset({"AIM", "STANDBY"})
 #: States in which a beam is at its aim.
@@ -57,8 +55,10 @@ class Commands:
         Parameters that local controllers should store, their standby points among them.
     patience
         Time that a heliostat waits for its turn to join, s.
-    movements
-        Beams that are a little beside their aims.
+    movements, locks
+        What visits have taken: aims, and heliostats that are locked.
+    authority
+        The plant's.
     """
 
     def __init__(
@@ -74,11 +74,13 @@ class Commands:
         wanted: Wanted,
         patience: float,
         movements: Movements,
+        locks: Locks,
+        authority: Authority,
     ) -> None:
         self._now, self._field, self._orders, self._joining = now, field, orders, joining
         self._permission, self._given, self._ways = permission, given, ways
         self._design, self._wanted, self._patience = design, wanted, patience
-        self._movements = movements
+        self._movements, self._locks, self._authority = movements, locks, authority
 
     def give(
         self,
@@ -96,9 +98,10 @@ class Commands:
         numbers = whole(values, row[3], name)
         names = tuple(dict.fromkeys(heliostats)) or self._field.names
         out = self._permission.locked_out(name, names)
-        clear, wrong = self.examine(name, numbers, tuple(n for n in names if n not in out))
-        ticket = self._permission.accept(person, token, name, numbers, names)
-        ticket.block({**wrong, **out})
+        others = tuple(n for n in names if n not in out)
+        clear, wrong = self.examine(name, numbers, others, token)
+        blocked = {**wrong, **out}
+        ticket = self._permission.accept(person, token, name, numbers, names, blocked=blocked)
         if name not in SETTINGS:
             # A heliostat that still waits to join must not undo a later command.
             self._joining.drop(f"superseded by {name}", frozenset(names))
@@ -124,18 +127,28 @@ class Commands:
         if again and left:
             self._permission.refuse_now(name, left)
             out = self._permission.still_locked_out(name, left)
-            left, wrong = self.examine(name, numbers, tuple(n for n in left if n not in out))
+            others = tuple(n for n in left if n not in out)
+            left, wrong = self.examine(name, numbers, others, token)
             ticket.block({**wrong, **out})
             if name not in SETTINGS:
                 # One that was given before it may have joined the queue after its acceptance.
                 self._joining.drop(f"superseded by {name}", frozenset(left))
+        if left and name == "LOCK":
+            self._note_lock(left, token)
         if left:
             waits = name in JOINING or in_slices(name, left)
             send = self._join if waits else self._orders.command
             send(ticket, name, numbers, left, token)
 
+    def _note_lock(self, heliostats: tuple[str, ...], token: int) -> None:
+        """Note whose lock it is: a visit's, which the plant opens in the end, or a person's."""
+        if self._authority.mandate_of(token) is None:
+            self._locks.forget(heliostats)
+        else:
+            self._locks.take(heliostats, token, self._now())
+
     def examine(
-        self, name: str, numbers: tuple[float, ...], names: tuple[str, ...]
+        self, name: str, numbers: tuple[float, ...], names: tuple[str, ...], token: int = 0
     ) -> tuple[tuple[str, ...], dict[str, str]]:
         """Return the heliostats that may be sent a command now, and why the others may not.
 
@@ -144,7 +157,7 @@ class Commands:
         BeamError
             If none may.
         """
-        able, wrong = self._permission.able(name, names)
+        able, wrong = self._permission.able(name, names, token)
         if in_slices(name, able):
             return able, wrong  # each slice is examined when its turn comes
         clear, blocked = self._ways.clear(name, numbers, able, self._now())
@@ -169,26 +182,27 @@ class Commands:
     ) -> Ticket:
         """Give AIM or STANDBY with a point (3,) for each heliostat; see `PlantController.aim`."""
         names, rows, wanted, out = self._pointed(name, points)
-        self._prove_points(name, names, rows, wanted)
-        keep = self._ways.points
+        self.prove_points(name, names, wanted)
+        visit = self._authority.mandate_of(token) is not None
 
         def assign() -> frozenset[str]:
             here = self._stays(rows, wanted)
-            keep.assign(name, rows, wanted)
-            if name == "AIM":
+            if name == "AIM" and visit:
+                self._movements.lend(names, self._aims(rows), wanted, token)
+            elif name == "AIM":
                 self._movements.forget(names)
             else:
                 for each, place in zip(names, wanted, strict=True):
                     self._wanted.rest(each, tuple(place))
+            self.assign(name, names, wanted)
             return frozenset(names[i] for i in np.flatnonzero(here))
 
         groups = grouped(names, wanted)
         values = next(iter(groups)) if len(groups) == 1 else ()
         all_names, note = (*names, *out), f"{len(groups)} points"
-        store = keep.storing(name, rows, wanted)
-        ticket = self._permission.accept(person, token, name, values, all_names, note, store)
-        ticket.block(out)
-        self._when_recorded(ticket, names, wanted, token, assign)
+        store = self._ways.points.storing(name, rows, wanted)
+        ticket = self._permission.accept(person, token, name, values, all_names, note, store, out)
+        self.when_recorded(ticket, names, wanted, token, assign)
         return ticket
 
     def move(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
@@ -197,66 +211,28 @@ class Commands:
         tracking, aims = self._field.among((states.TRACKING,), self._now())[rows], self._aims(rows)
         if wrong := self._movements.refused(names, rows, aims, wanted, tracking):
             raise BeamError("AIM", wrong)
-        self._prove_points("AIM", names, rows, wanted)
+        self.prove_points("AIM", names, wanted)
 
         def assign() -> frozenset[str]:
             aims, on = self._aims(rows), np.ones(len(rows), dtype=np.bool_)
             if wrong := self._movements.refused(names, rows, aims, wanted, on):
                 raise BeamError("AIM", wrong)  # aimed elsewhere while the record was written
             self._movements.take(names, aims, token, self._now())
-            self._ways.points.assign("AIM", rows, wanted)
+            self.assign("AIM", names, wanted)
             return frozenset(names)
 
         all_names, note = (*names, *out), f"{len(names)} coded movements"
-        ticket = self._permission.accept(person, token, "AIM", (), all_names, note)
-        ticket.block(out)
-        self._when_recorded(ticket, names, wanted, token, assign)
+        accept = self._permission.accept
+        ticket = accept(person, token, "AIM", (), all_names, note, blocked=out)
+        self.when_recorded(ticket, names, wanted, token, assign)
         return ticket
 
-    def bring_back(self, token: int) -> None:
-        """Send moved beams back to their aims that are due, as far as motions are accepted now.
+    def assign(self, name: str, names: Sequence[str], wanted: FloatArray) -> None:
+        """Assign points (K, 3) to heliostats, before they are sent."""
+        self._ways.points.assign(name, self._places(names), wanted)
 
-        ``token`` is that of the present command authority, whoever has it.
-        """
-        due = self._movements.due(self._now(), token)
-        if not due:
-            return
-        self._movements.wait(due, token, self._now())
-        names = self._free_to_return(due)
-        if not names:
-            return
-        rows = np.array([self._field.place(n) for n in names], dtype=np.intp)
-        wanted = np.stack([due[n] for n in names])
-
-        def assign() -> frozenset[str]:
-            aimed = [name for name in names if name not in self._movements.names]
-            if aimed:  # while the record was written
-                raise BeamError("AIM", dict.fromkeys(aimed, "it has another aim now"))
-            self._ways.points.assign("AIM", rows, wanted)
-            return frozenset(names)
-
-        note = f"{len(names)} beams go back to their aims"
-        try:
-            ticket = self._orders.accept(("plant", "anybody", "AIM"), (), names, note)
-        except AuditError:
-            return
-        self._movements.sent(ticket, token, self._now())
-        self._when_recorded(ticket, names, wanted, token, assign)
-
-    def _free_to_return(self, due: Mapping[str, FloatArray]) -> tuple[str, ...]:
-        """Return which moved beams may go back now."""
-        names = tuple(due)
-        while names:
-            rows = np.array([self._field.place(n) for n in names], dtype=np.intp)
-            try:
-                self._permission.refuse_now("AIM", names)
-                self._prove_points("AIM", names, rows, np.stack([due[n] for n in names]))
-                break
-            except BeamError as error:
-                names = tuple(n for n in names if n not in error.refusals)
-            except RefusedError:
-                return ()
-        return names
+    def _places(self, names: Sequence[str]) -> npt.NDArray[np.intp]:
+        return np.array([self._field.place(name) for name in names], dtype=np.intp)
 
     def _aims(self, rows: npt.NDArray[np.intp]) -> FloatArray:
         return np.asarray(self._ways.points.aims[rows])
@@ -267,10 +243,10 @@ class Commands:
         """Return heliostats, rows (K,) and points (K, 3), and which are out of service, and why."""
         out = self._permission.locked_out(name, points)
         points = {n: point for n, point in points.items() if n not in out}
-        rows = np.array([self._field.place(n) for n in points], dtype=np.intp)
+        rows = self._places(tuple(points))
         return tuple(points), rows, points_of(name, points), out
 
-    def _when_recorded(
+    def when_recorded(
         self,
         ticket: Ticket,
         names: tuple[str, ...],
@@ -282,18 +258,15 @@ class Commands:
 
         def send(again: bool) -> None:
             if again:
-                rows = np.array([self._field.place(n) for n in names], dtype=np.intp)
                 self._permission.refuse_now(ticket.name, names)
-                self._prove_points(ticket.name, names, rows, wanted)
+                self.prove_points(ticket.name, names, wanted)
             stays = assign()
             self._given.sent(ticket, names)
             self._send_points(ticket, ticket.name, grouped(names, wanted), token, stays)
 
         self._orders.when_recorded(ticket, send)
 
-    def _prove_points(
-        self, name: str, names: tuple[str, ...], rows: npt.NDArray[np.intp], wanted: FloatArray
-    ) -> None:
+    def prove_points(self, name: str, names: tuple[str, ...], wanted: FloatArray) -> None:
         """Prove that heliostats (K,) may be given points (K, 3) now.
 
         Raises
@@ -301,6 +274,7 @@ class Commands:
         BeamError
             If one of them may not.
         """
+        rows = self._places(names)
         tracking = self._field.among(_ON_AIM, self._now())[rows]
         moves = tracking if name == "AIM" else self._field.among((states.IDLE,), self._now())[rows]
         moved = [names[i] for i in np.flatnonzero(moves)]
@@ -321,7 +295,7 @@ class Commands:
         Those that bring no light to a receiver need no turn to join: see `_stays`.
         """
         names = [n for members in groups.values() for n in members]
-        rows = np.array([self._field.place(n) for n in names], dtype=np.intp)
+        rows = self._places(names)
         tracking = self._field.among(_ON_AIM, self._now())[rows]
         self._joining.drop(f"superseded by another {name}", frozenset(names), name)
         joins = {names[i] for i in np.flatnonzero(tracking)} - stays

@@ -56,9 +56,11 @@ from heliotrope.plant.doubts import Doubts
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.given import Given
+from heliotrope.plant.giving_back import GivingBack
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.joining import JoinDispatcher, JoinQueue
 from heliotrope.plant.lockouts import Lockout
+from heliotrope.plant.locks import Locks
 from heliotrope.plant.movements import Movements
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.parameters import ParameterSync, Tables, change_of_beam
@@ -124,8 +126,9 @@ class PlantController:
         Heliostats that only EMERGENCY, DEFOCUS and STOW move, by name; see `Lockout`.
     aims, standbys
         Points where the beams are sent, ENU, m, (N, 3); NaN where there is none.
-    movements
-        Beams that are a little beside their assigned aims, for a measurement.
+    movements, locks
+        Aims that visits have moved, and heliostats that they have locked; the plant gives back what
+        they leave.
 
     Raises
     ------
@@ -168,6 +171,7 @@ class PlantController:
         self.aims, self.standbys = points.aims, points.standbys
         self.movements = Movements(design.receivers, self.beams.armature)
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, self.beams.machines)
+        self.locks = Locks(self.field, self._ways.ordered)
         self._agreement = self._compared(points)
         self._clusters = Clusters(members, links, clock, self.counters)
         self._identities = Identities(
@@ -183,6 +187,7 @@ class PlantController:
         self._cluster_settings = ClusterSettings(self._tell, _expected(self.settings))
         self._orders = PlantOrders(
             clock,
+            self.authority,
             audit,
             disk or AtOnce(),
             self._clusters,
@@ -207,6 +212,7 @@ class PlantController:
         self._permission = self._permitting()
         self._commands = self._directed()
         self._joiner = self._dispatching()
+        self._giving_back = self._returning()
         self._named_at, self._slow_at = dict.fromkeys(members, -math.inf), -math.inf
         self._closing = asyncio.Event()
         self._last_safe: tuple[tuple[str, Act, tuple[str, ...]], Ticket] | None = None
@@ -281,6 +287,8 @@ class PlantController:
             self.wanted,
             self.settings.join_wait,
             self.movements,
+            self.locks,
+            self.authority,
         )
 
     def _dispatching(self) -> JoinDispatcher:
@@ -292,6 +300,19 @@ class PlantController:
             self.settings.join_life,
             self._permission.kept_back,
             self._commands.examine,
+        )
+
+    def _returning(self) -> GivingBack:
+        """Return what gives back what visits have left."""
+        return GivingBack(
+            self.field,
+            self.authority,
+            self._orders,
+            self._permission,
+            self._commands,
+            self.movements,
+            self.locks,
+            lambda names: self.stow("plant", names),
         )
 
     # -- running ---------------------------------------------------------------------------
@@ -395,9 +416,9 @@ class PlantController:
         for alarm in self._sentinel.beat(now):
             self._tell(alarm)
         token = self.authority.token
-        self._joiner.beat(now, token, held=bool(self._sentinel.refusal(("",))))
+        self._joiner.beat(now, self.authority.lost, held=bool(self._sentinel.refusal(("",))))
         self._orders.beat(now)
-        self._commands.bring_back(token)
+        self._giving_back.beat(now)
         slow = now - self._slow_at >= _SLOW_BEAT
         if self._orders.owing or slow:
             self._orders.pay()
@@ -472,9 +493,9 @@ class PlantController:
         """
         return self._safe(who, Act.STOW, heliostats)
 
-    def waits_to_stow(self, heliostat: str) -> bool:
-        """Return whether a heliostat waits for its turn to go to stow."""
-        return bool(self._orders.to_stow((heliostat,)))
+    def ordered_off(self, seen: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return which heliostats were ordered off by anybody, (N,); see `Ordered.off`."""
+        return self._ways.ordered.off(seen, self.now())
 
     def _safe(self, who: str, act: Act, heliostats: Sequence[str]) -> Ticket:
         for name in heliostats:

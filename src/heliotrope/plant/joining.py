@@ -5,8 +5,9 @@ lease could be renewed. So they go in slices, one a beat.
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 from heliotrope.links.messages import Stage
 from heliotrope.plant.authority import RefusedError
@@ -22,6 +23,9 @@ Examine = Callable[
     [str, tuple[float, ...], tuple[str, ...]], tuple[tuple[str, ...], dict[str, str]]
 ]
 
+#: Returns which of some heliostats may no longer be commanded under a token.
+Lost = Callable[[int, Iterable[str]], frozenset[str]]
+
 
 def in_slices(name: str, heliostats: Sequence[str]) -> bool:
     """Whether a command to some heliostats is examined and sent in slices."""
@@ -35,7 +39,7 @@ class JoiningJob:
     Attributes
     ----------
     ticket, name, values, token
-        Of the command.
+        Of the command; the token is the holder's or a mandate's.
     waiting
         Heliostats still to be sent.
     until
@@ -69,13 +73,16 @@ class JoinQueue:
         self._jobs.append(job)
 
     def admit(
-        self, now: float, token: int, *, held: bool = False
+        self, now: float, lost: Lost, *, held: bool = False
     ) -> list[tuple[JoiningJob, tuple[str, ...]]]:
-        """Return the heliostats that may go now, none while ``held``; drop jobs that are over."""
+        """Return the heliostats that may go now, none while ``held``; drop jobs that are over.
+
+        ``lost`` returns those that may no longer be commanded under the token of their job.
+        """
         for job in self._jobs:
-            if job.token != token:
-                self._fail(job, "the command authority changed while it waited its turn")
-            elif now >= job.until:
+            if gone := lost(job.token, job.waiting):
+                self._fail(job, "the command authority changed while it waited its turn", gone)
+            if now >= job.until:
                 self._fail(job, "it waited too long for its turn; command it again")
         self._jobs = deque(job for job in self._jobs if job.waiting)
         if held:
@@ -140,13 +147,25 @@ class JoinDispatcher:
         self._queue, self._orders, self._beams, self._life = queue, orders, beams, life
         self._barred, self._examine = barred, examine
 
-    def beat(self, now: float, token: int, *, held: bool) -> None:
+    def beat(self, now: float, lost: Lost, *, held: bool) -> None:
         """Send the heliostats whose turn it is, unless no new motion may begin (``held``)."""
-        for job, part in self._queue.admit(now, token, held=held):
+        for job, part in self._queue.admit(now, lost, held=held):
             wrong = self._wrong(job, part, now)
             job.ticket.block(wrong)
             clear = [name for name in part if name not in wrong]
-            self._orders.command(job.ticket, job.name, job.values, clear, token, self._life)
+            self._orders.command(
+                job.ticket,
+                job.name,
+                job.values,
+                clear,
+                job.token,
+                self._life,
+                partial(self._wait_again, job),
+            )
+
+    def _wait_again(self, job: JoiningJob, heliostats: tuple[str, ...]) -> None:
+        """Let heliostats whose cluster refused an earlier token wait for another turn."""
+        self._queue.put(replace(job, waiting=deque(heliostats)))
 
     def _wrong(self, job: JoiningJob, part: tuple[str, ...], now: float) -> dict[str, str]:
         """Return which heliostats whose turn has come may not go, and why."""

@@ -1,13 +1,14 @@
-"""Small movements of beams about their aims on a receiver, and the way back.
+"""Aims that visits have moved, and the aims to which the beams go back.
 
-A measurement in production moves beams by a milliradian. Their assigned aims stay in the store; so
-that they come back whatever becomes of the measurement, the plant itself sends each beam back to
-its aim: when the measurement says so, when it has not moved the beam for a while, and when the
-command authority under which it moved it has ended. That needs somebody's command authority, for
-clusters obey nobody else.
+A measurement in production moves beams by a milliradian; a visit to a target gives heliostats an
+aim there. So that they come back whatever becomes of the visit, the plant itself sends each beam
+back to its aim (`giving_back`): when the visit says so, when a small movement was not renewed for a
+while, and when the mandate or the command authority under which it was moved is over. That needs a
+command authority, for clusters obey nobody else.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,17 +23,26 @@ from heliotrope.plant.tickets import Ticket
 MOST = 3e-3
 #: Time without a movement after which a beam goes back, s.
 LIFE = 90.0
-#: Time after which a beam that did not go back is sent back again, s.
-_AGAIN = 3.0
+#: Time after which a beam that did not go back is sent back again, s: it doubles from one attempt
+#: to the next, up to the longest.
+_AGAIN, _LONGEST = 3.0, 300.0
+
+#: Returns the heliostats that nobody looks after any more under a token.
+Left = Callable[[int, Iterable[str]], frozenset[str]]
 
 
 @dataclass(frozen=True)
 class _Moved:
-    """A beam beside its aim: the aim, and until when which token keeps it there."""
+    """A beam beside its aim: the aim, and until when which token keeps it there.
+
+    ``small``: it is on the receiver where its aim is, too; ``pause``: before the next attempt, s.
+    """
 
     aim: FloatArray
     token: int
     until: float
+    small: bool
+    pause: float = _AGAIN
 
 
 class Movements:
@@ -93,12 +103,37 @@ class Movements:
     def take(self, names: Sequence[str], aims: FloatArray, token: int, now: float) -> None:
         """Note that beams are moved; ``aims`` (K, 3) are those of heliostats not moved before."""
         for name, present in zip(names, aims, strict=True):
-            self._moved[name] = _Moved(np.array(self.aim(name, present)), token, now + LIFE)
+            aim = np.array(self.aim(name, present))
+            self._moved[name] = _Moved(aim, token, now + LIFE, small=True)
+
+    def lend(self, names: Sequence[str], aims: FloatArray, wanted: FloatArray, token: int) -> None:
+        """Note aims that a visit gives (K, 3), and the present ones (K, 3) to which beams go back.
+
+        A heliostat that gets its own aim back, or had none, goes nowhere later.
+        """
+        for name, present, point in zip(names, aims, wanted, strict=True):
+            aim = np.array(self.aim(name, present))
+            if np.isfinite(aim).all() and not np.array_equal(aim, point):
+                self._moved[name] = _Moved(aim, token, np.inf, small=False)
+            else:
+                self._moved.pop(name, None)
+
+    def small(self, names: Sequence[str]) -> frozenset[str]:
+        """Return the heliostats that were moved a little: on the way back they need no turn."""
+        return frozenset(name for name in names if self._moved[name].small)
 
     def forget(self, heliostats: Iterable[str]) -> None:
         """Forget beams that have another aim now."""
         for name in heliostats:
             self._moved.pop(name, None)
+
+    @contextmanager
+    def ending(self, heliostats: Collection[str]) -> Iterator[None]:
+        """Let the beams of heliostats go back at the end of a block, however it ends."""
+        try:
+            yield
+        finally:
+            self.end(heliostats)
 
     def end(self, heliostats: Collection[str]) -> None:
         """Let beams go back at the next look."""
@@ -106,29 +141,34 @@ class Movements:
             if name in self._moved:
                 self._moved[name] = replace(self._moved[name], until=-np.inf)
 
-    def due(self, now: float, token: int) -> dict[str, FloatArray]:
+    def due(self, now: float, token: int, left: Left) -> dict[str, FloatArray]:
         """Return the aims of beams that are to go back now, by heliostat.
 
-        None are without a command authority (``token`` 0).
+        None are without a command authority (``token`` 0). ``left`` returns those that nobody
+        looks after any more under the token that moved them.
         """
         for ticket in [ticket for ticket in self._sent if ticket.finished]:
             self._sent.remove(ticket)
             self.forget(name for name in ticket.heliostats if name not in ticket.refusals)
         if not token:
             return {}
+        back = {name for ticket in self._sent for name in ticket.waiting(ticket.heliostats)}
         return {
             name: moved.aim
             for name, moved in self._moved.items()
-            if now >= moved.until or moved.token != token
+            if name not in back and (now >= moved.until or left(moved.token, (name,)))
         }
 
-    def sent(self, ticket: Ticket, token: int, now: float) -> None:
+    def sent(self, ticket: Ticket, now: float) -> None:
         """Note the order that brings beams back; those that do not obey are sent back again."""
         self._sent.append(ticket)
-        self.wait(ticket.heliostats, token, now)
+        for name in ticket.heliostats:
+            if (moved := self._moved.get(name)) is not None:
+                pause = min(2.0 * moved.pause, _LONGEST)
+                self._moved[name] = replace(moved, until=now + moved.pause, pause=pause)
 
     def wait(self, heliostats: Iterable[str], token: int, now: float) -> None:
         """Let beams that cannot go back now be tried again."""
         for name in heliostats:
-            if name in self._moved:
-                self._moved[name] = replace(self._moved[name], token=token, until=now + _AGAIN)
+            if (moved := self._moved.get(name)) is not None:
+                self._moved[name] = replace(moved, token=token, until=now + _AGAIN)

@@ -2,6 +2,9 @@
 
 A way is proven from where a heliostat was last reported. If another order has been sent since, it
 may have left that place, and is somewhere on a way that nobody has proven.
+
+A heliostat that leaves the receiver was lost, unless it was ordered off, by anybody: this is where
+`losses` asks for it.
 """
 
 from collections.abc import Sequence
@@ -9,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.plant import refusals
 from heliotrope.plant.field_state import FieldState
@@ -17,8 +21,10 @@ from heliotrope.plant.field_state import FieldState
 JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
 #: Commands that move heliostats by their parameters.
 MOTIONS = JOINING | {"APPROACH", "IDLE", "JOG", "GOTO", "DIAGNOSE"}
-#: Orders that send heliostats off.
-OFF = frozenset({"DEFOCUS", "STOW"})
+#: Orders that send heliostats off, and those that send them to stow.
+OFF, STOWING = frozenset({"DEFOCUS", "STOW"}), frozenset({"STOW"})
+#: Orders after which a heliostat may be out again.
+_OUT = MOTIONS | {"UNLOCK", "CLEAR_FAULT"}
 #: States in which a new point moves a heliostat.
 _POINTS = {"AIM": (states.TRACKING, states.SEARCHING), "STANDBY": (states.IDLE,)}
 #: Orders that move.
@@ -26,7 +32,11 @@ MOVING = MOTIONS | OFF | frozenset(_POINTS)
 #: From an order to a report that the board may have made before it took the order, s.
 _TAKEN_WITHIN = 1.0
 
+#: States in which a heliostat is off already: an order does not take it off.
+_GONE = (states.DEFOCUSED, states.STOWING, states.STOWED)
+
 Rows = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
 
 
 class Ordered:
@@ -41,25 +51,70 @@ class Ordered:
     def __init__(self, field: FieldState) -> None:
         self._field = field
         #: Times from which a report shows the last order of each kind, (N,).
-        self._shown = {kind: np.full(len(field), -np.inf) for kind in (MOVING, OFF, JOINING)}
+        kinds = (MOVING, OFF, JOINING, STOWING)
+        self._shown = {kind: np.full(len(field), -np.inf) for kind in kinds}
+        #: When heliostats that were out were ordered off, and when out, monotonic s, (N,).
+        self._off_at, self._out_at = np.full(len(field), -np.inf), np.full(len(field), -np.inf)
+        #: Whether the order off was acknowledged, (N,).
+        self._obeyed = np.zeros(len(field), dtype=np.bool_)
 
     def sent(self, name: str, heliostats: Sequence[str], now: float) -> None:
         """Note an order that has been sent."""
-        self._note(name, heliostats, now + _TAKEN_WITHIN)
+        rows = self._rows(name, heliostats)
+        if name in OFF:
+            # One that is silent, or off already, may have left before: then the order is no cause.
+            gone = np.isin(self._field.rows["state"][rows], _GONE)
+            gone &= self._out_at[rows] + _TAKEN_WITHIN <= self._field.heard[rows]
+            gone |= ~self._field.live(now)[rows] | (self._off_at[rows] > self._out_at[rows])
+            self._off_at[rows[~gone]], self._obeyed[rows[~gone]] = now, False
+        elif name in _OUT:
+            self._out_at[rows] = now
+        self._note(name, rows, now + _TAKEN_WITHIN)
+
+    def follows_loss(self, heliostats: Sequence[str]) -> None:
+        """Note that heliostats were ordered off because something was lost: see `off`."""
+        self._off_at[self._rows("STOW", heliostats)] = -np.inf
 
     def taken(self, name: str, heliostats: Sequence[str], now: float) -> None:
         """Note that an order has been acknowledged: it may have been long under way."""
-        self._note(name, heliostats, now)
+        rows = self._rows(name, heliostats)
+        if name in OFF:
+            heard = rows[self._field.live(now)[rows]]
+            last = heard[self._off_at[heard] > self._out_at[heard]]
+            self._off_at[last], self._obeyed[last] = now, True
+        self._note(name, rows, now)
 
-    def _note(self, name: str, heliostats: Sequence[str], shown: float) -> None:
-        if name not in MOVING:
-            return
-        rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
+    def _rows(self, name: str, heliostats: Sequence[str]) -> Rows:
+        if name not in MOVING | _OUT:
+            return np.array([], dtype=np.intp)
+        return np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
+
+    def _note(self, name: str, rows: Rows, shown: float) -> None:
         if name in _POINTS:
             rows = rows[np.isin(self._field.rows["state"][rows], _POINTS[name])]
         for kind, times in self._shown.items():
             if name in kind:
                 times[rows] = np.maximum(times[rows], shown)
+
+    def since(self, heliostat: str, kind: frozenset[str], at: float) -> bool:
+        """Return whether a heliostat was sent an order of a kind since a time, monotonic s.
+
+        ``kind`` is `OFF` or `STOWING`.
+        """
+        return bool(self._shown[kind][self._field.index[heliostat]] > at)
+
+    def off(self, seen: FloatArray, now: float) -> Mask:
+        """Return which heliostats were ordered off, by anybody, (N,); to be asked at each check.
+
+        It is the last order that they were sent, or it was sent after they were last ``seen`` out,
+        monotonic s, (N,). An order to one that was silent, or fell silent before it acknowledged
+        it, or was off already, does not count: it may have left by itself. Nor does an order of the
+        safety table to a whole cluster, which is silent, or has lost the time.
+        """
+        self._off_at[~self._field.live(now) & ~self._obeyed] = -np.inf
+        ordered = np.isfinite(self._off_at)
+        later = self._off_at + _TAKEN_WITHIN > seen
+        return np.asarray(ordered & (later | (self._off_at > self._out_at)))
 
     def unshown(self, rows: Rows, kind: frozenset[str] = MOVING) -> dict[str, str]:
         """Return which heliostats (K,) have told nothing since an order, and why others wait.

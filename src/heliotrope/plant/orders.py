@@ -14,7 +14,7 @@ from heliotrope.links.link import SendOutcome
 from heliotrope.links.messages import Command, Emergency, Parameters, Progress, Stage
 from heliotrope.plant.assigned import AssignedError
 from heliotrope.plant.audit import Audit, AuditError, Record
-from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.authority import Authority, RefusedError
 from heliotrope.plant.clusters import ClusterEnd, Clusters
 from heliotrope.plant.stowing import WAITS, StowQueue
 from heliotrope.plant.tickets import Ticket
@@ -33,20 +33,24 @@ RECORDING = 2.0
 #: Owed records that are written together, and the time after which the rest must wait: commands
 #: that are given meanwhile wait behind them, s.
 _BATCH, _TURN = 256, 0.5
+#: Clusters hear of a new token within this time, s.
+_HEARD = 3.0
 #: Commands that move nothing by themselves: an emergency does not overtake them.
 _STILL = frozenset({"AIM", "STANDBY", "PARAMETERS"})
 #: Time allowed at the end of the plant for the records that are owed, s.
 _LAST = 10.0
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Under:
-    """One message under way."""
+    """One message under way; ``again`` sends it again, if it was given under a mandate."""
 
     ticket: Ticket
     cluster: str
     heliostats: tuple[str, ...]
     at: float
+    token: int = 0
+    again: Callable[[tuple[str, ...]], None] | None = None
 
 
 @dataclass
@@ -80,6 +84,8 @@ class PlantOrders:
     ----------
     clock
         Clock of the plant.
+    authority
+        Tokens of the commands; what is accepted from anybody takes heliostats out of visits.
     audit
         Store of the records.
     disk
@@ -109,6 +115,7 @@ class PlantOrders:
     def __init__(
         self,
         clock: Clock,
+        authority: Authority,
         audit: Audit,
         disk: Disk,
         clusters: Clusters,
@@ -118,13 +125,15 @@ class PlantOrders:
         stow_rate: float,
         sent: Callable[[str, tuple[float, ...], tuple[str, ...], float], None],
     ) -> None:
-        self._sent = sent
+        self._sent, self._authority = sent, authority
         self._clock, self._audit, self._disk, self._clusters = clock, audit, disk, clusters
         self._prefix, self._lifetime, self._patience = prefix, lifetime, patience
         self._number = self._messages = 0
         self._open: dict[str, Ticket] = {}
         self.latest: Ticket | None = None
         self._under: dict[str, _Under] = {}
+        #: What clusters refused because their token was not the present one.
+        self._again: list[tuple[_Under, tuple[str, ...]]] = []
         #: Identities of commands that wait for their turn on the line to their cluster.
         self._unsent: set[str] = set()
         self._recording: dict[str, _Recording] = {}
@@ -183,6 +192,7 @@ class PlantOrders:
         ticket = Ticket(identity, what, heliostats, self._clock, self._patience)
         if late:
             self._overtake(frozenset(heliostats), what)
+            self._authority.prevail(heliostats, f"{who} ordered {what}{note and f' ({note})'}")
             self._owed.append(lambda: self._audit.begin(entry))
         else:
             self._record(ticket, entry, store)
@@ -329,9 +339,29 @@ class PlantOrders:
         heliostats: Iterable[str],
         token: int,
         lifetime: float | None = None,
+        again: Callable[[tuple[str, ...]], None] | None = None,
     ) -> None:
-        """Send a command to some heliostats of a ticket; ``lifetime``, s, replaces the usual."""
+        """Send a command to some heliostats of a ticket.
+
+        Under a mandate it is sent again where a cluster refuses it because the command authority
+        has just changed.
+
+        Parameters
+        ----------
+        ticket, name, values, heliostats
+            The ticket, and the command.
+        token
+            The holder's, or a mandate's.
+        lifetime
+            Replaces the usual one, s.
+        again
+            Sends it to some heliostats again; None: as before, at once.
+        """
         heliostats = tuple(heliostats)
+
+        def repeat(names: tuple[str, ...]) -> None:
+            self.command(ticket, name, values, names, token, lifetime)
+
         if name == "LOCK":
             for other, names in self._stowing.take(heliostats).items():
                 other.advance(names, Stage.FAILED, "superseded by LOCK")
@@ -339,6 +369,7 @@ class PlantOrders:
         life = self._lifetime if lifetime is None else lifetime
         for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part)
+            self._repeated(identity, token, again or repeat)
             self._unsent.add(identity)
 
             def message(
@@ -347,7 +378,8 @@ class PlantOrders:
                 self._unsent.discard(identity)
                 left = ticket.waiting(part)  # without those that DEFOCUS or STOW has overtaken
                 named = () if len(left) == len(end.members) else left
-                return Command(identity, name, values, named, token, life) if left else None
+                own = self._own(identity, token) if left else 0
+                return Command(identity, name, values, named, own, life) if own else None
 
             end.post(message, life, self._told(identity))
 
@@ -413,11 +445,22 @@ class PlantOrders:
         self, ticket: Ticket, heliostat: str, items: Mapping[str, bytes], token: int
     ) -> None:
         """Send items of one heliostat."""
+
+        def repeat(names: tuple[str, ...]) -> None:
+            if names:
+                self.parameters(ticket, heliostat, items, token)
+
         for end, part in self._clusters.parts([heliostat]):
             identity = self._begin(ticket, end, part)
-            message = Parameters.of(identity, heliostat, items, token)
-            ticket.expect(part, self._clock.monotonic() + message.lifetime + GRACE)
-            end.post(message, message.lifetime, self._told(identity))
+            self._repeated(identity, token, repeat)
+            life = Parameters.lifetime
+            ticket.expect(part, self._clock.monotonic() + life + GRACE)
+
+            def message(identity: str = identity) -> Parameters | None:
+                own = self._own(identity, token)
+                return Parameters.of(identity, heliostat, items, own) if own else None
+
+            end.post(message, life, self._told(identity))
 
     def _begin(
         self, ticket: Ticket, end: ClusterEnd, part: tuple[str, ...], *, again: bool = False
@@ -429,6 +472,20 @@ class PlantOrders:
         if not again:
             ticket.expect(part, now + self._lifetime + GRACE)
         return identity
+
+    def _repeated(
+        self, identity: str, token: int, again: Callable[[tuple[str, ...]], None]
+    ) -> None:
+        """Note how a message is sent again, if it is given under a mandate."""
+        if self._authority.mandate_of(token) is not None:
+            self._under[identity].again = again
+
+    def _own(self, identity: str, token: int) -> int:
+        """Return the token with which a message leaves now; 0: it may not leave any more."""
+        own = self._authority.present(token)
+        if own and identity in self._under:
+            self._under[identity].token, self._under[identity].ticket.sent = own, True
+        return own
 
     def _told(self, identity: str) -> Callable[[SendOutcome], None]:
         def told(outcome: SendOutcome) -> None:
@@ -452,20 +509,39 @@ class PlantOrders:
         part = tuple(name for name in progress.heliostats if name in mine)
         # A report without heliostats is about all of them.
         part = part if progress.heliostats else under.heliostats
+        if progress.stage in (Stage.REFUSED, Stage.FAILED) and self._crossed(under):
+            early = set(under.ticket.unacknowledged()).intersection(part)
+            self._again.append((under, tuple(early)))
+            part = tuple(name for name in part if name not in early)
         under.ticket.advance(part, progress.stage, progress.text)
         return under.ticket, part
+
+    def _crossed(self, under: _Under) -> bool:
+        """Whether a message and a change of the command authority may have crossed each other.
+
+        Its cluster may then have refused its token, and nothing else is wrong with it.
+        """
+        if under.again is None:
+            return False
+        young = self._clock.monotonic() - self._authority.changed_at < _HEARD
+        return young or under.token != self._authority.token
 
     def beat(self, now: float) -> None:
         """End commands that were not answered in time; record the results of ended tickets."""
         for recording in self._recording.values():
             self._give_up_late(recording, now)
         self._stow(self._stowing.due(now))
+        crossed, self._again = self._again, []
+        for under, names in crossed:
+            if under.again is not None and (left := under.ticket.waiting(names)):
+                under.again(left)
         ended = []
         for identity, ticket in self._open.items():
             ticket.expire(now)
             if ticket.finished and identity not in self._recording:
                 ended.append(identity)
-                self._owe_result(identity, ticket.text)
+                unsent = "" if ticket.sent or ticket.name in SAFE else "not sent: "
+                self._owe_result(identity, f"{unsent}{ticket.text}")
         for identity in ended:
             del self._open[identity]
         self._repeat(now)

@@ -1,6 +1,7 @@
 """Permission: which heliostats may be given a command now, by whom, and why others may not."""
 
 from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 
 from heliotrope.files.disk import Work
 from heliotrope.geometry import FloatArray
@@ -21,6 +22,8 @@ from heliotrope.plant.parameters import ParameterSync
 from heliotrope.plant.rivals import Rivals
 from heliotrope.plant.tickets import Ticket
 
+#: Commands that move nothing; they take no heliostat out of a visit.
+SETTINGS = frozenset({"LOCK_AIM", "ROUGH"})
 #: Commands that bring beams to standby.
 _TO_STANDBY = ("APPROACH", "IDLE")
 #: States in which beams are off.
@@ -68,13 +71,16 @@ class Permission:
         self._identities, self._sync, self._doubts = identities, sync, doubts
         self._out, self._given = out_of_service, given
 
-    def able(self, name: str, names: tuple[str, ...]) -> tuple[tuple[str, ...], dict[str, str]]:
+    def able(
+        self, name: str, names: tuple[str, ...], token: int = 0
+    ) -> tuple[tuple[str, ...], dict[str, str]]:
         """Return the heliostats that may be given a command, and why the others may not.
 
         Everything but LOCK needs a board that is the heliostat's; a motion, the wanted parameters;
         joining, its last aim, and that no alarm bars the heliostat. One whose beam went astray does
         not come back to standby either, before its alarm is acknowledged: its beam would go astray
-        again. Nor is one stopped that is just being sent off.
+        again. Nor is one stopped that is just being sent off. A setting that would disturb a
+        measurement waits for the end of the visit, unless it is given under the visit's ``token``.
 
         Raises
         ------
@@ -82,6 +88,8 @@ class Permission:
             If none may; the reason of the whole plant or of a cluster comes before their own.
         """
         wrong = {} if name == "LOCK" else self._identities.barred(names)
+        if name in SETTINGS:
+            wrong = wrong | self._visited(token, names)
         if name in MOTIONS:
             wrong = self._sync.differing(names) | self._orders.to_stow(names) | wrong
         if name in JOINING:
@@ -96,6 +104,15 @@ class Permission:
             self.refuse_now(name, names)
             raise BeamError(name, wrong)
         return tuple(n for n in names if n not in wrong), wrong
+
+    def _visited(self, token: int, names: tuple[str, ...]) -> dict[str, str]:
+        """Return the heliostats that are in other visits, and the reasons."""
+        visited = self._authority.visited()
+        return {
+            name: refusals.IN_VISIT.text.format(where=visited[name].where)
+            for name in names
+            if name in visited and visited[name].token != token
+        }
 
     def kept_back(self, name: str, names: tuple[str, ...]) -> dict[str, str]:
         """Return which heliostats whose turn to join has come may not be sent, and why."""
@@ -149,8 +166,12 @@ class Permission:
         heliostats: Sequence[str],
         note: str = "",
         store: tuple[Work, Work] | None = None,
+        blocked: Mapping[str, str] = MappingProxyType({}),
     ) -> Ticket:
         """Return the ticket of a command that may be given, with its record on the way.
+
+        It ends at once for those that are ``blocked``. A person's command takes the others out of
+        the visits that they are in.
 
         Raises
         ------
@@ -161,12 +182,19 @@ class Permission:
             self._field.place(each)
         self._authority.check(person, token, name)
         self.refuse_now(name, heliostats)
+        mandate = self._authority.mandate_of(token)
+        if mandate is not None and (wrong := mandate.refused(heliostats)):
+            raise BeamError(name, wrong)
         try:
-            return self._orders.accept(
+            ticket = self._orders.accept(
                 (person.name, person.role.title, name), values, heliostats, note, store=store
             )
         except AuditError as error:
             raise refusals.NOT_RECORDED.error(what=name, problem=error) from None
+        ticket.block(blocked)
+        if mandate is None and name not in SETTINGS:
+            self._authority.prevail(ticket.waiting(heliostats), f"{person.name} ordered {name}")
+        return ticket
 
     def refuse_now(self, name: str, heliostats: Sequence[str]) -> None:
         """Refuse a command where no new motion may begin now."""

@@ -159,6 +159,13 @@ NO_POSITION = Refusal(
     "Bring the beam to its aim by JOG, lock the heliostat, and repeat the command; where its "
     "counts are lost, give it counts by ZERO first.",
 )
+IN_VISIT = Refusal(
+    "in a visit",
+    "Stepping (ROUGH) or the lock of the aim would change in the middle of a measurement.",
+    "it is in a visit to {where}; give the command again when the visit has ended",
+    "Wait until the page *Calibration* shows the visit no more. The other heliostats of the same "
+    "command have got it.",
+)
 NO_CALIBRATION = Refusal(
     "no calibration now",
     "A heliostat is to be calibrated while automatic control cannot do it.",

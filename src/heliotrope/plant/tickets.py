@@ -41,6 +41,8 @@ class Ticket:
         Monotonic s.
     recorded
         Whether its record was on the disk before it was sent; False for DEFOCUS and STOW.
+    sent
+        Whether a message of it has left the plant.
     """
 
     def __init__(
@@ -49,7 +51,7 @@ class Ticket:
         self.identity, self.name, self.heliostats = identity, name, tuple(heliostats)
         self.refusals: dict[str, str] = {}
         self.blocked: dict[str, str] = {}
-        self.accepted_at, self.recorded = clock.monotonic(), False
+        self.accepted_at, self.recorded, self.sent = clock.monotonic(), False, False
         self._clock = clock
         self._row = {name: i for i, name in enumerate(self.heliostats)}
         self._stage = np.full(len(self.heliostats), WAITING, dtype=np.int8)

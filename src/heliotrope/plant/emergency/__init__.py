@@ -5,7 +5,7 @@ stands in its file. `TableWatch` evaluates the rows, and `EmergencyOrder` is one
 field with its proof.
 """
 
-from heliotrope.plant.emergency.order import EmergencyOrder, carried_out
+from heliotrope.plant.emergency.order import EmergencyOrder, at_stow, carried_out
 from heliotrope.plant.emergency.sentinel import Sentinel
 from heliotrope.plant.emergency.table import OWN_READINGS, PlantReadings, TableWatch
 
@@ -15,5 +15,6 @@ __all__ = [
     "PlantReadings",
     "Sentinel",
     "TableWatch",
+    "at_stow",
     "carried_out",
 ]

@@ -160,6 +160,15 @@ def switched_off(flags: npt.NDArray[Any]) -> Mask:
     return np.asarray((flags & _SWITCHED_OFF != 0) & (flags & _AT_STOW == 0))
 
 
+def at_stow(rows: npt.NDArray[Any]) -> Mask:
+    """Return which rows (K,) of `NODE` show a heliostat at stow that does not go on from there.
+
+    One that is locked there, or has a fault, is; one that is IDLE there may go on to track.
+    """
+    there = (rows["state"] == states.STOWED) | (rows["flags"] & _AT_STOW != 0)
+    return np.asarray(there & ~np.isin(rows["state"], ON_BEAM))
+
+
 def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) -> Mask:
     """Return which rows (K,) of `NODE` show that DEFOCUS or STOW has been carried out.
 
@@ -174,10 +183,9 @@ def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) 
     settled
         Whether a heliostat on its way to stow has had the time to leave the receiver, (K,).
     """
-    # A heliostat that stands at stow and is IDLE has not obeyed: it may go on to track.
     off = ~np.isin(rows["state"], ON_BEAM)
     known = (rows["flags"] & COUNTS_UNKNOWN == 0) & ~switched_off(rows["flags"])
-    stowed = off & known & ((rows["state"] == states.STOWED) | (rows["flags"] & _AT_STOW != 0))
+    stowed = known & at_stow(rows)
     if act is Act.STOW:
         return np.asarray(stowed)
     counts = np.stack([rows["primary"], rows["secondary"]], axis=-1).astype(np.float64)

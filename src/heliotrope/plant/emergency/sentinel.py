@@ -20,6 +20,7 @@ from heliotrope.plant.emergency.order import (
     COUNTS_UNKNOWN,
     ON_BEAM,
     EmergencyOrder,
+    at_stow,
     switched_off,
 )
 from heliotrope.plant.emergency.table import TableWatch
@@ -130,6 +131,7 @@ class Sentinel:
                 text = self.table.reasons(Act.DEFOCUS, name)
                 self._joining.drop(text, frozenset(members))
                 self.send_safe(_TABLE, act, members, text)
+                self._ways.ordered.follows_loss(members)
 
     def _obey_heliostats(self, now: float) -> None:
         """Send heliostats off, and send them again until their rows release.
@@ -294,10 +296,9 @@ class Sentinel:
     def _lit(self, rows: npt.NDArray[np.intp]) -> Mask:
         """Return which heliostats (K,) are not proven to be off: their beams are on a receiver.
 
-        At stow nothing can take a beam elsewhere, so it counts as off.
+        At stow nothing can take a beam elsewhere, so it counts as off, locked there or not.
         """
-        stowed = self._field.rows["state"][rows] == states.STOWED
-        return np.asarray(self._ways.unsent.lit(rows) & ~stowed)
+        return np.asarray(self._ways.unsent.lit(rows) & ~at_stow(self._field.rows[rows]))
 
     def barred(self, heliostats: Iterable[str], condition: str = "") -> dict[str, str]:
         """Return which heliostats one row, or any, keeps from their aims, and why."""

@@ -1,7 +1,8 @@
 """Automatic control: the field raised, calibrated target by target, and stowed before the night.
 
 It commands under a name of its own. It takes the command authority while nobody else has it, and
-gives way at once. It moves only *wanted* heliostats. A heliostat that a person stows, defocuses or
+gives way at once: it begins nothing new, and visits under way go on to their end. It moves only
+*wanted* heliostats. A heliostat that a person stows, defocuses or
 locks is not wanted until a person gives it back; after an emergency, none is. After a loss of many
 heliostats it waits for a person (`losses`).
 """
@@ -268,21 +269,27 @@ class AutomaticControl:
     def stop(self) -> None:
         """Begin nothing more; to be called before `run` is cancelled."""
         self._stopped = True
+        self._end_visits()
 
     async def halt(self, limit: float = 5.0) -> None:
         """Give up all work, and wait for visits under way to end, ``limit`` s at most."""
         self._on = False
         self._raising.give_up()
         self.give_way()
+        self._end_visits()
         until = self._plant.now() + limit
         while self._visiting() and self._plant.now() < until:
             await self._sleep(0.5)
 
     def give_way(self) -> None:
-        """Give the command authority to a person; visits under way are given up."""
+        """Give the command authority to a person; visits under way go on to their end."""
         self._gave_way_at = self._plant.now()
         if self._has_authority():
             self._plant.release_authority(AUTOMATIC, self._token)
+
+    def _end_visits(self) -> None:
+        """Refuse all further commands of visits under way: their beams are taken off."""
+        self._plant.authority.end_mandates(AUTOMATIC, "automatic control has been stopped")
 
     # -- views -----------------------------------------------------------------------------
 
@@ -413,7 +420,6 @@ class AutomaticControl:
         up = self._plant.field.among(_UP, self._plant.now()) & self._raising.wanted
         if up.any():
             names = tuple(self._plant.field.names[row] for row in np.flatnonzero(up))
-            self._losses.ordered(np.flatnonzero(up))
             self._plant.stow(AUTOMATIC.name, names)
         if told or up.any():
             text = f"the sun is low: {int(up.sum())} heliostats go to stow"
@@ -435,7 +441,6 @@ class AutomaticControl:
         """Send heliostats to stow that cannot go on from where they are; they are raised again."""
         if len(rows):
             names = tuple(self._plant.field.names[row] for row in rows)
-            self._losses.ordered(rows)
             self._plant.stow(AUTOMATIC.name, names)
             text = "cannot go on from where it is: it goes to stow, and is raised again"
             for name in names:

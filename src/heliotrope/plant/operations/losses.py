@@ -1,8 +1,9 @@
-"""Losses: heliostats that left the receiver or its standby point without an order.
+"""Losses: heliostats that left the receiver or its standby point without an order of the plant.
 
-A heliostat that lost its cluster, its sun or its supply turns away by itself. Automatic control may
-raise a few such heliostats again. After a loss of many it waits for a person: nobody knows what has
-happened in the field.
+Whether one was ordered off, by a person, a visit, the safety table or automatic control, is asked
+of what the plant has sent (`plant.ordered`). A heliostat that lost its cluster, its sun or its
+supply turns away by itself. Automatic control may raise a few such heliostats again. After a loss
+of many it waits for a person: nobody knows what has happened in the field.
 """
 
 import math
@@ -62,8 +63,8 @@ class Losses:
         count = len(plant.field)
         self._up: Mask = np.zeros(count, dtype=np.bool_)
         self._seen: Mask = np.zeros(count, dtype=np.bool_)
-        #: Those that automatic control has ordered down, until they are seen to have left.
-        self._ordered: Mask = np.zeros(count, dtype=np.bool_)
+        #: When they were last heard there, monotonic s.
+        self._up_at = np.full(count, -math.inf)
         self._lost_at = np.full(count, -math.inf)
         self._live_at = np.full(count, plant.now())
         self.reason = ""
@@ -78,10 +79,10 @@ class Losses:
         held = field.among((states.LOCKED,), now)
         lost = live & ~up & ~held & self._up
         lost |= ~self._seen & field.among(_LEAVING, now)
-        lost &= wanted & ~self._ordered
-        self._ordered &= ~(live & ~up & ~held)
+        lost &= wanted & ~self._plant.ordered_off(self._up_at)
         # A heliostat that is not heard, or is locked, keeps what was seen of it last.
         self._up = np.where(live & ~held, up, self._up)
+        self._up_at[live & up] = field.heard[live & up]
         self._seen |= live
         self._lost_at[lost] = now
         if lost.any():
@@ -97,10 +98,6 @@ class Losses:
     def settling(self) -> Mask:
         """Return which heliostats were lost a moment ago and are not raised yet, (N,)."""
         return np.asarray(self._plant.now() - self._lost_at < SPAN)
-
-    def ordered(self, rows: npt.NDArray[np.intp]) -> None:
-        """Note that automatic control itself takes heliostats down: they are not lost."""
-        self._up[rows], self._ordered[rows] = False, True
 
     def resume(self) -> None:
         """End the wait: a person has looked into the field."""

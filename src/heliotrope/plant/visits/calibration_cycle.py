@@ -28,7 +28,6 @@ from heliotrope.calibration.sightings import Sightings, camera_target, join
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
-from heliotrope.lcu import states
 from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.authority import Person, RefusedError
@@ -40,6 +39,7 @@ from heliotrope.plant.visits.fitting import (
     fit_heliostat,
     surprise_of,
 )
+from heliotrope.plant.visits.joint_visit import Returned
 from heliotrope.plant.visits.model_of_each import ModelOfEach
 from heliotrope.plant.visits.neighbours import Standing, Unhidden, UnhiddenCamera
 from heliotrope.plant.visits.photographs import (
@@ -192,8 +192,8 @@ class CalibrationCycle:
     ) -> CycleResult:
         """Calibrate one heliostat, and bring it back to where it was: standby, or its aim.
 
-        The command authority must be kept up meanwhile. If it is lost the beam is taken off the
-        target, and nothing is changed.
+        It works under a mandate of its own: whoever takes the command authority meanwhile, it goes
+        on. A person's order to the heliostat ends it.
 
         Parameters
         ----------
@@ -212,17 +212,14 @@ class CalibrationCycle:
             If there is no such heliostat or target.
         """
         plant = self._plant
-        plant.authority.check(person, token, "PARAMETERS")
-        visit = Visit(plant, person, token, heliostat, plant.design.target(target))
-        tracked, aim = visit.state == states.TRACKING, plant.aims[visit.row].copy()
-        async with visit:
-            await visit.go(self.settings.arrival)
-            taken = await self._photographing.take(visit, tell or _nobody)
-        result = await self.learn(visit, taken, tell)
-        if tracked and np.isfinite(aim).all():
-            await visit.aim(aim)
-            await visit.command("TRACK")
-        return result
+        place = plant.design.target(target)
+        with plant.authority.mandate(person, token, (heliostat,), target) as mandate:
+            visit = Visit(plant, mandate, heliostat, place)
+            async with Returned(plant, mandate, (heliostat,), place):
+                async with visit:
+                    await visit.go(self.settings.arrival)
+                    taken = await self._photographing.take(visit, tell or _nobody)
+                return await self.learn(visit, taken, tell)
 
     async def search(
         self, person: Person, token: int, heliostat: str, target: str, tell: Tell | None = None
@@ -231,16 +228,13 @@ class CalibrationCycle:
 
         The parameters are those of `run`.
         """
-        plant = self._plant
-        visit = Visit(plant, person, token, heliostat, plant.design.target(target))
-        tracked, aim = visit.state == states.TRACKING, plant.aims[visit.row].copy()
+        plant, place = self._plant, self._plant.design.target(target)
         searching = Centred(self._camera, self.settings, self._centring)
-        async with visit:
-            await visit.go(self.settings.arrival)
-            missed, why = await searching.search(visit, tell or _nobody)
-        if tracked and np.isfinite(aim).all():
-            await visit.aim(aim)
-            await visit.command("TRACK")
+        with plant.authority.mandate(person, token, (heliostat,), target) as mandate:
+            visit = Visit(plant, mandate, heliostat, place)
+            async with Returned(plant, mandate, (heliostat,), place), visit:
+                await visit.go(self.settings.arrival)
+                missed, why = await searching.search(visit, tell or _nobody)
         if missed is None:
             return CycleResult(heliostat, CalibrationOutcome.NO_BEAM, f"searched: {why}")
         slant = np.linalg.norm(plant.beams.armature.origin_1[visit.row] - visit.target.center)
@@ -453,7 +447,7 @@ class CalibrationCycle:
         record = found.record(
             self._plant.beliefs,
             self._plant.clock.utc().timestamp(),
-            person=visit.person.name,
+            person=visit.mandate.person.name,
             pushed=pushed,
         )
         if found.revealed is not None:
@@ -467,18 +461,15 @@ class CalibrationCycle:
         missing = differing(wanted, await plant.stored(name))
         if not missing:
             return ()
-        # Parameters are only exchanged while nothing can move.
-        await visit.command("LOCK")
-        items = {item: wanted[item] for item in missing}
-        ticket = plant.parameters(visit.person, visit.token, name, items, confirmed=why)
-        await visit.obey(ticket, 60.0)
-        left = differing(wanted, await plant.stored(name))
-        if left:
-            raise RefusedError(
-                f"{name}: {', '.join(left)} differ when read back; check its flash memory"
-            )
-        await visit.command("UNLOCK")
-        await visit.command("IDLE")
+        async with visit.locked():
+            items, mandate = {item: wanted[item] for item in missing}, visit.mandate
+            ticket = plant.parameters(mandate.person, mandate.token, name, items, confirmed=why)
+            await visit.obey(ticket, 60.0)
+            left = differing(wanted, await plant.stored(name))
+            if left:
+                raise RefusedError(
+                    f"{name}: {', '.join(left)} differ when read back; check its flash memory"
+                )
         return missing
 
 

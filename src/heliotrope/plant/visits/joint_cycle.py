@@ -34,7 +34,7 @@ from heliotrope.plant.visits.first_layout import newcomers
 from heliotrope.plant.visits.fitting import first_model
 from heliotrope.plant.visits.gathering import Gathering, Waiting
 from heliotrope.plant.visits.joint_layout import Layout, arranged, error_on, verifying
-from heliotrope.plant.visits.joint_visit import JointVisit
+from heliotrope.plant.visits.joint_visit import JointVisit, Returned
 from heliotrope.plant.visits.neighbours import Standing
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.stack_counts import CountsHeard, counts_at_rest
@@ -148,8 +148,8 @@ class JointCycle:
     ) -> tuple[CycleResult, ...]:
         """Calibrate heliostats together, and bring each back to where it was.
 
-        The command authority must be kept up meanwhile. If it is lost, the beams are taken off the
-        target, and nothing is changed.
+        It works under a mandate of its own: whoever takes the command authority meanwhile, it goes
+        on. A heliostat that a person commands leaves the visit.
 
         Parameters
         ----------
@@ -174,24 +174,24 @@ class JointCycle:
             If there is no such heliostat or target.
         """
         plant = self._plant
-        plant.authority.check(person, token, "PARAMETERS")
         place, names = plant.design.target(target), tuple(dict.fromkeys(heliostats))
-        first = self.first(names, place)
-        layout, wrong = self._arranged(place, names)
-        results = {name: _refused(name, text) for name, text in wrong.items()}
-        if layout.names:
-            joint = JointVisit(plant, person, token, layout.names, place)
-            visits = dict(joint.visits)
-            before = {name: _Before.of(visit) for name, visit in visits.items()}
-            tell("the empty target")
-            empty = await light_on(self._camera, place)
-            proven, lost = await self._stack(joint, layout, empty, tell)
-            results |= lost
-            if first:
-                self._note(results)
-            learn = self._learn_first if first else self._learn
-            results |= await learn(joint, proven, empty, tell)
-            await self._back(visits, before)
+        with plant.authority.mandate(person, token, names, target) as mandate:
+            first = self.first(names, place)
+            layout, wrong = self._arranged(place, names)
+            results = {name: _refused(name, text) for name, text in wrong.items()}
+            for name in wrong:
+                mandate.heliostats.discard(name)
+            if layout.names:
+                async with Returned(plant, mandate, layout.names, place):
+                    joint = JointVisit(plant, mandate, layout.names, place)
+                    tell("the empty target")
+                    empty = await light_on(self._camera, place)
+                    proven, lost = await self._stack(joint, layout, empty, tell)
+                    results |= lost
+                    if first:
+                        self._note(results)
+                    learn = self._learn_first if first else self._learn
+                    results |= await learn(joint, proven, empty, tell)
         return tuple(results[name] for name in names)
 
     def first(self, heliostats: Sequence[str], target: Target) -> bool:
@@ -430,7 +430,7 @@ class JointCycle:
         layout, problems, waits = verifying(plant, target, errors, self.settings, own=own)
         if not layout.names:
             return problems, [], waits
-        again = JointVisit(plant, joint.person, joint.token, layout.names, target)
+        again = JointVisit(plant, joint.mandate, layout.names, target)
         again.drop(
             {
                 name: f"the new parameters have no free way to their photograph: {why}"
@@ -469,44 +469,6 @@ class JointCycle:
         except HeliotropeError as error:
             text = f"{type(error).__name__}: {error}"
             return CycleResult(name, CalibrationOutcome.ERROR, text)
-
-    async def _back(self, visits: dict[str, Visit], before: "dict[str, _Before]") -> None:
-        """Send those that tracked back to their aims, as far as they are at standby."""
-        tracked = {
-            name: one.aim
-            for name, one in before.items()
-            if one.tracked and np.isfinite(one.aim).all() and _idle(visits[name])
-        }
-        if not tracked:
-            return
-        first = next(iter(visits.values()))
-        back = JointVisit(self._plant, first.person, first.token, tracked, first.target)
-        await back.aim(tracked)
-        await back.track()
-
-
-@dataclass(frozen=True)
-class _Before:
-    """Where a heliostat was before the visit: whether it tracked, and its aim."""
-
-    tracked: bool
-    aim: FloatArray
-
-    @classmethod
-    def of(cls, visit: Visit) -> "_Before":
-        """Return where it is now; one that is not heard is nowhere."""
-        try:
-            tracked = visit.state == states.TRACKING
-        except RefusedError:
-            tracked = False
-        return cls(tracked, visit.plant.aims[visit.row].copy())
-
-
-def _idle(visit: Visit) -> bool:
-    try:
-        return visit.state == states.IDLE
-    except RefusedError:
-        return False
 
 
 def _middle(pictures: Sequence[tuple[int, TargetLight]]) -> float:

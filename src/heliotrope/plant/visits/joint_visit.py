@@ -1,18 +1,23 @@
 """Many heliostats on one target: their way there, their aims, and their way back.
 
 One that is refused, is lost or leaves its aim drops out: it is brought to standby, or its beam is
-taken off the target, and the others go on. The visit ends only with what ends it for all: an
-emergency, a lost command authority, a cancelled task. Then all beams leave the target.
+taken off the target, and the others go on. So do they when a person's order takes one out of the
+visit; that one is left to the person. The visit ends only with what ends it for all: an emergency,
+the end of its mandate, a cancelled task. Then all beams leave the target.
 """
 
 import asyncio
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from typing import Self
+
+import numpy as np
 
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
-from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.authority import Mandate, RefusedError
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.tickets import Ticket
@@ -37,7 +42,7 @@ class JointVisit(BroughtHome):
 
     Parameters
     ----------
-    plant, person, token
+    plant, mandate
         As for `Visit`.
     heliostats, target
         Names, and the target.
@@ -53,14 +58,13 @@ class JointVisit(BroughtHome):
     def __init__(
         self,
         plant: PlantController,
-        person: Person,
-        token: int,
+        mandate: Mandate,
         heliostats: Iterable[str],
         target: Target,
     ) -> None:
-        self.plant, self.person, self.token, self.target = plant, person, token, target
+        self.plant, self.mandate, self.target = plant, mandate, target
         self.visits = {
-            name: Visit(plant, person, token, name, target) for name in dict.fromkeys(heliostats)
+            name: Visit(plant, mandate, name, target) for name in dict.fromkeys(heliostats)
         }
         self.lost: dict[str, str] = {}
         self._away: set[str] = set()
@@ -129,12 +133,13 @@ class JointVisit(BroughtHome):
         wanted = [name for name in self.names if name in points]
 
         def ordered(names: tuple[str, ...]) -> Ticket:
-            return self.plant.aim(self.person, self.token, {name: points[name] for name in names})
+            mandate, some = self.mandate, {name: points[name] for name in names}
+            return self.plant.aim(mandate.person, mandate.token, some)
 
         await self._obeyed(ordered, wanted, limit)
 
     def _command(self, name: str, heliostats: tuple[str, ...]) -> Ticket:
-        return self.plant.command(self.person, self.token, name, heliostats)
+        return self.plant.command(self.mandate.person, self.mandate.token, name, heliostats)
 
     async def _obeyed(
         self, order: Callable[[tuple[str, ...]], Ticket], heliostats: Iterable[str], limit: float
@@ -181,8 +186,12 @@ class JointVisit(BroughtHome):
                 until = min(until, begin + 2.0 * (now - begin) + _LATE)
 
     async def look(self) -> None:
-        """Let a little time pass, and note the step counts that are new."""
+        """Let a little time pass, and note the step counts that are new.
+
+        Those drop out that another order has taken out of the visit.
+        """
         await sleep_until(self.plant.clock, self.plant.now() + _LOOK)
+        self.drop({n: f"{n}: {text}" for n, text in self.mandate.refused(self.visits).items()})
         for visit in self.visits.values():
             visit.note()
 
@@ -205,25 +214,78 @@ class JointVisit(BroughtHome):
             await self._standby(tuple(self._away))
 
     async def _standby(self, names: tuple[str, ...]) -> None:
-        """Bring heliostats to standby; those that an order has taken off the target stay there."""
+        """Bring heliostats to standby; those that an order has taken off the target stay there.
+
+        Those that another order has taken out of the visit are left to that.
+        """
+        taken = self.mandate.taken
+        self._away -= taken.keys()
+        names = tuple(name for name in names if name not in taken)
         field, now = self.plant.field, self.plant.now()
         heard = {name: int(field.rows["state"][field.place(name)]) for name in names}
         live = field.live(now)
         on = tuple(n for n in names if live[field.place(n)] and heard[n] in _ON)
         left = {n for n in names if n not in on and not (live[field.place(n)] and heard[n] in _OFF)}
-        who = f"joint visit of {self.person.name}"
         try:
-            able = tuple(name for name in on if not self.plant.waits_to_stow(name))
-            if able:
-                ticket = self._command("IDLE", able)
+            if on:
+                ticket = self._command("IDLE", on)
                 await ticket.end(_HOME)
-                left |= set(ticket.waiting(able)) | set(ticket.refusals)
+                left |= set(ticket.waiting(on)) | set(ticket.refusals)
         except BeamError as error:
             left |= set(error.refusals)
         except (RefusedError, asyncio.CancelledError):
-            self.plant.defocus(who, names)
-            self._away -= set(names)
+            left |= set(names)
             raise
-        if left:
-            self.plant.defocus(who, tuple(sorted(left)))
-        self._away -= set(names)
+        finally:
+            self._away -= set(names)
+            if left := left - taken.keys():
+                self.plant.defocus(
+                    f"joint visit of {self.mandate.person.name}", tuple(sorted(left))
+                )
+
+
+class Returned:
+    """Heliostats that go back at the end of an ``async with`` to the aims that they tracked before.
+
+    Those that are not at standby then, and those that another order has taken out of the visit,
+    stay where they are. A cancelled visit leaves all at standby.
+
+    Parameters
+    ----------
+    plant, mandate, heliostats, target
+        As for `JointVisit`.
+    """
+
+    def __init__(
+        self, plant: PlantController, mandate: Mandate, heliostats: Iterable[str], target: Target
+    ) -> None:
+        tracking = plant.field.among((states.TRACKING,), plant.now())
+        self._plant, self._mandate, self._target = plant, mandate, target
+        rows = {name: plant.field.place(name) for name in dict.fromkeys(heliostats)}
+        self._aims = {
+            name: plant.aims[row].copy()
+            for name, row in rows.items()
+            if tracking[row] and np.isfinite(plant.aims[row]).all()
+        }
+
+    async def __aenter__(self) -> Self:
+        """Note where they are."""
+        return self
+
+    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Send them back; what ended the visit is raised rather than what hinders that."""
+        if kind is None:
+            await self._back()
+        elif issubclass(kind, Exception):
+            with suppress(RefusedError):
+                await self._back()
+
+    async def _back(self) -> None:
+        plant = self._plant
+        idle = plant.field.among((states.IDLE,), plant.now())
+        names = self._aims.keys() & self._mandate.heliostats
+        back = {name: self._aims[name] for name in names if idle[plant.field.place(name)]}
+        if back:
+            joint = JointVisit(plant, self._mandate, back, self._target)
+            await joint.aim(back)
+            await joint.track()

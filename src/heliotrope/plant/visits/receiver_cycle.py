@@ -10,6 +10,7 @@ to a target, and so is every mirror of which something is wrong.
 """
 
 import asyncio
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -33,7 +34,7 @@ from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult, Production
-from heliotrope.plant.visits.joint_visit import JointVisit
+from heliotrope.plant.visits.joint_visit import JointVisit, Returned
 from heliotrope.plant.visits.neighbours import Standing
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.receiver_layout import ReceiverLayout, arranged_on, production
@@ -106,8 +107,8 @@ class ReceiverCycle:
     ) -> tuple[CycleResult, ...]:
         """Calibrate heliostats that track the receiver; those that take no part stay as they are.
 
-        The command authority must be kept up meanwhile. However it ends, the plant takes the beams
-        back to their aims.
+        It works under a mandate of its own: whoever takes the command authority meanwhile, it goes
+        on. However it ends, the plant takes the beams back to their aims.
 
         Parameters
         ----------
@@ -132,20 +133,19 @@ class ReceiverCycle:
             If there is no such heliostat.
         """
         plant = self._plant
-        plant.authority.check(person, token, "PARAMETERS")
         names = tuple(dict.fromkeys(heliostats))
         made, wrong = arranged_on(plant, self.face, names, self.settings)
         results = {name: _refused(name, text) for name, text in wrong.items()}
-        if moving := made.layout.names:
-            joint = JointVisit(plant, person, token, moving, self.face)
-            try:
-                taken = await self._photograph(joint, made, await self._steady(tell), tell)
-            finally:
-                plant.movements.end(moving)
-            tell("back to the aims")
-            await self._settled(joint, plant.now() + _BACK, moving)
-            results |= {name: _refused(name, text) for name, text in joint.lost.items()}
-            results |= await self._learn(joint, made, taken, tell)
+        moving = made.layout.names
+        with plant.authority.mandate(person, token, moving, self.face.name) as mandate:
+            if moving:
+                joint = JointVisit(plant, mandate, moving, self.face)
+                with plant.movements.ending(moving):
+                    taken = await self._photograph(joint, made, await self._steady(tell), tell)
+                tell("back to the aims")
+                await self._settled(joint, plant.now() + _BACK, moving)
+                results |= {name: _refused(name, text) for name, text in joint.lost.items()}
+                results |= await self._learn(joint, made, taken, tell)
         return tuple(results[name] for name in names)
 
     # -- photographs -----------------------------------------------------------------------
@@ -199,7 +199,9 @@ class ReceiverCycle:
         while names := joint.names:
             try:
                 ticket = self._plant.move(
-                    joint.person, joint.token, {name: points[name] for name in names}
+                    joint.mandate.person,
+                    joint.mandate.token,
+                    {name: points[name] for name in names},
                 )
             except BeamError as error:
                 if not set(error.refusals) & set(names):
@@ -296,31 +298,24 @@ class ReceiverCycle:
         self, joint: JointVisit, name: str, taken: Photographs, away: asyncio.Semaphore
     ) -> CycleResult:
         """Learn from a proven beam; a mirror that leaves the receiver returns to its aim."""
-        plant, visit = self._plant, joint.visits[name]
-        aim = plant.aims[visit.row].copy()
-        left = False
+        visit = joint.visits[name]
 
-        async def leave(visit: Visit) -> None:
-            nonlocal left
-            await away.acquire()
-            left = True
-            await visit.command("IDLE")
+        async with contextlib.AsyncExitStack() as stack:
 
-        seen = Production(self.face.name, self.settings.worth, leave)
-        try:
-            result = await self._cycle.learn(visit, taken, production=seen)
-            if left:
-                await visit.aim(aim)
-                await visit.command("TRACK")
-        except RefusedError as error:
-            return _refused(name, str(error))
-        except HeliotropeError as error:
-            text = f"{type(error).__name__}: {error}"
-            return CycleResult(name, CalibrationOutcome.ERROR, text)
-        finally:
-            if left:
-                away.release()
-        return result
+            async def leave(visit: Visit) -> None:
+                await stack.enter_async_context(away)
+                back = Returned(self._plant, joint.mandate, (name,), self.face)
+                await stack.enter_async_context(back)
+                await visit.command("IDLE")
+
+            seen = Production(self.face.name, self.settings.worth, leave)
+            try:
+                return await self._cycle.learn(visit, taken, production=seen)
+            except RefusedError as error:
+                return _refused(name, str(error))
+            except HeliotropeError as error:
+                text = f"{type(error).__name__}: {error}"
+                return CycleResult(name, CalibrationOutcome.ERROR, text)
 
     def production(self) -> float:
         """Return the light that is sent to the receiver now, in square metres of sunlight."""

@@ -1,9 +1,16 @@
-"""A heliostat's visit to a target: the way there, the observed stay, and the way back."""
+"""A heliostat's visit to a target: the way there, the observed stay, and the way back.
+
+Whatever a visit takes it gives back on every way out: the place on the target (`BroughtHome`), the
+lock for writing parameters (`Visit.locked`), the aim and the receiver (`joint_visit.Returned`).
+Where it cannot, the plant does so later: see `plant.giving_back`.
+"""
 
 import asyncio
 import math
 from abc import ABC, abstractmethod
 from bisect import bisect_right
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from typing import Self
 
 import numpy as np
@@ -13,7 +20,8 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
 from heliotrope.mechanism.drives import Drive
-from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.authority import Mandate, RefusedError
+from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.tickets import Ticket
 
@@ -50,9 +58,8 @@ class Visit(BroughtHome):
 
     Parameters
     ----------
-    plant, person, token
-        The plant, the person under whose name commands are given, and the token of the command
-        authority.
+    plant, mandate
+        The plant, and the mandate under which commands are given.
     heliostat, target
         Name of the heliostat, and the target.
 
@@ -68,9 +75,9 @@ class Visit(BroughtHome):
     """
 
     def __init__(
-        self, plant: PlantController, person: Person, token: int, heliostat: str, target: Target
+        self, plant: PlantController, mandate: Mandate, heliostat: str, target: Target
     ) -> None:
-        self.plant, self.person, self.token = plant, person, token
+        self.plant, self.mandate = plant, mandate
         self.heliostat, self.target = heliostat, target
         self.row = plant.field.place(heliostat)
         self.boots = int(plant.field.rows["boots"][self.row])
@@ -122,17 +129,41 @@ class Visit(BroughtHome):
         Raises
         ------
         RefusedError
-            As `obey`; or if the heliostat waits for its turn to go to stow, from which a LOCK would
-            take it.
+            As `obey`; or if another order has taken the heliostat out of the visit.
         """
-        if self.plant.waits_to_stow(self.heliostat):
-            raise RefusedError(f"{self.heliostat}: it waits for its turn to go to stow")
-        ticket = self.plant.command(self.person, self.token, name, (self.heliostat,), values)
+        mandate = self.mandate
+        ticket = self.plant.command(mandate.person, mandate.token, name, (self.heliostat,), values)
         await self.obey(ticket, limit)
 
     async def aim(self, point: FloatArray, limit: float = 120.0) -> None:
         """Give the heliostat an aim and wait until it has taken it; see `obey`."""
-        await self.obey(self.plant.aim(self.person, self.token, {self.heliostat: point}), limit)
+        mandate = self.mandate
+        ticket = self.plant.aim(mandate.person, mandate.token, {self.heliostat: point})
+        await self.obey(ticket, limit)
+
+    @asynccontextmanager
+    async def locked(self) -> AsyncIterator[None]:
+        """Lock the heliostat, which is at standby, for a block, and bring it to standby again.
+
+        Parameters are only exchanged while nothing can move.
+
+        Raises
+        ------
+        RefusedError
+            See `command`. Where it cannot be unlocked now, the plant unlocks it later.
+        """
+        await self.command("LOCK")
+        try:
+            yield
+        except BaseException:
+            with suppress(RefusedError):
+                await self._unlock()
+            raise
+        await self._unlock()
+
+    async def _unlock(self) -> None:
+        await self.command("UNLOCK")
+        await self.command("IDLE")
 
     async def go(self, limit: float, point: FloatArray | None = None) -> None:
         """Send the heliostat to the target and wait until it is there.
@@ -186,8 +217,16 @@ class Visit(BroughtHome):
         return float(np.abs((goal - here) * self._drives.radians_per_count(here)).max())
 
     async def look(self) -> None:
-        """Let a little time pass, and note the counts if they are new."""
+        """Let a little time pass, and note the counts if they are new.
+
+        Raises
+        ------
+        RefusedError
+            If another order has taken the heliostat out of the visit.
+        """
         await sleep_until(self.plant.clock, self.plant.now() + _LOOK)
+        if wrong := self.mandate.refused((self.heliostat,)):
+            raise BeamError("visit", wrong)
         self.note()
 
     def note(self) -> None:
@@ -255,12 +294,17 @@ class Visit(BroughtHome):
         return np.array(self._times), np.array(self._counts).reshape(-1, 2)
 
     async def home(self) -> None:
-        """Bring it back to standby; where that is not possible, take its beam off the target."""
+        """Bring it back to standby; where that is not possible, take its beam off the target.
+
+        One that another order has taken out of the visit is left to that.
+        """
         if not self.away:
             return
-        try:
-            await self.command("IDLE", limit=60.0)
-        except (RefusedError, asyncio.CancelledError):
-            self.plant.defocus(f"visit of {self.person.name}", (self.heliostat,))
-            raise
         self.away = False
+        try:
+            if self.heliostat not in self.mandate.taken:
+                await self.command("IDLE", limit=60.0)
+        except (RefusedError, asyncio.CancelledError):
+            if self.heliostat not in self.mandate.taken:
+                self.plant.defocus(f"visit of {self.mandate.person.name}", (self.heliostat,))
+            raise

@@ -248,7 +248,7 @@ class FieldBus:
             made = np.zeros(len(self._rows), dtype=_STATUS)
             fresh = left > 0
             made["f0"] = np.maximum(state, 0)
-            made["f1"] = _SOUND + _SUN_FRESH * fresh + _AT_STOW * (state == states.STOWED)
+            made["f1"] = _SOUND + _SUN_FRESH * fresh + _AT_STOW * field.at_stow(self._all)
             made["f1"] += (_READY * field.ready(self._all)).astype(np.uint32)
             made["f2"] = field.fault[self._all]
             made["f4"] = np.where(fresh, LEASE_MS - left, _NEVER)

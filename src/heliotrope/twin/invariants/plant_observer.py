@@ -392,6 +392,9 @@ class PlantObserver:
         self._boards(now)
         if plant is None:
             return
+        # A beam that goes back to its aim on the receiver waits for its turn to join.
+        waits = {ticket.identity for ticket in plant.orders if not ticket.sent}
+        self._own.update(dict.fromkeys(self._own.keys() & waits, now))
         well_since = max(self._disk.well_since, self._stood_at)
         if now - well_since > RECORD_WITHIN and not (self._disk.full or self._disk.busy(now)):
             self._complete(now)

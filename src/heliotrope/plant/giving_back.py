@@ -1,0 +1,132 @@
+"""Giving back what visits have taken: moved aims and locks, once no visit holds them any more.
+
+A visit gives back what it took. Whatever is left when it ends, or when a person's order takes a
+heliostat out of it, the plant gives back itself, under whatever command authority there is, as soon
+as motions are accepted.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from heliotrope.geometry import FloatArray
+from heliotrope.plant.audit import AuditError
+from heliotrope.plant.authority import Authority, RefusedError
+from heliotrope.plant.beam_watch import BeamError
+from heliotrope.plant.commands import Commands
+from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.locks import Locks
+from heliotrope.plant.movements import Movements
+from heliotrope.plant.orders import PlantOrders
+from heliotrope.plant.permission import Permission
+
+#: Name and role in the record.
+_PLANT = ("plant", "anybody")
+
+
+class GivingBack:
+    """Sends beams back to their aims, and unlocks heliostats, that visits have left.
+
+    Parameters
+    ----------
+    field, authority, orders, permission, commands
+        The plant's.
+    movements, locks
+        What visits have taken.
+    stow
+        Sends heliostats to stow.
+    """
+
+    def __init__(
+        self,
+        field: FieldState,
+        authority: Authority,
+        orders: PlantOrders,
+        permission: Permission,
+        commands: Commands,
+        movements: Movements,
+        locks: Locks,
+        stow: Callable[[Sequence[str]], object],
+    ) -> None:
+        self._field, self._authority, self._orders = field, authority, orders
+        self._permission, self._commands = permission, commands
+        self._movements, self._locks, self._stow = movements, locks, stow
+
+    def beat(self, now: float) -> None:
+        """Give back what is due, as far as motions are accepted now."""
+        self._unlock(now)
+        self._bring_back(now)
+
+    # -- locks -----------------------------------------------------------------------------
+
+    def _unlock(self, now: float) -> None:
+        for what, names in self._locks.due(now, self._authority.left).items():
+            self._locks.sent(what, self._ordered(what, tuple(names)))
+
+    def _ordered(self, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Give an order to heliostats that were left locked; return those that need no other."""
+        try:
+            self._permission.refuse_now(what, names)
+            if what == "STOW":
+                if left := tuple(n for n in names if n not in self._locks.under_way(names)):
+                    self._stow(left)
+                return names
+            if not (token := self._authority.token):
+                return ()
+            able, _ = self._commands.examine(what, (), names)
+            note = "a visit has left it locked"
+            ticket = self._orders.accept((*_PLANT, what), (), able, note)
+        except (RefusedError, AuditError):
+            return ()
+
+        def send(again: bool) -> None:
+            del again
+            self._orders.command(ticket, what, (), ticket.waiting(able), token)
+
+        self._orders.when_recorded(ticket, send)
+        return able
+
+    # -- aims ------------------------------------------------------------------------------
+
+    def _bring_back(self, now: float) -> None:
+        """Send moved beams back to their aims."""
+        token = self._authority.token
+        due = self._movements.due(now, token, self._authority.left)
+        live = self._field.live(now)
+        due = {name: aim for name, aim in due.items() if live[self._field.place(name)]}
+        if not due:
+            return
+        self._movements.wait(due, token, now)
+        names = self._free_to_return(due)
+        if not names:
+            return
+        wanted = np.stack([due[name] for name in names])
+
+        def assign() -> frozenset[str]:
+            aimed = [name for name in names if name not in self._movements.names]
+            if aimed:  # while the record was written
+                raise BeamError("AIM", dict.fromkeys(aimed, "it has another aim now"))
+            self._commands.assign("AIM", names, wanted)
+            return self._movements.small(names)
+
+        note = f"{len(names)} beams go back to their aims"
+        try:
+            ticket = self._orders.accept((*_PLANT, "AIM"), (), names, note)
+        except AuditError:
+            return
+        self._movements.sent(ticket, now)
+        self._commands.when_recorded(ticket, names, wanted, token, assign)
+
+    def _free_to_return(self, due: Mapping[str, FloatArray]) -> tuple[str, ...]:
+        """Return the moved beams that may go back now."""
+        names = tuple(due)
+        while names:
+            try:
+                self._permission.refuse_now("AIM", names)
+                self._commands.prove_points("AIM", names, np.stack([due[n] for n in names]))
+                break
+            except BeamError as error:
+                names = tuple(name for name in names if name not in error.refusals)
+            except RefusedError:
+                return ()
+        return names

@@ -1,0 +1,113 @@
+"""Locks of visits: heliostats that a visit has locked to write their parameters.
+
+A visit unlocks them itself. Where it cannot, because an emergency holds, a person's order has taken
+the heliostat out of the visit or the visit was cancelled, the plant unlocks them as soon as it may
+(`giving_back`). A local controller stays LOCKED through DEFOCUS and STOW, and UNLOCK stops it; so
+one that was ordered off is unlocked at stow.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from heliotrope.lcu import names as meanings
+from heliotrope.lcu import states
+from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.ordered import OFF, STOWING, Ordered
+
+#: A report from this long after a lock was sent shows it, s.
+_SHOWN = 1.0
+#: Pause before an order is given again, s: it doubles from one to the next, up to the longest.
+_AGAIN, _LONGEST = 3.0, 300.0
+_AT_STOW = 1 << meanings.FLAGS.index("AT_STOW")
+
+
+@dataclass
+class _Lock:
+    """A lock: under which mandate, since when, the next attempt, and whether it was released."""
+
+    token: int
+    since: float
+    due: float
+    pause: float = _AGAIN
+    released: bool = False
+
+
+class Locks:
+    """The heliostats that visits have locked, by name.
+
+    Parameters
+    ----------
+    field, ordered
+        State of the field, and what was ordered.
+    """
+
+    def __init__(self, field: FieldState, ordered: Ordered) -> None:
+        self._field, self._ordered = field, ordered
+        self._locked: dict[str, _Lock] = {}
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The heliostats that a visit has locked, or that wait to be unlocked."""
+        return frozenset(self._locked)
+
+    def take(self, heliostats: Iterable[str], token: int, now: float) -> None:
+        """Note that heliostats are locked under the mandate of a visit."""
+        self._locked.update({name: _Lock(token, now, now + _SHOWN) for name in heliostats})
+
+    def forget(self, heliostats: Iterable[str]) -> None:
+        """Forget heliostats that a person locks: the person unlocks them."""
+        for name in heliostats:
+            self._locked.pop(name, None)
+
+    def due(
+        self, now: float, left: Callable[[int, Iterable[str]], frozenset[str]]
+    ) -> dict[str, list[str]]:
+        """Return the heliostats that are to be given an order now, by its name.
+
+        Parameters
+        ----------
+        now
+            Monotonic s.
+        left
+            Returns those that no visit looks after any more: the visit has ended, or a person has
+            ordered something else.
+        """
+        found: dict[str, list[str]] = {}
+        for name, lock in list(self._locked.items()):
+            heard = self._field.heard[self._field.index[name]]
+            fresh = heard >= lock.since + _SHOWN and now - heard <= self._field.limit
+            if not fresh or not left(lock.token, (name,)):
+                continue
+            what = self._next(name, lock)
+            if not what:
+                del self._locked[name]
+            elif now >= lock.due:
+                lock.due = now + lock.pause
+                found.setdefault(what, []).append(name)
+        return found
+
+    def _next(self, name: str, lock: _Lock) -> str:
+        """Return the order that brings a heliostat on, "" if none is left to be given."""
+        node = self._field.rows[self._field.index[name]]
+        if node["state"] != states.LOCKED:
+            # It stands where it was unlocked until it is sent to its standby point.
+            return "IDLE" if lock.released and node["state"] == states.IDLE else ""
+        off = self._ordered.since(name, OFF, lock.since)
+        return "STOW" if off and not node["flags"] & _AT_STOW else "UNLOCK"
+
+    def sent(self, what: str, heliostats: Iterable[str]) -> None:
+        """Note an order that has been given; one that is not obeyed is given again."""
+        for name in heliostats:
+            lock = self._locked[name]
+            if what == "UNLOCK":
+                lock.released, lock.pause = True, min(2.0 * lock.pause, _LONGEST)
+            if what == "IDLE":
+                del self._locked[name]
+
+    def under_way(self, heliostats: Iterable[str]) -> frozenset[str]:
+        """Return those that were sent to stow since they were locked: nothing more is needed."""
+        return frozenset(
+            name
+            for name in heliostats
+            if self._ordered.since(name, STOWING, self._locked[name].since)
+        )
