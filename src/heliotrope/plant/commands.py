@@ -24,6 +24,7 @@ from heliotrope.plant.movements import Movements
 from heliotrope.plant.ordered import JOINING
 from heliotrope.plant.orders import PlantOrders, whole
 from heliotrope.plant.permission import Permission
+from heliotrope.plant.stepping import Stepping
 from heliotrope.plant.tickets import Ticket
 
 #: Commands that move nothing.
@@ -59,6 +60,8 @@ class Commands:
         Time that a heliostat waits for its turn to join, s.
     movements
         Beams that are a little beside their aims.
+    stepping
+        How local controllers must step.
     """
 
     def __init__(
@@ -74,11 +77,12 @@ class Commands:
         wanted: Wanted,
         patience: float,
         movements: Movements,
+        stepping: Stepping,
     ) -> None:
         self._now, self._field, self._orders, self._joining = now, field, orders, joining
         self._permission, self._given, self._ways = permission, given, ways
         self._design, self._wanted, self._patience = design, wanted, patience
-        self._movements = movements
+        self._movements, self._stepping = movements, stepping
 
     def give(
         self,
@@ -129,6 +133,8 @@ class Commands:
             if name not in SETTINGS:
                 # One that was given before it may have joined the queue after its acceptance.
                 self._joining.drop(f"superseded by {name}", frozenset(left))
+        if name == "ROUGH":
+            self._stepping.ordered(left, bool(numbers[0]))
         if left:
             waits = name in JOINING or in_slices(name, left)
             send = self._join if waits else self._orders.command
@@ -242,6 +248,34 @@ class Commands:
             return
         self._movements.sent(ticket, token, self._now())
         self._when_recorded(ticket, names, wanted, token, assign)
+
+    def step(self, token: int) -> None:
+        """Order heliostats to step finely or roughly, as far as motions are accepted now.
+
+        ``token`` is that of the present command authority, whoever has it.
+        """
+        for rough, due in self._stepping.due(self._now(), token).items():
+            self._stepping.sent(due, self._now())
+            blocked = self._permission.strange(due)
+            names = tuple(name for name in due if name not in blocked)
+            if not names:
+                continue
+            note = f"{len(names)} step {'roughly again' if rough else 'finely for a visit'}"
+            values = (float(rough),)
+            try:
+                self._permission.refuse_now("ROUGH", names)
+                ticket = self._orders.accept(("plant", "anybody", "ROUGH"), values, names, note)
+            except (RefusedError, AuditError):
+                continue
+            self._orders.when_recorded(ticket, partial(self._send_step, ticket, values, token))
+
+    def _send_step(
+        self, ticket: Ticket, values: tuple[float, ...], token: int, again: bool
+    ) -> None:
+        left = ticket.waiting(ticket.heliostats)
+        if again:
+            self._permission.refuse_now(ticket.name, left)
+        self._orders.command(ticket, ticket.name, values, left, token)
 
     def _free_to_return(self, due: Mapping[str, FloatArray]) -> tuple[str, ...]:
         """Return which moved beams may go back now."""

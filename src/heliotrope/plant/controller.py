@@ -65,6 +65,7 @@ from heliotrope.plant.parameters import ParameterSync, Tables, change_of_beam
 from heliotrope.plant.permission import Permission
 from heliotrope.plant.rivals import Rivals
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
+from heliotrope.plant.stepping import Stepping
 from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.told_alarms import ToldAlarms
 from heliotrope.safety import Act, Alarm, Condition, alarms, conditions
@@ -126,6 +127,8 @@ class PlantController:
         Points where the beams are sent, ENU, m, (N, 3); NaN where there is none.
     movements
         Beams that are a little beside their assigned aims, for a measurement.
+    stepping
+        How local controllers must step.
 
     Raises
     ------
@@ -167,6 +170,8 @@ class PlantController:
         points = Points(self.field.names, assigned)
         self.aims, self.standbys = points.aims, points.standbys
         self.movements = Movements(design.receivers, self.beams.armature)
+        resting = (name for name, each in self.beams.machines.items() if each.rests)
+        self.stepping = Stepping(self.field, resting)
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, self.beams.machines)
         self._agreement = self._compared(points)
         self._clusters = Clusters(members, links, clock, self.counters)
@@ -280,6 +285,7 @@ class PlantController:
             self.wanted,
             self.settings.join_wait,
             self.movements,
+            self.stepping,
         )
 
     def _dispatching(self) -> JoinDispatcher:
@@ -397,6 +403,7 @@ class PlantController:
         self._joiner.beat(now, token, held=bool(self._sentinel.refusal(("",))))
         self._orders.beat(now)
         self._commands.bring_back(token)
+        self._commands.step(token)
         slow = now - self._slow_at >= _SLOW_BEAT
         if self._orders.owing or slow:
             self._orders.pay()

@@ -131,10 +131,11 @@ class ReceiverCycle:
         results = {name: _refused(name, text) for name, text in wrong.items()}
         if moving := made.layout.names:
             joint = JointVisit(plant, person, token, moving, self.face)
-            try:
-                taken = await self._photograph(joint, made, await self._steady(tell), tell)
-            finally:
-                plant.movements.end(moving)
+            with plant.stepping.fine(moving):
+                try:
+                    taken = await self._photograph(joint, made, await self._steady(tell), tell)
+                finally:
+                    plant.movements.end(moving)
             tell("back to the aims")
             await self._settled(joint, plant.now() + _BACK, moving)
             results |= {name: _refused(name, text) for name, text in joint.lost.items()}
@@ -164,6 +165,8 @@ class ReceiverCycle:
     ) -> _Taken:
         """Take the stack; a photograph in another light than the usual is taken again."""
         taken, needed, plant = _Taken(), len(made.layout.moves), self._plant
+        coarse = plant.stepping.coarse(joint.names, plant.now())
+        joint.drop(dict.fromkeys(coarse, "it does not take fine steps"))
         for _ in range(int(self.settings.again * needed)):
             number = len(taken.pictures)
             if number == needed:
