@@ -163,6 +163,45 @@ def test_movements_along_one_axis_need_half_as_many_photographs(along: int) -> N
         separate(stack, np.zeros_like(moves), beams)
 
 
+@pytest.mark.parametrize(
+    ("over", "aimed", "verdict"),
+    [
+        (0.15, 0.0, None),
+        (0.6, 0.0, None),
+        (1.2, 0.0, Verdict.ELSEWHERE),
+        (1.6, 0.0, Verdict.ELSEWHERE),
+        (20.0, 1.6, Verdict.FAINT),
+    ],
+)
+def test_a_beam_beyond_the_edge_is_not_proven_and_harms_no_other(
+    over: float, aimed: float, verdict: Verdict | None
+) -> None:
+    """A tail on the target does not say where its beam is, nor how strong; half a beam does.
+
+    One that was missed before aims beside the target.
+    """
+    rng = np.random.default_rng(3)
+    count, mirrors, width = 96, 12, 0.125
+    x = 2.0 * ((np.arange(count) + 0.5) / count - 0.5)
+    true = rng.uniform(-0.8, 0.8, (mirrors, 2))
+    true[0] = 1.0 + over * width, 0.7
+    moves = 0.076 * coded_movements(mirrors, along=0)
+    values = 0.05 + 0.0005 * rng.standard_normal((len(moves), count, count))
+    for k, i in np.ndindex(len(moves), mirrors):
+        values[k] += 0.006 * bell(x, -x, true[i] + moves[k, i], np.full(2, width))
+    empty = np.full((count, count), 0.05)
+    stack = Stack(values, x[1] - x[0], np.array([x[0], -x[0]]), empty > 0.0, None, empty)
+    place, spread = np.zeros((mirrors, 2)), np.eye(2)
+    place[0] = aimed, 0.0
+    expected = [
+        ExpectedBeam(f"AA{i}", place[i], 0.85**2 * spread, width**2 * spread)
+        for i in range(mirrors)
+    ]
+    found = separate(stack, moves, expected)
+    assert verdicts(found) == ({} if verdict is None else {"AA0": verdict}), found.beams
+    assert errors(found, true)[0 if verdict is None else 1 :].max() < 0.01
+
+
 def test_a_mirror_that_does_not_move_is_named_and_harms_no_other() -> None:
     found, true = separated(Field(stuck=(4,)))
     assert verdicts(found) == {"AA4": Verdict.STUCK}

@@ -308,7 +308,7 @@ def test_settings_of_first_visits_that_cannot_be_are_refused(
 
 def test_a_beam_is_as_bright_beside_the_middle_of_a_target_as_on_it() -> None:
     target = malan_plant(1).targets[0]
-    sent = {"A": SentBeam(100.0, np.eye(2), np.eye(2), 1.0, 16.0)}
+    sent = {"A": SentBeam(100.0, np.eye(2), np.eye(2), 1.0, 16.0, np.zeros(2))}
     aside = np.array([[0.25 * target.width, 0.25 * target.height]])
     middle = _brightest(target, sent, np.zeros((1, 2)))
     assert _brightest(target, sent, aside) == pytest.approx(middle, rel=0.1)

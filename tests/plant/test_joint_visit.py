@@ -32,6 +32,9 @@ class Member:
     def left(self) -> float:
         return self._left
 
+    def there(self) -> bool:
+        return self._left < ARRIVED
+
     def note(self) -> None:
         pass
 
@@ -128,7 +131,7 @@ def test_two_rows_in_place_are_waited_for_and_who_is_not_there_by_then_drops_out
     assert 1.5 < took[0] <= 2.5, "one row may have been on its way before the order"
     visit = play({"A": 0.0, "B": 1.1 * ARRIVED, "C": 0.0}, scene)
     assert 10.0 <= took[1] < 11.0
-    assert visit.lost == {"B": "B: not at its aim within 10 s"}
+    assert visit.lost == {"B": "B: not at its aim in fine steps within 10 s"}
 
 
 def test_who_does_not_go_to_standby_at_the_end_is_taken_off_the_target() -> None:
@@ -163,7 +166,7 @@ def test_only_a_mirror_before_the_plane_of_a_target_sends_its_beam_there(before:
 
 
 def test_beams_in_one_place_are_too_bright_wherever_it_is_and_those_apart_are_not() -> None:
-    beam = SentBeam(50.0, np.eye(2), 0.04 * np.eye(2), 1e-8, 1.0)
+    beam = SentBeam(50.0, np.eye(2), 0.04 * np.eye(2), 1e-8, 1.0, np.zeros(2))
     peak = 1.0 / (2.0 * np.pi * 0.04)
     known = dict.fromkeys(NAMES, beam)
     together = np.array([(-2.0, -1.5), (2.0, 1.0), (2.0, 1.0)])
@@ -179,7 +182,7 @@ def test_beams_stand_in_a_grid_of_the_targets_shape(wide: float, high: float) ->
     plane = target.plane_coordinates(target.corners)
     corners = 0.5 * np.array([wide, high]) * np.sign(plane)
     target = Target("wide", target.center + corners @ target.axes, target.center)
-    beam = SentBeam(50.0, 1e-6 * np.eye(2), 1e-6 * np.eye(2), 1e-8, 1.0)
+    beam = SentBeam(50.0, 1e-6 * np.eye(2), 1e-6 * np.eye(2), 1e-8, 1.0, np.zeros(2))
     places = _places(target, {str(number): beam for number in range(16)})
     columns, rows = (len(np.unique(np.round(places[:, k], 6))) for k in (0, 1))
     assert len(np.unique(np.round(places, 6), axis=0)) == 16

@@ -10,7 +10,7 @@ import pytest
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import direction
 from heliotrope.lcu.states import DEFOCUSED, TRACKING
-from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.clock import VirtualClock, run_virtual, sleep_until
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.authority import Mandate, Person, RefusedError, Role
 from heliotrope.plant.visits.photographs import Plain, Shot, measured
@@ -32,7 +32,12 @@ def visit(clock: VirtualClock) -> tuple[Visit, Any]:
     rows = np.zeros(1, [(name, float) for name in names])
     field = SimpleNamespace(place=lambda _: 0, rows=rows, counted_at=np.array([-np.inf]))
     plant = SimpleNamespace(
-        field=field, now=clock.monotonic, clock=clock, beams=BEAMS, sun_vector=lambda _: SUN
+        field=field,
+        now=clock.monotonic,
+        clock=clock,
+        beams=BEAMS,
+        sun_vector=lambda _: SUN,
+        stepping=SimpleNamespace(coarse=lambda *_: ()),
     )
     mandate = Mandate(Person("Egon", Role.ENGINEER), 1, "left", {DESIGN.names[0]})
     made = Visit(plant, mandate, DESIGN.names[0], DESIGN.targets[0])  # type: ignore[arg-type]
@@ -168,6 +173,20 @@ def test_a_swing_that_is_heard_beside_a_photograph_is_one() -> None:
     for at, off in ((1.0, 0.0), (2.0, 0.0), (3.0, -40.0), (4.0, 0.0)):
         hear(made, field, at, off)
     assert made.heard_moving(2.9) == pytest.approx(0.1)
+
+
+def test_a_mirror_has_not_arrived_before_it_takes_fine_steps() -> None:
+    async def main(clock: VirtualClock) -> None:
+        made, field = visit(clock)
+        hear(made, field, 0.0, 0.0)
+        plant: Any = made.plant
+        begin = clock.monotonic()
+        plant.stepping.coarse = lambda names, _: names if clock.monotonic() < begin + 4.0 else ()
+        assert not made.there()
+        await sleep_until(clock, clock.monotonic() + 5.0)
+        assert made.there()
+
+    run_virtual(main)
 
 
 def test_two_rows_in_place_are_waited_for_before_a_mirror_has_arrived() -> None:

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 from heliotrope.errors import InputError
 
+#: Largest coded movement of a beam, either way, rad.
+MOST_MOVEMENT = 5e-3
+
 
 @dataclass(frozen=True)
 class JointSettings:
@@ -18,7 +21,8 @@ class JointSettings:
     visit
         Part of it that is drawn anew at each visit, rad per axis.
     movement
-        Coded movement of a beam, either way along each axis, rad.
+        Coded movement of a beam, either way along each axis, rad; a heliostat whose drives move its
+        beam in steps of more than half of it moves by two steps.
     settle
         Time from the moment that all have taken their aims until the photograph, s.
     brightest
@@ -48,20 +52,20 @@ class JointSettings:
                 f"joint visits: {self.least} to {self.most} heliostats; give 2 to 127, the smaller "
                 "number first"
             )
-        if not 0.0 < self.movement <= 5e-3 or not 0.0 <= self.settle <= 60.0:
+        if not 0.0 < self.movement <= MOST_MOVEMENT or not 0.0 <= self.settle <= 60.0:
             raise InputError(
                 f"joint visits: movements of {1e3 * self.movement:g} mrad that settle in "
-                f"{self.settle:g} s; give above 0 to 5 mrad, and 0 to 60 s"
+                f"{self.settle:g} s; give above 0 to {1e3 * MOST_MOVEMENT:g} mrad, and 0 to 60 s"
             )
         if not (self.first == 0 or self.least <= self.first <= 127):
             raise InputError(
                 f"joint visits: {self.first} heliostats without a calibration; give 0, or "
                 f"{self.least} to 127"
             )
-        if not 0.0 < self.first_movement <= 5e-3:
+        if not 0.0 < self.first_movement <= MOST_MOVEMENT:
             raise InputError(
                 f"joint visits: first movements of {1e3 * self.first_movement:g} mrad; give above "
-                "0 to 5 mrad"
+                f"0 to {1e3 * MOST_MOVEMENT:g} mrad"
             )
         if not (self.brightest > 0.0 and self.known > 0.0 and self.again >= 1.0):
             raise InputError(

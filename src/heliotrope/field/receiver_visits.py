@@ -6,6 +6,8 @@ from heliotrope.errors import InputError
 
 #: Largest share of the power that the movements may cost.
 MOST_POWER = 0.01
+#: Largest coded movement of a beam, either way, rad.
+MOST_MOVEMENT = 2e-3
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,8 @@ class ReceiverSettings:
     visit
         Part of it that is drawn anew at each visit, rad per axis.
     movement
-        Coded movement of a beam, either way along each axis, rad.
+        Coded movement of a beam, either way along each axis, rad; a heliostat whose drives move its
+        beam in steps of more than half of it moves by two steps.
     settle
         Time from the moment that all have taken their aims until the photograph, s.
     exposures
@@ -65,10 +68,10 @@ class ReceiverSettings:
                 f"{who}: {self.least} to {self.most} heliostats; give 1 to 127, the smaller number "
                 "first"
             )
-        if not 0.0 < self.movement <= 2e-3 or not 0.0 <= self.settle <= 60.0:
+        if not 0.0 < self.movement <= MOST_MOVEMENT or not 0.0 <= self.settle <= 60.0:
             raise InputError(
                 f"{who}: movements of {1e3 * self.movement:g} mrad that settle in {self.settle:g} "
-                "s; give above 0 to 2 mrad, and 0 to 60 s"
+                f"s; give above 0 to {1e3 * MOST_MOVEMENT:g} mrad, and 0 to 60 s"
             )
         if not 0.0 < self.power <= MOST_POWER:
             raise InputError(

@@ -48,6 +48,11 @@ class AxisLimits:
     acceleration: int
     backlash: int
 
+    @property
+    def lead(self) -> int:
+        """Steps by which a goal that goes down with the sun is set ahead, as in `lcu.stepper`."""
+        return math.ceil(self.backlash / 8)
+
     def __post_init__(self) -> None:
         if not self.low < self.high:
             raise InputError(f"axis: from {self.low} to {self.high} steps; the low end comes first")
@@ -128,6 +133,11 @@ class Machine:
     way: tuple[tuple[float, float, float], ...] = ()
     stepping: Stepping | None = None
 
+    @property
+    def rests(self) -> bool:
+        """Whether the drivers are off between motions."""
+        return self.stepping is not None and self.stepping.rests
+
     def __post_init__(self) -> None:
         for name, axis, steps in zip(_NAMES, self.axes, self.stow, strict=True):
             if not axis.low <= steps <= axis.high:
@@ -135,7 +145,7 @@ class Machine:
                     f"machine: stow at {steps} steps of the {name} axis is outside its limits "
                     f"{axis.low} to {axis.high}"
                 )
-        if self.stepping is not None and self.stepping.rests:
+        if self.stepping is not None and self.rests:
             for name, steps, full in zip(_NAMES, self.stow, self.stepping.microsteps, strict=True):
                 if steps % full:
                     raise InputError(

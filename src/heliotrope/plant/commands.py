@@ -24,6 +24,7 @@ from heliotrope.plant.movements import Movements
 from heliotrope.plant.ordered import JOINING
 from heliotrope.plant.orders import PlantOrders, whole
 from heliotrope.plant.permission import SETTINGS, Permission
+from heliotrope.plant.stepping import Stepping
 from heliotrope.plant.tickets import Ticket
 
 #: Commands that assign points; `Commands.point` proves their beams.
@@ -55,8 +56,8 @@ class Commands:
         Parameters that local controllers should store, their standby points among them.
     patience
         Time that a heliostat waits for its turn to join, s.
-    movements, locks
-        What visits have taken: aims, and heliostats that are locked.
+    movements, locks, stepping
+        What visits have taken: aims, heliostats that are locked, and fine steps.
     authority
         The plant's.
     """
@@ -75,12 +76,14 @@ class Commands:
         patience: float,
         movements: Movements,
         locks: Locks,
+        stepping: Stepping,
         authority: Authority,
     ) -> None:
         self._now, self._field, self._orders, self._joining = now, field, orders, joining
         self._permission, self._given, self._ways = permission, given, ways
         self._design, self._wanted, self._patience = design, wanted, patience
-        self._movements, self._locks, self._authority = movements, locks, authority
+        self._movements, self._locks = movements, locks
+        self._stepping, self._authority = stepping, authority
 
     def give(
         self,
@@ -135,6 +138,8 @@ class Commands:
                 self._joining.drop(f"superseded by {name}", frozenset(left))
         if left and name == "LOCK":
             self._note_lock(left, token)
+        if name == "ROUGH":
+            self._stepping.ordered(left, bool(numbers[0]))
         if left:
             waits = name in JOINING or in_slices(name, left)
             send = self._join if waits else self._orders.command

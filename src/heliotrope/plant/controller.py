@@ -67,6 +67,7 @@ from heliotrope.plant.parameters import ParameterSync, Tables, change_of_beam
 from heliotrope.plant.permission import Permission
 from heliotrope.plant.rivals import Rivals
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
+from heliotrope.plant.stepping import Stepping
 from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.told_alarms import ToldAlarms
 from heliotrope.safety import Act, Alarm, Condition, alarms, conditions, limited
@@ -126,9 +127,9 @@ class PlantController:
         Heliostats that only EMERGENCY, DEFOCUS and STOW move, by name; see `Lockout`.
     aims, standbys
         Points where the beams are sent, ENU, m, (N, 3); NaN where there is none.
-    movements, locks
-        Aims that visits have moved, and heliostats that they have locked; the plant gives back what
-        they leave.
+    movements, locks, stepping
+        Aims that visits have moved, heliostats that they have locked, and fine steps that they
+        need; the plant gives back what they leave.
 
     Raises
     ------
@@ -170,6 +171,8 @@ class PlantController:
         points = Points(self.field.names, assigned)
         self.aims, self.standbys = points.aims, points.standbys
         self.movements = Movements(design.receivers, self.beams.armature)
+        resting = (name for name, each in self.beams.machines.items() if each.rests)
+        self.stepping = Stepping(self.field, resting)
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, self.beams.machines)
         self.locks = Locks(self.field, self._ways.ordered)
         self._agreement = self._compared(points)
@@ -288,6 +291,7 @@ class PlantController:
             self.settings.join_wait,
             self.movements,
             self.locks,
+            self.stepping,
             self.authority,
         )
 
@@ -312,6 +316,7 @@ class PlantController:
             self._commands,
             self.movements,
             self.locks,
+            self.stepping,
             lambda names: self.stow("plant", names),
         )
 

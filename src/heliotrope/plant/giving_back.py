@@ -1,4 +1,4 @@
-"""Giving back what visits have taken: moved aims and locks, once no visit holds them any more.
+"""Giving back what visits have taken: moved aims, locks and fine steps, once no visit holds them.
 
 A visit gives back what it took. Whatever is left when it ends, or when a person's order takes a
 heliostat out of it, the plant gives back itself, under whatever command authority there is, as soon
@@ -6,6 +6,7 @@ as motions are accepted.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -19,19 +20,21 @@ from heliotrope.plant.locks import Locks
 from heliotrope.plant.movements import Movements
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.permission import Permission
+from heliotrope.plant.stepping import Stepping
+from heliotrope.plant.tickets import Ticket
 
 #: Name and role in the record.
 _PLANT = ("plant", "anybody")
 
 
 class GivingBack:
-    """Sends beams back to their aims, and unlocks heliostats, that visits have left.
+    """Sends beams back to their aims, unlocks heliostats, and lets them step as before a visit.
 
     Parameters
     ----------
     field, authority, orders, permission, commands
         The plant's.
-    movements, locks
+    movements, locks, stepping
         What visits have taken.
     stow
         Sends heliostats to stow.
@@ -46,16 +49,19 @@ class GivingBack:
         commands: Commands,
         movements: Movements,
         locks: Locks,
+        stepping: Stepping,
         stow: Callable[[Sequence[str]], object],
     ) -> None:
         self._field, self._authority, self._orders = field, authority, orders
         self._permission, self._commands = permission, commands
-        self._movements, self._locks, self._stow = movements, locks, stow
+        self._movements, self._locks, self._stepping = movements, locks, stepping
+        self._stow = stow
 
     def beat(self, now: float) -> None:
         """Give back what is due, as far as motions are accepted now."""
         self._unlock(now)
         self._bring_back(now)
+        self._step(now)
 
     # -- locks -----------------------------------------------------------------------------
 
@@ -130,3 +136,31 @@ class GivingBack:
             except RefusedError:
                 return ()
         return names
+
+    # -- steps -----------------------------------------------------------------------------
+
+    def _step(self, now: float) -> None:
+        """Order heliostats to step finely for a visit, or roughly again."""
+        token = self._authority.token
+        for rough, due in self._stepping.due(now, token).items():
+            self._stepping.sent(due, now)
+            blocked = self._permission.strange(due)
+            names = tuple(name for name in due if name not in blocked)
+            if not names:
+                continue
+            note = f"{len(names)} step {'roughly again' if rough else 'finely for a visit'}"
+            values = (float(rough),)
+            try:
+                self._permission.refuse_now("ROUGH", names)
+                ticket = self._orders.accept((*_PLANT, "ROUGH"), values, names, note)
+            except (RefusedError, AuditError):
+                continue
+            self._orders.when_recorded(ticket, partial(self._send_step, ticket, values, token))
+
+    def _send_step(
+        self, ticket: Ticket, values: tuple[float, ...], token: int, again: bool
+    ) -> None:
+        left = ticket.waiting(ticket.heliostats)
+        if again:
+            self._permission.refuse_now(ticket.name, left)
+        self._orders.command(ticket, ticket.name, values, left, token)

@@ -42,6 +42,9 @@ class Fit:
         Of the place, m², (2, 2).
     power_sigma
         Standard deviation of ``power``.
+    shown
+        Whether the surface shows where it is; False for one that lies beside the surface by more
+        than its radius, of which only a tail was fitted.
     """
 
     power: float
@@ -49,6 +52,12 @@ class Fit:
     moments: FloatArray
     covariance: FloatArray
     power_sigma: float = float("nan")
+    shown: bool = True
+
+    @property
+    def radius(self) -> float:
+        """The standard deviation of its light, both axes together, m."""
+        return float(np.sqrt(0.5 * np.trace(self.moments)))
 
 
 @dataclass(frozen=True)
@@ -156,7 +165,9 @@ def fitted(
             if fit is None or first is None:
                 continue
             window = _window(points, fit)
-            if last:
+            if last and (_beside(points, fit.place) > first.radius).any():
+                fits[i] = replace(fit, shown=False)
+            elif last:
                 used = light.weights > 0.0
                 own = rows.reshape(len(fits), len(axes), -1)[i][:, used]
                 left = rest[used][:, window]
@@ -164,6 +175,11 @@ def fitted(
             else:
                 fits[i] = _improved(points[window], pictures[i][:, window], fit, first, axes)
     return Fitted(tuple(fits), light, mean)
+
+
+def _beside(points: FloatArray, place: FloatArray) -> FloatArray:
+    """Return how far a place is beyond points (N, 2) along each axis, m, (2,); 0 or less: not."""
+    return np.asarray(np.maximum(points.min(axis=0) - place, place - points.max(axis=0)))
 
 
 def _window(points: FloatArray, fit: Fit) -> npt.NDArray[np.bool_]:
@@ -181,9 +197,8 @@ def _improved(
     scale = np.sqrt((terms**2).sum(axis=1))
     scale[scale == 0.0] = 1.0
     step = np.linalg.lstsq((terms / scale[:, None]).T, picture.ravel(), rcond=1e-6)[0] / scale
-    radius = float(np.sqrt(0.5 * np.trace(fit.moments)))
     length = float(np.hypot(*step[1:3]))
-    place = fit.place + step[1:3] * min(1.0, 0.5 * radius / max(length, 1e-12))
+    place = fit.place + step[1:3] * min(1.0, 0.5 * fit.radius / max(length, 1e-12))
     moments = fit.moments + np.array([[step[3], step[4]], [step[4], step[5]]])
     power = float(np.clip(fit.power + step[0], fit.power / 1.5, fit.power * 1.5))
     return replace(fit, power=power, place=place, moments=_bounded(moments, fit, first))
@@ -239,7 +254,7 @@ def _measured(
     # The fit has taken its part of the moments already.
     beyond = moments - np.einsum("ip,pan->ian", np.einsum("ian,pan->ip", moments, terms), gauss)
     picture = rows @ rest
-    lopsided = _LOPSIDED**2 * 0.5 * float(np.trace(fit.moments))
+    lopsided = (_LOPSIDED * fit.radius) ** 2
     noise = 0.5 * float(np.trace(_covariance(beyond, rest, rows)))
     share = lopsided / (lopsided + noise)
     levers = gauss[1:3] + share * beyond

@@ -118,7 +118,8 @@ def _gain(
 
 
 def _within(fit: Fit, beam: ExpectedBeam) -> bool:
-    return _distance(fit.place - beam.place, fit.covariance + beam.covariance) < _GATE
+    away = _distance(fit.place - beam.place, fit.covariance + beam.covariance)
+    return fit.shown and away < _GATE
 
 
 def _distance(away: FloatArray, covariance: FloatArray) -> float:

@@ -12,6 +12,8 @@ from heliotrope.imaging.coded.stack import Stack
 #: Light that no known beam explains is another beam from this share of the usual power.
 _OTHER = 0.35
 _MOST = 5
+#: A beam is on the surface if its light there, as a root mean square, is this share of the most.
+_SHOWN = 1e-3
 
 
 @dataclass(frozen=True)
@@ -78,12 +80,18 @@ def still_light(
 
 
 def _powers(terms: list[FloatArray], mean: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return powers of 0 or more by least squares, and what they leave."""
+    """Return powers of 0 or more by least squares, and what they leave.
+
+    A beam of which the surface shows next to nothing has no power: any power would explain it.
+    """
     from scipy.optimize import nnls
 
     design = np.stack(terms, axis=-1)
-    powers, _ = nnls(design, mean)
-    return np.asarray(powers), np.asarray(mean - design @ powers)
+    size = np.linalg.norm(design, axis=0)
+    shown = size > _SHOWN * size.max(initial=0.0)
+    powers = np.zeros(len(terms))
+    powers[shown] = nnls(design[:, shown] / size[shown], mean)[0] / size[shown]
+    return powers, np.asarray(mean - design @ powers)
 
 
 def _strongest(stack: Stack, picture: FloatArray, moments: FloatArray) -> tuple[FloatArray, float]:

@@ -1,8 +1,9 @@
 """Where the beams of a joint visit stand on their target, and which codes they move by.
 
 Each beam gets a place in a grid that leaves room to the border, and a movement of a few tenths of a
-milliradian. Beams that do not overlap share a code, so that few photographs are needed. The light
-of all of them together stays below what the target may take.
+milliradian, or of two of the steps in which its drives move it if that is more. Beams that do not
+overlap share a code, so that few photographs are needed. The light of all of them together stays
+below what the target may take.
 """
 
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.uncertainty import expected_error
-from heliotrope.field.joint_visits import JointSettings
+from heliotrope.field.joint_visits import MOST_MOVEMENT, JointSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, bisector
 from heliotrope.imaging.coded import (
@@ -22,6 +23,7 @@ from heliotrope.imaging.coded import (
 )
 from heliotrope.optics.beam import beam_sigma
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.visits.resolution import LEAST_STEPS, beam_steps
 
 #: Slope error of a mirror's surface that is assumed for the width of its beam, rad.
 _SLOPE = 1e-3
@@ -128,6 +130,8 @@ class SentBeam:
         Of its place along each axis, m².
     power
         Of its light, in suns m².
+    step
+        Steps in which it follows its aim, m right and up, (2,); see `beam_steps`.
     """
 
     slant: float
@@ -135,6 +139,7 @@ class SentBeam:
     likely: FloatArray
     variance: float
     power: float
+    step: FloatArray
 
 
 def arranged(
@@ -263,15 +268,21 @@ def beam_of(plant: PlantController, target: Target, name: str, error: float) -> 
     sun = plant.sun_vector()
     if not float(way @ target.normal) < 0.0:
         return f"it does not see the front of {target.name}"
+    slanted = abs(float(way @ target.normal)) / slant
+    step = beam_steps(plant, row, target, sun, np.asarray(target.center))
+    if (coarse := LEAST_STEPS * float(step.max()) * slanted / slant) > MOST_MOVEMENT:
+        return (
+            f"its drives move its beam in steps of {1e3 * coarse / LEAST_STEPS:.1f} mrad, the "
+            f"limit is {1e3 * MOST_MOVEMENT / LEAST_STEPS:g} mrad; it is calibrated alone"
+        )
     normal = bisector(sun, way / slant)
     width, height = float(group.width[place]), float(group.height[place])
-    slanted = abs(float(way @ target.normal)) / slant
     variance = 0.5 * (error * slant / slanted) ** 2
     power = _REFLECTED * width * height * float(normal @ sun)
     wide, likely = (
         moments_on(target, vertex, normal, width, height, flat) for flat in (1.0, _CURVED)
     )
-    return SentBeam(slant, wide, likely, variance, power)
+    return SentBeam(slant, wide, likely, variance, power, step)
 
 
 def _places(target: Target, known: Mapping[str, SentBeam]) -> FloatArray:
@@ -339,12 +350,18 @@ def coded(
     places, code
         m right of and above the centre; numbers of the codes.
     movement
-        Either way, rad.
+        Either way, rad; more for a beam that follows its aim in coarse steps.
     along
         The only axis of the movements; None: both.
     """
     count = int(code.max(initial=0)) + 1
-    size = np.array([movement * beam.slant for beam in known.values()])
+    axes = slice(None) if along is None else slice(along, along + 1)
+    size = np.array(
+        [
+            max(movement * beam.slant, LEAST_STEPS * float(beam.step[axes].max()))
+            for beam in known.values()
+        ]
+    )
     moves = coded_movements(count, along=along)[:, code] * size[:, None]
     beams = tuple(
         ExpectedBeam(name, place, beam.variance * np.eye(2), beam.likely)

@@ -21,7 +21,7 @@ from heliotrope.plant.authority import Mandate, RefusedError
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.tickets import Ticket
-from heliotrope.plant.visits.visit import ARRIVED, BroughtHome, Visit
+from heliotrope.plant.visits.visit import BroughtHome, Visit
 
 #: Longest time of an order, and of the way to standby, s.
 _ORDER, _HOME = 60.0, 120.0
@@ -177,10 +177,10 @@ class JointVisit(BroughtHome):
                 if counted > since:
                     left = visit.left()
                     kept = count if left < _STEP else 0
-                    seen[name] = counted, count + 1 if left < ARRIVED else kept
+                    seen[name] = counted, count + 1 if visit.there() else kept
             late = [name for name in self.visits if seen[name][1] < 2]
             if (now := self.plant.now()) >= until:
-                gone = f"not at its aim within {now - begin:.0f} s"
+                gone = f"not at its aim in fine steps within {now - begin:.0f} s"
                 self.drop({name: f"{name}: {gone}" for name in late})
             elif len(late) <= _FEW * len(self.visits):
                 until = min(until, begin + 2.0 * (now - begin) + _LATE)

@@ -140,7 +140,7 @@ class ReceiverCycle:
         with plant.authority.mandate(person, token, moving, self.face.name) as mandate:
             if moving:
                 joint = JointVisit(plant, mandate, moving, self.face)
-                with plant.movements.ending(moving):
+                with plant.stepping.fine(moving), plant.movements.ending(moving):
                     taken = await self._photograph(joint, made, await self._steady(tell), tell)
                 tell("back to the aims")
                 await self._settled(joint, plant.now() + _BACK, moving)
@@ -171,6 +171,8 @@ class ReceiverCycle:
     ) -> _Taken:
         """Take the stack; a photograph in another light than the usual is taken again."""
         taken, needed, plant = _Taken(), len(made.layout.moves), self._plant
+        coarse = plant.stepping.coarse(joint.names, plant.now())
+        joint.drop(dict.fromkeys(coarse, "it does not take fine steps"))
         for _ in range(int(self.settings.again * needed)):
             number = len(taken.pictures)
             if number == needed:

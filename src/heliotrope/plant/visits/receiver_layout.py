@@ -11,13 +11,14 @@ from math import erf, sqrt
 import numpy as np
 
 from heliotrope.calibration.uncertainty import expected_error
-from heliotrope.field.receiver_visits import ReceiverSettings
+from heliotrope.field.receiver_visits import MOST_MOVEMENT, ReceiverSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, bisector
 from heliotrope.imaging.coded import ExpectedBeam, coded_movements
 from heliotrope.lcu import states
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.joint_layout import Layout, moments_on
+from heliotrope.plant.visits.resolution import LEAST_STEPS, beam_steps
 
 #: Likely share of a mirror's size in its beam: between flat mirrors and well canted ones.
 _CURVED = 0.5
@@ -116,10 +117,17 @@ def _known(
     slant = float(np.linalg.norm(way))
     if not float(way @ face.normal) < 0.0:
         return f"it does not see the front of {face.name}"
-    place, size = face.plane_coordinates(aim), settings.movement * slant
+    sun = plant.sun_vector()
+    slanted = abs(float(way @ face.normal)) / slant
+    least = LEAST_STEPS * float(beam_steps(plant, row, face, sun, aim).max())
+    if (coarse := least * slanted / slant) > MOST_MOVEMENT:
+        return (
+            f"its drives move its beam in steps of {1e3 * coarse / LEAST_STEPS:.1f} mrad, the "
+            f"limit is {1e3 * MOST_MOVEMENT / LEAST_STEPS:g} mrad; it is calibrated on a target"
+        )
+    place, size = face.plane_coordinates(aim), max(settings.movement * slant, least)
     if not face.holds(aim + size * _ENDS @ face.axes).all():
         return f"its aim is less than {size:.2f} m inside the edge of {face.name}"
-    sun = plant.sun_vector()
     normal = bisector(sun, way / slant)
     covariance = record.covariance_at(plant.clock.utc().timestamp())
     present, here = plant.beliefs.present(name), plant.field.counts(np.array([row]))
@@ -134,7 +142,6 @@ def _known(
     width, height = float(group.width[number]), float(group.height[number])
     moments = moments_on(face, vertex, normal, width, height, _CURVED)
     power = width * height * float(normal @ sun)
-    slanted = abs(float(way @ face.normal)) / slant
     there = caught(face, place, moments)
     moved = float(np.mean([caught(face, place + size * end, moments) for end in _ENDS]))
     return _Beam(

@@ -12,21 +12,16 @@ import math
 
 import numpy as np
 
-from heliotrope.geometry import FloatArray, reflect
-from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.drives import Drive
+from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.machine import AxisLimits
+from heliotrope.plant.visits.resolution import beam_slopes
 from heliotrope.plant.visits.visit import Visit
 
 #: Mean square over time of a motion that speeds up and slows down evenly, of its length.
 _MEAN_SQUARE = 23.0 / 60.0
-#: A goal that goes down is set ahead by this share of the backlash, as in `lcu.stepper`.
-_LEAD = 1.0 / 8.0
 #: The variance of the mixture is taken this many times: its own, with one photograph of five in a
 #: swing, would leave the deepest point 3.5 standard deviations away; this leaves it 2 away.
 _TAIL = 3.0
-#: Steps over which the beam's motion is a straight line.
-_STEPS = 10.0
 
 
 def swung(axis: AxisLimits, fall: float, span: float, heard: float = math.inf) -> float:
@@ -45,7 +40,7 @@ def swung(axis: AxisLimits, fall: float, span: float, heard: float = math.inf) -
     """
     if axis.backlash == 0 or not (fall > 0.0 and span > 0.0):
         return 0.0
-    lead = 2.0 * math.ceil(_LEAD * axis.backlash)
+    lead = 2.0 * axis.lead
     deep, times = lead + axis.backlash, max(1.0, round(fall / lead))
     lasts = _lasts(axis, deep) + _lasts(axis, axis.backlash)
     chance = 1.0 if heard <= lasts else min(1.0, _TAIL * times * lasts / span)
@@ -78,16 +73,9 @@ def spread_at(visit: Visit, instant: float, counts: FloatArray) -> FloatArray:
     if machine is None:
         return covariance
     sun = plant.sun_vector(instant - plant.now())
-    drives = Drive(plant.beams.drives.table[row])
-    armature = Armature(plant.beams.armature.table[row])
-
-    def point(at: FloatArray) -> FloatArray:
-        normal, vertex = armature.pose(np.asarray(drives.angles(at)))
-        return np.asarray(target.intersect(vertex, reflect(sun, normal)))
-
-    for i, axis in enumerate(machine.axes):
-        square = swung(axis, float(falls[i]), span, visit.heard_moving(instant))
+    slopes = beam_slopes(plant, row, target, sun, counts)
+    for axis, fall, slope in zip(machine.axes, falls, slopes, strict=True):
+        square = swung(axis, float(fall), span, visit.heard_moving(instant))
         if square > 0.0:
-            slope = (point(counts) - point(counts - _STEPS * np.eye(2)[i])) / _STEPS
             covariance += square * np.outer(slope, slope)
     return covariance if np.isfinite(covariance).all() else np.zeros((3, 3))

@@ -34,7 +34,14 @@ _LOOK = 0.25
 
 
 class BroughtHome(ABC):
-    """What is brought home when its ``async with`` ends."""
+    """What takes fine steps in its ``async with``, and is brought home when that ends."""
+
+    plant: PlantController
+
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """Those that take part."""
 
     @abstractmethod
     async def home(self) -> None:
@@ -42,6 +49,8 @@ class BroughtHome(ABC):
 
     async def __aenter__(self) -> Self:
         """Begin the visit; at its end the heliostats are brought home."""
+        self._fine = self.plant.stepping.fine(self.names)
+        self._fine.__enter__()
         return self
 
     async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -51,6 +60,8 @@ class BroughtHome(ABC):
         except RefusedError:
             if kind is None or not issubclass(kind, asyncio.CancelledError):
                 raise
+        finally:
+            self._fine.__exit__(None, None, None)
 
 
 class Visit(BroughtHome):
@@ -87,6 +98,11 @@ class Visit(BroughtHome):
         self._counts: list[FloatArray] = []
         self._goals: list[FloatArray] = []
         self._there: list[bool] = []
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The heliostat."""
+        return (self.heliostat,)
 
     @property
     def state(self) -> int:
@@ -198,7 +214,9 @@ class Visit(BroughtHome):
         since, seen = self.plant.now(), 0
         while seen < 2:
             if self.plant.now() >= until:
-                raise RefusedError(f"{self.heliostat}: not at its aim within {limit:g} s")
+                raise RefusedError(
+                    f"{self.heliostat}: not at its aim in fine steps within {limit:g} s"
+                )
             await self.look()
             if self.state != states.TRACKING:
                 raise RefusedError(
@@ -207,7 +225,12 @@ class Visit(BroughtHome):
             counted = float(self.plant.field.counted_at[self.row])
             if counted > since:
                 since = counted
-                seen = seen + 1 if self.left() < ARRIVED else 0
+                seen = seen + 1 if self.there() else 0
+
+    def there(self) -> bool:
+        """Return whether the heliostat is at its goals, and follows them in fine steps."""
+        coarse = self.plant.stepping.coarse(self.names, self.plant.now())
+        return self.left() < ARRIVED and not coarse
 
     def left(self) -> float:
         """Return how far the axes are from their goals, rad, the further one."""
