@@ -4,7 +4,8 @@ It is told of each photograph when the camera takes it, and reads the step count
 then. A sighting that the plant keeps must have the time, the point and the step counts of a
 photograph, and the true sun. A result must count the sightings that it brought, and its errors must
 be those of the two calibrations, before and after. The store and the logbook must have it, and a
-new program must know what the one before it knew (16).
+new program must know what the one before it knew (16). Visits that bring nothing do not go on
+without end (L2).
 """
 
 from collections import Counter
@@ -22,7 +23,7 @@ from heliotrope.plant.operations import Operations
 from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.store.records import Records
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.invariants.invariants import InvariantError, Violation
+from heliotrope.twin.invariants.invariants import L2, InvariantError, Violation
 
 #: Times of a sighting and of its photograph agree to within this, s.
 SAME = 1e-3
@@ -35,6 +36,9 @@ COUNTS_WITHIN = 60.0
 SHOWN_WITHIN = 1.0
 #: Errors of a result agree with the observer's own to within this share, and this, rad.
 SHARE, ERROR_WITHIN = 0.05, 2e-5
+#: Visits of one mirror in a row that may bring nothing, for which no person has asked: nine joint
+#: ones in which its beam is looked for, and some alone.
+RETRIES = 14
 #: Results of visits that broke off: what they brought is not counted.
 _BROKEN = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)
 
@@ -59,6 +63,7 @@ class _Account:
     version: int = 0
     told: int = 0  # version at its last result
     before: Mechanism | None = None
+    vain: int = 0  # visits in a row that brought nothing
 
 
 class ResultObserver:
@@ -99,16 +104,21 @@ class ResultObserver:
         self._program: Operations | None = None
         self._looked = start
 
-    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
-        self.checks[16] += 1
+    def _check(self, good: bool, now: float, subject: str, saw: str, number: int = 16) -> None:
+        self.checks[number] += 1
         if not good:
-            raise InvariantError(Violation(16, now - self._start, subject, saw))
+            raise InvariantError(Violation(number, now - self._start, subject, saw))
 
     def photographed(self, heliostat: str, target: str, point: FloatArray, now: float) -> None:
         """Note a photograph at the moment of its exposure."""
         board = self._boards[heliostat]
         counts = np.array([axis.turned for axis in board.axes], dtype=np.float64) - board.slip
         self._accounts[heliostat].pictures.append(Picture(now, target, point, counts))
+
+    def asked(self, heliostats: Sequence[str]) -> None:
+        """Note that a person wants heliostats calibrated now, whatever came of it before."""
+        for name in heliostats:
+            self._accounts[name].vain = 0
 
     def look(self, operations: Operations | None, now: float) -> None:
         """Judge what is new since the last look; None: the plant's program does not run."""
@@ -192,6 +202,9 @@ class ResultObserver:
         self._check(entry.outcome is not CalibrationOutcome.ERROR, now, name, saw)
         if entry.outcome in _BROKEN:
             return
+        account.vain = 0 if entry.new else account.vain + 1
+        saw = f"{account.vain} visits in a row have brought nothing, the last: {entry.text}"
+        self._check(account.vain <= RETRIES, now, name, saw, L2)
         saw = f"a result counts {entry.new} new sightings; {brought} came"
         self._check(entry.new == brought, now, name, saw)
         saw = f"a result counts {entry.sightings} sightings; {account.kept} are known"

@@ -50,27 +50,32 @@ from heliotrope.twin.invariants.sensors import SensorObserver
 from heliotrope.twin.invariants.shown import ShownObserver
 from heliotrope.twin.invariants.tickets import TicketObserver
 from heliotrope.twin.invariants.visits import VisitObserver
+from heliotrope.twin.invariants.watch import Watch
 from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
 from heliotrope.twin.true_mirrors import mirrors_of
 from heliotrope.twin.world import faults as kinds
+from heliotrope.twin.world.acts import Acts
+from heliotrope.twin.world.crew import CREW, Crew
 from heliotrope.twin.world.damage import Damage
 from heliotrope.twin.world.design import MIRROR, design_of, wanted_of
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.instruments import READINGS, Instruments
-from heliotrope.twin.world.operator import ENGINEER, VIEWER, Operator
+from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
 from heliotrope.twin.world.scene import scene_of
-from heliotrope.twin.world.shift import Shift, Watch, Working
+from heliotrope.twin.world.shift import Shift, Working
 from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
 from heliotrope.twin.world.twice import SecondPlant
-from heliotrope.twin.world.work import LOSSES, Work
+from heliotrope.twin.world.work import DAY_WORK, LIT_WORK, LOSSES, USUAL_WORK, Work
 from heliotrope.twin.world.worlds import (
+    DAYS,
     PARTY,
     Habits,
     PodErrors,
     checked,
     drawn,
     knows_boards,
+    measured,
     parties,
     stored_by,
     works,
@@ -279,13 +284,14 @@ class Simulation:
         self.beams = BeamObserver(self.begin, boards, self.sun, scene.keep_outs, most)
         self.readings = SensorObserver(self.begin, boards)
         self.alarms = AlarmObserver(self.begin, boards, plan.worlds)
-        self.tickets = TicketObserver(self.begin)
+        accounts = {each.name: each for pod in self.pods for each in pod.observer.accounts}
+        self.tickets = TicketObserver(self.begin, accounts)
         self.quiet = self._quiet_observer()
         for pod in self.pods:
             if self.quiet is not None:
                 pod.answers.quiet = self.quiet.calm
         self.instruments = Instruments(self._clock, plan.seed, self._flux, self.readings)
-        self._measured = "sensors" in plan.worlds
+        self._measured = measured(plan.worlds)
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
         together = parties(plan.worlds)
         self._design, self._homes = design_of(fits, homes, scene, together=together), homes
@@ -338,26 +344,33 @@ class Simulation:
         mirrors = mirrors_of(boards, MIRROR, MIRROR)
         sight = FieldSnapshot(clock, mirrors, lambda: self.sun(clock.monotonic()))
         lights, together = "lights" in plan.worlds, parties(plan.worlds)
-        work = Work(plan.seed, sight, self._exits, lights=lights, together=together)
+        kind = DAY_WORK if DAYS in plan.worlds else LIT_WORK if lights else USUAL_WORK
+        kind = replace(kind, together=together, lowest=self._scene.lowest)
+        work = Work(plan.seed, sight, self._exits, kind)
         watch, names = self._new_watch(work, together=together), tuple(boards)
-        pause = PARTY_PAUSE if together else SHIFT_PAUSE
-        shift = Shift(
-            work, self.operator, self.observer, self.beams, watch, names, clock, plan.seed, pause
-        )
-        return Working(work, shift, watch)
+        acts = Acts(work, self.operator, self.observer, self.beams, watch, names, clock, plan.seed)
+        if DAYS in plan.worlds:
+            return Working(work, Crew(acts, self.boards, plan.seconds), watch)
+        return Working(work, Shift(acts, PARTY_PAUSE if together else SHIFT_PAUSE), watch)
 
     def _new_watch(self, work: Work, *, together: bool) -> Watch:
         begin, boards, targets = self.begin, self.boards, self._scene.targets
         zero = self._clock.utc().timestamp() - self._clock.monotonic()
         results = ResultObserver(begin, boards, work.records, self.sun, zero)
         work.camera.told = results.photographed
-        persons = (ENGINEER.name, VIEWER.name)
+        persons = [person.name for person in CREW]
+        lowest = self._scene.lowest
         return Watch(
             VisitObserver(begin, boards, targets, work.away, followed=work.centred),
-            DayObserver(begin, boards),
+            DayObserver(begin, boards, lowest),
             results,
             ProgressObserver(
-                begin, boards, targets, together=together, across=drawn(self.plan.worlds)
+                begin,
+                boards,
+                targets,
+                together=together,
+                across=drawn(self.plan.worlds),
+                lowest=lowest,
             ),
             ShownObserver(begin, boards, self._homes, targets, self.observer, persons),
         )
@@ -491,7 +504,7 @@ class Simulation:
                 pod.ear.end()
         if self._work is not None:
             self._work.control.ends()
-            self._work.watch.visits.ended()
+            self._work.watch.ended()
         if self.plant is not None:
             self._audit.lose()
         for task in self._program:
