@@ -51,7 +51,7 @@ MISLED = {
         "clock", "site", "calibrations", "visits", "day", "lights", "parties", "days",
     }),
 }  # fmt: skip
-#: Alarms that say that mirrors did what nobody ordered, or not what was ordered: their only cause is
+#: Alarms that say that mirrors did what nobody ordered, or not what was: their only cause is
 #: a fault that has ended no longer ago than this, s. A new program goes on with earlier ones.
 UNORDERED = {
     "beam_unsent": 60.0, "counts_doubtful": 60.0, "nodes_unacknowledged": 90.0,
@@ -100,6 +100,7 @@ class AlarmObserver:
         self._clusters = {name: [b.outfit.name for b in some] for name, some in boards.items()}
         self._active: dict[tuple[str, str], float] = {}
         self._new: list[Alarm] = []
+        self._last: dict[tuple[str, str], Alarm] = {}
         self._heard = dict.fromkeys(boards, start)
         self._runs_since = inf
         self._wrote_at = start
@@ -113,8 +114,15 @@ class AlarmObserver:
             raise InvariantError(Violation(number, now - self._start, subject or "plant", saw))
 
     def alarmed(self, alarm: Alarm, now: float) -> None:
-        """Note an alarm of the plant; it is judged at the next look."""
+        """Note an alarm of the plant; it is judged at the next look.
+
+        The same one may come twice: from the controller, and from the logbook, which has those of
+        automatic control too.
+        """
         key = alarm.condition, alarm.subject
+        if self._last.get(key) == alarm:
+            return
+        self._last[key] = alarm
         if alarm.active:
             self._active.setdefault(key, now)
             self._new.append(alarm)
@@ -124,6 +132,7 @@ class AlarmObserver:
     def ended(self) -> None:
         """Note that the plant's program has ended, and its alarms with it."""
         self._active.clear()
+        self._last.clear()
         self._new.clear()
         self._began_at = inf
         self._runs_since = inf  # it may begin again before the next look

@@ -94,7 +94,7 @@ class ProgressObserver:
         self._up: bool | None = None
         self._locked: set[str] = set()
         self._calibrates, self._measured = True, 0.0
-        self._emergency = self._ended = False
+        self._emergency = self._called = self._ended = False
 
     def _check(self, good: bool, now: float, subject: str, saw: str, number: int = 16) -> None:
         self.checks[number] += 1
@@ -121,6 +121,10 @@ class ProgressObserver:
     def switched(self, *, on: bool) -> None:
         """Note that a person has switched calibration on or off."""
         self._calibrates = on
+
+    def emergency(self, *, on: bool) -> None:
+        """Note that a person has raised an emergency, or that it was cleared."""
+        self._called = on
 
     def ended(self) -> None:
         """Note that the plant's program has ended."""
@@ -201,12 +205,14 @@ class ProgressObserver:
                 key = ("left", name, target.name)
                 self._within(key, lights, now, LEFT_WITHIN, name, saw)
         busy = {run.target for run in running}
+        results = operations.calibration().results
+        failed = {entry.heliostat for entry in results if not entry.good}
         limit = TOGETHER_WITHIN if self._together else IDLE_WITHIN
         for name in self._boards:
             up = self._boards[name].state in (states.IDLE, states.TRACKING)
             ready = name in working and name not in visited and up and self._calibrates
-            if self._together:  # a schedule may leave alone whom it knows well
-                ready &= operations.plant.beliefs.record(name) is None
+            if self._together:  # a schedule may leave alone whom it knows well, or who has failed
+                ready &= operations.plant.beliefs.record(name) is None and name not in failed
             for place in self._targets:
                 free = ready and place not in busy
                 saw = f"{place} has been free, and it ready for a visit"
@@ -234,8 +240,8 @@ class ProgressObserver:
         on = operations.plant.emergency_on
         if self._ended:
             self._ended = False
-            saw = "an emergency held when the last program ended, and the new one goes on"
-            good = on or bool(operations.automatic.waits) or not self._emergency
+            saw = "a person's emergency held when the last program ended, and the new one goes on"
+            good = on or bool(operations.automatic.waits) or not self._called
             self._check(good, now, "plant", saw, L4)
             out = {lockout.heliostat for lockout in operations.holds()}
             lost = sorted(self._out.keys() - out)
@@ -246,10 +252,12 @@ class ProgressObserver:
     def _measures(
         self, operations: Operations, working: Sequence[str], *, may: bool, now: float
     ) -> None:
-        """Check that measurements come while mirrors that photographs show are not calibrated."""
+        """Check that measurements come while some mirrors have not been visited yet."""
         beliefs = operations.plant.beliefs
-        left = [n for n in working if n not in self._dark and beliefs.record(n) is None]
-        last = max((e.at for e in operations.calibration().results if e.new), default=0.0)
+        results = operations.calibration().results
+        done = {each.heliostat for each in results} | self._dark
+        left = [name for name in working if name not in done and beliefs.record(name) is None]
+        last = max((each.at for each in results if each.new), default=0.0)
         fresh, self._measured = last > self._measured, max(last, self._measured)
         holds = may and bool(left) and self._calibrates and not fresh
         saw = f"{len(left)} heliostats are not calibrated, and no visit has measured any"

@@ -9,7 +9,7 @@ without end (L2).
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from math import isfinite, nan
 
@@ -39,6 +39,9 @@ SHARE, ERROR_WITHIN = 0.05, 2e-5
 #: Visits of one mirror in a row that may bring nothing, for which no person has asked: nine joint
 #: ones in which its beam is looked for, and some alone.
 RETRIES = 14
+#: Results in a row, of mirrors that photographs show, that may bring nothing though no visit broke
+#: off: those of a whole field of this many, or of more.
+BARREN = 6
 #: Results of visits that broke off: what they brought is not counted.
 _BROKEN = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)
 
@@ -81,6 +84,8 @@ class ResultObserver:
         Returns the true direction to the sun, (3,), at a time in s.
     zero
         POSIX time at 0 s of the clock.
+    dark
+        Heliostats whose beams no photograph shows.
 
     Attributes
     ----------
@@ -95,11 +100,13 @@ class ResultObserver:
         records: Records,
         sun: Callable[[float], FloatArray],
         zero: float,
+        dark: Collection[str] = (),
     ) -> None:
         self.checks: Counter[int] = Counter()
         self._start, self._records, self._sun, self._zero = start, records, sun, zero
         self._boards = {board.outfit.name: board for board in boards}
         self._accounts = {name: _Account() for name in self._boards}
+        self._dark, self._barren = frozenset(dark), 0
         self._results: set[tuple[str, float]] = set()
         self._program: Operations | None = None
         self._looked = start
@@ -205,6 +212,10 @@ class ResultObserver:
         account.vain = 0 if entry.new else account.vain + 1
         saw = f"{account.vain} visits in a row have brought nothing, the last: {entry.text}"
         self._check(account.vain <= RETRIES, now, name, saw, L2)
+        if name not in self._dark:
+            self._barren = 0 if entry.new else self._barren + 1
+            saw = f"{self._barren} results in a row have brought nothing, the last: {entry.text}"
+            self._check(self._barren < max(BARREN, len(self._boards)), now, name, saw)
         saw = f"a result counts {entry.new} new sightings; {brought} came"
         self._check(entry.new == brought, now, name, saw)
         saw = f"a result counts {entry.sightings} sightings; {account.kept} are known"

@@ -53,6 +53,10 @@ class Watch:
         """Note that a person wants heliostats calibrated now."""
         self.results.asked(heliostats)
 
+    def emergency(self, *, on: bool) -> None:
+        """Note that a person has raised an emergency, or that it was cleared."""
+        self.progress.emergency(on=on)
+
     def switched(self, *, on: bool) -> None:
         """Note that a person switches calibration on or off."""
         self.progress.switched(on=on)

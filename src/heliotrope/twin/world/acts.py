@@ -69,6 +69,7 @@ class Acts:
         self.names, self._clock = tuple(names), clock
         self.chance = random.Random(f"shift {seed}")
         self._left: set[str] = set()  # what a person keeps from automatic control
+        self._locked: dict[str, str] = {}  # who has locked each heliostat
         operator.commands = False
 
     def now(self) -> float:
@@ -91,6 +92,7 @@ class Acts:
         self._operator.clear(operations.plant)
         if operations.plant.emergency_on:
             return
+        self._watch.emergency(on=False)
         if operations.automatic.waits:
             self._beams.released(self.now())
             operations.resume(ENGINEER)
@@ -147,6 +149,8 @@ class Acts:
         if leaves or self._work.operations is not operations or self._operator.waits:
             return
         with contextlib.suppress(RefusedError):
+            for name in [name for name, by in self._locked.items() if by == person.name]:
+                self.command(operations, person, token, "UNLOCK", (name,))
             operations.release_authority(person, token)
             self.acted("command authority back", person)
             self._observer.released(person, self.now())
@@ -186,6 +190,11 @@ class Acts:
         ticket = operations.command(person, token, what, names, values)
         self.accepted(person, token, ticket, what)
         self._watch.commanded(what, ticket.heliostats)
+        if what == "LOCK":
+            self._locked.update(dict.fromkeys(ticket.heliostats, person.name))
+        elif what == "UNLOCK":
+            for name in ticket.heliostats:
+                self._locked.pop(name, None)
 
     def aims(
         self, operations: Operations, person: Person, token: int, names: Sequence[str]
@@ -239,6 +248,7 @@ class Acts:
         operations.emergency(person, act.name, "somebody is in the field")
         self.acted(f"EMERGENCY {act.name}", person)
         self._operator.raised(person, act)
+        self._watch.emergency(on=True)
 
     def calibrate(
         self, operations: Operations, person: Person, *, together: bool, receiver: bool

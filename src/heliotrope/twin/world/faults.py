@@ -46,7 +46,7 @@ KINDS_OF_WORLDS = {
     "twice": {"plant_twice": (8, "a second plant with the same keys runs")},
     "disk": {"disk_slow": (10, "the disk of the plant's records is slow")},
     "days": {
-        "plant_crash": (2, "the plant crashes and restarts later"),
+        "plant_crash": (6, "the plant crashes and restarts later"),
         "gust": (1, "a gust passes"),
         "sensor_silent": (1, "a sensor shows nothing"),
     },

@@ -442,7 +442,8 @@ class Simulation:
         audit = self._audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
         if self._work is not None:
             self._wanted = wanted_of(self._fits)  # the store knows better; see `Work.begins`
-            self._work.control.opens()
+            noted = self.alarms.alarmed
+            self._work.control.opens(lambda alarm: noted(alarm, self._clock.monotonic()))
         context = context_of(_PLANT)
         plant = self.plant = PlantController(
             self._design,

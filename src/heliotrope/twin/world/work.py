@@ -9,7 +9,7 @@ import contextlib
 import math
 import random
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -162,9 +162,10 @@ class Work:
         zero = self._clock.utc().timestamp() - self._clock.monotonic()
         return self.camera.away(at - zero)
 
-    def opens(self) -> Logbook:
-        """Return the logbook of a new program."""
+    def opens(self, on_alarm: Callable[[Alarm], None]) -> Logbook:
+        """Return the logbook of a new program, which tells of all alarms that begin or end."""
         self.logbook = Logbook(self._clock, self.records)
+        self.logbook.forward = on_alarm
         return self.logbook
 
     def begins(self, plant: PlantController) -> Operations:

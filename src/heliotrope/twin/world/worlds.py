@@ -41,7 +41,7 @@ PARTIES, PARTY = ("parties", DAYS), 6
 DRAWN = ("place", "day")
 #: Faults in a run with automatic control come this many times more seldom: a visit takes a minute,
 #: and a person's act is most of what happens on a day.
-_SELDOM, _SELDOM_BY_DAY = 4.0, 30.0
+_SELDOM, _SELDOM_BY_DAY = 4.0, 50.0
 #: Name that lets each run draw its worlds: see `mixed`.
 ANY = "any"
 #: Worlds that hold, of which `mixed` chooses.
