@@ -53,10 +53,7 @@ MISLED = {
 }  # fmt: skip
 #: Alarms that say that mirrors did what nobody ordered, or not what was: their only cause is
 #: a fault that has ended no longer ago than this, s. A new program goes on with earlier ones.
-UNORDERED = {
-    "beam_unsent": 60.0, "counts_doubtful": 60.0, "nodes_unacknowledged": 90.0,
-    "resume_needed": 60.0,
-}  # fmt: skip
+UNORDERED = {"counts_doubtful": 60.0, "nodes_unacknowledged": 90.0, "resume_needed": 60.0}
 RECALLED_WITHIN = 5.0
 #: The alarm that the records cannot be written.
 UNWRITTEN = "database_unwritable"
