@@ -151,9 +151,20 @@ class Acts:
         with contextlib.suppress(RefusedError):
             for name in [name for name, by in self._locked.items() if by == person.name]:
                 self.command(operations, person, token, "UNLOCK", (name,))
-            operations.release_authority(person, token)
-            self.acted("command authority back", person)
-            self._observer.released(person, self.now())
+            self._gives(operations, person, token)
+
+    def once(
+        self, operations: Operations, person: Person, what: str, values: Sequence[float]
+    ) -> None:
+        """Take the command authority for one command to all, and give it back."""
+        token = self._takes(operations, person, "")
+        self.command(operations, person, token, what, (), values)
+        self._gives(operations, person, token)
+
+    def _gives(self, operations: Operations, person: Person, token: int) -> None:
+        operations.release_authority(person, token)
+        self.acted("command authority back", person)
+        self._observer.released(person, self.now())
 
     def _takes(self, operations: Operations, person: Person, reason: str) -> int:
         grant = operations.plant.authority.grant

@@ -57,9 +57,12 @@ class Crew:
         All heliostats, which persons see.
     seconds
         Length of the day, s.
+    rough
+        Whether the engineer lets all heliostats step roughly in the morning.
     """
 
-    def __init__(self, acts: Acts, boards: Sequence[Board], seconds: float) -> None:
+    def __init__(self, acts: Acts, boards: Sequence[Board], seconds: float, *, rough: bool) -> None:
+        self._rough = rough
         self._acts, self._boards, self._chance = acts, tuple(boards), acts.chance
         self._begin = acts.now()
         share = _LEFT if self._chance.random() < _LEAVE else 1.0
@@ -70,6 +73,9 @@ class Crew:
     async def work(self) -> None:
         """Work until cancelled."""
         await asyncio.sleep(4.0)
+        if self._rough and (operations := self._acts.present()) is not None:
+            with contextlib.suppress(RefusedError):
+                self._acts.once(operations, ENGINEER, "ROUGH", (1.0,))
         async with asyncio.TaskGroup() as group:
             group.create_task(self._cares())
             for person in (OPERATOR, ENGINEER, SCRIPT):

@@ -32,6 +32,7 @@ from heliotrope.sun import vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.clocks import TickCounter
 from heliotrope.twin.boards.outfit import (
+    COARSE,
     RECEIVER,
     STANDBY,
     Outfit,
@@ -44,7 +45,7 @@ from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.progress import ProgressObserver
-from heliotrope.twin.invariants.quiet import QuietObserver
+from heliotrope.twin.invariants.quiet import NEAR, QuietObserver
 from heliotrope.twin.invariants.results import ResultObserver
 from heliotrope.twin.invariants.sensors import SensorObserver
 from heliotrope.twin.invariants.shown import ShownObserver
@@ -76,8 +77,10 @@ from heliotrope.twin.world.worlds import (
     drawn,
     knows_boards,
     measured,
+    motors_of,
     parties,
     stored_by,
+    surveyed,
     works,
 )
 
@@ -94,6 +97,8 @@ _WRONG = ("addresses", "clock", "site")
 MOST_HOURS = 8.0
 #: Mean time between two interruptions by persons, s: a joint visit takes two minutes.
 SHIFT_PAUSE, PARTY_PAUSE = 90.0, 300.0
+#: The same as `NEAR` for motors that step coarsely, and may stay two full steps behind, rad.
+NEAR_COARSE = 4e-3
 #: With this few mirrors they join one at a time.
 SETTINGS = PlantSettings(
     join_rate=0.5,
@@ -275,13 +280,19 @@ class Simulation:
         self._loop, self._clock = loop, VirtualClock(loop.time, scene.start)
         self.begin = loop.time()
         self._suns: dict[int, FloatArray] = {}
-        fits = outfits(plan.size, plan.seed, scene.places)
-        stored = stored_by(fits, plan.worlds, plan.seed)
+        fits = motors_of(outfits(plan.size, plan.seed, scene.places), plan.worlds, plan.seed)
+        known = surveyed(fits, plan.worlds, plan.seed)
+        self._coarse = fits[0].machine is COARSE
+        self._astray = {a.name for a, b in zip(fits, known, strict=True) if a is not b}
+        stored = [
+            replace(fit, items=one.items)
+            for fit, one in zip(fits, stored_by(known, plan.worlds, plan.seed), strict=True)
+        ]
         self.boards = [self._board(each) for each in stored]
         self.pods = self._new_pods()
         boards = {pod.name: pod.boards for pod in self.pods}
         most = LOSSES if works(plan.worlds) else None
-        self.beams = BeamObserver(self.begin, boards, self.sun, scene.keep_outs, most)
+        self.beams = BeamObserver(self.begin, boards, self.sun, scene.keep_outs, most, self._astray)
         self.readings = SensorObserver(self.begin, boards)
         self.alarms = AlarmObserver(self.begin, boards, plan.worlds)
         accounts = {each.name: each for pod in self.pods for each in pod.observer.accounts}
@@ -294,10 +305,10 @@ class Simulation:
         self._measured = measured(plan.worlds)
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
         together = parties(plan.worlds)
-        self._design, self._homes = design_of(fits, homes, scene, together=together), homes
+        self._design, self._homes = design_of(known, homes, scene, together=together), homes
         # The boards' wanted items and assigned points survive the plant's program.
-        self._fits = fits
-        self._wanted = wanted_of(fits) if knows_boards(plan.worlds) else Wanted()
+        self._fits = known
+        self._wanted = wanted_of(known) if knows_boards(plan.worlds) else Wanted()
         self._assigned = AssignedDisk()
         self._assigned.keep({"STANDBY": {each.name: STANDBY for each in fits}})
         self.disk = RecordsDisk()
@@ -335,7 +346,10 @@ class Simulation:
         if not set(_WRONG).isdisjoint(self.plan.worlds):
             return None
         observers = {pod.name: pod.observer for pod in self.pods}
-        return QuietObserver(self.begin, observers, self.sun, reaches=not drawn(self.plan.worlds))
+        near = NEAR_COARSE if self._coarse else NEAR
+        return QuietObserver(
+            self.begin, observers, self.sun, reaches=not drawn(self.plan.worlds), near=near
+        )
 
     def _new_work(self) -> Working:
         """Return automatic control with its persons and its observer."""
@@ -345,18 +359,19 @@ class Simulation:
         sight = FieldSnapshot(clock, mirrors, lambda: self.sun(clock.monotonic()))
         lights, together = "lights" in plan.worlds, parties(plan.worlds)
         kind = DAY_WORK if DAYS in plan.worlds else LIT_WORK if lights else USUAL_WORK
-        kind = replace(kind, together=together, lowest=self._scene.lowest)
+        machine, lowest = self._fits[0].machine, self._scene.lowest
+        kind = replace(kind, together=together, lowest=lowest, machine=machine)
         work = Work(plan.seed, sight, self._exits, kind)
         watch, names = self._new_watch(work, together=together), tuple(boards)
         acts = Acts(work, self.operator, self.observer, self.beams, watch, names, clock, plan.seed)
         if DAYS in plan.worlds:
-            return Working(work, Crew(acts, self.boards, plan.seconds), watch)
+            return Working(work, Crew(acts, self.boards, plan.seconds, rough=self._coarse), watch)
         return Working(work, Shift(acts, PARTY_PAUSE if together else SHIFT_PAUSE), watch)
 
     def _new_watch(self, work: Work, *, together: bool) -> Watch:
         begin, boards, targets = self.begin, self.boards, self._scene.targets
         zero = self._clock.utc().timestamp() - self._clock.monotonic()
-        results = ResultObserver(begin, boards, work.records, self.sun, zero)
+        results = ResultObserver(begin, boards, work.records, self.sun, zero, self._astray)
         work.camera.told = results.photographed
         persons = [person.name for person in CREW]
         lowest = self._scene.lowest
@@ -371,6 +386,7 @@ class Simulation:
                 together=together,
                 across=drawn(self.plan.worlds),
                 lowest=lowest,
+                dark=self._astray,
             ),
             ShownObserver(begin, boards, self._homes, targets, self.observer, persons),
         )

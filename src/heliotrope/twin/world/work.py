@@ -19,6 +19,7 @@ import numpy.typing as npt
 from heliotrope.calibration.learn.drift import START_NOISE
 from heliotrope.links.clock import Clock
 from heliotrope.mechanism.board_items import items_of
+from heliotrope.mechanism.machine import Machine
 from heliotrope.plant.assembly import CYCLE
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations import AutomaticSettings, Logbook, Operations
@@ -60,6 +61,8 @@ class WorkKind:
         Whether the plant chooses by its own schedule, and measures several heliostats at once.
     lowest
         Elevation of the sun below which the field is stowed, rad.
+    machine
+        Motors of all heliostats.
     """
 
     lies: float = 0.2
@@ -67,6 +70,7 @@ class WorkKind:
     lights: bool = False
     together: bool = False
     lowest: float = math.radians(8.0)
+    machine: Machine = MACHINE
 
 
 #: Kinds of work: of most worlds, of "lights", and of "days".
@@ -146,7 +150,7 @@ class Work:
         # A stack of photographs tells beams apart, as a search does.
         searches = random.Random(f"visits {seed}").random() < kind.searches
         self.centred = kind.together or searches
-        self._together = kind.together
+        self._together, self._kind = kind.together, kind
         self._settings = replace(SETTINGS, lowest=kind.lowest)
         waver = START_NOISE * VISIT.sigma
         self.camera = LyingCamera(sight, seed, kind.lies, waver, standing=kind.lights)
@@ -185,7 +189,7 @@ class Work:
             receiver=self._receiver(plant, cycle),
         )
         for name in plant.field.names:
-            plant.wanted.set(name, items_of(plant.beliefs.present(name)[0], MACHINE))
+            plant.wanted.set(name, items_of(plant.beliefs.present(name)[0], self._kind.machine))
         return self.operations
 
     def _schedule(self, plant: PlantController) -> PlantSchedule:

@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 from heliotrope.errors import InputError
 from heliotrope.mechanism.board_items import items_of, packed
 from heliotrope.sun import Site
-from heliotrope.twin.boards.outfit import MACHINE, Outfit
+from heliotrope.twin.boards.outfit import COARSE, MACHINE, Outfit
 
 #: Everything that a run may add, and its meaning.
 WORLDS = {
@@ -53,6 +53,9 @@ MIX = (
 #: Worlds that `mixed` adds to this share of runs each, beside those that it draws. A cluster that
 #: is wrong from the start is found within seconds, and then keeps its mirrors from all else.
 RARE, RARE_SHARE = ("lights", "clock", "site", "addresses"), 0.04
+#: Shares of days with motors that step coarsely, and with a heliostat of which the plant file is
+#: wrong; by how much, rad of the mirror.
+_COARSE, _UNSURVEYED, _BESIDE = 1.0 / 3.0, 1.0 / 3.0, (0.02, 0.03)
 #: Share of the runs of `mixed` that are a working day, and nothing else.
 DAYS_SHARE = 0.1
 
@@ -189,6 +192,32 @@ def stored_by(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[
         else fit
         for fit in fits
     ]
+
+
+def motors_of(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
+    """Return heliostats with their motors: on one day in three these step coarsely."""
+    coarse = DAYS in worlds and random.Random(f"motors {seed}").random() < _COARSE
+    if not coarse:
+        return list(fits)
+    items = items_of(fits[0].mechanism, COARSE)["stepping"]
+    return [replace(f, machine=COARSE, items={**f.items, "stepping": items}) for f in fits]
+
+
+def surveyed(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
+    """Return heliostats as the plant file has them: on one day in three it is wrong about one.
+
+    Its beam then goes beside a target, where no photograph shows it.
+    """
+    chance = random.Random(f"survey {seed}")
+    if DAYS not in worlds or chance.random() >= _UNSURVEYED:
+        return list(fits)
+    one, size = chance.randrange(len(fits)), chance.choice([-1.0, 1.0]) * chance.uniform(*_BESIDE)
+    found = list(fits)
+    causes = {**fits[one].causes, "canting": fits[one].causes["canting"] + size}
+    mechanism = fits[one].with_causes(causes)
+    items = {**fits[one].items, **items_of(mechanism, fits[one].machine)}
+    found[one] = replace(fits[one], causes=causes, mechanism=mechanism, items=items)
+    return found
 
 
 def wrong_items(fit: Outfit, others: Sequence[Outfit], chance: random.Random) -> dict[str, bytes]:
