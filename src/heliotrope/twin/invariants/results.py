@@ -39,9 +39,9 @@ SHARE, ERROR_WITHIN = 0.05, 2e-5
 #: Visits of one mirror in a row that may bring nothing, for which no person has asked: nine joint
 #: ones in which its beam is looked for, and some alone.
 RETRIES = 14
-#: Results in a row, of mirrors that photographs show, that may bring nothing though no visit broke
-#: off: those of a whole field of this many, or of more.
-BARREN = 6
+#: Results in a row, of mirrors that photographs show, that do not all bring nothing though no
+#: visit broke off: so many, or all of the field but one.
+BARREN = 5
 #: Results of visits that broke off: what they brought is not counted.
 _BROKEN = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)
 
@@ -215,7 +215,7 @@ class ResultObserver:
         if name not in self._dark:
             self._barren = 0 if entry.new else self._barren + 1
             saw = f"{self._barren} results in a row have brought nothing, the last: {entry.text}"
-            self._check(self._barren < max(BARREN, len(self._boards)), now, name, saw)
+            self._check(self._barren < max(BARREN, len(self._boards) - 1), now, name, saw)
         saw = f"a result counts {entry.new} new sightings; {brought} came"
         self._check(entry.new == brought, now, name, saw)
         saw = f"a result counts {entry.sightings} sightings; {account.kept} are known"

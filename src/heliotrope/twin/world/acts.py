@@ -23,6 +23,9 @@ from heliotrope.twin.world.work import Work
 
 #: What a person does each second on duty, with the token of the command authority.
 Commanding = Callable[[Operations, Person, int], None]
+#: Time until the clusters have a new token, and in which a command is done that only changes a
+#: setting, s.
+_DONE = 4.0
 #: Least time on duty, s.
 _LEAST_DUTY = 2.0
 
@@ -153,12 +156,14 @@ class Acts:
                 self.command(operations, person, token, "UNLOCK", (name,))
             self._gives(operations, person, token)
 
-    def once(
+    async def once(
         self, operations: Operations, person: Person, what: str, values: Sequence[float]
     ) -> None:
-        """Take the command authority for one command to all, and give it back."""
+        """Take the command authority for one command to all, and give it back when it is done."""
         token = self._takes(operations, person, "")
+        await asyncio.sleep(_DONE)  # until the clusters have the new token
         self.command(operations, person, token, what, (), values)
+        await asyncio.sleep(_DONE)
         self._gives(operations, person, token)
 
     def _gives(self, operations: Operations, person: Person, token: int) -> None:

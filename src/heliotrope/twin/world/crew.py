@@ -75,7 +75,7 @@ class Crew:
         await asyncio.sleep(4.0)
         if self._rough and (operations := self._acts.present()) is not None:
             with contextlib.suppress(RefusedError):
-                self._acts.once(operations, ENGINEER, "ROUGH", (1.0,))
+                await self._acts.once(operations, ENGINEER, "ROUGH", (1.0,))
         async with asyncio.TaskGroup() as group:
             group.create_task(self._cares())
             for person in (OPERATOR, ENGINEER, SCRIPT):

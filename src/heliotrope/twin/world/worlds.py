@@ -53,7 +53,7 @@ MIX = (
 #: Worlds that `mixed` adds to this share of runs each, beside those that it draws. A cluster that
 #: is wrong from the start is found within seconds, and then keeps its mirrors from all else.
 RARE, RARE_SHARE = ("lights", "clock", "site", "addresses"), 0.04
-#: Shares of days with motors that step coarsely, and with a heliostat of which the plant file is
+#: Shares of days with motors that step coarsely, and with heliostats of which the plant file is
 #: wrong; by how much, rad of the mirror.
 _COARSE, _UNSURVEYED, _BESIDE = 1.0 / 3.0, 1.0 / 3.0, (0.02, 0.03)
 #: Share of the runs of `mixed` that are a working day, and nothing else.
@@ -204,19 +204,20 @@ def motors_of(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[
 
 
 def surveyed(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
-    """Return heliostats as the plant file has them: on one day in three it is wrong about one.
+    """Return heliostats as the plant file has them: on one day in three it is wrong about three.
 
-    Its beam then goes beside a target, where no photograph shows it.
+    Their beams then go beside a target, where no photograph shows them.
     """
     chance = random.Random(f"survey {seed}")
     if DAYS not in worlds or chance.random() >= _UNSURVEYED:
         return list(fits)
-    one, size = chance.randrange(len(fits)), chance.choice([-1.0, 1.0]) * chance.uniform(*_BESIDE)
     found = list(fits)
-    causes = {**fits[one].causes, "canting": fits[one].causes["canting"] + size}
-    mechanism = fits[one].with_causes(causes)
-    items = {**fits[one].items, **items_of(mechanism, fits[one].machine)}
-    found[one] = replace(fits[one], causes=causes, mechanism=mechanism, items=items)
+    for i in chance.sample(range(len(fits)), 3):
+        fit, size = fits[i], chance.choice([-1.0, 1.0]) * chance.uniform(*_BESIDE)
+        causes = {**fit.causes, "canting": fit.causes["canting"] + size}
+        mechanism = fit.with_causes(causes)
+        items = {**fit.items, **items_of(mechanism, fit.machine)}
+        found[i] = replace(fit, causes=causes, mechanism=mechanism, items=items)
     return found
 
 
