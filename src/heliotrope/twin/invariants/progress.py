@@ -64,7 +64,8 @@ class ProgressObserver:
     lowest
         Elevation of the sun below which the field belongs at stow, rad.
     dark
-        Heliostats whose beams no photograph shows.
+        Heliostats of which the plant file is wrong: their beams go beside the receiver and the
+        targets, and nobody can know.
 
     Attributes
     ----------
@@ -195,7 +196,8 @@ class ProgressObserver:
                 name,
                 "it has stood at stow",
             )
-            tracks = board.state == states.TRACKING and board.miss(sun, RECEIVER) <= OFF
+            there = name in self._dark or board.miss(sun, RECEIVER) <= OFF
+            tracks = board.state == states.TRACKING and there
             saw = "automatic control has it, and it has not tracked the receiver"
             away = mine and not tracks
             self._within(("tracks", name), away, now, TRACKS_WITHIN, name, saw, L3)

@@ -85,7 +85,7 @@ class ResultObserver:
     zero
         POSIX time at 0 s of the clock.
     dark
-        Heliostats whose beams no photograph shows.
+        Heliostats of which the plant file is wrong, so that no photograph shows their beams.
 
     Attributes
     ----------

@@ -388,7 +388,9 @@ class Simulation:
                 lowest=lowest,
                 dark=self._astray,
             ),
-            ShownObserver(begin, boards, self._homes, targets, self.observer, persons),
+            ShownObserver(
+                begin, boards, self._homes, targets, self.observer, persons, self._astray
+            ),
         )
 
     def _board(self, outfit: Outfit) -> Board:
