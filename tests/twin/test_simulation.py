@@ -3,6 +3,7 @@
 import re
 import shlex
 from dataclasses import replace
+from math import sin
 
 import pytest
 from _pytest.mark import ParameterSet
@@ -14,7 +15,7 @@ from heliotrope.lcu import states
 from heliotrope.lcu.motion import Motion
 from heliotrope.safety import JoinLimiter
 from heliotrope.sun import vector
-from heliotrope.twin.invariants.day import LOW
+from heliotrope.twin.invariants.day import LOWEST
 from heliotrope.twin.invariants.invariants import TITLES
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.faults import Fault
@@ -204,7 +205,8 @@ def test_the_field_is_raised_in_the_morning() -> None:
     plan = RunPlan(0, 400.0, 3, faults=(), worlds=("day",))
     scene = scene_of(plan.worlds, plan.seed, plan.seconds, plan.heliostats)
     begin = scene.start.timestamp()
-    assert vector(begin, scene.site)[2] < LOW < vector(begin + 300.0, scene.site)[2]
+    before, after = (vector(begin + at, scene.site)[2] for at in (0.0, 300.0))
+    assert before < sin(LOWEST) < after
     outcome = run(plan)
     assert outcome.good, f"{outcome.text}; {outcome.command}"
     assert outcome.states[states.TRACKING] > 0

@@ -197,7 +197,7 @@ class JointVisit(BroughtHome):
 
     async def leave(self) -> bool:
         """Bring those home that take part no longer; return whether there were any."""
-        gone = tuple(name for name in self._away if name not in self.visits)
+        gone = tuple(name for name in sorted(self._away) if name not in self.visits)
         if gone:
             await self._standby(gone)
         return bool(gone)
@@ -211,7 +211,7 @@ class JointVisit(BroughtHome):
             If the plant refuses every motion; the beams are taken off the target then.
         """
         if self._away:
-            await self._standby(tuple(self._away))
+            await self._standby(tuple(sorted(self._away)))
 
     async def _standby(self, names: tuple[str, ...]) -> None:
         """Bring heliostats to standby; those that an order has taken off the target stay there.

@@ -5,7 +5,7 @@ import math
 import random
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,7 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
-from heliotrope.mechanism.machine import AxisLimits, Machine
+from heliotrope.mechanism.machine import AxisLimits, Machine, Stepping
 
 #: Steps per turn of a joint: 15.7 µrad a step. At 8000 steps/s a turn takes 50 s.
 STEPS_PER_TURN = 400_000
@@ -33,6 +33,8 @@ DEFOCUS = (0.1, 0.05)
 MACHINE = Machine(
     (AxisLimits(*RANGES[0], *LIMITS), AxisLimits(*RANGES[1], *LIMITS)), STOW, DEFOCUS, STANDBY
 )
+#: The same with motors whose full step is 0.5 mrad of the joint: rough stepping goes by full steps.
+COARSE = replace(MACHINE, stepping=Stepping((32, 32)))
 #: Centre and radius of a sphere that no beam may enter, m; no way leads there unless ordered.
 KEEP_OUT, KEEP_OUT_RADIUS = (-12.0, 0.0, 25.0), 2.0
 #: Centre and radius of a ball, ENU, m.
@@ -53,6 +55,8 @@ class Outfit:
         Imperfections by parameter, rad.
     items
         Items of its journal, by name: see `lcu.journal.ITEMS`.
+    machine
+        Its motors and resting places.
     """
 
     name: str
@@ -62,6 +66,7 @@ class Outfit:
     mechanism: Mechanism
     causes: dict[str, float]
     items: dict[str, bytes]
+    machine: Machine = MACHINE
 
     def with_causes(self, causes: Mapping[str, float]) -> Mechanism:
         """Return its mechanism with other imperfections (rad, by parameter) in place of its own."""

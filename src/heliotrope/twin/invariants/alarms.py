@@ -8,6 +8,9 @@ itself, unless a person must end it. A board without power, a board in FAULT, an
 the plant hears nothing must be named within a time (invariant 16). The table and the times are its
 own.
 
+Some alarms say that mirrors did what nobody ordered. Where no fault is near, only the plant itself
+can have done it, and its own act is no cause (L2).
+
 An alarm of a mirror that points elsewhere says that what should have kept it from moving has
 failed. It has a cause only where a cluster is wrong from the start, where what is believed changes,
 or where a fault is near.
@@ -21,7 +24,7 @@ from math import inf
 from heliotrope.lcu import states
 from heliotrope.safety import Alarm
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.invariants.invariants import InvariantError, Violation
+from heliotrope.twin.invariants.invariants import L2, InvariantError, Violation
 
 #: Alarms that only faults cause, and within what time they end once nothing has failed near the
 #: subject, s; inf: a person ends them, or another run of a program does.
@@ -45,9 +48,13 @@ BY_OTHERS = frozenset({
 MISLED = {
     "identity": frozenset({"addresses", "parameters", "calibrations"}),
     "pointing_disagrees": frozenset({
-        "clock", "site", "calibrations", "visits", "day", "lights", "parties",
+        "clock", "site", "calibrations", "visits", "day", "lights", "parties", "days",
     }),
 }  # fmt: skip
+#: Alarms that say that mirrors did what nobody ordered, or not what was: their only cause is
+#: a fault that has ended no longer ago than this, s. A new program goes on with earlier ones.
+UNORDERED = {"counts_doubtful": 60.0, "nodes_unacknowledged": 90.0, "resume_needed": 60.0}
+RECALLED_WITHIN = 5.0
 #: The alarm that the records cannot be written.
 UNWRITTEN = "database_unwritable"
 #: An alarm comes this long after the end of its cause at most, s.
@@ -83,12 +90,14 @@ class AlarmObserver:
     ) -> None:
         self.checks: Counter[int] = Counter()
         self._start, self._alone = start, "twice" not in worlds
+        self._works, self._began_at = "days" in worlds, start
         sound = [kind for kind, ways in MISLED.items() if ways.isdisjoint(worlds)]
         self._by_faults = BY_FAULTS | dict.fromkeys(sound, inf)
         self._boards = {each.outfit.name: each for some in boards.values() for each in some}
         self._clusters = {name: [b.outfit.name for b in some] for name, some in boards.items()}
         self._active: dict[tuple[str, str], float] = {}
         self._new: list[Alarm] = []
+        self._last: dict[tuple[str, str], Alarm] = {}
         self._heard = dict.fromkeys(boards, start)
         self._runs_since = inf
         self._wrote_at = start
@@ -96,14 +105,21 @@ class AlarmObserver:
         self._off: dict[str, float] = {}
         self._faulty: dict[str, float] = {}
 
-    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
-        self.checks[16] += 1
+    def _check(self, good: bool, now: float, subject: str, saw: str, number: int = 16) -> None:
+        self.checks[number] += 1
         if not good:
-            raise InvariantError(Violation(16, now - self._start, subject or "plant", saw))
+            raise InvariantError(Violation(number, now - self._start, subject or "plant", saw))
 
     def alarmed(self, alarm: Alarm, now: float) -> None:
-        """Note an alarm of the plant; it is judged at the next look."""
+        """Note an alarm of the plant; it is judged at the next look.
+
+        The same one may come twice: from the controller, and from the logbook, which has those of
+        automatic control too.
+        """
         key = alarm.condition, alarm.subject
+        if self._last.get(key) == alarm:
+            return
+        self._last[key] = alarm
         if alarm.active:
             self._active.setdefault(key, now)
             self._new.append(alarm)
@@ -113,7 +129,9 @@ class AlarmObserver:
     def ended(self) -> None:
         """Note that the plant's program has ended, and its alarms with it."""
         self._active.clear()
+        self._last.clear()
         self._new.clear()
+        self._began_at = inf
         self._runs_since = inf  # it may begin again before the next look
 
     def heard(self, cluster: str, now: float) -> None:
@@ -149,6 +167,8 @@ class AlarmObserver:
         rests |= {name: max(rest[each] for each in some) for name, some in self._clusters.items()}
         rests[""] = max(rest.values())
         new, self._new = self._new, []
+        if runs:
+            self._began_at = min(self._began_at, now)
         for alarm in new:
             self._caused(alarm, rests, now)
         self._runs_since = min(self._runs_since, now) if runs else inf
@@ -177,6 +197,11 @@ class AlarmObserver:
         self._check(subject in rests, now, subject, f"{saw}: there is no {subject!r}")
         sense = len(alarm.text) > len(kind) and not _NONSENSE.search(alarm.text)
         self._check(sense, now, subject, f"{saw}: that says nothing")
+        if kind in UNORDERED and self._works:
+            calm, began = now - rests[""], now - self._began_at
+            good = calm <= UNORDERED[kind] or began <= RECALLED_WITHIN
+            own = f"nothing has failed for {calm:.0f} s; its cause is the plant's own act"
+            self._check(good, now, subject, f"{saw}: {own}", L2)
         if kind in self._by_faults:
             calm = now - rests[subject]
             good = calm <= RAISED_WITHIN

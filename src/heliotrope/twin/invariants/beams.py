@@ -7,7 +7,7 @@ It checks invariants 12 to 15.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -176,6 +176,9 @@ class BeamObserver:
     losses
         Number of mirrors that automatic control may lose together and raise again without a person;
         None: only persons command.
+    unsurveyed
+        Heliostats of which the plant file says something else than is true: until they are
+        calibrated, their beams are not where they are sent, and nobody can know.
 
     Attributes
     ----------
@@ -192,11 +195,12 @@ class BeamObserver:
         sun: Callable[[float], FloatArray],
         keep_outs: Sequence[Ball],
         losses: int | None = None,
+        unsurveyed: Collection[str] = (),
     ) -> None:
         self.checks: Counter[int] = Counter()
         self.losses = 0
         self._start, self._sun, self._most = start, sun, losses
-        self._keep_outs = tuple(keep_outs)
+        self._keep_outs, self._unsurveyed = tuple(keep_outs), set(unsurveyed)
         self._mirrors = {
             board.outfit.name: _Mirror(board, cluster)
             for cluster, some in boards.items()
@@ -354,11 +358,14 @@ class BeamObserver:
             if mirror.state < 0:
                 mirror.astray_since = mirror.lit_since = mirror.inside_since = None
                 continue
-            self._placed(mirror, sun, now)
+            if mirror.name not in self._unsurveyed:
+                self._placed(mirror, sun, now)
             self._dark(mirror, sun, now)
         if self._most is None:
             self._loss(on, now)
         if plant is not None:
+            beliefs = plant.beliefs
+            self._unsurveyed = {n for n in self._unsurveyed if beliefs.record(n) is None}
             if plant.emergency_on:  # automatic control has given up the field
                 self.taken(self._mirrors)
             self._proofs(plant, sun, now)

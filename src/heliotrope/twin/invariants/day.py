@@ -15,8 +15,8 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.invariants.invariants import InvariantError, Violation
 
-#: Vertical part of the sun's direction below which the field belongs at stow: 8 degrees.
-LOW = sin(radians(8.0))
+#: Elevation of the sun below which the field belongs at stow, rad.
+LOWEST = radians(8.0)
 #: Time from there, from the last person's act, and from the beginning of a quiet stretch until a
 #: mirror is on its way to stow: the sun is looked at every 30 s, the field every 2 s, s.
 AWAY_WITHIN = 45.0
@@ -38,6 +38,8 @@ class DayObserver:
         Zero of the times that it reports, s.
     boards
         All heliostats.
+    lowest
+        Elevation of the sun below which the field belongs at stow, rad.
 
     Attributes
     ----------
@@ -45,8 +47,9 @@ class DayObserver:
         Number of checks of each invariant.
     """
 
-    def __init__(self, start: float, boards: Sequence[Board]) -> None:
+    def __init__(self, start: float, boards: Sequence[Board], lowest: float = LOWEST) -> None:
         self.checks: Counter[int] = Counter()
+        self._low = sin(lowest)
         self._start, self._boards = start, {board.outfit.name: board for board in boards}
         self._given: dict[str, float] = {}
         self._calm: dict[str, float] = {}
@@ -82,7 +85,7 @@ class DayObserver:
         now
             s.
         """
-        self._low_at = min(self._low_at, now) if sun[2] < LOW else inf
+        self._low_at = min(self._low_at, now) if sun[2] < self._low else inf
         # A new program knows nothing of what it was given, and in an emergency all is given up.
         if plant is None or plant.emergency is not None:
             self._given.clear()

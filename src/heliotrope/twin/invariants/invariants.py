@@ -38,6 +38,18 @@ number    check
           causes have alarms; each command ends, and says why it failed.
 ========  ============================================================================
 
+Besides being safe, life must go on:
+
+========  ============================================================================
+L1        What a visit or a person took is given back: no mirror stays LOCKED, or its beam on
+          a target, without an owner that the page shows.
+L2        Each ticket ends, and DONE is true; each retry has an end; no alarm has the plant's
+          own act as its cause.
+L3        When the last cause is gone and a person has resumed, every healthy mirror that
+          automatic control has tracks the receiver again.
+L4        What holds for safety outlives a restart of the plant's program.
+========  ============================================================================
+
 `twin.invariants.beams` checks 12 to 15, `twin.invariants.quiet`, `.visits`, `.day`, `.alarms` and
 `.tickets` 16, and `twin.invariants.answers` 11.
 """
@@ -78,7 +90,19 @@ TITLES = {
     14: "only a person resumes the field",
     15: "a proof counts only what is known",
     16: "work that is possible is done, and what is shown is true",
+    17: "what was taken is given back",
+    18: "each ticket and each retry ends, truthfully",
+    19: "every healthy mirror tracks again",
+    20: "what holds for safety outlives a restart",
 }
+#: Numbers of the invariants of liveness, which people call by name.
+L1, L2, L3, L4 = 17, 18, 19, 20
+
+
+def named(number: int) -> str:
+    """Return what people call an invariant: 1 to 16, L1 to L4."""
+    return str(number) if number < L1 else f"L{number - L1 + 1}"
+
 
 #: Local lease, and how late a board may notice its end, s.
 LEASE, LOOK = 6.0, 0.15
@@ -165,7 +189,7 @@ class Violation:
     Attributes
     ----------
     number
-        1 to 16.
+        Of `TITLES`: 1 to 16, or `L1` to `L4`.
     at
         Time since the start, s.
     subject
@@ -181,7 +205,8 @@ class Violation:
 
     def __str__(self) -> str:
         title = TITLES[self.number]
-        return f"invariant {self.number} ({title}): at {self.at:.3f} s, {self.subject}: {self.saw}"
+        what = f"invariant {named(self.number)} ({title})"
+        return f"{what}: at {self.at:.3f} s, {self.subject}: {self.saw}"
 
 
 class Observer:

@@ -3,13 +3,16 @@
 It knows from the persons what they have given to automatic control, and who has the command
 authority. In a quiet stretch (`quiet`) a heliostat that was given must leave stow, and be measured
 when a target is free; a visit must end, and leave no beam on its target; no part of the work may
-fail (16). One that stays at stow because volumes lie across its way must be named. All times are
-the observer's own.
+fail; measurements come while some are not calibrated (16). One that stays at stow because volumes
+lie across its way must be named. What a visit has taken is given back: no mirror stays LOCKED
+without a visit, a person or an emergency that has it (L1). One that automatic control has tracks
+the receiver, or is in a visit, within a time (L3). An emergency, and what is out of service,
+outlive a restart (L4). All times are the observer's own.
 """
 
 from collections import Counter
-from collections.abc import Sequence, Set
-from math import inf, radians, sin
+from collections.abc import Collection, Sequence, Set
+from math import asin, inf, radians
 
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
@@ -17,10 +20,13 @@ from heliotrope.lcu import states
 from heliotrope.plant.operations import Operations
 from heliotrope.plant.operations.views import Running
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.invariants.invariants import InvariantError, Violation
+from heliotrope.twin.boards.outfit import RECEIVER
+from heliotrope.twin.invariants.day import LOWEST
+from heliotrope.twin.invariants.invariants import L1, L3, L4, OFF, InvariantError, Violation
 
-#: Vertical part of the sun's direction above which the field belongs up: 9.5 degrees.
-HIGH = sin(radians(9.5))
+#: The field belongs up once the sun is this much higher than the elevation below which it belongs
+#: at stow, rad, or if it was never below it.
+HIGHER = radians(1.1)
 #: A heliostat that was given leaves stow within this: losses rest for 30 s; s.
 RAISED_WITHIN = 60.0
 #: A target is idle this long at most while a heliostat is ready for it; the same where heliostats
@@ -30,6 +36,12 @@ IDLE_WITHIN, TOGETHER_WITHIN = 25.0, 110.0
 VISIT_WITHIN = 260.0
 #: A beam may stay on a target without a visit for this long, wherever a person has sent it, s.
 LEFT_WITHIN = 30.0
+#: A mirror is LOCKED without an owner for this long at most, s: parameters take seconds.
+LOCKED_WITHIN = 60.0
+#: One that automatic control has tracks within this, s: ten minutes are allowed, and a few mirrors
+#: that leave stow one each second need three. While some are not calibrated, a measurement comes
+#: within this, s.
+TRACKS_WITHIN, MEASURED_WITHIN = 240.0, 300.0
 #: Names of the alarms that a part of the work has failed, and that a way from stow is not free.
 FAILED, BLOCKED = "work", "beam_blocked"
 
@@ -49,6 +61,11 @@ class ProgressObserver:
         Whether heliostats wait for each other, to be measured at once.
     across
         Whether keep-out volumes may lie across the ways from stow.
+    lowest
+        Elevation of the sun below which the field belongs at stow, rad.
+    dark
+        Heliostats of which the plant file is wrong: their beams go beside the receiver and the
+        targets, and nobody can know.
 
     Attributes
     ----------
@@ -64,6 +81,8 @@ class ProgressObserver:
         *,
         together: bool,
         across: bool,
+        lowest: float = LOWEST,
+        dark: Collection[str] = (),
     ) -> None:
         self.checks: Counter[int] = Counter()
         self._start, self._targets = start, {target.name: target for target in targets}
@@ -72,11 +91,16 @@ class ProgressObserver:
         self._given: set[str] = set()
         self._out: dict[str, float] = {}
         self._since: dict[tuple[str, ...], float] = {}
+        self._lowest, self._dark = lowest, frozenset(dark)
+        self._up: bool | None = None
+        self._locked: set[str] = set()
+        self._calibrates, self._measured = True, 0.0
+        self._emergency = self._called = self._ended = False
 
-    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
-        self.checks[16] += 1
+    def _check(self, good: bool, now: float, subject: str, saw: str, number: int = 16) -> None:
+        self.checks[number] += 1
         if not good:
-            raise InvariantError(Violation(16, now - self._start, subject, saw))
+            raise InvariantError(Violation(number, now - self._start, subject, saw))
 
     # -- persons -----------------------------------------------------------------------------
 
@@ -87,6 +111,27 @@ class ProgressObserver:
     def taken(self, heliostats: Sequence[str]) -> None:
         """Note that a person has moved heliostats, and may do so until they are given again."""
         self._given.difference_update(heliostats)
+
+    def commanded(self, what: str, heliostats: Sequence[str]) -> None:
+        """Note a command of a person that the plant has accepted: a lock has its owner."""
+        if what == "LOCK":
+            self._locked.update(heliostats)
+        elif what == "UNLOCK":
+            self._locked.difference_update(heliostats)
+
+    def switched(self, *, on: bool) -> None:
+        """Note that a person has switched calibration on or off."""
+        self._calibrates = on
+
+    def emergency(self, *, on: bool) -> None:
+        """Note that a person has raised an emergency, or that it was cleared."""
+        self._called = on
+
+    def ended(self) -> None:
+        """Note that the plant's program has ended."""
+        self._ended, self._calibrates = True, True
+        self._since.clear()
+        self._given.clear()
 
     def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
         """Note that a person has taken heliostats out of service, or given them back."""
@@ -126,6 +171,7 @@ class ProgressObserver:
             self._since.clear()
             return
         rows = operations.alarms()
+        self._recalled(operations, now)
         failures = [row.text for row in rows if row.condition == FAILED]
         self._check(not failures, now, "automatic control", failures[0] if failures else "")
         if operations.plant.emergency is not None:
@@ -136,8 +182,9 @@ class ProgressObserver:
         stowed = {n for n, board in self._boards.items() if board.state == states.STOWED}
         blocked = {row.subject for row in rows if row.condition == BLOCKED and row.active}
         stowed -= blocked if self._across else set()
-        may = governs and not operations.automatic.waits and sun[2] > HIGH
+        may = governs and not operations.automatic.waits and self._high(sun)
         may &= not operations.plant.emergency_on
+        self._owned(visited, now)
         working = [name for name in self._given & quiet if may and name not in self._out]
         for name, board in self._boards.items():
             mine = name in working and name not in visited
@@ -149,32 +196,92 @@ class ProgressObserver:
                 name,
                 "it has stood at stow",
             )
+            there = name in self._dark or board.miss(sun, RECEIVER) <= OFF
+            tracks = board.state == states.TRACKING and there
+            saw = "automatic control has it, and it has not tracked the receiver"
+            away = mine and not tracks
+            self._within(("tracks", name), away, now, TRACKS_WITHIN, name, saw, L3)
             for target in self._targets.values():
                 lights = mine and board.state == states.TRACKING and self._on(board, target, sun)
                 saw = f"no visit is under way, and its beam has been on {target.name}"
                 key = ("left", name, target.name)
                 self._within(key, lights, now, LEFT_WITHIN, name, saw)
         busy = {run.target for run in running}
+        results = operations.calibration().results
+        failed = {entry.heliostat for entry in results if not entry.good}
         limit = TOGETHER_WITHIN if self._together else IDLE_WITHIN
         for name in self._boards:
             up = self._boards[name].state in (states.IDLE, states.TRACKING)
-            ready = name in working and name not in visited and up
-            if self._together:  # a schedule may leave alone whom it knows well
-                ready &= operations.plant.beliefs.record(name) is None
+            ready = name in working and name not in visited and up and self._calibrates
+            if self._together:  # a schedule may leave alone whom it knows well, or who has failed
+                ready &= operations.plant.beliefs.record(name) is None and name not in failed
             for place in self._targets:
                 free = ready and place not in busy
                 saw = f"{place} has been free, and it ready for a visit"
                 self._within(("idle", name, place), free, now, limit, name, saw)
+        self._measures(operations, working, may=may, now=now)
+
+    def _high(self, sun: FloatArray) -> bool:
+        """Return whether the field belongs up: it was raised, and the sun has not fallen since."""
+        above = asin(float(sun[2])) - self._lowest
+        if self._up is None or above < 0.0:
+            self._up = above > 0.0
+        self._up |= above > HIGHER
+        return self._up
+
+    def _owned(self, visited: Set[str], now: float) -> None:
+        """Check that no mirror is LOCKED without an owner."""
+        for name, board in self._boards.items():
+            locked = board.state == states.LOCKED and not self._emergency
+            locked &= name not in visited | self._locked and name not in self._out
+            saw = "no visit, person or emergency has it, and it has been LOCKED"
+            self._within(("locked", name), locked, now, LOCKED_WITHIN, name, saw, L1)
+
+    def _recalled(self, operations: Operations, now: float) -> None:
+        """Check that a new program goes on with what held when the last one ended."""
+        on = operations.plant.emergency_on
+        if self._ended:
+            self._ended = False
+            saw = "a person's emergency held when the last program ended, and the new one goes on"
+            good = on or bool(operations.automatic.waits) or not self._called
+            self._check(good, now, "plant", saw, L4)
+            out = {lockout.heliostat for lockout in operations.holds()}
+            lost = sorted(self._out.keys() - out)
+            saw = f"a restart has put back in service: {', '.join(lost)}"
+            self._check(not lost, now, "plant", saw, L4)
+        self._emergency = on
+
+    def _measures(
+        self, operations: Operations, working: Sequence[str], *, may: bool, now: float
+    ) -> None:
+        """Check that measurements come while some mirrors have not been visited yet."""
+        beliefs = operations.plant.beliefs
+        results = operations.calibration().results
+        done = {each.heliostat for each in results} | self._dark
+        left = [name for name in working if name not in done and beliefs.record(name) is None]
+        last = max((each.at for each in results if each.new), default=0.0)
+        fresh, self._measured = last > self._measured, max(last, self._measured)
+        holds = may and bool(left) and self._calibrates and not fresh
+        saw = f"{len(left)} heliostats are not calibrated, and no visit has measured any"
+        self._within(("measured",), holds, now, MEASURED_WITHIN, "automatic control", saw)
 
     def _within(
-        self, key: tuple[str, ...], holds: bool, now: float, limit: float, name: str, what: str
+        self,
+        key: tuple[str, ...],
+        holds: bool,
+        now: float,
+        limit: float,
+        name: str,
+        what: str,
+        number: int = 16,
     ) -> None:
         """Check that something does not hold for longer than a time."""
         if not holds:
             self._since.pop(key, None)
             return
         passed = now - self._since.setdefault(key, now)
-        self._check(passed <= limit, now, name, f"{what} for {passed:.0f} s, limit {limit:.0f} s")
+        saw = f"{what} for {passed:.0f} s, limit {limit:.0f} s"
+        self._check(passed <= limit, now, name, saw, number)
 
     def _on(self, board: Board, target: Target, sun: FloatArray) -> bool:
         """Whether a beam is within a target, by the steps that were made."""

@@ -144,6 +144,8 @@ class QuietObserver:
         Returns the true direction to the sun, (3,), at a time in s.
     reaches
         Whether every mirror reaches its points at every hour of the run.
+    near
+        A beam is this near its point, as a share of its length, rad.
 
     Attributes
     ----------
@@ -158,9 +160,10 @@ class QuietObserver:
         sun: Callable[[float], FloatArray],
         *,
         reaches: bool,
+        near: float = NEAR,
     ) -> None:
         self.checks: Counter[int] = Counter()
-        self._start, self._sun, self._reaches = start, sun, reaches
+        self._start, self._sun, self._reaches, self._near = start, sun, reaches, near
         self._clusters = clusters
         self._mirrors = {
             account.name: _Mirror(account, cluster)
@@ -426,7 +429,7 @@ class QuietObserver:
         goal = (point[0], point[1], point[2])
         miss = board.miss(sun, goal, believed=True)
         far = float(np.linalg.norm(np.subtract(goal, board.outfit.mechanism.position)))
-        limit = NEAR * far + NEAR_M
+        limit = self._near * far + NEAR_M
         if miss <= limit:
             mirror.due_at = inf
         elif mirror.due_at == inf:

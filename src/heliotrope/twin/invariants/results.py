@@ -4,11 +4,12 @@ It is told of each photograph when the camera takes it, and reads the step count
 then. A sighting that the plant keeps must have the time, the point and the step counts of a
 photograph, and the true sun. A result must count the sightings that it brought, and its errors must
 be those of the two calibrations, before and after. The store and the logbook must have it, and a
-new program must know what the one before it knew (16).
+new program must know what the one before it knew (16). Visits that bring nothing do not go on
+without end (L2).
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from math import isfinite, nan
 
@@ -22,7 +23,7 @@ from heliotrope.plant.operations import Operations
 from heliotrope.plant.operations.views import CalibrationEntry, EventRow
 from heliotrope.store.records import Records
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.invariants.invariants import InvariantError, Violation
+from heliotrope.twin.invariants.invariants import L2, InvariantError, Violation
 
 #: Times of a sighting and of its photograph agree to within this, s.
 SAME = 1e-3
@@ -35,6 +36,12 @@ COUNTS_WITHIN = 60.0
 SHOWN_WITHIN = 1.0
 #: Errors of a result agree with the observer's own to within this share, and this, rad.
 SHARE, ERROR_WITHIN = 0.05, 2e-5
+#: Visits of one mirror in a row that may bring nothing, for which no person has asked: nine joint
+#: ones in which its beam is looked for, and some alone.
+RETRIES = 14
+#: Results in a row, of mirrors that photographs show, that do not all bring nothing though no
+#: visit broke off: so many, or all of the field but one.
+BARREN = 5
 #: Results of visits that broke off: what they brought is not counted.
 _BROKEN = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)
 
@@ -59,6 +66,7 @@ class _Account:
     version: int = 0
     told: int = 0  # version at its last result
     before: Mechanism | None = None
+    vain: int = 0  # visits in a row that brought nothing
 
 
 class ResultObserver:
@@ -76,6 +84,8 @@ class ResultObserver:
         Returns the true direction to the sun, (3,), at a time in s.
     zero
         POSIX time at 0 s of the clock.
+    dark
+        Heliostats of which the plant file is wrong, so that no photograph shows their beams.
 
     Attributes
     ----------
@@ -90,25 +100,32 @@ class ResultObserver:
         records: Records,
         sun: Callable[[float], FloatArray],
         zero: float,
+        dark: Collection[str] = (),
     ) -> None:
         self.checks: Counter[int] = Counter()
         self._start, self._records, self._sun, self._zero = start, records, sun, zero
         self._boards = {board.outfit.name: board for board in boards}
         self._accounts = {name: _Account() for name in self._boards}
+        self._dark, self._barren = frozenset(dark), 0
         self._results: set[tuple[str, float]] = set()
         self._program: Operations | None = None
         self._looked = start
 
-    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
-        self.checks[16] += 1
+    def _check(self, good: bool, now: float, subject: str, saw: str, number: int = 16) -> None:
+        self.checks[number] += 1
         if not good:
-            raise InvariantError(Violation(16, now - self._start, subject, saw))
+            raise InvariantError(Violation(number, now - self._start, subject, saw))
 
     def photographed(self, heliostat: str, target: str, point: FloatArray, now: float) -> None:
         """Note a photograph at the moment of its exposure."""
         board = self._boards[heliostat]
         counts = np.array([axis.turned for axis in board.axes], dtype=np.float64) - board.slip
         self._accounts[heliostat].pictures.append(Picture(now, target, point, counts))
+
+    def asked(self, heliostats: Sequence[str]) -> None:
+        """Note that a person wants heliostats calibrated now, whatever came of it before."""
+        for name in heliostats:
+            self._accounts[name].vain = 0
 
     def look(self, operations: Operations | None, now: float) -> None:
         """Judge what is new since the last look; None: the plant's program does not run."""
@@ -192,6 +209,13 @@ class ResultObserver:
         self._check(entry.outcome is not CalibrationOutcome.ERROR, now, name, saw)
         if entry.outcome in _BROKEN:
             return
+        account.vain = 0 if entry.new else account.vain + 1
+        saw = f"{account.vain} visits in a row have brought nothing, the last: {entry.text}"
+        self._check(account.vain <= RETRIES, now, name, saw, L2)
+        if name not in self._dark:
+            self._barren = 0 if entry.new else self._barren + 1
+            saw = f"{self._barren} results in a row have brought nothing, the last: {entry.text}"
+            self._check(self._barren < max(BARREN, len(self._boards) - 1), now, name, saw)
         saw = f"a result counts {entry.new} new sightings; {brought} came"
         self._check(entry.new == brought, now, name, saw)
         saw = f"a result counts {entry.sightings} sightings; {account.kept} are known"

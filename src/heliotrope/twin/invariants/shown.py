@@ -8,7 +8,7 @@ names a person who did nothing (11).
 """
 
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Collection, Mapping, Sequence, Set
 from math import inf, isfinite
 
 import numpy as np
@@ -68,6 +68,8 @@ class ShownObserver:
         Observer of the plant, which knows what boards have reported, and who has the authority.
     persons
         Names of the persons whose acts it is told of.
+    dark
+        Heliostats of which the plant file is wrong: where their beams are, nobody can know.
 
     Attributes
     ----------
@@ -83,9 +85,11 @@ class ShownObserver:
         targets: Sequence[Target],
         plant: PlantObserver,
         persons: Sequence[str],
+        dark: Collection[str] = (),
     ) -> None:
         self.checks: Counter[int] = Counter()
         self._start, self._plant, self._persons = start, plant, tuple(persons)
+        self._dark = frozenset(dark)
         self._boards = {board.outfit.name: board for board in boards}
         self._homes = {name: cluster for cluster, names in homes.items() for name in names}
         self._middles = {target.name: target.center for target in targets}
@@ -240,7 +244,8 @@ class ShownObserver:
         works = state in (states.TRACKING, states.SEARCHING)
         saw = f"{states.STATES[state]}, and its beam is shown on {place or 'nothing'}"
         self._check(works == (place != NOWHERE), now, name, saw)
-        if state == states.TRACKING and place in self._middles and self._came(name, now):
+        known = place in self._middles and name not in self._dark
+        if state == states.TRACKING and known and self._came(name, now):
             x, y, z = (float(each) for each in self._middles[place])
             miss = self._boards[name].miss(sun, (x, y, z), believed=True)
             saw += f", {miss:.1f} m from its middle"

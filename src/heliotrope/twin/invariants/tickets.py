@@ -3,17 +3,30 @@
 A ticket says for each heliostat how far its command has come. While the plant's program runs, a
 heliostat must have acknowledged it, or the ticket must have ended for it, within a time of the
 observer's own, whatever has failed; commands that wait for their turn to join are left out. One
-that has failed must say why (invariant 16).
+that has failed must say why (invariant 16). Every ticket ends, and DONE is true: the mirror has
+been in the state that its command asks for (L2).
 """
 
 from collections import Counter
+from collections.abc import Mapping
 
+from heliotrope.lcu import states
 from heliotrope.links.messages import Stage
 from heliotrope.plant.tickets import Ticket
-from heliotrope.twin.invariants.invariants import InvariantError, Violation
+from heliotrope.twin.invariants._account import HeliostatAccount
+from heliotrope.twin.invariants.invariants import ASKED, L2, InvariantError, Violation
 
 #: A command that no heliostat has acknowledged has ended after this, s: it lives for 10 s.
 ENDS_WITHIN = 20.0
+#: Every ticket has ended after this, but those of parameters, which wait for a safe place, s.
+OVER_WITHIN = 300.0
+#: A state may have been left this long before the command was accepted, s: reports are as old.
+_REPORTED = 2.2
+#: States that orders which anybody may give lead to; a mirror that is locked stays so.
+_SAFE = {
+    "DEFOCUS": (states.DEFOCUSED, states.STOWING, states.STOWED, states.LOCKED, states.FAULT),
+    "STOW": (states.STOWED, states.LOCKED),
+}
 #: Commands that may wait for their turn or for a safe place, and stages of a command that is under
 #: way.
 _WAIT = ("TRACK", "REFOCUS", "SEARCH", "PARAMETERS")
@@ -29,6 +42,8 @@ class TicketObserver:
     ----------
     start
         Zero of the times that it reports, s.
+    accounts
+        Accounts of the heliostats, by name.
 
     Attributes
     ----------
@@ -36,9 +51,9 @@ class TicketObserver:
         Number of checks of each invariant.
     """
 
-    def __init__(self, start: float) -> None:
+    def __init__(self, start: float, accounts: Mapping[str, HeliostatAccount]) -> None:
         self.checks: Counter[int] = Counter()
-        self._start = start
+        self._start, self._accounts = start, accounts
         self._open: list[tuple[float, Ticket]] = []
         self._stood_at = start
 
@@ -57,6 +72,9 @@ class TicketObserver:
             return
         for at, ticket in self._open:
             passed = now - max(at, self._stood_at)
+            over = ticket.finished or ticket.name == "PARAMETERS" or passed <= OVER_WITHIN
+            self._check(over, now, f"{ticket.text} after {passed:.0f} s", L2)
+            self._true(at, ticket, now)
             for name in ticket.heliostats:
                 stage = ticket.stage(name)
                 waits = ticket.name in _WAIT or stage not in _UNDER_WAY
@@ -69,7 +87,18 @@ class TicketObserver:
                 self._check(not failed or len(why) >= _REASON, now, saw)
         self._open = [(at, each) for at, each in self._open if not each.finished]
 
-    def _check(self, good: bool, now: float, saw: str) -> None:
-        self.checks[16] += 1
+    def _true(self, at: float, ticket: Ticket, now: float) -> None:
+        """Check that a mirror for which a ticket is done has been where its command leads."""
+        asked = ASKED.get(ticket.name) or _SAFE.get(ticket.name)
+        if asked is None:
+            return
+        for name in ticket.heliostats:
+            if ticket.stage(name) is Stage.DONE and name not in ticket.refusals:
+                account = self._accounts[name]
+                saw = f"{ticket.name} of {name} is done; it is {states.STATES[account.state]}"
+                self._check(account.was_in(asked, at - _REPORTED), now, saw, L2)
+
+    def _check(self, good: bool, now: float, saw: str, number: int = 16) -> None:
+        self.checks[number] += 1
         if not good:
-            raise InvariantError(Violation(16, now - self._start, "plant", saw))
+            raise InvariantError(Violation(number, now - self._start, "plant", saw))

@@ -13,7 +13,7 @@ from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.target import Receiver
 from heliotrope.field.volumes import Sphere
 from heliotrope.mechanism.board_items import Wanted, items_of
-from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, Outfit, mechanisms
+from heliotrope.twin.boards.outfit import RECEIVER, Outfit, mechanisms
 from heliotrope.twin.world.scene import Scene
 
 #: Width and height of every mirror, m.
@@ -53,7 +53,7 @@ def design_of(
         size,
         size,
         cluster=tuple(home[name] for name in names),
-        machines=(MACHINE,) * len(fits),
+        machines=tuple(each.machine for each in fits),
     )
     receiver = Receiver(
         "receiver", "planar", np.array(RECEIVER), np.array([0.0, 1.0, 0.0]), 6.0, 6.0
@@ -78,5 +78,5 @@ def wanted_of(fits: Sequence[Outfit]) -> Wanted:
     """Return what the boards of heliostats should store."""
     wanted = Wanted()
     for fit in fits:
-        wanted.set(fit.name, items_of(fit.mechanism, MACHINE))
+        wanted.set(fit.name, items_of(fit.mechanism, fit.machine))
     return Wanted(wanted.items)

@@ -45,6 +45,11 @@ KINDS_OF_WORLDS = {
     },
     "twice": {"plant_twice": (8, "a second plant with the same keys runs")},
     "disk": {"disk_slow": (10, "the disk of the plant's records is slow")},
+    "days": {
+        "plant_crash": (6, "the plant crashes and restarts later"),
+        "gust": (1, "a gust passes"),
+        "sensor_silent": (1, "a sensor shows nothing"),
+    },
     "sensors": {
         "sensor_stuck": (3, "a sensor shows its last value for ever"),
         "sensor_jumps": (2, "a sensor jumps"),
@@ -133,7 +138,8 @@ def drawn(
     if not pause > 0.0:
         raise InputError(f"a pause of {pause} s between faults; it must be above 0")
     chance = random.Random(f"faults {seed}")
-    kinds = list(only) or [*KINDS, *(k for w in worlds for k in KINDS_OF_WORLDS.get(w, {}))]
+    usual = () if "days" in worlds else KINDS
+    kinds = list(only) or [*usual, *(k for w in worlds for k in KINDS_OF_WORLDS.get(w, {}))]
     weighed = weights_of(worlds, seed, {kind: known[kind][0] for kind in kinds})
     weights = [weighed[kind] for kind in kinds]
     pause = pause_of(worlds, seed, pause)

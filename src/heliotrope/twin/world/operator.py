@@ -406,12 +406,16 @@ class Operator:
 
     def raises(self, plant: PlantController, who: Person, act: Act) -> EmergencyOrder:
         """Raise an emergency, which anybody may do."""
-        self.counts["emergencies"] += 1
         order = plant.raise_emergency(who.name, act)
+        self.raised(who, act)
+        return order
+
+    def raised(self, who: Person, act: Act) -> None:
+        """Note an emergency that a person has raised."""
+        self.counts["emergencies"] += 1
         self._beams.taken(self._names)  # after it none is automatic control's
         self._observer.obeyed(who.name, act.name, self._clock.monotonic())
         self._called = True
-        return order
 
     def _one_safe(self, plant: PlantController) -> None:
         what = self._chance.choice(["DEFOCUS", "STOW"])

@@ -20,7 +20,7 @@ from heliotrope.twin.boards.outfit import (
     stow_beams,
 )
 from heliotrope.twin.invariants.invariants import OFF
-from heliotrope.twin.world.worlds import drawn, works
+from heliotrope.twin.world.worlds import DAYS, drawn, works
 
 #: The sun is at least this high at the beginning and at the end of a drawn scene, rad.
 _LOWEST = math.radians(8.0)
@@ -37,6 +37,8 @@ _APART, _BESIDE = 6.0, 8.0
 _ROOM = 10.0
 #: The sun is looked at this often, s.
 _OFTEN = 60.0
+#: Time after the evening's limit of a short day in which the field goes to stow, s.
+_EVENING = 130.0
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class Scene:
         Balls that no beam may enter; the first is the one that persons aim at.
     targets
         Calibration targets.
+    lowest
+        Elevation of the sun below which automatic control stows the field, rad.
     """
 
     site: Site
@@ -60,6 +64,7 @@ class Scene:
     places: tuple[tuple[float, float], ...] = ()
     keep_outs: tuple[Ball, ...] = ((KEEP_OUT, KEEP_OUT_RADIUS),)
     targets: tuple[Target, ...] = ()
+    lowest: float = math.radians(8.0)
 
 
 def _square(name: str, middle: tuple[float, float, float], side: float) -> Target:
@@ -78,11 +83,17 @@ USUAL = Scene(Site(37.4, -6.0, 100.0, name="simulation"), datetime(2026, 6, 21, 
 
 
 def scene_of(worlds: Sequence[str], seed: int, seconds: float, heliostats: int) -> Scene:
-    """Return the scene of a run: drawn in the worlds "place" and "day", else the usual one."""
+    """Return the scene of a run: drawn in the worlds "place" and "day", else the usual one.
+
+    That of "days" has the usual places, and a sun that crosses the zenith.
+    """
     targets = TARGETS if works(worlds) else ()
+    chance = random.Random(f"place {seed}")
+    if DAYS in worlds:
+        site, start, lowest = _short_day(chance, seconds)
+        return replace(USUAL, site=site, start=start, targets=targets, lowest=lowest)
     if not drawn(worlds):
         return replace(USUAL, targets=targets)
-    chance = random.Random(f"place {seed}")
     site, start = (_limit if "day" in worlds else _when)(chance, seconds)
     times = np.linspace(0.0, seconds, 2 + int(seconds / _OFTEN))
     suns = np.stack([vector(start.timestamp() + float(at), site) for at in times])
@@ -150,6 +161,30 @@ def _limit(chance: random.Random, seconds: float) -> tuple[Site, datetime]:
         raised = evening or bool((height[: 1 + int(0.7 * len(height))] > _RAISES).any())
         if raised and bool((height > _UP).all()):
             return site, datetime.fromtimestamp(first, UTC)
+
+
+def _short_day(chance: random.Random, seconds: float) -> tuple[Site, datetime, float]:
+    """Return a site, a time and the elevation, rad, above which the sun then stays for a short day.
+
+    Where the sun crosses the zenith its elevation rises and falls by a degree in four minutes, so
+    that a whole day of the field passes in less time than an hour has. One day in five begins below
+    the limit, and the field waits in stow until the sun is high enough.
+    """
+    noon = datetime(2026, 1, 1, 12, tzinfo=UTC) + timedelta(days=chance.randrange(365))
+    declination = math.degrees(math.asin(float(vector(noon.timestamp(), Site(90.0, 0.0, 0.0))[2])))
+    site = Site(
+        declination + chance.uniform(-0.2, 0.2),
+        chance.uniform(-180.0, 180.0),
+        100.0,
+        name="simulation",
+    )
+    times = noon.timestamp() + np.arange(-43200.0, 43200.0, 10.0)
+    highest = float(times[int(np.argmax(vector(times, site)[:, 2]))])
+    evening = seconds - _EVENING
+    share = chance.uniform(0.35, 0.48) if chance.random() < 0.8 else chance.uniform(0.51, 0.53)
+    start = highest - share * evening
+    lowest = math.asin(float(vector(start + evening, site)[2]))
+    return site, datetime.fromtimestamp(start, UTC), lowest
 
 
 def _ball(chance: random.Random, places: Sequence[tuple[float, float]], suns: FloatArray) -> Ball:

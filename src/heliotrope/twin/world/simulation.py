@@ -32,6 +32,7 @@ from heliotrope.sun import vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.clocks import TickCounter
 from heliotrope.twin.boards.outfit import (
+    COARSE,
     RECEIVER,
     STANDBY,
     Outfit,
@@ -44,35 +45,42 @@ from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.progress import ProgressObserver
-from heliotrope.twin.invariants.quiet import QuietObserver
+from heliotrope.twin.invariants.quiet import NEAR, QuietObserver
 from heliotrope.twin.invariants.results import ResultObserver
 from heliotrope.twin.invariants.sensors import SensorObserver
 from heliotrope.twin.invariants.shown import ShownObserver
 from heliotrope.twin.invariants.tickets import TicketObserver
 from heliotrope.twin.invariants.visits import VisitObserver
+from heliotrope.twin.invariants.watch import Watch
 from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
 from heliotrope.twin.true_mirrors import mirrors_of
 from heliotrope.twin.world import faults as kinds
+from heliotrope.twin.world.acts import Acts
+from heliotrope.twin.world.crew import CREW, Crew
 from heliotrope.twin.world.damage import Damage
 from heliotrope.twin.world.design import MIRROR, design_of, wanted_of
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.instruments import READINGS, Instruments
-from heliotrope.twin.world.operator import ENGINEER, VIEWER, Operator
+from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
 from heliotrope.twin.world.scene import scene_of
-from heliotrope.twin.world.shift import Shift, Watch, Working
+from heliotrope.twin.world.shift import Shift, Working
 from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
 from heliotrope.twin.world.twice import SecondPlant
-from heliotrope.twin.world.work import LOSSES, Work
+from heliotrope.twin.world.work import DAY_WORK, LIT_WORK, LOSSES, USUAL_WORK, Work
 from heliotrope.twin.world.worlds import (
+    DAYS,
     PARTY,
     Habits,
     PodErrors,
     checked,
     drawn,
     knows_boards,
+    measured,
+    motors_of,
     parties,
     stored_by,
+    surveyed,
     works,
 )
 
@@ -89,6 +97,8 @@ _WRONG = ("addresses", "clock", "site")
 MOST_HOURS = 8.0
 #: Mean time between two interruptions by persons, s: a joint visit takes two minutes.
 SHIFT_PAUSE, PARTY_PAUSE = 90.0, 300.0
+#: The same as `NEAR` for motors that step coarsely, and may stay two full steps behind, rad.
+NEAR_COARSE = 4e-3
 #: With this few mirrors they join one at a time.
 SETTINGS = PlantSettings(
     join_rate=0.5,
@@ -270,28 +280,35 @@ class Simulation:
         self._loop, self._clock = loop, VirtualClock(loop.time, scene.start)
         self.begin = loop.time()
         self._suns: dict[int, FloatArray] = {}
-        fits = outfits(plan.size, plan.seed, scene.places)
-        stored = stored_by(fits, plan.worlds, plan.seed)
+        fits = motors_of(outfits(plan.size, plan.seed, scene.places), plan.worlds, plan.seed)
+        known = surveyed(fits, plan.worlds, plan.seed)
+        self._coarse = fits[0].machine is COARSE
+        self._astray = {a.name for a, b in zip(fits, known, strict=True) if a is not b}
+        stored = [
+            replace(fit, items=one.items)
+            for fit, one in zip(fits, stored_by(known, plan.worlds, plan.seed), strict=True)
+        ]
         self.boards = [self._board(each) for each in stored]
         self.pods = self._new_pods()
         boards = {pod.name: pod.boards for pod in self.pods}
         most = LOSSES if works(plan.worlds) else None
-        self.beams = BeamObserver(self.begin, boards, self.sun, scene.keep_outs, most)
+        self.beams = BeamObserver(self.begin, boards, self.sun, scene.keep_outs, most, self._astray)
         self.readings = SensorObserver(self.begin, boards)
         self.alarms = AlarmObserver(self.begin, boards, plan.worlds)
-        self.tickets = TicketObserver(self.begin)
+        accounts = {each.name: each for pod in self.pods for each in pod.observer.accounts}
+        self.tickets = TicketObserver(self.begin, accounts)
         self.quiet = self._quiet_observer()
         for pod in self.pods:
             if self.quiet is not None:
                 pod.answers.quiet = self.quiet.calm
         self.instruments = Instruments(self._clock, plan.seed, self._flux, self.readings)
-        self._measured = "sensors" in plan.worlds
+        self._measured = measured(plan.worlds)
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
         together = parties(plan.worlds)
-        self._design, self._homes = design_of(fits, homes, scene, together=together), homes
+        self._design, self._homes = design_of(known, homes, scene, together=together), homes
         # The boards' wanted items and assigned points survive the plant's program.
-        self._fits = fits
-        self._wanted = wanted_of(fits) if knows_boards(plan.worlds) else Wanted()
+        self._fits = known
+        self._wanted = wanted_of(known) if knows_boards(plan.worlds) else Wanted()
         self._assigned = AssignedDisk()
         self._assigned.keep({"STANDBY": {each.name: STANDBY for each in fits}})
         self.disk = RecordsDisk()
@@ -329,7 +346,10 @@ class Simulation:
         if not set(_WRONG).isdisjoint(self.plan.worlds):
             return None
         observers = {pod.name: pod.observer for pod in self.pods}
-        return QuietObserver(self.begin, observers, self.sun, reaches=not drawn(self.plan.worlds))
+        near = NEAR_COARSE if self._coarse else NEAR
+        return QuietObserver(
+            self.begin, observers, self.sun, reaches=not drawn(self.plan.worlds), near=near
+        )
 
     def _new_work(self) -> Working:
         """Return automatic control with its persons and its observer."""
@@ -338,28 +358,39 @@ class Simulation:
         mirrors = mirrors_of(boards, MIRROR, MIRROR)
         sight = FieldSnapshot(clock, mirrors, lambda: self.sun(clock.monotonic()))
         lights, together = "lights" in plan.worlds, parties(plan.worlds)
-        work = Work(plan.seed, sight, self._exits, lights=lights, together=together)
+        kind = DAY_WORK if DAYS in plan.worlds else LIT_WORK if lights else USUAL_WORK
+        machine, lowest = self._fits[0].machine, self._scene.lowest
+        kind = replace(kind, together=together, lowest=lowest, machine=machine)
+        work = Work(plan.seed, sight, self._exits, kind)
         watch, names = self._new_watch(work, together=together), tuple(boards)
-        pause = PARTY_PAUSE if together else SHIFT_PAUSE
-        shift = Shift(
-            work, self.operator, self.observer, self.beams, watch, names, clock, plan.seed, pause
-        )
-        return Working(work, shift, watch)
+        acts = Acts(work, self.operator, self.observer, self.beams, watch, names, clock, plan.seed)
+        if DAYS in plan.worlds:
+            return Working(work, Crew(acts, self.boards, plan.seconds, rough=self._coarse), watch)
+        return Working(work, Shift(acts, PARTY_PAUSE if together else SHIFT_PAUSE), watch)
 
     def _new_watch(self, work: Work, *, together: bool) -> Watch:
         begin, boards, targets = self.begin, self.boards, self._scene.targets
         zero = self._clock.utc().timestamp() - self._clock.monotonic()
-        results = ResultObserver(begin, boards, work.records, self.sun, zero)
+        results = ResultObserver(begin, boards, work.records, self.sun, zero, self._astray)
         work.camera.told = results.photographed
-        persons = (ENGINEER.name, VIEWER.name)
+        persons = [person.name for person in CREW]
+        lowest = self._scene.lowest
         return Watch(
             VisitObserver(begin, boards, targets, work.away, followed=work.centred),
-            DayObserver(begin, boards),
+            DayObserver(begin, boards, lowest),
             results,
             ProgressObserver(
-                begin, boards, targets, together=together, across=drawn(self.plan.worlds)
+                begin,
+                boards,
+                targets,
+                together=together,
+                across=drawn(self.plan.worlds),
+                lowest=lowest,
+                dark=self._astray,
             ),
-            ShownObserver(begin, boards, self._homes, targets, self.observer, persons),
+            ShownObserver(
+                begin, boards, self._homes, targets, self.observer, persons, self._astray
+            ),
         )
 
     def _board(self, outfit: Outfit) -> Board:
@@ -429,7 +460,8 @@ class Simulation:
         audit = self._audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
         if self._work is not None:
             self._wanted = wanted_of(self._fits)  # the store knows better; see `Work.begins`
-            self._work.control.opens()
+            noted = self.alarms.alarmed
+            self._work.control.opens(lambda alarm: noted(alarm, self._clock.monotonic()))
         context = context_of(_PLANT)
         plant = self.plant = PlantController(
             self._design,
@@ -491,7 +523,7 @@ class Simulation:
                 pod.ear.end()
         if self._work is not None:
             self._work.control.ends()
-            self._work.watch.visits.ended()
+            self._work.watch.ended()
         if self.plant is not None:
             self._audit.lose()
         for task in self._program:

@@ -1,14 +1,16 @@
 """Automatic control in a run: raising, visits to targets, and the memory of both.
 
-The worlds "visits", "lights", "day" and "parties" run the whole plant, not its controller alone:
-`Operations` with automatic control and calibration visits. The store outlives the plant's program,
-as a disk does.
+The worlds "visits", "lights", "day", "parties" and "days" run the whole plant, not its controller
+alone: `Operations` with automatic control and calibration visits. The store outlives the plant's
+program, as a disk does.
 """
 
 import contextlib
+import math
 import random
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ import numpy.typing as npt
 from heliotrope.calibration.learn.drift import START_NOISE
 from heliotrope.links.clock import Clock
 from heliotrope.mechanism.board_items import items_of
+from heliotrope.mechanism.machine import Machine
 from heliotrope.plant.assembly import CYCLE
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations import AutomaticSettings, Logbook, Operations
@@ -39,10 +42,41 @@ SETTINGS = AutomaticSettings(rate=1.0, losses=LOSSES, patience=20.0)
 VISIT = CycleSettings(shots=3, interval=2.0, arrival=60.0, least=3, model=CYCLE.model)
 #: A search that stays near its target.
 SEARCH = Centring(most=8)
-#: Share of the photographs with which lies begin, and of the runs whose visits search for the beam;
-#: the same in the world "lights": what is searched for and followed is never a light that stands.
-LIES, SEARCHES = 0.2, 0.5
-LIGHTS, SEARCHES_BY_LIGHTS = 0.5, 0.25
+
+
+@dataclass(frozen=True)
+class WorkKind:
+    """How automatic control works in a run, and what its camera sees.
+
+    Attributes
+    ----------
+    lies
+        Share of the photographs with which lies begin.
+    searches
+        Share of the runs whose visits search for the beam and follow it: what is searched for is
+        never a light that stands.
+    lights
+        Whether lights stand on the targets for minutes.
+    together
+        Whether the plant chooses by its own schedule, and measures several heliostats at once.
+    lowest
+        Elevation of the sun below which the field is stowed, rad.
+    machine
+        Motors of all heliostats.
+    """
+
+    lies: float = 0.2
+    searches: float = 0.5
+    lights: bool = False
+    together: bool = False
+    lowest: float = math.radians(8.0)
+    machine: Machine = MACHINE
+
+
+#: Kinds of work: of most worlds, of "lights", and of "days".
+USUAL_WORK = WorkKind()
+LIT_WORK = WorkKind(0.5, 0.25, lights=True)
+DAY_WORK = WorkKind(0.02)
 
 
 class _Rounds:
@@ -91,10 +125,8 @@ class Work:
         True mirrors and sun.
     exits
         Closes the store at the end of the run.
-    lights
-        Whether lights stand on the targets for minutes.
-    together
-        Whether the plant chooses by its own schedule, and measures several heliostats at once.
+    kind
+        How it works.
 
     Attributes
     ----------
@@ -113,16 +145,15 @@ class Work:
         seed: int,
         sight: FieldSnapshot,
         exits: contextlib.ExitStack,
-        *,
-        lights: bool,
-        together: bool,
+        kind: WorkKind,
     ) -> None:
-        searches, lies = (SEARCHES_BY_LIGHTS, LIGHTS) if lights else (SEARCHES, LIES)
         # A stack of photographs tells beams apart, as a search does.
-        self.centred = together or random.Random(f"visits {seed}").random() < searches
-        self._together = together
+        searches = random.Random(f"visits {seed}").random() < kind.searches
+        self.centred = kind.together or searches
+        self._together, self._kind = kind.together, kind
+        self._settings = replace(SETTINGS, lowest=kind.lowest)
         waver = START_NOISE * VISIT.sigma
-        self.camera = LyingCamera(sight, seed, lies, waver, standing=lights)
+        self.camera = LyingCamera(sight, seed, kind.lies, waver, standing=kind.lights)
         self._clock = sight.clock
         folder = exits.enter_context(tempfile.TemporaryDirectory())
         self.records = Keeper(Path(folder) / "records.sqlite", inline=True)
@@ -135,9 +166,10 @@ class Work:
         zero = self._clock.utc().timestamp() - self._clock.monotonic()
         return self.camera.away(at - zero)
 
-    def opens(self) -> Logbook:
-        """Return the logbook of a new program."""
+    def opens(self, on_alarm: Callable[[Alarm], None]) -> Logbook:
+        """Return the logbook of a new program, which tells of all alarms that begin or end."""
         self.logbook = Logbook(self._clock, self.records)
+        self.logbook.forward = on_alarm
         return self.logbook
 
     def begins(self, plant: PlantController) -> Operations:
@@ -152,12 +184,12 @@ class Work:
             cycle,
             scheduler=self._schedule(plant) if self._together else rounds,
             records=self.records,
-            settings=SETTINGS,
+            settings=self._settings,
             joint=self._joint(plant, cycle),
             receiver=self._receiver(plant, cycle),
         )
         for name in plant.field.names:
-            plant.wanted.set(name, items_of(plant.beliefs.present(name)[0], MACHINE))
+            plant.wanted.set(name, items_of(plant.beliefs.present(name)[0], self._kind.machine))
         return self.operations
 
     def _schedule(self, plant: PlantController) -> PlantSchedule:

@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 from heliotrope.errors import InputError
 from heliotrope.mechanism.board_items import items_of, packed
 from heliotrope.sun import Site
-from heliotrope.twin.boards.outfit import MACHINE, Outfit
+from heliotrope.twin.boards.outfit import COARSE, MACHINE, Outfit
 
 #: Everything that a run may add, and its meaning.
 WORLDS = {
@@ -29,15 +29,19 @@ WORLDS = {
     "day": "automatic control meets the morning's or the evening's limit of the sun, at any place",
     "lights": "as visits; lights stand on the targets for minutes, and most visits search no beam",
     "parties": "as visits, by the plant's own schedule: many at once on a target and the receiver",
+    "days": "as parties, from morning to evening stow: several persons act at any stage of a visit",
 }
+#: A short working day, and its length, s.
+DAYS, DAY = "days", 840.0
 #: Worlds with automatic control.
-WORKING = ("visits", "day", "lights", "parties")
-#: World with joint visits and receiver visits, and the least number of its heliostats.
-PARTIES, PARTY = "parties", 6
+WORKING = ("visits", "day", "lights", "parties", DAYS)
+#: Worlds with joint visits and receiver visits, and the least number of their heliostats.
+PARTIES, PARTY = ("parties", DAYS), 6
 #: Worlds in which site, date, hour, and places are drawn.
 DRAWN = ("place", "day")
-#: Faults in a run with automatic control come this many times more seldom: a visit takes a minute.
-_SELDOM = 4.0
+#: Faults in a run with automatic control come this many times more seldom: a visit takes a minute,
+#: and a person's act is most of what happens on a day.
+_SELDOM, _SELDOM_BY_DAY = 4.0, 50.0
 #: Name that lets each run draw its worlds: see `mixed`.
 ANY = "any"
 #: Worlds that hold, of which `mixed` chooses.
@@ -49,6 +53,11 @@ MIX = (
 #: Worlds that `mixed` adds to this share of runs each, beside those that it draws. A cluster that
 #: is wrong from the start is found within seconds, and then keeps its mirrors from all else.
 RARE, RARE_SHARE = ("lights", "clock", "site", "addresses"), 0.04
+#: Shares of days with motors that step coarsely, and with heliostats of which the plant file is
+#: wrong; by how much, rad of the mirror.
+_COARSE, _UNSURVEYED, _BESIDE = 1.0 / 3.0, 1.0 / 3.0, (0.04, 0.05)
+#: Share of the runs of `mixed` that are a working day, and nothing else.
+DAYS_SHARE = 0.1
 
 
 def checked(worlds: Sequence[str]) -> None:
@@ -65,7 +74,9 @@ def checked(worlds: Sequence[str]) -> None:
 
 
 def mixed(seed: int) -> tuple[str, ...]:
-    """Return worlds drawn from a seed: none, some or all of `MIX`, and seldom one of `RARE`."""
+    """Return worlds drawn from a seed: some of `MIX`, and seldom one of `RARE`; or a day alone."""
+    if random.Random(f"{DAYS} {seed}").random() < DAYS_SHARE:
+        return (DAYS,)
     chance = random.Random(f"worlds {seed}")
     share = chance.choice([0.0, 0.2, 0.5, 0.8])
     found = [name for name in MIX if chance.random() < share]
@@ -125,7 +136,7 @@ def weights_of(worlds: Sequence[str], seed: int, weights: Mapping[str, float]) -
 def pause_of(worlds: Sequence[str], seed: int, pause: float) -> float:
     """Return the mean time between two faults of a run, s."""
     if works(worlds):
-        pause *= _SELDOM
+        pause *= _SELDOM_BY_DAY if DAYS in worlds else _SELDOM
     if "swarm" not in worlds:
         return pause
     return pause * random.Random(f"pause {seed}").choice([0.5, 1.0, 3.0, 10.0])
@@ -138,7 +149,19 @@ def works(worlds: Sequence[str]) -> bool:
 
 def parties(worlds: Sequence[str]) -> bool:
     """Whether several heliostats are measured at once in a run."""
-    return PARTIES in worlds
+    return not set(worlds).isdisjoint(PARTIES)
+
+
+def measured(worlds: Sequence[str]) -> bool:
+    """Whether sensors of wind and flux feed the plant of a run."""
+    return not {"sensors", DAYS}.isdisjoint(worlds)
+
+
+def length_of(worlds: Sequence[str], hours: float | None) -> float:
+    """Return the length of a run, s: a day for "days", else 0.1 h, where no ``hours`` are given."""
+    if hours is not None:
+        return 3600.0 * hours
+    return DAY if DAYS in worlds else 360.0
 
 
 def drawn(worlds: Sequence[str]) -> bool:
@@ -169,6 +192,33 @@ def stored_by(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[
         else fit
         for fit in fits
     ]
+
+
+def motors_of(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
+    """Return heliostats with their motors: on one day in three these step coarsely."""
+    coarse = DAYS in worlds and random.Random(f"motors {seed}").random() < _COARSE
+    if not coarse:
+        return list(fits)
+    items = items_of(fits[0].mechanism, COARSE)["stepping"]
+    return [replace(f, machine=COARSE, items={**f.items, "stepping": items}) for f in fits]
+
+
+def surveyed(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
+    """Return heliostats as the plant file has them: on one day in three it is wrong about four.
+
+    Their beams then go beside the targets, where no photograph shows them.
+    """
+    chance = random.Random(f"survey {seed}")
+    if DAYS not in worlds or chance.random() >= _UNSURVEYED:
+        return list(fits)
+    found = list(fits)
+    for i in chance.sample(range(len(fits)), 4):
+        fit, size = fits[i], chance.choice([-1.0, 1.0]) * chance.uniform(*_BESIDE)
+        causes = {**fit.causes, "canting": fit.causes["canting"] + size}
+        mechanism = fit.with_causes(causes)
+        items = {**fit.items, **items_of(mechanism, fit.machine)}
+        found[i] = replace(fit, causes=causes, mechanism=mechanism, items=items)
+    return found
 
 
 def wrong_items(fit: Outfit, others: Sequence[Outfit], chance: random.Random) -> dict[str, bytes]:

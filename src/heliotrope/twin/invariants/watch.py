@@ -1,0 +1,72 @@
+"""The observers of automatic control of a run, and the reports of persons that they need."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from heliotrope.plant.authority import Person
+from heliotrope.plant.operations import Operations
+from heliotrope.twin.invariants.day import DayObserver
+from heliotrope.twin.invariants.progress import ProgressObserver
+from heliotrope.twin.invariants.results import ResultObserver
+from heliotrope.twin.invariants.shown import ShownObserver
+from heliotrope.twin.invariants.visits import VisitObserver
+
+
+@dataclass(frozen=True)
+class Watch:
+    """The observers of automatic control, and of what the plant shows of it."""
+
+    visits: VisitObserver
+    day: DayObserver
+    results: ResultObserver
+    progress: ProgressObserver
+    shown: ShownObserver
+
+    @property
+    def checks(self) -> Counter[int]:
+        """Number of checks of each invariant, of all of them."""
+        some = (self.visits, self.day, self.results, self.progress, self.shown)
+        return sum((each.checks for each in some), Counter())
+
+    # -- reports of persons -------------------------------------------------------------------
+
+    def acted(self, operations: Operations | None, person: Person, word: str, now: float) -> None:
+        """Note an act in a program; its event there has this word in it."""
+        self.shown.acted(operations, person.name, word, now)
+
+    def given(self, heliostats: Sequence[str], now: float) -> None:
+        """Note that heliostats were given to automatic control."""
+        self.day.given(heliostats, now)
+        self.progress.given(heliostats)
+
+    def taken(self, heliostats: Sequence[str]) -> None:
+        """Note that a person moves heliostats."""
+        self.day.taken(heliostats)
+        self.progress.taken(heliostats)
+
+    def commanded(self, what: str, heliostats: Sequence[str]) -> None:
+        """Note a command of a person that the plant has accepted."""
+        self.progress.commanded(what, heliostats)
+
+    def asked(self, heliostats: Sequence[str]) -> None:
+        """Note that a person wants heliostats calibrated now."""
+        self.results.asked(heliostats)
+
+    def emergency(self, *, on: bool) -> None:
+        """Note that a person has raised an emergency, or that it was cleared."""
+        self.progress.emergency(on=on)
+
+    def switched(self, *, on: bool) -> None:
+        """Note that a person switches calibration on or off."""
+        self.progress.switched(on=on)
+
+    def ended(self) -> None:
+        """Note that the plant's program has ended."""
+        self.visits.ended()
+        self.progress.ended()
+
+    def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
+        """Note that heliostats go out of service, or come back."""
+        self.progress.held(heliostats, now, out=out)
+        self.shown.held(heliostats, now, out=out)

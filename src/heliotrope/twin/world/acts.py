@@ -1,0 +1,283 @@
+"""What persons do at a plant with automatic control, each act by the calls that a page makes.
+
+The observers are told of each act that the plant accepts. Who acts, and when, is another matter:
+see `shift` and `crew`.
+"""
+
+import asyncio
+import contextlib
+import random
+from collections.abc import Callable, Sequence
+
+from heliotrope.links.clock import Clock
+from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.operations import Operations
+from heliotrope.plant.operations.automatic import AUTOMATIC
+from heliotrope.plant.tickets import Ticket
+from heliotrope.safety import Act
+from heliotrope.twin.invariants.beams import BeamObserver
+from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.invariants.watch import Watch
+from heliotrope.twin.world.operator import ENGINEER, VIEWER, Operator
+from heliotrope.twin.world.work import Work
+
+#: What a person does each second on duty, with the token of the command authority.
+Commanding = Callable[[Operations, Person, int], None]
+#: Time until the clusters have a new token, and in which a command is done that only changes a
+#: setting, s.
+_DONE = 4.0
+#: Least time on duty, s.
+_LEAST_DUTY = 2.0
+
+
+class Acts:
+    """Acts of persons; each raises `RefusedError` where the plant refuses it.
+
+    Parameters
+    ----------
+    work
+        Automatic control.
+    operator
+        Its persons' means: clears what latches, raises emergencies.
+    observer, beams, watch
+        Told of each act.
+    names
+        The heliostats.
+    clock
+        True time.
+    seed
+        Seed of their acts.
+
+    Attributes
+    ----------
+    names
+        As given.
+    chance
+        Source of all that is drawn.
+    """
+
+    def __init__(
+        self,
+        work: Work,
+        operator: Operator,
+        observer: PlantObserver,
+        beams: BeamObserver,
+        watch: Watch,
+        names: Sequence[str],
+        clock: Clock,
+        seed: int,
+    ) -> None:
+        self._work, self._operator = work, operator
+        self._observer, self._beams, self._watch = observer, beams, watch
+        self.names, self._clock = tuple(names), clock
+        self.chance = random.Random(f"shift {seed}")
+        self._left: set[str] = set()  # what a person keeps from automatic control
+        self._locked: dict[str, str] = {}  # who has locked each heliostat
+        operator.commands = False
+
+    def now(self) -> float:
+        """Return the true time, s."""
+        return self._clock.monotonic()
+
+    def present(self) -> Operations | None:
+        """Return the operations of the plant; None while it does not run, or nobody is there."""
+        away = self._operator.away or self._operator.waits
+        return None if away else self._work.operations
+
+    def acted(self, word: str, person: Person = ENGINEER) -> None:
+        """Report an act; its event has this word in it."""
+        self._watch.acted(self._work.operations, person, word, self.now())
+
+    # -- giving back -------------------------------------------------------------------------
+
+    def tidies(self, operations: Operations) -> None:
+        """Clear what latches, let automatic control go on, and give it the field."""
+        self._operator.clear(operations.plant)
+        if operations.plant.emergency_on:
+            return
+        self._watch.emergency(on=False)
+        if operations.automatic.waits:
+            self._beams.released(self.now())
+            operations.resume(ENGINEER)
+            self.acted("resumed")
+        names = tuple(name for name in self.names if name not in self._left)
+        out = {lockout.heliostat for lockout in operations.holds()}
+        if back := sorted(out - self._left):
+            operations.unhold(ENGINEER, back)
+            self.acted("back in service")
+            self._watch.held(back, self.now(), out=False)
+        operations.give_back(ENGINEER, names)
+        self.acted(f"{len(names)} heliostats given")
+        self._beams.given(names, self.now())
+        self._watch.given(names, self.now())
+        self._left.clear()
+
+    # -- command authority -------------------------------------------------------------------
+
+    async def duty(
+        self,
+        operations: Operations,
+        person: Person,
+        *,
+        most: float,
+        commands: Commanding,
+        reason: str = "",
+        leaves: bool = False,
+    ) -> None:
+        """Take the command authority for a while, and command; automatic control gives way.
+
+        Parameters
+        ----------
+        operations, person
+            The plant, and who takes it.
+        most
+            Longest time on duty, s.
+        commands
+            Called each second with a chance of a fifth.
+        reason
+            Why it is seized from the person who has it; "": it is taken.
+        leaves
+            Whether the person goes without giving it back, so that it runs out.
+        """
+        token = self._takes(operations, person, reason)
+        until = self.now() + self.chance.uniform(_LEAST_DUTY, most)
+        with contextlib.suppress(RefusedError):
+            while self.now() < until and self.present() is operations:
+                operations.keep_authority(person, token)
+                self._observer.kept(self.now())
+                self._watch.day.on_duty(self.now())
+                if self.chance.random() < 0.2:
+                    commands(operations, person, token)
+                await asyncio.sleep(1.0)
+        if leaves or self._work.operations is not operations or self._operator.waits:
+            return
+        with contextlib.suppress(RefusedError):
+            for name in [name for name, by in self._locked.items() if by == person.name]:
+                self.command(operations, person, token, "UNLOCK", (name,))
+            self._gives(operations, person, token)
+
+    async def once(
+        self, operations: Operations, person: Person, what: str, values: Sequence[float]
+    ) -> None:
+        """Take the command authority for one command to all, and give it back when it is done."""
+        token = self._takes(operations, person, "")
+        await asyncio.sleep(_DONE)  # until the clusters have the new token
+        self.command(operations, person, token, what, (), values)
+        await asyncio.sleep(_DONE)
+        self._gives(operations, person, token)
+
+    def _gives(self, operations: Operations, person: Person, token: int) -> None:
+        operations.release_authority(person, token)
+        self.acted("command authority back", person)
+        self._observer.released(person, self.now())
+
+    def _takes(self, operations: Operations, person: Person, reason: str) -> int:
+        grant = operations.plant.authority.grant
+        its = grant.token if grant is not None and grant.holder == AUTOMATIC else 0
+        self._observer.gave_way(self.now(), its)
+        self._watch.day.on_duty(self.now())
+        if reason:
+            token = operations.seize_authority(person, reason).token
+            self.acted("has seized the command authority", person)
+        else:
+            token = operations.take_authority(person).token
+            self.acted("has the command authority", person)
+        self._observer.granted(person, token, self.now(), seized=bool(reason))
+        return token
+
+    def commands(self, operations: Operations, person: Person, token: int) -> None:
+        """Command one heliostat."""
+        name = self.chance.choice(self.names)
+        what = self.chance.choice(["IDLE", "TRACK", "APPROACH", "REFOCUS"])
+        self.command(operations, person, token, what, (name,))
+
+    def command(
+        self,
+        operations: Operations,
+        person: Person,
+        token: int,
+        what: str,
+        names: Sequence[str],
+        values: Sequence[float] = (),
+    ) -> None:
+        """Give a command to some heliostats, () for all."""
+        if what not in ("ROUGH", "LOCK_AIM"):
+            self._watch.taken(names or self.names)
+        ticket = operations.command(person, token, what, names, values)
+        self.accepted(person, token, ticket, what)
+        self._watch.commanded(what, ticket.heliostats)
+        if what == "LOCK":
+            self._locked.update(dict.fromkeys(ticket.heliostats, person.name))
+        elif what == "UNLOCK":
+            for name in ticket.heliostats:
+                self._locked.pop(name, None)
+
+    def aims(
+        self, operations: Operations, person: Person, token: int, names: Sequence[str]
+    ) -> None:
+        """Aim some heliostats at the receiver anew, or at a target."""
+        where = self.chance.choice(("receiver", *operations.targets))
+        self._watch.taken(names)
+        ticket = operations.aim_at(person, token, names, where)
+        self.accepted(person, token, ticket, "AIM")
+
+    def accepted(self, person: Person, token: int, ticket: Ticket, what: str) -> None:
+        """Report a command that the plant has accepted."""
+        some = ticket.heliostats
+        if what != "PARAMETERS":
+            self.acted(f"{what} {some[0]}", person)
+        self._observer.accepted(person, token, ticket, what, self.now())
+        if what not in ("ROUGH", "PARAMETERS"):
+            self._beams.resumed(some, what, self.now())
+        if self._operator.tickets is not None:
+            self._operator.tickets.accepted(ticket, self.now())
+
+    # -- what anybody may do -----------------------------------------------------------------
+
+    async def takes_off(self, operations: Operations) -> None:
+        """Take a mirror off, in a visit or not."""
+        name = self.chance.choice(self.names)
+        self._watch.taken((name,))
+        what = self.chance.choice(["DEFOCUS", "STOW"])
+        self._beams.taken((name,))
+        ticket = (operations.defocus if what == "DEFOCUS" else operations.stow)(VIEWER, (name,))
+        self.acted(f"{what} {name}", VIEWER)
+        self._observer.obeyed(VIEWER.name, what, self.now(), ticket.identity)
+        if self._operator.tickets is not None:
+            self._operator.tickets.accepted(ticket, self.now())
+        self._left.add(name)
+
+    async def holds(self, operations: Operations) -> None:
+        """Take a mirror out of service: it goes to stow."""
+        name = self.chance.choice(self.names)
+        self._watch.taken((name,))
+        self._beams.taken((name,))
+        operations.hold(ENGINEER, (name,), "washing")
+        self.acted(f"{name} out of service")
+        self._watch.held((name,), self.now(), out=True)
+        self._observer.obeyed(ENGINEER.name, "STOW", self.now())
+        self._left.add(name)
+
+    def emergency(self, operations: Operations, person: Person, act: Act) -> None:
+        """Raise an emergency: automatic control gives up all that it has."""
+        self._watch.taken(self.names)
+        operations.emergency(person, act.name, "somebody is in the field")
+        self.acted(f"EMERGENCY {act.name}", person)
+        self._operator.raised(person, act)
+        self._watch.emergency(on=True)
+
+    def calibrate(
+        self, operations: Operations, person: Person, *, together: bool, receiver: bool
+    ) -> None:
+        """Ask for a calibration now: of one heliostat or of several."""
+        count = self.chance.randint(2, 3) if together or receiver else 1
+        first, *others = self.chance.sample(self.names, count)
+        operations.calibrate(person, first, together=others, receiver=receiver)
+        self.acted("asked for a", person)
+        self._watch.asked((first, *others))
+
+    def switches(self, operations: Operations, person: Person, *, on: bool) -> None:
+        """Switch calibration on or off."""
+        operations.switch_calibration(person, on)
+        self.acted(f"calibration switched {'on' if on else 'off'}", person)
+        self._watch.switched(on=on)

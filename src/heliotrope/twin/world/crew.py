@@ -1,0 +1,187 @@
+"""The persons of a working day: two operators, a script, and whoever looks after the field.
+
+They do what people do, and do it at instants that matter: when a visit is on its way, between its
+photographs, while a mirror is locked for its parameters, while the beams are taken apart. Two of
+them may act at once. Whoever looks after the field withdraws emergencies, presses Resume, and gives
+the field back to automatic control, some time later. On one day in two everybody goes to lunch for
+good, and automatic control has the rest of the day.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Sequence
+
+from heliotrope.lcu import states
+from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.operations import Operations
+from heliotrope.safety import Act
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.world.acts import Acts
+from heliotrope.twin.world.operator import ENGINEER, OPERATOR, VIEWER
+
+#: The script, which has an operator's token.
+SCRIPT = Person("script", Role.OPERATOR)
+#: All persons of a crew whose acts are reported.
+CREW = (OPERATOR, ENGINEER, VIEWER, SCRIPT)
+#: Mean time between two acts of one person, and longest wait for a moment, s.
+_PAUSE, _PATIENCE = 110.0, 60.0
+#: Longest time from a moment until a person acts, s.
+_AFTER = 3.0
+#: Pause between two looks at the plant, s.
+_LOOK = 0.5
+#: Longest time on duty, of an emergency, and until somebody looks after the field, s.
+_DUTY, _EMERGENCY, _CARE = 40.0, 40.0, 40.0
+#: Share of the days on which all leave at this share of the day.
+_LEAVE, _LEFT = 0.5, 0.45
+#: Words in the stages of visits for which persons wait; a mirror is locked; and any instant.
+LOCKED, ANY_TIME = "locked", "any time"
+MOMENTS = (
+    "on the way", "empty target", "photograph", "on the way back", "taking the beams apart",
+    "learning", "verification", LOCKED, ANY_TIME,
+)  # fmt: skip
+#: Acts with their weights; see `Crew.acts`.
+WEIGHTS = {
+    "duty": 5, "rough": 1, "seizes": 1, "leaves": 1, "off": 3, "hold": 2, "emergency": 2,
+    "calibrate": 3, "together": 1, "receiver": 1, "switch": 1,
+}  # fmt: skip
+
+
+class Crew:
+    """The persons of a working day.
+
+    Parameters
+    ----------
+    acts
+        What they do.
+    boards
+        All heliostats, which persons see.
+    seconds
+        Length of the day, s.
+    rough
+        Whether the engineer lets all heliostats step roughly in the morning.
+    """
+
+    def __init__(self, acts: Acts, boards: Sequence[Board], seconds: float, *, rough: bool) -> None:
+        self._rough = rough
+        self._acts, self._boards, self._chance = acts, tuple(boards), acts.chance
+        self._begin = acts.now()
+        share = _LEFT if self._chance.random() < _LEAVE else 1.0
+        self._until = self._begin + share * seconds
+        self._ends_at = 0.0  # until then an emergency is wanted
+        self._care_at: float | None = None
+
+    async def work(self) -> None:
+        """Work until cancelled."""
+        await asyncio.sleep(4.0)
+        if self._rough and (operations := self._acts.present()) is not None:
+            with contextlib.suppress(RefusedError):
+                await self._acts.once(operations, ENGINEER, "ROUGH", (1.0,))
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._cares())
+            for person in (OPERATOR, ENGINEER, SCRIPT):
+                group.create_task(self._acts_as(person))
+
+    # -- looking after the field ---------------------------------------------------------------
+
+    async def _cares(self) -> None:
+        """Withdraw emergencies, press Resume, give the field back: soon, but not at once."""
+        while True:
+            await asyncio.sleep(_LOOK)
+            operations, now = self._acts.present(), self._acts.now()
+            if operations is None or now < self._ends_at:
+                continue
+            if self._care_at is None:
+                soon = 2.0 if now - self._begin < _CARE else _CARE
+                self._care_at = now + self._chance.uniform(1.0, soon)
+            if now >= self._care_at:
+                self._care_at = None
+                with contextlib.suppress(RefusedError):
+                    self._acts.tidies(operations)
+
+    # -- acting --------------------------------------------------------------------------------
+
+    async def _acts_as(self, person: Person) -> None:
+        """Act now and then, at a moment that matters."""
+        while True:
+            await asyncio.sleep(self._chance.expovariate(1.0 / _PAUSE))
+            await self._moment(self._chance.choice(MOMENTS))
+            await asyncio.sleep(self._chance.uniform(0.0, _AFTER))
+            what = self._chance.choices(list(WEIGHTS), list(WEIGHTS.values()))[0]
+            operations = self._acts.present()
+            if operations is None or self._acts.now() > self._until:
+                continue
+            with contextlib.suppress(RefusedError):
+                await self._does(what, operations, person)
+
+    async def _moment(self, wanted: str) -> None:
+        """Wait until a visit is at a stage, for a minute at most."""
+        until = self._acts.now() + _PATIENCE
+        while self._acts.now() < until and wanted not in self._moments():
+            await asyncio.sleep(_LOOK)
+
+    def _moments(self) -> set[str]:
+        operations = self._acts.present()
+        running = () if operations is None else operations.calibration().running
+        found = {word for word in MOMENTS for run in running if word in run.stage}
+        if any(board.state == states.LOCKED for board in self._boards):
+            found.add(LOCKED)
+        return found | {ANY_TIME}
+
+    async def _does(self, what: str, operations: Operations, person: Person) -> None:
+        acts, chance = self._acts, self._chance
+        if what == "off":
+            await acts.takes_off(operations)
+        elif what == "hold":
+            await acts.holds(operations)
+        elif what == "emergency":
+            self._ends_at = acts.now() + chance.uniform(2.0, _EMERGENCY)
+            act = chance.choice([Act.DEFOCUS, Act.DEFOCUS, Act.STOW])
+            acts.emergency(operations, chance.choice([VIEWER, person]), act)
+        elif what in ("calibrate", "together", "receiver"):
+            lit = what == "receiver"
+            acts.calibrate(operations, person, together=what == "together", receiver=lit)
+        elif what == "switch":
+            acts.switches(operations, person, on=False)
+            await asyncio.sleep(chance.uniform(5.0, _CARE))
+            if (later := acts.present()) is not None:
+                acts.switches(later, person, on=True)
+        else:
+            await self._duty(what, operations, person)
+
+    async def _duty(self, what: str, operations: Operations, person: Person) -> None:
+        """Take the command authority, and command some or all."""
+        everybody = what == "rough" and person is ENGINEER
+        commands = self._roughens if everybody else self._some
+        if person is SCRIPT:
+            commands = self._all
+        await self._acts.duty(
+            operations,
+            person,
+            most=_DUTY,
+            commands=commands,
+            reason="it is my shift" if what == "seizes" else "",
+            leaves=what == "leaves",
+        )
+
+    def _roughens(self, operations: Operations, person: Person, token: int) -> None:
+        """Let all step roughly, or finely."""
+        rough = float(self._chance.random() < 0.7)
+        self._acts.command(operations, person, token, "ROUGH", (), (rough,))
+
+    def _all(self, operations: Operations, person: Person, token: int) -> None:
+        what = self._chance.choice(["TRACK", "IDLE", "REFOCUS", "APPROACH"])
+        self._acts.command(operations, person, token, what, ())
+
+    def _some(self, operations: Operations, person: Person, token: int) -> None:
+        """Command one heliostat, a few, or none: most look only."""
+        chance, acts = self._chance, self._acts
+        names = chance.sample(acts.names, chance.randint(1, 3))
+        does: list[Callable[[], None]] = [
+            lambda: acts.command(operations, person, token, "TRACK", names),
+            lambda: acts.command(operations, person, token, "IDLE", names),
+            lambda: acts.command(operations, person, token, "REFOCUS", names),
+            lambda: acts.command(operations, person, token, "LOCK", names[:1]),
+            lambda: acts.command(operations, person, token, "UNLOCK", names[:1]),
+            lambda: acts.aims(operations, person, token, names),
+        ]
+        chance.choice(does)()

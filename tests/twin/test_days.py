@@ -1,0 +1,267 @@
+"""Working days in simulation: what breaks on them is found, and each observer can fail."""
+
+import os
+import subprocess
+import sys
+from math import degrees, inf
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from heliotrope.calibration.record import CalibrationOutcome
+from heliotrope.lcu import states
+from heliotrope.links.messages import Stage
+from heliotrope.safety import Alarm, Severity
+from heliotrope.sun import vector
+from heliotrope.twin.invariants.alarms import AlarmObserver
+from heliotrope.twin.invariants.invariants import (
+    L2,
+    L3,
+    TITLES,
+    InvariantError,
+    Violation,
+    named,
+)
+from heliotrope.twin.invariants.progress import LOCKED_WITHIN, TRACKS_WITHIN, ProgressObserver
+from heliotrope.twin.invariants.results import BARREN, RETRIES, ResultObserver
+from heliotrope.twin.invariants.tickets import OVER_WITHIN, TicketObserver
+from heliotrope.twin.world.scene import scene_of
+from heliotrope.twin.world.simulation import RunPlan, run
+from heliotrope.twin.world.worlds import DAY, DAYS, DAYS_SHARE, length_of, mixed
+
+#: High enough for every day, above no limit.
+ZENITH = np.array([0.0, 0.0, 1.0])
+
+
+def day(seed: int, seconds: float = DAY) -> RunPlan:
+    """Return the plan of a day."""
+    return RunPlan(seed, seconds, worlds=(DAYS,))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_day_has_a_morning_an_evening_and_an_hour_of_neither(seed: int) -> None:
+    scene = scene_of((DAYS,), seed, DAY, 6)
+    times = scene.start.timestamp() + np.arange(0.0, DAY + 1.0, 5.0)
+    above = np.degrees(np.arcsin(vector(times, scene.site)[:, 2])) - degrees(scene.lowest)
+    assert above.max() > 1.2  # the field is raised again only a degree above the limit
+    assert (above[-20:] < 0.0).all()
+    assert (above > 0.0).sum() * 5.0 > 0.6 * DAY
+
+
+def test_a_day_is_some_of_any_and_has_its_own_length() -> None:
+    drawn = [mixed(seed) for seed in range(400)]
+    days = [worlds for worlds in drawn if DAYS in worlds]
+    assert all(worlds == (DAYS,) for worlds in days)
+    assert 0.5 * DAYS_SHARE < len(days) / 400 < 1.5 * DAYS_SHARE
+    assert length_of((DAYS,), None) == DAY
+    assert length_of((DAYS,), 0.5) == 1800.0
+    assert length_of(("visits",), None) == 360.0
+
+
+def test_people_call_invariants_of_liveness_by_their_names() -> None:
+    assert [named(number) for number in TITLES] == [
+        *map(str, range(1, 17)), "L1", "L2", "L3", "L4"
+    ]  # fmt: skip
+    assert str(Violation(L2, 3.0, "H1", "so")).startswith("invariant L2 (each ticket")
+
+
+# -- each observer can fail --------------------------------------------------------------------
+
+
+def board(state: int, miss: float = 0.0) -> Any:
+    """Return a board in a state, with its beam so far from wherever one asks, m."""
+    return SimpleNamespace(
+        state=state, outfit=SimpleNamespace(name="H1"), miss=lambda *_, **__: miss
+    )
+
+
+def plant(**more: Any) -> Any:
+    """Return the operations of a plant at which nothing is under way."""
+    order = SimpleNamespace(emergency=None, emergency_on=False, beliefs=SimpleNamespace())
+    order.beliefs.record = lambda name: None
+    order.__dict__.update(more.pop("plant", {}))
+    found = SimpleNamespace(
+        plant=order,
+        alarms=lambda: (),
+        holds=lambda: (),
+        automatic=SimpleNamespace(waits=""),
+        calibration=lambda: SimpleNamespace(running=(), results=()),
+    )
+    found.__dict__.update(more)
+    return found
+
+
+def progress(state: int, seconds: float, *, miss: float = 0.0, begins: Any = None) -> Any:
+    """Observe a mirror that automatic control has, for a while."""
+    observer = ProgressObserver(0.0, [board(state, miss)], (), together=True, across=False)
+    observer.given(("H1",))
+    if begins is not None:
+        begins(observer)
+    for now in np.arange(0.0, seconds, 0.5):
+        observer.look(plant(), {"H1"}, ZENITH, float(now), governs=True)
+    return observer
+
+
+def test_no_mirror_stays_locked_without_an_owner() -> None:
+    progress(states.LOCKED, LOCKED_WITHIN)
+    with pytest.raises(InvariantError, match=r"invariant L1 .* has been LOCKED for 60 s"):
+        progress(states.LOCKED, LOCKED_WITHIN + 2.0)
+    # A person has locked it, and unlocks it; another one has it out of service.
+    progress(
+        states.LOCKED, LOCKED_WITHIN + 9.0, begins=lambda seen: seen.commanded("LOCK", ("H1",))
+    )
+
+    def unlocks(observer: ProgressObserver) -> None:
+        observer.commanded("LOCK", ("H1",))
+        observer.commanded("UNLOCK", ("H1",))
+
+    with pytest.raises(InvariantError, match="invariant L1"):
+        progress(states.LOCKED, LOCKED_WITHIN + 2.0, begins=unlocks)
+
+
+def test_a_mirror_that_automatic_control_has_tracks_again() -> None:
+    progress(states.TRACKING, TRACKS_WITHIN + 9.0)
+    for state, miss in ((states.IDLE, 0.0), (states.TRACKING, 9.0), (states.DEFOCUSED, 0.0)):
+        with pytest.raises(InvariantError, match=r"invariant L3 .* has not tracked the receiver"):
+            progress(state, TRACKS_WITHIN + 2.0, miss=miss)
+
+
+def test_a_persons_emergency_and_what_is_out_of_service_outlive_a_restart() -> None:
+    def restarted(new: Any, *, called: bool, out: bool) -> None:
+        observer = ProgressObserver(0.0, [board(states.STOWED)], (), together=True, across=False)
+        observer.emergency(on=called)
+        if out:
+            observer.held(("H1",), 0.0, out=True)
+        observer.ended()
+        observer.look(new, set(), ZENITH, 1.0, governs=False)
+
+    waits = SimpleNamespace(waits="an emergency held")
+    restarted(plant(), called=False, out=False)
+    restarted(plant(automatic=waits), called=True, out=False)
+    restarted(plant(holds=lambda: (SimpleNamespace(heliostat="H1"),)), called=False, out=True)
+    with pytest.raises(InvariantError, match=r"invariant L4 .* the new one goes on"):
+        restarted(plant(), called=True, out=False)
+    with pytest.raises(InvariantError, match=r"invariant L4 .* back in service: H1"):
+        restarted(plant(), called=False, out=True)
+
+
+def ticket(stage: Stage | None, *, finished: bool, name: str = "STOW") -> Any:
+    """Return a ticket of one heliostat."""
+    return SimpleNamespace(
+        name=name, heliostats=("H1",), refusals={}, text=f"{name}: 1 waiting",
+        finished=finished, stage=lambda _: stage,
+    )  # fmt: skip
+
+
+def ticked(one: Any, at: float, *, was: bool = True) -> None:
+    """Observe a ticket some time after it was accepted."""
+    account: Any = SimpleNamespace(state=states.LOCKED, was_in=lambda wanted, since: was)
+    observer = TicketObserver(0.0, {"H1": account})
+    observer.accepted(one, 1.0)
+    observer.look(1.0 + at, runs=True)
+
+
+def test_a_ticket_ends_and_is_done_only_where_the_mirror_is() -> None:
+    ticked(ticket(Stage.ACKNOWLEDGED, finished=False), OVER_WITHIN)
+    ticked(ticket(Stage.DONE, finished=True), 5.0)
+    ticked(ticket(None, finished=False, name="PARAMETERS"), OVER_WITHIN + 9.0)
+    with pytest.raises(InvariantError, match=r"invariant L2 .* STOW: 1 waiting after 301 s"):
+        ticked(ticket(Stage.ACKNOWLEDGED, finished=False), OVER_WITHIN + 1.0)
+    with pytest.raises(InvariantError, match=r"invariant L2 .* STOW of H1 is done; it is LOCKED"):
+        ticked(ticket(Stage.DONE, finished=True), 5.0, was=False)
+
+
+def alarmed(kind: str, *, rest: float, began: float = 0.0) -> None:
+    """Observe an alarm at 200 s, after a fault that ended at some time."""
+    observer = AlarmObserver(0.0, {"C1": [board(states.STOWED)]}, (DAYS,))
+    for now in np.arange(began, 200.0, 0.5):
+        observer.heard("C1", float(now))
+        observer.look({"H1": rest}, {"C1"}, float(now), runs=True, writes=True)
+    observer.alarmed(Alarm(kind, "", Severity.ALARM, "three heliostats left the receiver"), 200.0)
+    observer.heard("C1", 200.0)
+    observer.look({"H1": rest}, {"C1"}, 200.0, runs=True, writes=True)
+
+
+def test_the_plants_own_act_is_no_cause_of_an_alarm() -> None:
+    alarmed("resume_needed", rest=150.0)
+    alarmed("operator_emergency", rest=-inf)
+    for rest in (-inf, 100.0):
+        with pytest.raises(InvariantError, match=r"invariant L2 .* cause is the plant's own act"):
+            alarmed("resume_needed", rest=rest)
+
+
+def visited(count: int, *, asks: int = 0, outcome: str = "not_proven", names: int = 1) -> None:
+    """Observe visits, each of which brings nothing."""
+    observer = ResultObserver.__new__(ResultObserver)
+    accounts: dict[str, Any] = {}
+    observer.__dict__.update(
+        checks=dict.fromkeys(TITLES, 0), _start=0.0, _zero=0.0, _accounts=accounts,
+        _boards={f"H{i}": None for i in range(names)}, _dark=frozenset(), _barren=0,
+    )  # fmt: skip
+    observer.__dict__["_noted"] = lambda *_: None
+    for i in range(names):
+        accounts[f"H{i}"] = SimpleNamespace(
+            kept=0, last=0, version=0, told=0, before=None, vain=0, pictures=[]
+        )
+    beliefs = SimpleNamespace(record=lambda _: None, seen=lambda _: None, present=lambda _: None)
+    operations: Any = SimpleNamespace(plant=SimpleNamespace(beliefs=beliefs))
+    for k in range(count):
+        if asks and k % asks == 0:
+            observer.asked(("H0",))
+        entry: Any = SimpleNamespace(
+            heliostat=f"H{k % names}", at=float(k), target="left", new=0, sightings=0, good=False,
+            outcome=CalibrationOutcome[outcome.upper()], version=0, text="no light follows",
+        )  # fmt: skip
+        observer._concluded(operations, entry, float(k))
+
+
+def test_visits_that_bring_nothing_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InvariantError, match=rf"invariant 16 .* {BARREN} results in a row"):
+        visited(BARREN, names=3)
+    visited(3 * BARREN, names=3, outcome="refused")
+    monkeypatch.setattr("heliotrope.twin.invariants.results.BARREN", 10**6)
+    visited(RETRIES)
+    visited(3 * RETRIES, asks=RETRIES)
+    with pytest.raises(InvariantError, match=rf"invariant L2 .* {RETRIES + 1} visits in a row"):
+        visited(RETRIES + 1)
+
+
+# -- whole days --------------------------------------------------------------------------------
+
+
+def test_days_are_lived_through() -> None:
+    outcome = run(day(2))
+    assert outcome.good, outcome.text
+    assert outcome.seconds == DAY
+    assert min(outcome.checks[number] for number in (16, L2, L3)) > 100
+    assert outcome.states[states.LOCKED] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [4, 7])
+def test_more_days_are_lived_through(seed: int) -> None:
+    outcome = run(day(seed))
+    assert outcome.good, outcome.text
+
+
+@pytest.mark.slow
+def test_a_day_is_the_same_in_every_process() -> None:
+    """The order of a set of texts differs from process to process."""
+    text = (
+        "from heliotrope.twin.world.simulation import RunPlan, run\n"
+        "found = run(RunPlan(8, 300.0, worlds=('days',)))\n"
+        "print(found.seconds, sorted(found.checks.items()), found.text)"
+    )
+    seen = {
+        subprocess.run(
+            [sys.executable, "-c", text],
+            env={**os.environ, "PYTHONHASHSEED": seed},
+            capture_output=True,
+            check=True,
+            text=True,
+        ).stdout
+        for seed in ("0", "1", "2")
+    }
+    assert len(seen) == 1
