@@ -64,6 +64,14 @@ def controlling() -> None:
         part()
 
 
+def computing() -> None:
+    """Load what is computed beside the loop of a plant."""
+    from heliotrope.imaging import coded, photograph  # noqa: F401 - only loaded
+
+    tracking()
+    fitting()
+
+
 def tracking() -> None:
     """Track a mirror."""
     from heliotrope.mechanism.tracking import track

@@ -63,10 +63,10 @@ class WorkerProcesses:
         self._count = count
         self._pool = pool(count, _begin)
 
-    def start(self) -> None:
-        """Begin the processes, which load their libraries."""
+    def start(self, load: Callable[[], None]) -> None:
+        """Begin the processes, each of which loads what computations need."""
         for _ in range(self._count):
-            self._pool.submit(_load)
+            self._pool.submit(load)
 
     async def __call__(self, work: Callable[[*Given], T], *given: *Given) -> T:
         """Return what a function returns; see `Worker`."""
@@ -95,15 +95,6 @@ def _begin() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     os.environ["HELIOTROPE_THREADS"] = "1"
-
-
-def _load() -> None:
-    """Load what most computations need."""
-    from heliotrope import warm
-    from heliotrope.imaging import coded, photograph  # noqa: F401 - only loaded
-
-    warm.tracking()
-    warm.fitting()
 
 
 def _computed(work: Callable[[*Given], T], *given: *Given) -> T:

@@ -165,7 +165,7 @@ def _missing(error: ImportError) -> InputError:
 def computing() -> Iterator[WorkerProcesses]:
     """Begin the processes that compute for a plant, and load what the plant itself computes."""
     with contextlib.closing(WorkerProcesses()) as worker:
-        worker.start()
+        worker.start(warm.computing)
         warm.controlling()
         yield worker
 
