@@ -156,7 +156,7 @@ class Calibrating:
         self._withdrawn: dict[str, str] = {}
         self._last: dict[str, CalibrationEntry] = {}
         #: When each was on a target last, POSIX s, (N,).
-        self._visited = np.full(len(plant.field), -np.inf)
+        self._visited = np.full(len(plant.field.names), -np.inf)
         self._flown: frozenset[str] = frozenset()
         self._places = Attempts(PLACES, log.take_alarm)
         scheduler.attempts.report_to(log.take_alarm)
