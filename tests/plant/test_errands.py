@@ -15,8 +15,8 @@ from heliotrope.plant.tickets import Ticket
 from support.live import LivePlant, live
 
 ENGINEER, OPERATOR = Person("Egon", Role.ENGINEER), Person("Olga", Role.OPERATOR)
-#: A minute before the sun is too low.
-EVENING = datetime(2026, 10, 21, 16, 6, 20, tzinfo=UTC)
+#: Half a minute before the sun is too low.
+EVENING = datetime(2026, 10, 21, 16, 6, 50, tzinfo=UTC)
 BY_HAND = AutomaticSettings(wanted=True, calibrate=False, margin=0.0)
 WORK = AutomaticSettings(wanted=True)
 
