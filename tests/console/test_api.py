@@ -37,7 +37,8 @@ NEEDED = {
     **{("GET", path): "viewer" for path in (
         "alarms", "authority", "calibration", "clusters", "commands", "commands/{identity}",
         "emergency", "events", "field", "flights", "heliostats/{name}", "holds", "learning",
-        "packets", "heliostats/{name}/parameters", "receivers/{name}/flux", "schedule", "session",
+        "packets", "heliostats/{name}/parameters", "receivers/{name}/flux", "retries", "schedule",
+        "session",
         "summary", "sun", "targets/{name}",
         "targets/{name}/photograph", "tokens", "photographs", "photographs/{identity}")},
     ("POST", "emergency"): "viewer",
@@ -120,7 +121,7 @@ def test_what_a_session_needs(console: LiveConsole, signed_in: httpx.Client) -> 
     foreign = {"X-CSRF-Token": word, "Origin": "https://elsewhere.example"}
     assert signed_in.put("authority", headers=foreign).status_code == 403
     own = {"X-CSRF-Token": word, "Origin": console.address.rstrip("/")}
-    assert signed_in.post("automatic", headers=own, json={}).status_code == 204
+    assert signed_in.post("automatic", headers=own, json={}).status_code == 200
     assert signed_in.delete("session", headers=own).status_code == 204
     assert signed_in.get(cookie + "session").status_code == 401
 
@@ -631,8 +632,21 @@ def test_what_cannot_be_used(ask: Ask, path: str, body: object, status: int, tex
 
 def test_holds(ask: Ask, console: LiveConsole) -> None:
     name = console.live.names[5]
-    found = ask("operator", "POST", "holds", {"heliostats": [name], "reason": "being painted"})
+    order = {"heliostats": [name], "reason": "being painted"}
+    ticket = ask("operator", "POST", "holds", order).json()
+    assert (ticket["command"], ticket["finished"]) == ("OUT_OF_SERVICE", False)
+    assert ticket["steps"][name].startswith("on its way to stow: ")
+    found = ask("viewer", "GET", "holds")
     assert [one["heliostat"] for one in found.json()] == [name]
+    until = time.monotonic() + 90.0
+    while not ticket["finished"]:
+        assert time.monotonic() < until, ticket
+        time.sleep(0.5)
+        ticket = ask("viewer", "GET", f"commands/{ticket['identity']}").json()
+    assert ticket["good"], ticket
+    assert "parked in stow and locked out" in ticket["text"]
+    assert ask("viewer", "GET", f"heliostats/{name}").json()["state"] == "STOWED"
+    assert isinstance(ask("viewer", "GET", "retries").json(), list)
     assert "being painted" in ask("viewer", "GET", f"heliostats/{name}").json()["hold"]
     assert ask("operator", "POST", "holds/release", {"heliostats": [name]}).json() == []
 

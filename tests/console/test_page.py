@@ -161,12 +161,15 @@ def test_calibrate_now_is_for_operators(field: LiveConsole, enter: Callable[[str
         page.wait_for_selector(".hx-heliostat >> text=Kept photographs")
         button = page.locator(".hx-heliostat >> text=Calibrate now")
         assert button.count() == (role == "operator")
+    # The bar says how far it is, and at last the result.
+    matches = "text => RegExp(text).test(document.querySelector('.hx-bar .hx-said').textContent)"
+    field.until(lambda: field.live.operations.heliostat(name).state in ("IDLE", "TRACKING"))
     button.click()
-    # Accepted, or refused by the plant with its reason.
     page.wait_for_function(
-        """name => new RegExp(`calibrate ${name}: (done|calibration of ${name}: )`).test(
-        document.querySelector('.hx-bar .hx-said').textContent)""",
-        arg=name,
+        matches, arg=f"CALIBRATE: 1 (waiting|acknowledged) .{name}: (it waits: |at )"
+    )
+    page.wait_for_function(
+        matches, arg=f"CALIBRATE: 1 (done|failed|refused) .{name}: (at .*: |withdrawn: )"
     )
 
 

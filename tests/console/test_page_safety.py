@@ -210,7 +210,9 @@ def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
     for each in (page, viewer):
         each.wait_for_selector(".hx-legend .hx-out:has-text('out of service 1')")
         assert each.evaluate("[...heliotrope.store.out].indexOf(1)") == 3
-    field.until(lambda: field.live.operations.heliostat(name).state == "STOWED")
+    said(page, f"OUT_OF_SERVICE: 1 acknowledged ({name}: on its way to stow: ")
+    said(page, f"OUT_OF_SERVICE: 1 done ({name}: parked in stow and locked out")
+    assert field.live.operations.heliostat(name).state == "STOWED"
     page.click(".hx-tabs >> text=Heliostat")
     page.wait_for_selector(".hx-heliostat dd:has-text('washing (operator, since')")
     page.wait_for_selector(".hx-heliostat dd:has-text('expected back'):has-text('in stow')")
@@ -227,7 +229,7 @@ def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
     page.select_option(".hx-to select", "field")
     page.click(".hx-orders >> text=Automatic")
     page.click("dialog >> text='Give to automatic control'")
-    page.wait_for_timeout(5000)
+    said(page, f"{name}: out of service: washing")
     assert field.call(lambda: field.live.operations.heliostat(name).state) == "STOWED"
     page.click(".hx-tabs >> text=Schedule")
     row = page.locator(f".hx-schedule tr:has-text('{name}'):has-text('washing')")

@@ -11,10 +11,12 @@ import pytest
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.field_state import Mask
 from heliotrope.plant.operations.calibrating import Calibrating
 from heliotrope.plant.operations.views import CalibrationEntry
+from heliotrope.plant.schedule.scheduler import VISITS
 from heliotrope.safety import alarms
 from support.plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
 
@@ -130,6 +132,7 @@ class Chooser:
     def __init__(self, bench: Bench, *rest: str) -> None:
         self.names, self.rest = bench.plant.field.names, rest
         self.entries: list[CalibrationEntry] = []
+        self.attempts = Attempts(VISITS)
 
     def next(self, target: str, ready: Mask) -> Chosen | None:
         del target
@@ -165,7 +168,9 @@ def test_heliostats_in_doubt_are_visited_before_others(
             assert plant.field.names[0] == "P1A"
             chooser = Chooser(bench, "P2A")
             book = SimpleNamespace(error=np.zeros(len(plant.field)), conclude=lambda entry: None)
-            silent = SimpleNamespace(event=lambda *_: None, keep=lambda *_: None)
+            silent = SimpleNamespace(
+                event=lambda *_: None, keep=lambda *_: None, take_alarm=lambda alarm: None
+            )
             unknown = SimpleNamespace(now=lambda row: math.nan)
             calibrating = Calibrating(
                 plant,
@@ -177,13 +182,13 @@ def test_heliostats_in_doubt_are_visited_before_others(
                 unknown,  # type: ignore[arg-type]
                 lambda: (),
             )
-            ready = np.ones(len(plant.field), dtype=np.bool_)
-            assert await calibrating.visit("target", ready, ENGINEER, 1) == (first,)
+            ready, token = np.ones(len(plant.field), dtype=np.bool_), await bench.commanded()
+            assert await calibrating.visit("target", ready, ENGINEER, token) == (first,)
             assert [entry.heliostat for entry in chooser.entries] == [first]
             # Not if it is on its way elsewhere, or held.
             for name in doubted:
                 ready[plant.field.place(name)] = False
-            (last,) = await calibrating.visit("target", ready, ENGINEER, 1)
+            (last,) = await calibrating.visit("target", ready, ENGINEER, token)
             assert last not in doubted
 
     run_virtual(main)

@@ -245,6 +245,8 @@ def test_a_beam_beside_the_target_is_looked_for_in_the_next_visit() -> None:
         results = await here.run()
         assert results[lost].verdict is Verdict.FAINT, results[lost]
         assert {results[name].outcome for name in good} == {_CALIBRATED}, results
+        for result in results.values():
+            here.cycle.note(result)
         assert here.cycle.searching(lost)
         assert not any(here.cycle.searching(name) for name in good)
         nominal = plant.beliefs.nominal

@@ -3,9 +3,8 @@
 import asyncio
 import contextlib
 import math
-from collections.abc import Awaitable, Callable
-from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +32,9 @@ from heliotrope.plant.visits.photographs import Shot, seen, spiral
 from heliotrope.plant.visits.settings import Centring
 from heliotrope.safety import Alarm, Severity, alarms
 from heliotrope.store.keeper import Keeper
-from heliotrope.store.records import Records, StoreError
+from heliotrope.store.records import StoreError
 from heliotrope.sun import fast_vector
-from support.live import LiveOptions, LivePlant
+from support.live import START, LivePlant, live
 from support.plant_bench import Bench, running
 
 MRAD = 1e-3
@@ -44,7 +43,6 @@ ENGINEER, OPERATOR, VIEWER = (
     Person("Olga", Role.OPERATOR),
     Person("Vera", Role.VIEWER),
 )
-START = datetime(2026, 10, 21, 7, tzinfo=UTC)
 RECEIVER = Receiver("R", "planar", np.array([0.0, 0.0, 60.0]), np.array([0.0, -1.0, 0.0]), 6.0, 5.0)
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -253,31 +251,6 @@ def test_a_store_that_keeps_nothing_is_an_alarm_and_stops_nothing() -> None:
 
 
 # -- a plant at work -----------------------------------------------------------------------------
-
-
-def live(
-    work: Callable[[LivePlant], Awaitable[None]],
-    settings: AutomaticSettings,
-    count: int = 4,
-    records: Records | None = None,
-    plant: PlantSettings | None = None,
-    start: datetime = START,
-) -> None:
-    """Run some heliostats on two clusters in virtual time."""
-    design = lay_out("radial", count)
-    (group,) = design.groups.values()
-    group = replace(group, cluster=("C1",) * (count // 2) + ("C2",) * (count // 2))
-    plant = plant or PlantSettings()
-    options = LiveOptions(rendered=False, threads=0, work=settings, plant=plant)
-
-    async def main(clock: VirtualClock) -> None:
-        made = LivePlant(replace(design, groups={"azel": group}), clock, options, records=records)
-        async with made.running() as plant:
-            await asyncio.sleep(4.0)
-            await work(plant)
-            await plant.end()
-
-    run_virtual(main, start=start)
 
 
 def test_whose_beam_has_no_way_is_named_and_the_others_join() -> None:

@@ -445,7 +445,7 @@ def chooser(error: float = 1e-3, **chosen: float) -> tuple[ProductionVisits, Sim
     settings = ReceiverSettings("eye", "receiver", **({"most": 4, "least": 2} | chosen))  # type: ignore[arg-type]
     cycle = SimpleNamespace(settings=settings, face=face)
     book = SimpleNamespace(error=np.full(6, error))
-    made = ProductionVisits(plant, book, cycle)  # type: ignore[arg-type]
+    made = ProductionVisits(plant, book, cycle, lambda alarm: None)  # type: ignore[arg-type]
     return made, clock
 
 

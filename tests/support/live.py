@@ -2,15 +2,17 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from heliotrope.field.layouts import lay_out
 from heliotrope.field.plant import Plant
 from heliotrope.files.disk import Disk
 from heliotrope.geometry import FloatArray
-from heliotrope.links.clock import Clock
+from heliotrope.links.clock import Clock, VirtualClock, run_virtual
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
 from heliotrope.plant.assigned import Assigned
@@ -22,6 +24,9 @@ from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import Records
 from heliotrope.twin.live import CYCLE, World, WorldOptions
+
+#: Morning: the sun is at 20°, and rises.
+START = datetime(2026, 10, 21, 7, tzinfo=UTC)
 
 
 async def in_thread(work: Callable[..., Any], *given: Any) -> Any:
@@ -119,3 +124,28 @@ class LivePlant:
     async def stowed(self, limit: float = 300.0) -> bool:
         """Stow the field."""
         return await self.assembly.stowed(limit)
+
+
+def live(
+    work: Callable[[LivePlant], Awaitable[None]],
+    settings: AutomaticSettings,
+    count: int = 4,
+    records: Records | None = None,
+    plant: PlantSettings | None = None,
+    start: datetime = START,
+) -> None:
+    """Run some heliostats on two clusters in virtual time."""
+    design = lay_out("radial", count)
+    (group,) = design.groups.values()
+    group = replace(group, cluster=("C1",) * (count // 2) + ("C2",) * (count // 2))
+    plant = plant or PlantSettings()
+    options = LiveOptions(rendered=False, threads=0, work=settings, plant=plant)
+
+    async def main(clock: VirtualClock) -> None:
+        made = LivePlant(replace(design, groups={"azel": group}), clock, options, records=records)
+        async with made.running() as plant:
+            await asyncio.sleep(4.0)
+            await work(plant)
+            await plant.end()
+
+    run_virtual(main, start=start)

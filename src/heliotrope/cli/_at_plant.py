@@ -17,7 +17,7 @@ from heliotrope.local import EMERGENCY, ORDINARY, CallError, ask_once, socket_fo
 
 _VIEWS = (
     "alarms", "authority", "calibration", "clusters", "emergency", "events", "field", "flights",
-    "holds", "learning", "packets", "schedule", "summary", "sun",
+    "holds", "learning", "packets", "retries", "schedule", "summary", "sun",
 )  # fmt: skip
 #: Calls of the socket for emergencies.
 _URGENT = ("order_emergency", "stow", "defocus")
@@ -43,6 +43,7 @@ _CALLS = {
     ("POST", "holds"): "hold",
     ("POST", "holds/release"): "unhold",
     ("POST", "parameters"): "set_parameters",
+    ("POST", "automatic"): "automatic",
     ("POST", "automatic/resume"): "resume",
 }
 #: Calls about one thing, by the method, the beginning and the end of the path.

@@ -230,7 +230,7 @@ def show(
         str,
         typer.Argument(
             help="alarms, events, packets, clusters, calibration, flights, learning, schedule, "
-            "holds, emergency, sun, accounts, tokens, or the name of a heliostat."
+            "holds, retries, emergency, sun, accounts, tokens, or the name of a heliostat."
         ),
     ],
 ) -> None:
@@ -247,6 +247,7 @@ def show(
         "learning",
         "schedule",
         "holds",
+        "retries",
         "emergency",
         "sun",
         "authority",
@@ -368,20 +369,22 @@ def calibrate(
     receiver: Annotated[
         bool, typer.Option("--receiver", help="All at once where they shine, in production.")
     ] = False,
+    wait: Wait = 3600.0,
 ) -> None:
-    """Have automatic control calibrate heliostats next, as soon as a target is free."""
+    """Have automatic control calibrate heliostats next, and wait for the results."""
     if search and (together or receiver):
         raise InputError("calibrate: --search looks for one beam; leave out --together, --receiver")
     if receiver and (together or target):
         raise InputError("calibrate: --receiver needs no target; leave out --target, --together")
     with _client(context) as client:
         first = heliostats[:1] if together or receiver else heliostats
+        tickets = []
         for name in first:
             order = {"heliostat": name, "target": target, "search": search, "receiver": receiver}
             if together or receiver:
                 order["together"] = heliostats[1:]
-            found = client.ask("POST", "calibration/next", order)
-    print(f"asked for: {', '.join(found['asked'])}")
+            tickets.append(client.ask("POST", "calibration/next", order))
+        _follow_all(client, tickets, wait)
 
 
 @app.command("parameters")
@@ -598,11 +601,12 @@ def out_of_service(
     hours: Annotated[
         float | None, typer.Option(help="Hours until they are expected back.", show_default=False)
     ] = None,
+    wait: Wait = 600.0,
 ) -> None:
-    """Take heliostats out of service: they go to stow, and nobody moves them."""
+    """Take heliostats out of service; wait until they are parked in stow and locked out."""
     order = {"heliostats": heliostats, "reason": reason, "hours": hours}
     with _client(context) as client:
-        print_json(client.ask("POST", "holds", order))
+        _follow_all(client, [client.ask("POST", "holds", order)], wait)
 
 
 @app.command("give-back")
@@ -613,6 +617,16 @@ def give_back(
     """Give heliostats back to service, each by its name; nothing moves."""
     with _client(context) as client:
         print_json(client.ask("POST", "holds/release", {"heliostats": heliostats}))
+
+
+@app.command()
+def automatic(
+    context: typer.Context, heliostats: Whom = None, everybody: All = False, wait: Wait = 600.0
+) -> None:
+    """Give heliostats to automatic control; wait until they follow, or print why they do not."""
+    names = _names(heliostats, everybody)
+    with _client(context) as client:
+        _follow_all(client, [client.ask("POST", "automatic", {"heliostats": names})], wait)
 
 
 @app.command()
@@ -645,6 +659,26 @@ def _give(
         finally:
             if not safe:
                 client.ask("DELETE", "authority")
+
+
+def _follow_all(client: "Client | AtPlant", tickets: list[dict[str, Any]], wait: float) -> None:
+    """Print the progress of operations to their ends; exit code 1 if one is not done."""
+    until, printed = time.monotonic() + wait, dict[str, str]()
+    while True:
+        for ticket in tickets:
+            if printed.get(ticket["identity"]) != ticket["text"]:
+                printed[ticket["identity"]] = ticket["text"]
+                print(ticket["text"], flush=True)
+        left = [ticket["identity"] for ticket in tickets if not ticket["finished"]]
+        if not left or time.monotonic() >= until:
+            break
+        time.sleep(0.5)
+        tickets = [
+            client.get(f"commands/{each['identity']}") if each["identity"] in left else each
+            for each in tickets
+        ]
+    if wait > 0.0 and not all(ticket["good"] for ticket in tickets):
+        raise typer.Exit(1)
 
 
 def _follow(client: "Client | AtPlant", ticket: dict[str, Any], wait: float) -> None:

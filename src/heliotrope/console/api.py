@@ -244,6 +244,13 @@ async def holds(console: Here, who: Anyone) -> JSONResponse:
     return answer(await console.plant.ask("holds"))
 
 
+@router.get("/retries", response_model=models.many(models.Retry), tags=["calibration"])
+async def retries(console: Here, who: Anyone) -> JSONResponse:
+    """Return what automatic control tries again or has given up, and why."""
+    del who
+    return answer(await console.plant.ask("retries"))
+
+
 @router.get("/emergency", response_model=models.EmergencyView, tags=["safety"])
 async def emergency(console: Here, who: Anyone) -> JSONResponse:
     """Return the last emergency order with its proof."""

@@ -134,10 +134,16 @@ async def standby(console: Here, who: Operator, order: orders.StandbyOrder) -> m
     return models.TicketState(**await console.plant.point("standby", who.person, order.points))
 
 
-@router.post("/automatic", status_code=204, tags=["commands"])
-async def automatic(console: Here, who: Operator, order: orders.SomeHeliostats) -> None:
-    """Give heliostats to automatic control, which raises and calibrates them."""
-    await console.plant.ask("automatic", who.person, heliostats=order.heliostats)
+@router.post("/automatic", response_model=models.TicketState, tags=["commands"])
+async def automatic(
+    console: Here, who: Operator, order: orders.SomeHeliostats
+) -> models.TicketState:
+    """Give heliostats to automatic control, which raises and calibrates them.
+
+    Done where a heliostat follows; else its step says why not.
+    """
+    found = await console.plant.ask("automatic", who.person, heliostats=order.heliostats)
+    return models.TicketState(**found)
 
 
 @router.post("/automatic/resume", status_code=204, tags=["commands"])
@@ -152,10 +158,13 @@ async def switch(console: Here, who: Operator, to: orders.Switch) -> JSONRespons
     return answer(await console.plant.ask("switch_calibration", who.person, on=to.on))
 
 
-@router.post("/calibration/next", response_model=models.CalibrationView, tags=["calibration"])
-async def calibrate(console: Here, who: Operator, order: orders.OneCalibration) -> JSONResponse:
-    """Calibrate a heliostat as soon as a target is free, before all others."""
-    return answer(await console.plant.ask("calibrate", who.person, **order.model_dump()))
+@router.post("/calibration/next", response_model=models.TicketState, tags=["calibration"])
+async def calibrate(
+    console: Here, who: Operator, order: orders.OneCalibration
+) -> models.TicketState:
+    """Calibrate a heliostat before all others; it ends with the result of its visit."""
+    found = await console.plant.ask("calibrate", who.person, **order.model_dump())
+    return models.TicketState(**found)
 
 
 @router.post("/parameters", response_model=models.TicketState, tags=["calibration"])
@@ -232,10 +241,13 @@ async def give_reading(console: Here, who: Engineer, name: Named, order: orders.
     await console.plant.ask("give_reading", who.person, name=name, **order.model_dump())
 
 
-@router.post("/holds", response_model=models.many(models.Lockout), tags=["commands"])
-async def hold(console: Here, who: Operator, order: orders.HoldOrder) -> JSONResponse:
-    """Take heliostats out of service: they go to stow, and nobody moves them."""
-    return answer(await console.plant.ask("hold", who.person, **order.model_dump()))
+@router.post("/holds", response_model=models.TicketState, tags=["commands"])
+async def hold(console: Here, who: Operator, order: orders.HoldOrder) -> models.TicketState:
+    """Take heliostats out of service: they go to stow, and nobody moves them.
+
+    Done where a heliostat is parked in stow.
+    """
+    return models.TicketState(**await console.plant.ask("hold", who.person, **order.model_dump()))
 
 
 @router.post("/holds/release", response_model=models.many(models.Lockout), tags=["commands"])

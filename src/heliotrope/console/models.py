@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import BaseModel, Field, create_model
 
 from heliotrope.optics import flux
-from heliotrope.plant import lockouts
+from heliotrope.plant import attempts, lockouts
 from heliotrope.plant.interface.orders import Name, Strict
 from heliotrope.plant.operations import marking, typed_parameters, views
 
@@ -166,6 +166,9 @@ class TicketState(BaseModel):
     good: bool = Field(description="Whether every heliostat is done")
     text: str
     refusals: dict[str, str] = Field(description="Reasons of the first hundred")
+    steps: dict[str, str] = Field(
+        description="What the first hundred of an operation do or wait for now, or their results"
+    )
 
 
 class AuthorityState(BaseModel):
@@ -260,4 +263,5 @@ CalibrationView, Planned = model_of(views.CalibrationView), model_of(views.Plann
 PictureRow = model_of(views.PictureRow)
 PictureToMark, MarksView = model_of(marking.PictureToMark), model_of(marking.MarksView)
 ParametersView = model_of(typed_parameters.ParametersView)
+Retry = model_of(attempts.Retry)
 Lockout, EmergencyView = model_of(lockouts.Lockout), model_of(views.EmergencyView)

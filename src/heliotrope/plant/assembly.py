@@ -347,6 +347,7 @@ class _WhereAwake:
 
     def __init__(self, schedule: Scheduling, cameras: Cameras) -> None:
         self._schedule, self._cameras = schedule, cameras
+        self.attempts = schedule.attempts
 
     def next(
         self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False

@@ -498,6 +498,10 @@ class PlantController:
         """
         return self._safe(who, Act.STOW, heliostats)
 
+    def waits_to_stow(self, heliostat: str) -> bool:
+        """Return whether a heliostat waits for its turn to go to stow."""
+        return bool(self._orders.to_stow((heliostat,)))
+
     def ordered_off(self, seen: FloatArray) -> npt.NDArray[np.bool_]:
         """Return which heliostats were ordered off by anybody, (N,); see `Ordered.off`."""
         return self._ways.ordered.off(seen, self.now())

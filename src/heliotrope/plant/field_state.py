@@ -63,11 +63,16 @@ class HeliostatState:
     @property
     def text(self) -> str:
         """One line."""
+        return f"{self.name}: {self.condition}"
+
+    @property
+    def condition(self) -> str:
+        """Its state and its fault, or for how long it was not heard."""
         if not self.live:
             since = f"for {self.age:.0f} s" if math.isfinite(self.age) else "yet"
-            return f"{self.name}: not heard {since}"
+            return f"not heard {since}"
         fault = f", {self.fault}" if self.fault != "none" else ""
-        return f"{self.name}: {self.state}{fault}"
+        return f"{self.state}{fault}"
 
 
 class FieldState:
@@ -274,7 +279,7 @@ class FieldState:
         """
         row = self.place(name)
         cluster = self.clusters[self.cluster[row]]
-        age = float(self.age(now)[row])
+        age = float(now - self.heard[row])
         if not age <= self.limit:
             return HeliostatState(name, cluster, age, live=False)
         node = self.rows[row]

@@ -37,6 +37,8 @@ class Ticket:
         Reasons why it was refused or failed, by heliostat.
     blocked
         Those of the reasons that are beams in keep-out volumes.
+    steps
+        What each heliostat of an operation does or waits for now, or its result; none of a command.
     accepted_at
         Monotonic s.
     recorded
@@ -51,6 +53,7 @@ class Ticket:
         self.identity, self.name, self.heliostats = identity, name, tuple(heliostats)
         self.refusals: dict[str, str] = {}
         self.blocked: dict[str, str] = {}
+        self.steps: dict[str, str] = {}
         self.accepted_at, self.recorded, self.sent = clock.monotonic(), False, False
         self._clock = clock
         self._row = {name: i for i, name in enumerate(self.heliostats)}
@@ -84,6 +87,15 @@ class Ticket:
                 self.refusals[self.heliostats[i]] = text or stage.value
         if index.size:
             self._news.set()
+
+    def step(self, texts: Mapping[str, str], stage: Stage | None) -> None:
+        """Note what heliostats do or wait for, by name, and their stage; None: no new one."""
+        self.steps.update(texts)
+        if stage is None:
+            return
+        self.advance(texts, stage)
+        if RANK[stage] > FINAL:
+            self.refusals.update(texts)
 
     def block(self, refusals: Mapping[str, str]) -> None:
         """End the ticket for heliostats whose beams may not go there."""
@@ -141,7 +153,9 @@ class Ticket:
     def text(self) -> str:
         """One line: the number at each stage, and the reasons of most heliostats."""
         parts = ", ".join(f"{n} {word}" for word, n in self.counted().items())
-        why = by_reason(self.refusals)
+        left = self.waiting(self.steps)
+        # The results of those that are done are said once nothing else is to be said.
+        why = by_reason((self.refusals | {n: self.steps[n] for n in left}) or self.steps)
         return f"{self.name}: {parts}" + (f" ({why})" if why else "")
 
     async def reached(self, stage: Stage, timeout: float = math.inf) -> bool:

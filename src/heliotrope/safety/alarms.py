@@ -271,7 +271,7 @@ WORK = AlarmKind(
     _PLANT,
     Severity.ALARM,
     "A part of automatic control failed.",
-    "automatic control, part {subject}, failed: {error}",
+    "automatic control, part {subject}, failed: {reason}",
     "It is tried again after 5 s.",
     "Report the text; without this part, command the field by hand.",
     over="automatic control, part {subject}, works again",
@@ -320,6 +320,53 @@ BEAM_DISPROVED = AlarmKind(
     "Look at its drives and couplings if it does not move; at addresses and the wiring of its bus "
     "if it is exchanged with another one.",
     over="{subject}: a photograph has shown its own beam at its place",
+)
+CALIBRATION_GIVEN_UP = AlarmKind(
+    "calibration_given_up",
+    _PLANT,
+    Severity.WARNING,
+    "A heliostat was not calibrated in several visits to targets, the last of them alone with a "
+    "search for its beam.",
+    "{subject}: {count} visits to targets have not calibrated it; the last: {reason}",
+    "It keeps the parameters that it has, and takes no target time from others for 16 hours; then "
+    "it gets one visit a day. New parameters and a flight of a drone give it new visits.",
+    "Look at its photographs (tab Heliostat), at its mirror and its drives; then press Calibrate "
+    "now, or Out of service.",
+    over="{subject}: it is calibrated, or gets new visits for new parameters",
+)
+RAISING_GIVEN_UP = AlarmKind(
+    "raising_given_up",
+    _PLANT,
+    Severity.WARNING,
+    "Within half an hour each a heliostat has left the receiver without an order, or could not go "
+    "on from where it was, five times in a row.",
+    "{subject}: it was raised {count} times in a row in vain; the last time it {reason}",
+    "Automatic control does not raise it any more; after 16 hours it is raised once.",
+    "Find the cause (tab Heliostat, tab Logs): its supply, its cluster or a fault; then give it "
+    "back with Automatic.",
+    over="{subject}: it is up, or a person has given it to automatic control again",
+)
+NOT_PARKED = AlarmKind(
+    "not_parked",
+    _PLANT,
+    Severity.ALARM,
+    "A heliostat was taken out of service, and was not seen in stow within five minutes.",
+    "{subject}: it is out of service and not in stow: {reason}",
+    "STOW is sent to it once a minute until it is seen in stow.",
+    "Nobody may go to its mirror: its beam is where its state says, or unknown. Check its fault, "
+    "its supply and its cable.",
+    over="{subject}: it is in stow, or was given back to service",
+)
+VISITS_FAIL = AlarmKind(
+    "visits_fail",
+    _PLANT,
+    Severity.WARNING,
+    "Visits to a target or receiver have come to nothing several times in a row, through no fault "
+    "of one heliostat.",
+    "{subject}: {count} visits in a row have come to nothing; the last: {reason}",
+    "Nothing is calibrated there but what a person asks for; each hour there is one more visit.",
+    "Check its camera, the light on it and its view; then press Calibrate now.",
+    over="{subject}: a visit has brought a result",
 )
 SENSOR = AlarmKind(
     "sensor",

@@ -13,13 +13,16 @@ export async function act(what, name, plain = true) {
   } catch (error) { say(`${name}: ${error.message}`, true); return null; }
 }
 
+// Says how far a ticket is, to its end; a later one does not silence an earlier one's result.
+let latest = "";
 async function follow(ticket) {
   let seen = ticket;
-  say(seen.text);
-  for (let i = 0; i < 120 && !seen.finished; i++) {
+  latest = ticket.identity;
+  say(seen.text, seen.finished && !seen.good);
+  for (let i = 0; !seen.finished; i++) {
     await new Promise((wake) => setTimeout(wake, i < 10 ? 700 : 3000));
     try { seen = await api("GET", `commands/${encodeURIComponent(ticket.identity)}`); } catch { return; }
-    say(seen.text, seen.finished && !seen.good);
+    if (seen.finished || latest === ticket.identity) say(seen.text, seen.finished && !seen.good);
   }
 }
 

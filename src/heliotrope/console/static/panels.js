@@ -339,10 +339,15 @@ export function schedule(box) {
   const body = h("div");
   box.append(body);
   return refreshed(async () => {
-    const [plan, holds] = await Promise.all([api("GET", "schedule?limit=50"), api("GET", "holds")]);
+    const [plan, retries, holds] = await Promise.all([api("GET", "schedule?limit=50"), api("GET", "retries"), api("GET", "holds")]);
     body.replaceChildren(h("h3", {}, "Next measurements"),
       plan.length ? table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target], ["Gain (mrad)", (r) => mrad(r.gain), "num"], ["Why", (r) => r.reason]], plan, (r) => look(r.heliostat))
         : h("p", { className: "hx-hint" }, "No measurement is planned."),
+      h("h3", {}, `Tried again, or given up (${count(retries.length)})`),
+      retries.length ? table([["Work", (r) => r.work], ["Of", (r) => r.subject], ["Failed", (r) => `${r.count} of ${r.most}`, "num"], ["Reason", (r) => r.reason],
+        ["Next try", (r) => h("span", { className: r.given_up ? "warn" : "" }, r.given_up ? "given up" : "", r.left === null ? "" : ` ${r.left > 0 ? `in ${span(r.left)}` : "at the next turn"}`)],
+        ["Then", (r) => r.following]], retries.slice(0, 100), (r) => look(r.subject))
+        : h("p", { className: "hx-hint" }, "Nothing."),
       h("h3", {}, "Out of service"),
       holds.length ? table([["Heliostat", (r) => r.heliostat], ["State", (r) => stateOf(r.heliostat)], ["Owner", (r) => r.who], ["Since", (r) => minute(r.since)],
         ["Expected back", (r) => h("span", { className: r.until && r.until < store.head.utc ? "warn" : "" }, r.until ? minute(r.until) : "–", r.until && r.until < store.head.utc ? " overdue" : "")], ["Why", (r) => r.reason],

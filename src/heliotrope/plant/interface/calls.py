@@ -126,15 +126,16 @@ def _switch(desk: Desk, who: Person, given: orders.Switch, _: bytes) -> Any:
 
 
 def _calibrate(desk: Desk, who: Person, given: orders.OneCalibration, _: bytes) -> Any:
-    desk.operations.calibrate(
-        who,
-        given.heliostat,
-        given.target,
-        search=given.search,
-        together=given.together,
-        receiver=given.receiver,
+    return desk.tickets.put(
+        desk.operations.calibrate(
+            who,
+            given.heliostat,
+            given.target,
+            search=given.search,
+            together=given.together,
+            receiver=given.receiver,
+        )
     )
-    return desk.operations.calibration()
 
 
 def _learn(desk: Desk, who: Person, given: orders.OneGroup, _: bytes) -> Any:
@@ -144,8 +145,7 @@ def _learn(desk: Desk, who: Person, given: orders.OneGroup, _: bytes) -> Any:
 
 def _hold(desk: Desk, who: Person, given: orders.HoldOrder, _: bytes) -> Any:
     hours = math.nan if given.hours is None else given.hours
-    desk.operations.hold(who, given.heliostats, given.reason, hours)
-    return desk.operations.holds()
+    return desk.tickets.put(desk.operations.hold(who, given.heliostats, given.reason, hours))
 
 
 def _unhold(desk: Desk, who: Person, given: orders.GivenBack, _: bytes) -> Any:
@@ -163,6 +163,7 @@ _VIEWS = {
     "calibration": _see(lambda desk: desk.operations.calibration()),
     "flights": _see(lambda desk: desk.operations.flights()),
     "learning": _see(lambda desk: desk.operations.learning()),
+    "retries": _see(lambda desk: desk.operations.retries()),
     "holds": _see(lambda desk: desk.operations.holds()),
     "emergency": _see(lambda desk: desk.operations.emergency_view()),
     "commands": _see(lambda desk: desk.tickets.last()),
@@ -230,7 +231,7 @@ _ORDERS = {
     "automatic": Call(
         Role.OPERATOR,
         orders.SomeHeliostats,
-        lambda d, who, a, _: d.operations.give_back(who, a.heliostats),
+        lambda d, who, a, _: d.tickets.put(d.operations.give_back(who, a.heliostats)),
     ),
     "resume": Call(Role.OPERATOR, orders.Nothing, lambda d, who, *_: d.operations.resume(who)),
     "switch_calibration": Call(Role.OPERATOR, orders.Switch, _switch),

@@ -52,4 +52,5 @@ def state_of(ticket: Ticket) -> dict[str, Any]:
         "good": ticket.good,
         "text": ticket.text,
         "refusals": dict(list(ticket.refusals.items())[:100]),
+        "steps": dict(list(ticket.steps.items())[:100]),
     }

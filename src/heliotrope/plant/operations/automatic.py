@@ -9,21 +9,25 @@ heliostats it waits for a person (`losses`).
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
+from heliotrope.links.messages import Stage
 from heliotrope.plant import refusals
+from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, TrueErrors
 from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.plant.operations.errands import Step
 from heliotrope.plant.operations.flights import FlightIntake
 from heliotrope.plant.operations.foresight import POINT_EVERY, Foresight
 from heliotrope.plant.operations.keeping import Keeping
@@ -47,6 +51,31 @@ from heliotrope.store.records import Records
 AUTOMATIC = Person("automatic control", Role.ENGINEER)
 _UP = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING, states.DEFOCUSED)
 _READY = (states.IDLE, states.TRACKING)
+#: What a person does about a state from which automatic control raises nothing.
+_REMEDIES = {
+    states.LOCKED: "unlock it",
+    states.FAULT: "find the cause, then clear the fault",
+    states.UNCONFIGURED: "store its parameters",
+}
+#: Parts of the work that failed: each failure is an alarm, and it is tried again soon.
+PARTS = RetryLaw(
+    "part of automatic control",
+    1,
+    5.0,
+    "it is repeated; a person commands by hand what it does not do",
+    rest=5.0,
+    alarm=alarms.WORK,
+)
+#: Why nothing is moved before it has taken the command authority.
+_STARTING = "it is starting"
+#: Outcomes of a visit that a person asked for and that has shown what it can.
+_AS_WANTED = (
+    CalibrationOutcome.CALIBRATED,
+    CalibrationOutcome.UNCHANGED,
+    CalibrationOutcome.NO_BETTER,
+)
+#: Time in which a heliostat that automatic control has must follow, s; and until it is heard.
+_FOLLOWS, _HEARD = 120.0, 15.0
 #: Time between checks of the sun's elevation, s: a mirror that is locked for its parameters at one
 #: check in the evening is stowed at the next.
 _SUN_EVERY = 10.0
@@ -156,7 +185,8 @@ class AutomaticControl:
         )
         self.installed = self.book.installed()
         self._keeping = Keeping(plant.field.names, plant.beliefs, records)
-        self.service = Service(plant, self._keeping)
+        self.service = Service(plant, self._keeping, logbook.take_alarm)
+        self._parts = Attempts(PARTS, logbook.take_alarm)
         self._raising = Raising(
             plant,
             logbook,
@@ -186,7 +216,9 @@ class AutomaticControl:
                 self.flights.first,
                 pictures,
                 None if joint is None else Parties(plant, self.book, joint, logbook.take_alarm),
-                None if receiver is None else ProductionVisits(plant, self.book, receiver),
+                None
+                if receiver is None
+                else ProductionVisits(plant, self.book, receiver, logbook.take_alarm),
             )
             if settings.foresee > 0.0:
                 self._foresight = Foresight(
@@ -209,8 +241,21 @@ class AutomaticControl:
     def want(self, heliostats: Sequence[str], *, wanted: bool, by_person: bool = False) -> None:
         """Give heliostats to automatic control, or take them out of it; see `Raising.want`."""
         self._raising.want(heliostats, wanted=wanted, by_person=by_person)
-        if not wanted and self._calibrating is not None:
-            self._calibrating.withdraw(heliostats or self._plant.field.names)
+        if not wanted:
+            self._withdraw(heliostats or self._plant.field.names, "a person has taken it away")
+
+    def hold(self, person: Person, heliostats: Sequence[str], reason: str, hours: float) -> None:
+        """Take heliostats out of service; see `Operations.hold`."""
+        self.service.take(person, heliostats, reason, hours)
+        self._withdraw(heliostats, f"{person.name} has taken it out of service")
+
+    def drop(self, heliostats: Sequence[str], why: str) -> None:
+        """Give up what persons asked for of heliostats."""
+        self._withdraw(heliostats, why)
+
+    def _withdraw(self, heliostats: Sequence[str], why: str) -> None:
+        if self._calibrating is not None:
+            self._calibrating.withdraw(heliostats, why)
 
     def calibrate(
         self,
@@ -256,6 +301,99 @@ class AutomaticControl:
             why = "automatic control does not have it"
         if why or self._calibrating is None:
             raise refusals.NO_CALIBRATION.error(heliostat=heliostat, why=why)
+
+    # -- progress --------------------------------------------------------------------------
+
+    @property
+    def follows_within(self) -> float:
+        """Time in which all heliostats that are given to it must follow, s."""
+        return _FOLLOWS + len(self._plant.field) / self._settings.rate
+
+    def following(self, since: float, heliostats: Sequence[str]) -> Mapping[str, Step]:
+        """Return whether heliostats follow automatic control, or why not.
+
+        Parameters
+        ----------
+        since
+            When they were given to it, monotonic s.
+        heliostats
+            Names.
+        """
+        idle, visiting = self._why_idle(), self._visiting()
+        field, out, age = self._plant.field, self._plant.out_of_service, self._plant.now() - since
+        able, state = self._raising.able(), field.rows["state"]
+        steps = {}
+        for name in heliostats:
+            if name in out:
+                steps[name] = Step(f"out of service: {out[name].text}", Stage.REFUSED)
+            elif not self._raising.wanted[field.place(name)]:
+                text = "automatic control does not have it any more"
+                steps[name] = Step(text, Stage.REFUSED)
+            elif idle == _STARTING:
+                steps[name] = Step(idle)
+            elif idle:
+                text = f"automatic control has it, but moves nothing: {idle}"
+                steps[name] = Step(text, Stage.FAILED)
+            elif name in visiting:
+                steps[name] = Step("automatic control has it: it is calibrated", Stage.DONE)
+            else:
+                row = field.place(name)
+                steps[name] = self._up_step(name, int(state[row]), age, able=bool(able[row]))
+        return steps
+
+    def _up_step(self, name: str, state: int, age: float, *, able: bool) -> Step:
+        """Return the step of a heliostat that automatic control may move."""
+        shown = self._plant.field.of(name, self._plant.now())
+        if not shown.live:
+            return Step(shown.condition, Stage.FAILED if age > _HEARD else None)
+        if state in _REMEDIES:
+            return Step(f"it is {shown.condition}: {_REMEDIES[state]}", Stage.FAILED)
+        if why := self._raising.why_not(name):
+            return Step(why, Stage.FAILED)
+        if state == states.APPROACHING or (state in _READY and able):
+            return Step(f"automatic control has it: {shown.condition}", Stage.DONE)
+        return Step(f"it waits for its turn: {shown.condition}")
+
+    def calibrating(self, since: float, heliostats: Sequence[str]) -> Mapping[str, Step]:
+        """Return how far calibrations are that persons asked for at a time, POSIX s."""
+        return {name: self._calibration_step(name, since) for name in heliostats}
+
+    def _calibration_step(self, name: str, since: float) -> Step:
+        assert self._calibrating is not None
+        running = self._calibrating.running.values()
+        run = next((one for one in running if name in one.heliostats), None)
+        if name in self._calibrating.asked:
+            return Step(f"it waits: {self._why_waiting(name, run is not None)}")
+        if run is not None:
+            return Step(f"at {run.target}: {run.stage}", Stage.ACKNOWLEDGED)
+        found = self._calibrating.result(name, since)
+        if isinstance(found, str):
+            return Step(found, Stage.REFUSED)
+        stages = dict.fromkeys(_AS_WANTED, Stage.DONE) | {CalibrationOutcome.REFUSED: Stage.REFUSED}
+        return Step(f"at {found.target}: {found.text}", stages.get(found.outcome, Stage.FAILED))
+
+    def _why_waiting(self, name: str, visits: bool) -> str:
+        """Return why a calibration that a person asked for has not begun."""
+        row = self._plant.field.place(name)
+        if why := self._why_not():
+            return why
+        if visits:
+            return "another visit of it has to end first"
+        if not self._ready()[row]:
+            return f"it is not ready: {self._plant.field.of(name, self._plant.now()).condition}"
+        assert self._calibrating is not None
+        busy = [f"{run.heliostat} ({run.stage})" for run in self._calibrating.running.values()]
+        return f"its turn comes after {', '.join(busy)}" if busy else "its turn comes next"
+
+    def retries(self) -> tuple[Retry, ...]:
+        """Return what is tried again or was given up, and why."""
+        now, visits = self._plant.now(), self._calibrating
+        return (
+            *(() if visits is None else visits.retries()),
+            *self._raising.attempts.shown(now),
+            *self.service.attempts.shown(now),
+            *self._parts.shown(now),
+        )
 
     @property
     def waits(self) -> str:
@@ -336,20 +474,21 @@ class AutomaticControl:
 
     async def _again(self, name: str, part: Callable[[], Awaitable[None]], pause: float) -> None:
         """Repeat a part of the work; a failure raises an alarm and ends nothing."""
-        failed = False
+        refused = ""
         # A cancelled visit brings its beam home, and may end with another error then.
         while not self._stopped:
             try:
                 await part()
-                if failed:
-                    self._log.take_alarm(alarms.WORK.ended(name))
-                failed = False
+                refused = ""
+                self._parts.done(name)
             except RefusedError as error:
-                self._log.event("calibration", AUTOMATIC.name, str(error))
+                if str(error) != refused:
+                    self._log.event("calibration", AUTOMATIC.name, str(error))
+                refused = str(error)
             except Exception as error:  # noqa: BLE001 - the work survives whatever fails in a part
-                failed, text = True, f"{type(error).__name__}: {error}"
-                self._log.take_alarm(alarms.WORK.raised(name, error=text))
-                await self._sleep(5.0)
+                text = f"{type(error).__name__}: {error}"
+                self._parts.failed(name, text, self._plant.now())
+                await self._sleep(PARTS.rest)
             await self._sleep(pause)
 
     async def _sleep(self, seconds: float) -> None:
@@ -382,7 +521,7 @@ class AutomaticControl:
             return "the sun is too low"
         if not self._has_authority():
             grant = self._plant.authority.grant
-            return f"{grant.holder.name} has the command authority" if grant else "it is starting"
+            return f"{grant.holder.name} has the command authority" if grant else _STARTING
         return ""
 
     async def _govern(self) -> None:
@@ -411,6 +550,7 @@ class AutomaticControl:
             # while a person has the command authority.
             if falls or self._plant.authority.grant is None or self._has_authority():
                 self._stow_up(told=falls)
+            self._withdraw(self._plant.field.names, "the sun is too low; ask again tomorrow")
         elif not self._day and elevation > lowest + math.radians(1.0):
             self._day = True
             self._log.event("plant", AUTOMATIC.name, "the sun is high enough")
@@ -433,7 +573,7 @@ class AutomaticControl:
             self._raising.give_up()
         self._raising.lose(self._losses.look(self._raising.wanted))
         if not self._why_idle():
-            resting = self._losses.settling() | self.service.rows()
+            resting = self._losses.settling() | self.service.rows() | self._raising.given_up()
             self._start_again(self._raising.stuck(self._visiting(), resting))
             await self._raising.step(self._token, self._visiting, resting)
 

@@ -11,6 +11,8 @@ import numpy.typing as npt
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.errors import HeliotropeError
 from heliotrope.geometry import FloatArray
+from heliotrope.imaging.coded import Verdict
+from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
@@ -23,13 +25,34 @@ from heliotrope.plant.operations.production import ProductionVisits
 from heliotrope.plant.operations.views import CalibrationEntry, Planned, Running
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
 from heliotrope.plant.visits.photographs import Tell
+from heliotrope.safety import alarms
 
+#: Visits to a target that failed through no fault of a heliostat: the camera, clouds, refusals.
+PLACES = RetryLaw(
+    "visits to this target",
+    5,
+    10.0,
+    "a person looks at its camera and its light; one visit an hour until then",
+    longest=600.0,
+    rest=3600.0,
+    alarm=alarms.VISITS_FAIL,
+)
+#: A heliostat that was on a target leaves it to all others for this time, s.
+FRESH = 600.0
 #: Time between computations of the true errors, s.
 _TRUTH_EVERY = 5.0
 
 
 class Scheduling(Foreseeing, Protocol):
-    """The choice of the heliostat that is calibrated next."""
+    """The choice of the heliostat that is calibrated next.
+
+    Attributes
+    ----------
+    attempts
+        Visits that failed, by heliostat; in POSIX s.
+    """
+
+    attempts: Attempts
 
     def next(
         self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False
@@ -129,6 +152,14 @@ class Calibrating:
         self._pictures = pictures
         self._running: dict[str, Running] = {}
         self._asked: dict[str, tuple[str, bool]] = {}
+        #: Why requests of persons were given up, and the last result, by heliostat.
+        self._withdrawn: dict[str, str] = {}
+        self._last: dict[str, CalibrationEntry] = {}
+        #: When each was on a target last, POSIX s, (N,).
+        self._visited = np.full(len(plant.field.names), -np.inf)
+        self._flown: frozenset[str] = frozenset()
+        self._places = Attempts(PLACES, log.take_alarm)
+        scheduler.attempts.report_to(log.take_alarm)
 
     @property
     def asked(self) -> tuple[str, ...]:
@@ -142,7 +173,13 @@ class Calibrating:
 
         With ``search`` its beam is only searched for.
         """
+        self._forget((heliostat,))
         self._asked[heliostat] = target, search
+
+    def _forget(self, heliostats: Sequence[str]) -> None:
+        """Forget why earlier requests for heliostats were given up."""
+        for name in heliostats:
+            self._withdrawn.pop(name, None)
 
     @property
     def together(self) -> bool:
@@ -152,6 +189,7 @@ class Calibrating:
     def ask_together(self, heliostats: Sequence[str], target: str) -> None:
         """Calibrate heliostats in a joint visit before all others; see `ask`."""
         if self._parties is not None:
+            self._forget(heliostats)
             self._parties.ask(heliostats, target)
 
     @property
@@ -162,10 +200,12 @@ class Calibrating:
     def ask_in_production(self, heliostats: Sequence[str]) -> None:
         """Calibrate heliostats on the receiver as soon as all of them track it."""
         if self._production is not None:
+            self._forget(heliostats)
             self._production.ask(heliostats)
 
-    def withdraw(self, heliostats: Sequence[str]) -> None:
-        """Forget that persons wanted these heliostats calibrated."""
+    def withdraw(self, heliostats: Collection[str], why: str) -> None:
+        """Forget that persons wanted these heliostats calibrated, and why."""
+        self._withdrawn |= dict.fromkeys(set(self.asked).intersection(heliostats), why)
         if self._parties is not None:
             self._parties.withdraw(heliostats)
         if self._production is not None:
@@ -178,6 +218,23 @@ class Calibrating:
         """Visits under way, by target."""
         return MappingProxyType(self._running)
 
+    def result(self, heliostat: str, since: float) -> CalibrationEntry | str:
+        """Return the result of a visit that ended since a time, POSIX s; without one, why not."""
+        found, why = self._last.get(heliostat), self._withdrawn.get(heliostat)
+        if why is None and found is not None and found.at >= since:
+            return found
+        return f"withdrawn: {why or 'the visit was broken off'}"
+
+    def retries(self) -> tuple[Retry, ...]:
+        """Return the visits that are tried again, or were given up."""
+        now, joint, lit = self._plant.now(), self._parties, self._production
+        return (
+            *self._scheduler.attempts.shown(self._now()),
+            *(() if joint is None else joint.cycle.attempts.shown(now)),
+            *self._places.shown(now),
+            *(() if lit is None else lit.attempts.shown(now)),
+        )
+
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> tuple[Planned, ...]:
         """Return the coming visits of the ready heliostats, (N,)."""
         return tuple(self._scheduler.plan(ready, limit))
@@ -189,15 +246,17 @@ class Calibrating:
 
         Those that persons asked for come first, then those whose step counts are in doubt: a
         photograph ends it. Then those for which a flight has brought a large change, which a
-        photograph confirms.
+        photograph confirms. One that was on a target a moment ago comes after all others.
         """
+        if not self.asked and not self._places.due(target, self._plant.now()):
+            return ()
         if self._parties is not None and not self.asked and self._parties.awaited(target, ready):
             return ()
         if self._parties is not None and (names := await self._party(target, ready)):
             cycle = self._parties.cycle
             self._parties.begun(target)
             await self._together(
-                names, target, lambda tell: cycle.run(person, token, names, target, tell)
+                names, target, token, lambda tell: cycle.run(person, token, names, target, tell)
             )
             return names
         name, search = self._chosen(target, ready)
@@ -213,17 +272,20 @@ class Calibrating:
             self._pictures.begin(name)
         row = self._plant.field.place(name)
         truth, sigma = self._truth.now(row), float(self._book.error[row])
+        blameless = False
         try:
             work = self._cycle.search if search else self._cycle.run
             result = await work(person, token, name, target, tell)
         except RefusedError as error:
             result = CycleResult(name, CalibrationOutcome.REFUSED, str(error))
+            blameless = self._interrupted(token)
         except HeliotropeError as error:
-            text = f"{type(error).__name__}: {error}"
+            text, blameless = f"{type(error).__name__}: {error}", True
             result = CycleResult(name, CalibrationOutcome.ERROR, text)
         finally:
             self._running.pop(target, None)
-        self._conclude(target, result, truth, begun, sigma)
+        self._note_place(target, result.text if blameless else "", token)
+        self._conclude(target, result, truth, begun, sigma, blameless=blameless)
         return (name,)
 
     async def _party(self, target: str, ready: npt.NDArray[np.bool_]) -> tuple[str, ...]:
@@ -236,7 +298,7 @@ class Calibrating:
             where in ("", target) and ready[self._plant.field.place(name)]
             for name, (where, _) in self._asked.items()
         )
-        if alone or (ready & self._pressing()).any():
+        if alone or (ready & self._pressing() & self._fresh()).any():
             return ()
         names = await self._parties.chosen(target, ready, self._scheduler.next)
         # Another target's visit may have begun meanwhile.
@@ -258,14 +320,15 @@ class Calibrating:
             return ()
         begun, lit = self._now(), self._production.lit
         results = await self._together(
-            names, self.receiver, lambda tell: cycle.run(person, token, names, tell)
+            names, self.receiver, token, lambda tell: cycle.run(person, token, names, tell)
         )
         # One that is broken off, or came to nothing, does not tell how long a visit takes.
         if any(result.new > 0 for result in results):
             out = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)
             moved = sum(result.outcome not in out for result in results)
             self._scheduler.shone(moved, lit, self._now() - begun)
-        for name in self._production.concluded(results):
+        odd = () if self._interrupted(token) else self._production.concluded(results)
+        for name in odd:
             self.ask(name, "")
         return names
 
@@ -273,6 +336,7 @@ class Calibrating:
         self,
         names: tuple[str, ...],
         place: str,
+        token: int,
         visit: Callable[[Tell], Awaitable[tuple[CycleResult, ...]]],
     ) -> tuple[CycleResult, ...]:
         """Calibrate heliostats at one place at once."""
@@ -297,9 +361,13 @@ class Calibrating:
             self._running.pop(place, None)
         if said:
             results = tuple(CycleResult(name, outcome, said) for name in names)
+        clouds = [result for result in results if result.verdict is Verdict.CLOUD]
+        if place != self.receiver:
+            self._note_place(
+                place, said or (clouds[0].text if 2 * len(clouds) > len(results) else ""), token
+            )
         entries = [
-            # A visit that was refused as a whole is one event, below.
-            self._conclude(place, result, true, begun, expected, joint=True, noted=not said)
+            self._conclude(place, result, true, begun, expected, joint=True, refused=bool(said))
             for result, true, expected in zip(results, truth, sigma, strict=True)
         ]
         if self._pictures is not None:
@@ -310,9 +378,29 @@ class Calibrating:
         self._log.event("calibration", place, f"{what}: {text}{said and f'; {said}'}")
         return results
 
+    def _fresh(self) -> npt.NDArray[np.bool_]:
+        """Return which heliostats were not on a target a moment ago, (N,)."""
+        return np.asarray(self._now() - self._visited > FRESH)
+
+    def _interrupted(self, token: int) -> bool:
+        """Return whether an emergency, or another holder of the authority, ended a visit."""
+        grant = self._plant.authority.grant
+        return self._plant.emergency_on or grant is None or grant.token != token
+
+    def _note_place(self, place: str, problem: str, token: int) -> None:
+        """Note whether a visit failed through no fault of a heliostat, "" if it did not."""
+        if not problem:
+            self._places.done(place)
+        elif not self._interrupted(token):
+            self._places.failed(place, problem, self._plant.now())
+
     def _pressing(self) -> npt.NDArray[np.bool_]:
         """Return which heliostats are in doubt or changed by a flight, (N,): they go alone."""
-        changed = np.isin(self._plant.field.names, list(self._first()))
+        first = frozenset(self._first())
+        # A flight is new knowledge of those that were given up.
+        self._scheduler.attempts.renew(first - self._flown)
+        self._flown = first
+        changed = np.isin(self._plant.field.names, list(first))
         return np.asarray(self._plant.doubts.standing | changed)
 
     def _chosen(self, target: str, ready: npt.NDArray[np.bool_]) -> tuple[str, bool]:
@@ -322,9 +410,10 @@ class Calibrating:
                 del self._asked[name]
                 return name, search
         changed = np.isin(self._plant.field.names, list(self._first()))
-        alone = ready if self._parties is None else self._parties.alone(ready)
-        doubted = ready & self._plant.doubts.standing
-        for rows in (doubted, ready & changed, alone, ready):
+        fresh = ready & self._fresh()
+        alone = fresh if self._parties is None else self._parties.alone(fresh)
+        doubted = fresh & self._plant.doubts.standing
+        for rows in (doubted, fresh & changed, alone, fresh, ready):
             chosen = self._scheduler.next(target, rows) if rows.any() else None
             if chosen is not None:
                 return chosen.heliostat, False
@@ -342,7 +431,8 @@ class Calibrating:
         sigma: float,
         *,
         joint: bool = False,
-        noted: bool = True,
+        refused: bool = False,
+        blameless: bool = False,
     ) -> CalibrationEntry:
         row, good = self._plant.field.place(result.heliostat), result.outcome.calibrated
         record = result.record
@@ -363,15 +453,21 @@ class Calibrating:
             0 if record is None else record.version,
         )
         lit = target == self.receiver
+        self._last[result.heliostat] = entry
+        if not lit:
+            self._visited[row] = entry.at
         if self._parties is not None:
-            self._parties.concluded(result, joint=joint)
+            self._parties.concluded(result)
         self._book.conclude(entry)
         # The schedule plans visits to targets: one in production that brings nothing is no failure,
-        # and a beam that is looked for in several joint visits has not failed yet.
+        # nor is one that the camera, a cloud or a person has ended, and a beam that is looked for
+        # in several joint visits has not failed yet.
         looked = joint and self._parties is not None and self._parties.again(result)
-        if good or not (lit or looked):
+        blameless |= refused or result.verdict is Verdict.CLOUD
+        if good or not (lit or looked or blameless):
             self._scheduler.done(entry)
-        if noted:
+        # A joint visit that was refused as a whole is one event, and not one of each heliostat.
+        if not refused:
             self._log.event("calibration", entry.heliostat, f"at {target}: {entry.text}")
         self._keeping.keep(entry, begun, sigma)
         if self._pictures is not None:

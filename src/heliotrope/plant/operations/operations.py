@@ -14,6 +14,7 @@ import asyncio
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import numpy.typing as npt
@@ -24,14 +25,17 @@ from heliotrope.errors import UnknownNameError
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
+from heliotrope.links.clock import sleep_until
 from heliotrope.optics import FluxView, predict_flux
 from heliotrope.plant import refusals
+from heliotrope.plant.attempts import Retry
 from heliotrope.plant.authority import Grant, Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
 from heliotrope.plant.lockouts import Lockout
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
+from heliotrope.plant.operations.errands import Errands
 from heliotrope.plant.operations.learning import Learner
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking
@@ -71,6 +75,10 @@ _BACK = frozenset({"APPROACH", "TRACK", "REFOCUS"})
 _FLUX_EVERY = 5.0
 #: Time between looks after the security events, s.
 _LOOKED = 5.0
+#: Time between looks at operations under way, s.
+_FOLLOWED = 1.0
+#: Longest time of a calibration that a person asks for, and of the path to stow, s.
+_ASKED, _PARKED = 3600.0, 600.0
 #: Row of the summary with the reason why the last link was refused.
 REFUSED_LINK = "refused link"
 
@@ -167,6 +175,7 @@ class Operations:
             joint=joint,
             receiver=receiver,
         )
+        self.errands = Errands(plant.clock)
         self.security = SecurityLog(logbook, plant.clock)
         self._viewer = Viewer(plant, self.automatic)
         self.parameters = TypedParameters(plant, logbook, records)
@@ -180,11 +189,13 @@ class Operations:
         self.logbook.event("plant", "", f"{self.design.name}: operations begin")
         async with asyncio.TaskGroup() as group:
             work = group.create_task(self.automatic.run())
-            looking = group.create_task(self._look())
+            beside = [group.create_task(self._look()), group.create_task(self._follow())]
             await self._closing.wait()
             self.automatic.stop()
             work.cancel()
-            looking.cancel()
+            for task in beside:
+                task.cancel()
+        self.errands.end("the plant's program has ended")
         self.logbook.event("plant", "", f"{self.design.name}: operations end")
 
     async def _look(self) -> None:
@@ -193,6 +204,12 @@ class Operations:
             facts = {} if self._extra is None else self._extra()
             self.security.look(str(facts.get(REFUSED_LINK, "")))
             await asyncio.sleep(_LOOKED)
+
+    async def _follow(self) -> None:
+        """Follow operations of persons to their ends."""
+        while True:
+            self.errands.look()
+            await sleep_until(self.plant.clock, self.plant.now() + _FOLLOWED)
 
     async def close(self) -> None:
         """End automatic control; beams stay where they are, so stow the field first."""
@@ -354,11 +371,12 @@ class Operations:
         search: bool = False,
         together: Sequence[str] = (),
         receiver: bool = False,
-    ) -> None:
+    ) -> Ticket:
         """Calibrate a heliostat, or only search its beam, on the next free target, before others.
 
         With others (``together``) it is calibrated in one joint visit, as soon as all are ready.
-        With ``receiver`` it is measured in production, as soon as all track the receiver.
+        With ``receiver`` it is measured in production, as soon as all track the receiver. The
+        ticket ends with the result of the visit.
 
         Raises
         ------
@@ -374,8 +392,16 @@ class Operations:
         what = "search for the beam" if search else "calibration"
         what = "joint calibration" if together else what
         what = "calibration in production" if receiver else what
-        whose = ", ".join((heliostat, *together))
-        self._tell(person, f"asked for a {what} of {whose}{target and f' on {target}'}")
+        names = tuple(dict.fromkeys((heliostat, *together)))
+        self._tell(person, f"asked for a {what} of {', '.join(names)}{target and f' on {target}'}")
+        since = self.plant.clock.utc().timestamp()
+        return self.errands.begin(
+            "SEARCH_BEAM" if search else "CALIBRATE",
+            names,
+            partial(self.automatic.calibrating, since),
+            _ASKED,
+            self.automatic.drop,
+        )
 
     async def photograph(self, person: Person, target: str) -> CameraView:
         """Photograph a target now, with whatever beam is on it; return what is seen.
@@ -438,8 +464,10 @@ class Operations:
 
     def hold(
         self, person: Person, heliostats: Sequence[str], reason: str, hours: float = math.nan
-    ) -> None:
+    ) -> Ticket:
         """Take heliostats out of service: they go to stow, and nobody moves them.
+
+        The ticket is done where a heliostat is parked in stow and locked out.
 
         Parameters
         ----------
@@ -460,8 +488,10 @@ class Operations:
         _operator(person, "out of service")
         if not reason.strip():
             raise refusals.REASON_MISSING.error(what="out of service")
-        self.automatic.service.take(person, heliostats, reason, hours)
+        self.automatic.hold(person, heliostats, reason, hours)
         self._tell(person, f"{_some(heliostats)} out of service: {reason}", "command")
+        names, progress = tuple(dict.fromkeys(heliostats)), self.automatic.service.progress
+        return self.errands.begin("OUT_OF_SERVICE", names, progress, _PARKED)
 
     def unhold(self, person: Person, heliostats: Sequence[str]) -> None:
         """Give heliostats back to service by their names; nothing moves.
@@ -630,8 +660,10 @@ class Operations:
         self.logbook.acknowledge(person.name, condition, subject)
         self._tell(person, f"acknowledged {condition} {subject}".strip(), "command")
 
-    def give_back(self, person: Person, heliostats: Sequence[str] = ()) -> None:
+    def give_back(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
         """Give heliostats (() for all) to automatic control, which raises and calibrates them.
+
+        The ticket is done where a heliostat follows, and says why where it does not.
 
         Raises
         ------
@@ -639,9 +671,15 @@ class Operations:
             If the person is a viewer.
         """
         _operator(person, "give back")
-        names = tuple(heliostats) or self.names
+        names = tuple(dict.fromkeys(heliostats)) or self.names
         self.automatic.want(names, wanted=True)
         self._tell(person, f"{len(names)} heliostats given to automatic control", "command")
+        progress = partial(self.automatic.following, self.plant.now())
+        return self.errands.begin("AUTOMATIC", names, progress, self.automatic.follows_within)
+
+    def retries(self) -> tuple[Retry, ...]:
+        """Return what automatic control tries again or has given up, and why."""
+        return self.automatic.retries()
 
     def resume(self, person: Person) -> None:
         """Let automatic control go on after a loss of many heliostats.

@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.lcu import states
@@ -59,8 +58,6 @@ class Parties:
     ) -> None:
         self._plant, self._book, self.cycle, self._tell = plant, book, cycle, tell
         self._asked: list[tuple[list[str], str]] = []
-        #: Those that go alone next: something was wrong with them in a joint visit.
-        self._alone: set[str] = set()
         self._disproved: set[str] = set()
         #: Targets whose last visit was a joint one.
         self._last: set[str] = set()
@@ -155,9 +152,9 @@ class Parties:
         return tuple(names)
 
     def alone(self, ready: Mask) -> Mask:
-        """Return which of the ready heliostats (N,) go alone: a joint visit did not prove them."""
+        """Return which of the ready heliostats (N,) go alone: joint visits did not prove them."""
         found = np.zeros_like(ready)
-        found[[self._plant.field.place(name) for name in self._alone]] = True
+        found[[self._plant.field.place(name) for name in self.cycle.attempts.given_up]] = True
         return found & ready
 
     def awaited(self, target: str, ready: Mask) -> bool:
@@ -181,16 +178,12 @@ class Parties:
         """Return whether a result is no failure: its beam is looked for in another joint visit."""
         return result.verdict is not None and self.cycle.searching(result.heliostat)
 
-    def concluded(self, result: CycleResult, *, joint: bool) -> None:
+    def concluded(self, result: CycleResult) -> None:
         """Note the result of a visit: what it proves, or disproves, of a heliostat."""
+        self.cycle.note(result)
         name, kind = result.heliostat, alarms.BEAM_DISPROVED
         # Nothing says where the beam of a mirror without a calibration ought to be.
         known = np.isfinite(self._book.calibrated_at[self._plant.field.place(name)])
-        unproven = result.verdict not in (None, Verdict.CLOUD) and not self.again(result)
-        if unproven or result.outcome is CalibrationOutcome.NOT_VERIFIED:
-            self._alone.add(name)
-        elif result.new and not joint:
-            self._alone.discard(name)
         if result.verdict in _WRONG and known:
             self._disproved.add(name)
             self._tell(kind.raised(name, problem=result.text.removeprefix("unchanged: ")))

@@ -1,6 +1,6 @@
 """Receiver visits of automatic calibration: which heliostats are measured in production."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -8,17 +8,28 @@ import numpy.typing as npt
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.imaging.coded import Verdict
 from heliotrope.lcu import states
+from heliotrope.plant.attempts import Attempts, RetryLaw
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.visits.calibration_cycle import CycleResult
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
+from heliotrope.safety import Alarm, alarms
 
 Mask = npt.NDArray[np.bool_]
 
 #: Share of the largest expected error that a heliostat may have which automatic control measures.
 _SURE = 0.75
-#: Time after which automatic control tries again where a visit came to nothing, s.
-_LATER = 600.0
+#: Receiver visits that came to nothing: mostly the light is to blame, and not a mirror.
+RECEIVER = RetryLaw(
+    "visits on this receiver",
+    5,
+    600.0,
+    "a person looks at its camera and its light; one visit an hour until then",
+    growth=1.5,
+    longest=3600.0,
+    rest=3600.0,
+    alarm=alarms.VISITS_FAIL,
+)
 #: Verdicts after which a heliostat is looked at on a target.
 _ODD = (Verdict.STUCK, Verdict.EXCHANGED, Verdict.ELSEWHERE, Verdict.JOINED, Verdict.FAINT)
 
@@ -32,18 +43,29 @@ class ProductionVisits:
         The controller, and the predicted errors.
     cycle
         Makes a receiver visit.
+    tell
+        Called with each alarm.
 
     Attributes
     ----------
     cycle
         As given.
+    attempts
+        Visits that came to nothing, by receiver.
     """
 
-    def __init__(self, plant: PlantController, book: CalibrationBook, cycle: ReceiverCycle) -> None:
+    def __init__(
+        self,
+        plant: PlantController,
+        book: CalibrationBook,
+        cycle: ReceiverCycle,
+        tell: Callable[[Alarm], None],
+    ) -> None:
         self._plant, self._book, self.cycle = plant, book, cycle
         self._asked: list[tuple[str, ...]] = []
-        #: When each heliostat was measured last, and when the next visit may begin, monotonic s.
-        self._at, self._next = np.full(len(plant.field), -np.inf), -np.inf
+        self.attempts = Attempts(RECEIVER, tell)
+        #: When each heliostat was measured last, monotonic s.
+        self._at = np.full(len(plant.field), -np.inf)
 
     @property
     def surface(self) -> str:
@@ -87,7 +109,7 @@ class ProductionVisits:
         # The book has errors of the normal; a beam is off by twice as much.
         due = lit & (2.0 * self._book.error <= _SURE * settings.known)
         due &= now - self._at >= settings.every
-        if now < self._next or int(due.sum()) < settings.least:
+        if not self.attempts.due(self.surface, now) or int(due.sum()) < settings.least:
             return ()
         rows = np.flatnonzero(due)
         first = rows[np.argsort(-self._book.error[rows], kind="stable")][: settings.most]
@@ -100,8 +122,10 @@ class ProductionVisits:
         """
         now, seen = self._plant.now(), [r.heliostat for r in results if r.verdict is None]
         good = [r for r in results if r.new > 0 or r.outcome is CalibrationOutcome.NOT_VERIFIED]
-        if not good:
-            self._next = now + _LATER
+        if good:
+            self.attempts.done(self.surface)
+        elif results:
+            self.attempts.failed(self.surface, results[0].text, now)
         self._at[[self._plant.field.place(name) for name in seen]] = now
         if 2 * len(good) < len(results):
             return ()

@@ -11,6 +11,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.plant import refusals
+from heliotrope.plant.attempts import Attempts, RetryLaw
 from heliotrope.plant.authority import Person
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
@@ -29,6 +30,16 @@ _SOON = (
 _BLOCKED = 300.0
 #: Time after which a heliostat that can only go on from stow is sent there, s.
 _HALTED = 10.0
+#: Heliostats that were lost, or could not go on from where they were, after they had been raised.
+RAISING = RetryLaw(
+    "raising",
+    5,
+    0.0,
+    "a person finds the cause and gives it back with Automatic; else it is raised once next day",
+    rest=16.0 * 3600.0,
+    memory=1800.0,
+    alarm=alarms.RAISING_GIVEN_UP,
+)
 _READY = 1 << meanings.FLAGS.index("READY")
 
 Rows = npt.NDArray[np.intp]
@@ -59,6 +70,8 @@ class Raising:
     ----------
     wanted
         Which heliostats automatic control may move, (N,).
+    attempts
+        Heliostats that were raised in vain.
     """
 
     def __init__(
@@ -80,7 +93,9 @@ class Raising:
         self._busy_until = np.full(count, -math.inf)
         self._told_in = np.full(count, -1, dtype=np.int16)
         self._halted_at = np.full(count, math.inf)
-        self._blocked: set[str] = set()
+        #: Why beams have no free path, by heliostat.
+        self._blocked: dict[str, str] = {}
+        self.attempts = Attempts(RAISING, log.take_alarm)
         self._joins: list[Ticket] = []  # some of their heliostats still wait for their turn
         self._aims = plant.default_aims() if plant.design.receivers else {}
         #: Middle, ENU, m, and radius of each target, m.
@@ -99,10 +114,32 @@ class Raising:
         self._by_people[rows] = by_person & (self._by_people[rows] | ~self.wanted[rows])
         self.wanted[rows] = wanted
         self._busy_until[rows] = -math.inf
+        for name in heliostats:
+            self.attempts.done(name)
 
     def lose(self, lost: Mask) -> None:
         """Leave lost heliostats (N,) that people had raised to people."""
         self.wanted &= ~(lost & self._by_people)
+        self._failed(np.flatnonzero(lost & self.wanted), "left the receiver without an order")
+
+    def _failed(self, rows: Rows, reason: str) -> None:
+        for row in rows:
+            self.attempts.failed(self._plant.field.names[row], reason, self._plant.now())
+
+    def given_up(self) -> Mask:
+        """Return which heliostats are not raised for now: that has failed too often, (N,)."""
+        found = np.zeros(len(self._plant.field), dtype=np.bool_)
+        waiting = self.attempts.waiting(self._plant.now())
+        found[[self._plant.field.place(name) for name in waiting]] = True
+        return found
+
+    def why_not(self, heliostat: str) -> str:
+        """Return why a wanted heliostat is not raised, "" if it is or waits for its turn."""
+        if heliostat in self._blocked:
+            return f"its beam has no free path: {self._blocked[heliostat]}"
+        if not self.attempts.due(heliostat, self._plant.now()):
+            return f"it was raised in vain too often: {alarms.RAISING_GIVEN_UP.name}"
+        return ""
 
     def give_up(self) -> None:
         """Take all heliostats out of automatic control."""
@@ -147,6 +184,7 @@ class Raising:
         self._halted_at = np.where(halted, np.minimum(self._halted_at, now), math.inf)
         found = now - self._halted_at >= _HALTED
         self._halted_at[found] = math.inf
+        self._failed(np.flatnonzero(found), "could not go on from where it was")
         return np.flatnonzero(found)
 
     def able(self) -> Mask:
@@ -234,7 +272,7 @@ class Raising:
                 continue
             row = self._plant.field.place(name)
             self._busy_until[row], self._told_in[row] = self._plant.now() + _BLOCKED, state
-            self._blocked.add(name)
+            self._blocked[name] = text
             self._log.take_alarm(alarms.BEAM_BLOCKED.raised(name, reason=text))
 
     def _look_at_blocked(self) -> None:
@@ -245,5 +283,5 @@ class Raising:
         for name in sorted(self._blocked):
             row = self._plant.field.place(name)
             if self._plant.field.rows["state"][row] != self._told_in[row]:
-                self._blocked.remove(name)
+                del self._blocked[name]
                 self._log.take_alarm(alarms.BEAM_BLOCKED.ended(name))

@@ -61,6 +61,8 @@ class PlantSchedule:
     ----------
     weather
         Weather, as far as it is measured; set it when it changes.
+    attempts
+        See `Scheduler`.
     """
 
     def __init__(self, plant: PlantController, scheduler: Scheduler) -> None:
@@ -72,6 +74,7 @@ class PlantSchedule:
         self._made = -np.inf
         #: Heliostats that go to a target, by target.
         self._sent: dict[str, list[str]] = {}
+        self.attempts = scheduler.attempts
         plant.beliefs.subscribe(scheduler.learn)
         plant.beliefs.subscribe_drift(scheduler.drift)
 

@@ -11,7 +11,7 @@ Nothing here reads a clock or moves a mirror: time, sun and states are arguments
 
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from itertools import groupby, islice
 from typing import Protocol
@@ -27,10 +27,12 @@ from heliotrope.errors import InputError, TimeError, UnknownNameError
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, as_vectors
 from heliotrope.lcu import states as lcu_states
+from heliotrope.plant.attempts import Attempts, RetryLaw
 from heliotrope.plant.schedule.choice import Assignment, Judge, Mask
 from heliotrope.plant.schedule.knowledge import FieldKnowledge
 from heliotrope.plant.schedule.prospect import FieldProspect, Party, Shining, terms_of
 from heliotrope.plant.schedule.settings import Settings, Weather
+from heliotrope.safety import alarms
 
 #: A beam this many times as far off as expected says that its heliostat has changed.
 SURPRISE = 3.0
@@ -38,6 +40,17 @@ SURPRISE = 3.0
 READY = (lcu_states.IDLE, lcu_states.TRACKING)
 #: Visits from which their true pace counts in a prediction.
 ENOUGH = 10
+#: Visits to targets that failed, by heliostat; the wait is that of the settings. The rest lasts to
+#: the next day.
+VISITS = RetryLaw(
+    "visit to a target",
+    5,
+    900.0,
+    "a person looks at the mirror; one visit a day until then",
+    longest=DAY,
+    rest=16.0 * 3600.0,
+    alarm=alarms.CALIBRATION_GIVEN_UP,
+)
 #: Receiver visits to remember, some days of them.
 _SHINING = 100
 #: Finished visits to remember.
@@ -224,6 +237,8 @@ class Scheduler:
         The last visits, each with its assignment.
     shining
         The last receiver visits; they are not chosen here.
+    attempts
+        Visits that failed, by heliostat; in POSIX s.
 
     Raises
     ------
@@ -257,8 +272,8 @@ class Scheduler:
         self._judge = Judge(design, self.settings, self._known, self.names)
         # The expected information of the assignments under way, by heliostat.
         self._slopes: dict[str, FloatArray] = {}
-        self._failures, self._learnt = np.zeros((2, len(self.names)), dtype=np.int64)
-        self._retry = np.full(len(self.names), -np.inf)
+        self._learnt = np.zeros(len(self.names), dtype=np.int64)
+        self.attempts = Attempts(replace(VISITS, wait=self.settings.retry))
 
     # -- knowledge -------------------------------------------------------------------------
 
@@ -281,6 +296,7 @@ class Scheduler:
         row = self._find(record.heliostat)
         self._known.learn(row, record)
         self._learnt[row] += 1
+        self.attempts.done(record.heliostat)
 
     def drift(self, record: HeliostatCalibration) -> None:
         """Let a heliostat drift as the record of its last calibration says now.
@@ -371,7 +387,7 @@ class Scheduler:
         return assignment
 
     def _ready(self, now: float, states: States | None, away: Collection[str]) -> Mask:
-        ready = now >= self._retry
+        ready = np.ones(len(self.names), dtype=np.bool_)
         if states is not None:
             if np.shape(states.state) != ready.shape:
                 raise InputError(
@@ -379,7 +395,7 @@ class Scheduler:
                     f"{len(ready)} heliostats"
                 )
             ready &= np.isin(states.state, READY)
-        return self._without(ready, away)
+        return self._without(ready, (*away, *self.attempts.waiting(now)))
 
     def _without(self, ready: Mask, names: Collection[str]) -> Mask:
         left = np.array(ready)
@@ -401,14 +417,12 @@ class Scheduler:
         self._slopes.pop(visited.heliostat, None)
         finished = None if planned is None else Finished(planned, visited)
         if visited.calibrated:
-            self._failures[row], self._retry[row] = 0, -np.inf
+            self.attempts.done(visited.heliostat)
             if finished is not None and finished.surprise and self._learnt[row] > 1:
                 # Sightings from before the change are worth less than the covariance assumes.
                 self._known.doubt(row, (visited.measured / finished.planned.predicted) ** 2)
         else:
-            self._failures[row] += 1
-            wait = self.settings.retry * 2.0 ** (min(int(self._failures[row]), 30) - 1)
-            self._retry[row] = visited.ended + min(wait, DAY)
+            self.attempts.failed(visited.heliostat, visited.text, visited.ended)
         if finished is not None:
             self.finished.append(finished)
         return finished

@@ -54,7 +54,7 @@ class Settings:
     most_age
         Age of a calibration from which its heliostat comes before all gains, s.
     retry
-        Wait after a visit that failed, s; doubled each time, a day at most.
+        Wait after a visit that failed, s; doubled each time, until it is given up (`VISITS`).
     glare
         Least angle between the sun and a camera's line to its target, rad.
     most_hidden

@@ -27,6 +27,7 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import SeparatedBeam, Verdict
 from heliotrope.lcu import states
+from heliotrope.plant.attempts import Attempts, RetryLaw
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
@@ -53,8 +54,17 @@ from heliotrope.plant.visits.visit import Visit
 _FIRST = 1
 #: Photographs that may wait to be read while the next is taken.
 _UNREAD = 2
-#: Verdicts on a new mirror whose beam may be beside the target.
-_NOT_FOUND = (Verdict.FAINT, Verdict.ELSEWHERE)
+#: Verdicts on a new mirror whose beam may be beside the target: light that does not move at its
+#: place may be another one's.
+_NOT_FOUND = (Verdict.FAINT, Verdict.ELSEWHERE, Verdict.STUCK)
+#: Joint visits that have not proven a heliostat; one whose beam may be beside the target comes
+#: again, and aims at another place beside it.
+JOINT = RetryLaw(
+    "joint visit",
+    LOOKS,
+    0.0,
+    "it goes to a target alone, with a search for its beam",
+)
 #: Verdicts that are no mirror's fault: a verification that ends so is made again, once.
 _AGAIN = (Verdict.JOINED, Verdict.CLOUD)
 
@@ -120,6 +130,8 @@ class JointCycle:
     ----------
     settings
         See `JointSettings`.
+    attempts
+        Joint visits that have not proven a heliostat; those given up go alone.
     """
 
     def __init__(
@@ -131,12 +143,25 @@ class JointCycle:
     ) -> None:
         self._plant, self._camera, self._cycle = plant, camera, cycle
         self.settings = settings or JointSettings()
-        #: Joint first visits in which the beam of a heliostat was not found.
-        self._missed: dict[str, int] = {}
+        self.attempts = Attempts(JOINT)
 
     def searching(self, heliostat: str) -> bool:
         """Return whether a beam that was not found is looked for again in a joint first visit."""
-        return 0 < self._missed.get(heliostat, 0) < LOOKS
+        return 0 < self.attempts.counts.get(heliostat, 0) < LOOKS
+
+    def note(self, result: CycleResult) -> None:
+        """Note the result of a visit, joint or alone: whether the heliostat may come together."""
+        name, now, text = result.heliostat, self._plant.now(), result.text
+        new = self._plant.beliefs.record(name) is None
+        if result.new:
+            self.attempts.done(name)
+        elif result.verdict in _NOT_FOUND and new:
+            self.attempts.failed(name, text, now)
+        elif (
+            result.verdict not in (None, Verdict.CLOUD)
+            or result.outcome is CalibrationOutcome.NOT_VERIFIED
+        ):
+            self.attempts.give_up(name, text, now)
 
     async def run(
         self,
@@ -188,8 +213,6 @@ class JointCycle:
                     empty = await light_on(self._camera, place)
                     proven, lost = await self._stack(joint, layout, empty, tell)
                     results |= lost
-                    if first:
-                        self._note(results)
                     learn = self._learn_first if first else self._learn
                     results |= await learn(joint, proven, empty, tell)
         return tuple(results[name] for name in names)
@@ -209,13 +232,7 @@ class JointCycle:
             return arranged(self._plant, target, names, self.settings)
         nominal, cycle = self._plant.beliefs.nominal, self._cycle.settings
         model = {name: first_model(cycle, nominal(name)).parameters for name in names}
-        return newcomers(self._plant, target, names, self.settings, model, self._missed)
-
-    def _note(self, lost: Mapping[str, CycleResult]) -> None:
-        """Note which beams of new heliostats a first stack has not found."""
-        for name, result in lost.items():
-            if result.verdict in _NOT_FOUND and self._plant.beliefs.record(name) is None:
-                self._missed[name] = self._missed.get(name, 0) + 1
+        return newcomers(self._plant, target, names, self.settings, model, self.attempts.counts)
 
     # -- photographs -----------------------------------------------------------------------
 

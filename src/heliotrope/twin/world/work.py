@@ -21,11 +21,12 @@ from heliotrope.links.clock import Clock
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.mechanism.machine import Machine
 from heliotrope.plant.assembly import CYCLE
+from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations import AutomaticSettings, Logbook, Operations
 from heliotrope.plant.operations.views import CalibrationEntry, Planned
 from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
-from heliotrope.plant.schedule.scheduler import Scheduler
+from heliotrope.plant.schedule.scheduler import VISITS, Scheduler
 from heliotrope.plant.visits import CalibrationCycle, Centring, CycleSettings, JointCycle
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import Alarm
@@ -85,6 +86,7 @@ class _Rounds:
     def __init__(self, names: Sequence[str], clock: Clock) -> None:
         self._names, self._clock = names, clock
         self._last = dict.fromkeys(names, -1)
+        self.attempts = Attempts(VISITS)
         self._count = 0
 
     def next(
