@@ -43,12 +43,16 @@ _LAST = 10.0
 
 @dataclass
 class _Under:
-    """One message under way; ``again`` sends it again, if it was given under a mandate."""
+    """One message under way.
+
+    It was given with the token ``given`` and left with ``token``; ``again`` sends it again.
+    """
 
     ticket: Ticket
     cluster: str
     heliostats: tuple[str, ...]
     at: float
+    given: int = 0
     token: int = 0
     again: Callable[[tuple[str, ...]], None] | None = None
 
@@ -343,8 +347,7 @@ class PlantOrders:
     ) -> None:
         """Send a command to some heliostats of a ticket.
 
-        Under a mandate it is sent again where a cluster refuses it because the command authority
-        has just changed.
+        It is sent again where a cluster refuses it because the command authority has just changed.
 
         Parameters
         ----------
@@ -476,9 +479,8 @@ class PlantOrders:
     def _repeated(
         self, identity: str, token: int, again: Callable[[tuple[str, ...]], None]
     ) -> None:
-        """Note how a message is sent again, if it is given under a mandate."""
-        if self._authority.mandate_of(token) is not None:
-            self._under[identity].again = again
+        """Note how a message is sent again."""
+        self._under[identity].given, self._under[identity].again = token, again
 
     def _own(self, identity: str, token: int) -> int:
         """Return the token with which a message leaves now; 0: it may not leave any more."""
@@ -509,22 +511,28 @@ class PlantOrders:
         part = tuple(name for name in progress.heliostats if name in mine)
         # A report without heliostats is about all of them.
         part = part if progress.heliostats else under.heliostats
-        if progress.stage in (Stage.REFUSED, Stage.FAILED) and self._crossed(under):
+        if self._crossed(under, progress.stage):
             early = set(under.ticket.unacknowledged()).intersection(part)
             self._again.append((under, tuple(early)))
             part = tuple(name for name in part if name not in early)
         under.ticket.advance(part, progress.stage, progress.text)
         return under.ticket, part
 
-    def _crossed(self, under: _Under) -> bool:
+    def _crossed(self, under: _Under, stage: Stage) -> bool:
         """Whether a message and a change of the command authority may have crossed each other.
 
-        Its cluster may then have refused its token, and nothing else is wrong with it.
+        Its cluster may then have refused its token, and nothing else is wrong with it. What failed
+        may have been done, so a person's command is sent again only where it was refused. One of an
+        earlier holder is never sent again.
         """
-        if under.again is None:
+        mandated = self._authority.mandate_of(under.given) is not None
+        if stage is not Stage.REFUSED and not (mandated and stage is Stage.FAILED):
+            return False
+        own = self._authority.present(under.given)
+        if under.again is None or own == 0 or own != self._authority.token:
             return False
         young = self._clock.monotonic() - self._authority.changed_at < _HEARD
-        return young or under.token != self._authority.token
+        return young or under.token != own
 
     def beat(self, now: float) -> None:
         """End commands that were not answered in time; record the results of ended tickets."""
