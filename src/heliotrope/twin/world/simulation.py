@@ -378,7 +378,9 @@ class Simulation:
         persons = [person.name for person in CREW]
         lowest = self._scene.lowest
         return Watch(
-            VisitObserver(begin, boards, targets, work.away, followed=work.centred),
+            VisitObserver(
+                begin, boards, targets, work.away, followed=work.centred, dark=self._astray
+            ),
             DayObserver(begin, boards, lowest),
             results,
             ProgressObserver(
