@@ -184,7 +184,7 @@ class ProgressObserver:
         stowed -= blocked if self._across else set()
         may = governs and not operations.automatic.waits and self._high(sun)
         may &= not operations.plant.emergency_on
-        self._owned(visited, now)
+        self._owned(visited, quiet, now)
         working = [name for name in self._given & quiet if may and name not in self._out]
         for name, board in self._boards.items():
             mine = name in working and name not in visited
@@ -229,10 +229,10 @@ class ProgressObserver:
         self._up |= above > HIGHER
         return self._up
 
-    def _owned(self, visited: Set[str], now: float) -> None:
-        """Check that no mirror is LOCKED without an owner."""
+    def _owned(self, visited: Set[str], quiet: Set[str], now: float) -> None:
+        """Check that no mirror is LOCKED without an owner, where nothing has failed."""
         for name, board in self._boards.items():
-            locked = board.state == states.LOCKED and not self._emergency
+            locked = board.state == states.LOCKED and name in quiet and not self._emergency
             locked &= name not in visited | self._locked and name not in self._out
             saw = "no visit, person or emergency has it, and it has been LOCKED"
             self._within(("locked", name), locked, now, LOCKED_WITHIN, name, saw, L1)

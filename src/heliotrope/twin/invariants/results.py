@@ -86,6 +86,8 @@ class ResultObserver:
         POSIX time at 0 s of the clock.
     dark
         Heliostats of which the plant file is wrong, so that no photograph shows their beams.
+    together
+        Whether heliostats are measured at once: that one lamp or cloud spoils all is seldom.
 
     Attributes
     ----------
@@ -101,12 +103,14 @@ class ResultObserver:
         sun: Callable[[float], FloatArray],
         zero: float,
         dark: Collection[str] = (),
+        *,
+        together: bool = False,
     ) -> None:
         self.checks: Counter[int] = Counter()
         self._start, self._records, self._sun, self._zero = start, records, sun, zero
         self._boards = {board.outfit.name: board for board in boards}
         self._accounts = {name: _Account() for name in self._boards}
-        self._dark, self._barren = frozenset(dark), 0
+        self._dark, self._barren, self._together = frozenset(dark), 0, together
         self._results: set[tuple[str, float]] = set()
         self._program: Operations | None = None
         self._looked = start
@@ -215,7 +219,8 @@ class ResultObserver:
         if name not in self._dark:
             self._barren = 0 if entry.new else self._barren + 1
             saw = f"{self._barren} results in a row have brought nothing, the last: {entry.text}"
-            self._check(self._barren < max(BARREN, len(self._boards) - 1), now, name, saw)
+            few = self._barren < max(BARREN, len(self._boards) - 1)
+            self._check(few or not self._together, now, name, saw)
         saw = f"a result counts {entry.new} new sightings; {brought} came"
         self._check(entry.new == brought, now, name, saw)
         saw = f"a result counts {entry.sightings} sightings; {account.kept} are known"

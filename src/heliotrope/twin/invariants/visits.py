@@ -6,7 +6,7 @@ sighting, which must show the mirror's own beam (16).
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
@@ -50,6 +50,9 @@ class VisitObserver:
     followed
         Whether visits follow the beam that they photograph, so that the light of another one is
         never kept; without that, only a later photograph contradicts it.
+    dark
+        Heliostats that are wrong by far more than the priors allow: a covariance that stands on
+        these is not judged.
 
     Attributes
     ----------
@@ -65,9 +68,11 @@ class VisitObserver:
         away: Callable[[float], float],
         *,
         followed: bool,
+        dark: Collection[str] = (),
     ) -> None:
         self.checks: Counter[int] = Counter()
         self._start, self._away, self._followed = start, away, followed
+        self._dark = frozenset(dark)
         self._boards, self._targets = {b.outfit.name: b for b in boards}, tuple(targets)
         self._judged: set[tuple[str, int, float]] = set()
         self._kept: dict[str, int] = {}
@@ -136,7 +141,7 @@ class VisitObserver:
             deviations = float(np.sqrt(off @ np.linalg.solve(spread, off)))
             saw = f"by the calibration that the plant believes its beam is {miss:.1f} m astray"
             self._check(12, miss <= ASTRAY, now, name, saw)
-            if self._followed:
+            if self._followed and name not in self._dark:
                 saw = f"its calibration misses by {deviations:.1f} of its own standard deviations"
                 self._check(12, deviations <= DEVIATIONS, now, name, saw)
 

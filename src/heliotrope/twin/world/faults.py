@@ -131,16 +131,19 @@ def drawn(
     InputError
         An unknown kind, or a pause that is not above 0.
     """
-    known = KINDS | {k: v for kinds in KINDS_OF_WORLDS.values() for k, v in kinds.items()}
+    others = {k: v for kinds in KINDS_OF_WORLDS.values() for k, v in kinds.items()}
+    known = KINDS | {k: v for k, v in others.items() if k not in KINDS}
     for kind in only:
         if kind not in known:
             raise InputError(f"fault {kind!r} is not known; known: {', '.join(known)}")
     if not pause > 0.0:
         raise InputError(f"a pause of {pause} s between faults; it must be above 0")
     chance = random.Random(f"faults {seed}")
-    usual = () if "days" in worlds else KINDS
-    kinds = list(only) or [*usual, *(k for w in worlds for k in KINDS_OF_WORLDS.get(w, {}))]
-    weighed = weights_of(worlds, seed, {kind: known[kind][0] for kind in kinds})
+    here = {} if "days" in worlds else dict(KINDS)
+    for world in worlds:
+        here |= KINDS_OF_WORLDS.get(world, {})
+    kinds = list(only) or list(here)
+    weighed = weights_of(worlds, seed, {kind: here.get(kind, known[kind])[0] for kind in kinds})
     weights = [weighed[kind] for kind in kinds]
     pause = pause_of(worlds, seed, pause)
     found: list[Fault] = []

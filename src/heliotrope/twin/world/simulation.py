@@ -371,12 +371,16 @@ class Simulation:
     def _new_watch(self, work: Work, *, together: bool) -> Watch:
         begin, boards, targets = self.begin, self.boards, self._scene.targets
         zero = self._clock.utc().timestamp() - self._clock.monotonic()
-        results = ResultObserver(begin, boards, work.records, self.sun, zero, self._astray)
+        results = ResultObserver(
+            begin, boards, work.records, self.sun, zero, self._astray, together=together
+        )
         work.camera.told = results.photographed
         persons = [person.name for person in CREW]
         lowest = self._scene.lowest
         return Watch(
-            VisitObserver(begin, boards, targets, work.away, followed=work.centred),
+            VisitObserver(
+                begin, boards, targets, work.away, followed=work.centred, dark=self._astray
+            ),
             DayObserver(begin, boards, lowest),
             results,
             ProgressObserver(

@@ -55,7 +55,7 @@ MIX = (
 RARE, RARE_SHARE = ("lights", "clock", "site", "addresses"), 0.04
 #: Shares of days with motors that step coarsely, and with heliostats of which the plant file is
 #: wrong; by how much, rad of the mirror.
-_COARSE, _UNSURVEYED, _BESIDE = 1.0 / 3.0, 1.0 / 3.0, (0.04, 0.05)
+_COARSE, _UNSURVEYED, _BESIDE = 1.0 / 3.0, 1.0 / 3.0, (0.018, 0.022)
 #: Share of the runs of `mixed` that are a working day, and nothing else.
 DAYS_SHARE = 0.1
 
@@ -204,15 +204,15 @@ def motors_of(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[
 
 
 def surveyed(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
-    """Return heliostats as the plant file has them: on one day in three it is wrong about four.
+    """Return heliostats as the plant file has them: on one day in three it is wrong about three.
 
-    Their beams then go beside the targets, where no photograph shows them.
+    From 80 m on, their beams then go beside the targets, where no photograph shows them.
     """
     chance = random.Random(f"survey {seed}")
     if DAYS not in worlds or chance.random() >= _UNSURVEYED:
         return list(fits)
     found = list(fits)
-    for i in chance.sample(range(len(fits)), 4):
+    for i in chance.sample(range(len(fits)), 3):
         fit, size = fits[i], chance.choice([-1.0, 1.0]) * chance.uniform(*_BESIDE)
         causes = {**fit.causes, "canting": fit.causes["canting"] + size}
         mechanism = fit.with_causes(causes)
