@@ -612,6 +612,7 @@ def test_a_joint_visit_that_is_refused_is_one_event_and_not_one_of_each() -> Non
 
     made.cycle.run = run  # type: ignore[method-assign]
     made._plant.emergency_on = True  # type: ignore[misc]
+    made._plant.authority = SimpleNamespace(grant=None)  # type: ignore[assignment]
     noted, done = list[tuple[str, ...]](), list[str]()
     calibrating = calibrating_of(made, lambda *words: noted.append(words), done)
     calibrating.ask_together(("A", "B", "C"), "left")

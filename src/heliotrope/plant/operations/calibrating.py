@@ -383,7 +383,7 @@ class Calibrating:
         return np.asarray(self._now() - self._visited > FRESH)
 
     def _interrupted(self, token: int) -> bool:
-        """Return whether an emergency, or another holder of the authority, ended a visit."""
+        """Return whether an emergency, or a person who took command, may have ended a visit."""
         grant = self._plant.authority.grant
         return self._plant.emergency_on or grant is None or grant.token != token
 
