@@ -16,7 +16,7 @@ from heliotrope.lcu import states
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.operations.automatic import AUTOMATIC
-from heliotrope.plant.visits import CycleResult
+from heliotrope.plant.visits import CycleResult, CycleSettings
 from support.joint_scene import Scene, joint
 from support.visit_scene import ENGINEER, believe
 
@@ -372,3 +372,49 @@ def test_a_command_that_crosses_a_change_of_the_token_is_sent_again() -> None:
         assert "authority" in ticket.refusals.get(name, "authority")
 
     played(scene, count=2)
+
+
+def test_no_person_sends_a_beam_to_an_aim_with_parameters_that_are_not_verified() -> None:
+    """Simulated run 7200006: TRACK came between the writing and the photograph."""
+
+    async def scene(here: Scene) -> None:
+        plant, name = here.live.plant, here.names[0]
+        visit = asyncio.create_task(here.run())
+        await reached(here, "verification: photograph 2", visit)
+        token = commanded(here, VERA)
+        await asyncio.sleep(3.0)
+        target = here.live.design.targets[1].center
+        with pytest.raises(BeamError, match="has yet to verify its new parameters"):
+            plant.command(VERA, token, "TRACK", (name,))
+        with pytest.raises(BeamError, match="has yet to verify its new parameters"):
+            plant.aim(VERA, token, {name: target})
+        plant.command(VERA, token, "JOG", (name,), (0, 400))
+        await visit
+        # Its local controller refuses the JOG and tracks on: the visit takes the beam off.
+        await until(here, lambda: here.states()[name] in ("DEFOCUSED", "IDLE"), 60.0)
+        plant.stow("Vera", (name,))
+        await until(here, lambda: here.states()[name] == "STOWED")
+        await kept(here)
+
+    played(scene, installed=1.0, cycle=CycleSettings())
+
+
+def test_a_loss_of_many_ends_the_visits_of_automatic_control() -> None:
+    """Simulated run 7200013: a visit that had just begun sent a beam to its target after it."""
+
+    async def scene(here: Scene) -> None:
+        plant, operations = here.live.plant, here.live.operations
+        believe(here.live, 1e-3)
+        plant.release_authority(ENGINEER, here.token)
+        operations.give_back(ENGINEER)
+        operations.automatic.switch(on=True)
+        await until(here, lambda: any(_stages(here, "photograph 2 ")))
+        operations.automatic._losses._wait("many were lost")
+        await until(here, lambda: not operations.calibration().running, 30.0)
+        await asyncio.sleep(5.0)
+        assert "TRACKING" not in {here.states()[name] for name in here.names}
+        results = operations.calibration().results
+        assert all("waits for Resume" in result.text for result in results), results
+        operations.automatic.switch(on=False)
+
+    played(scene)

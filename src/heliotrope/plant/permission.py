@@ -24,6 +24,8 @@ from heliotrope.plant.tickets import Ticket
 
 #: Commands that move nothing; they take no heliostat out of a visit.
 SETTINGS = frozenset({"LOCK_AIM", "ROUGH"})
+#: Commands that send beams to their aims.
+_TO_AIMS = JOINING | {"AIM"}
 #: Commands that bring beams to standby.
 _TO_STANDBY = ("APPROACH", "IDLE")
 #: States in which beams are off.
@@ -171,7 +173,8 @@ class Permission:
         """Return the ticket of a command that may be given, with its record on the way.
 
         It ends at once for those that are ``blocked``. A person's command takes the others out of
-        the visits that they are in.
+        the visits that they are in. Where a visit verifies new parameters, no person sends the beam
+        to an aim: only the visit sees whether it gets there.
 
         Raises
         ------
@@ -183,7 +186,13 @@ class Permission:
         self._authority.check(person, token, name)
         self.refuse_now(name, heliostats)
         mandate = self._authority.mandate_of(token)
-        if mandate is not None and (wrong := mandate.refused(heliostats)):
+        if mandate is not None:
+            wrong = mandate.refused(heliostats)
+        else:
+            wrong = self._doubts.verifying(heliostats) if name in _TO_AIMS else {}
+            if name in JOINING and len(wrong) < len(heliostats):
+                blocked, wrong = {**blocked, **wrong}, {}
+        if wrong:
             raise BeamError(name, wrong)
         try:
             ticket = self._orders.accept(

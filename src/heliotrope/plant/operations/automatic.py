@@ -196,7 +196,7 @@ class AutomaticControl:
             clearance=settings.margin * self.installed,
             wanted=settings.wanted,
         )
-        self._losses = Losses(plant, logbook, settings.losses, records, self.give_way)
+        self._losses = Losses(plant, logbook, settings.losses, records, self._wait)
         visits = CycleSettings() if cycle is None else cycle.settings
         self.flights = FlightIntake(plant, logbook, self._keeping, visits)
         self.learning = Learning(
@@ -407,14 +407,14 @@ class AutomaticControl:
     def stop(self) -> None:
         """Begin nothing more; to be called before `run` is cancelled."""
         self._stopped = True
-        self._end_visits()
+        self._end_visits("automatic control has been stopped")
 
     async def halt(self, limit: float = 5.0) -> None:
         """Give up all work, and wait for visits under way to end, ``limit`` s at most."""
         self._on = False
         self._raising.give_up()
         self.give_way()
-        self._end_visits()
+        self._end_visits("automatic control has been stopped")
         until = self._plant.now() + limit
         while self._visiting() and self._plant.now() < until:
             await self._sleep(0.5)
@@ -425,9 +425,14 @@ class AutomaticControl:
         if self._has_authority():
             self._plant.release_authority(AUTOMATIC, self._token)
 
-    def _end_visits(self) -> None:
+    def _wait(self) -> None:
+        """Begin to wait for a person's Resume: visits under way end, too."""
+        self.give_way()
+        self._end_visits("automatic control waits for Resume")
+
+    def _end_visits(self, why: str) -> None:
         """Refuse all further commands of visits under way: their beams are taken off."""
-        self._plant.authority.end_mandates(AUTOMATIC, "automatic control has been stopped")
+        self._plant.authority.end_mandates(AUTOMATIC, why)
 
     # -- views -----------------------------------------------------------------------------
 

@@ -435,6 +435,7 @@ class CalibrationCycle:
         except BaseException:
             # The local controller gets the old parameters as soon as its state allows it.
             plant.want(name, present[0])
+            visit.taken_off()
             raise
         plant.want(name, present[0])
         said = f"{problem}; the old parameters are back"

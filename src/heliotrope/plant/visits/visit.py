@@ -316,6 +316,12 @@ class Visit(BroughtHome):
         """The times, monotonic s, (R,), and the step counts, (R, 2), that were noted."""
         return np.array(self._times), np.array(self._counts).reshape(-1, 2)
 
+    def taken_off(self) -> None:
+        """Take its beam off where another order has left it at an aim with unproven parameters."""
+        state = int(self.plant.field.rows["state"][self.row])
+        if state in (states.TRACKING, states.SEARCHING):
+            self.plant.defocus(f"visit of {self.mandate.person.name}", (self.heliostat,))
+
     async def home(self) -> None:
         """Bring it back to standby; where that is not possible, take its beam off the target.
 
