@@ -11,9 +11,10 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import direction
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.mechanism.drives import SLOTS
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.beam_watch import BeamError
-from heliotrope.plant.visits.joint_layout import SentBeam, _places, _too_bright, beam_of
+from heliotrope.plant.visits.joint_layout import SentBeam, _places, _too_bright, beam_of, coded
 from heliotrope.plant.visits.joint_visit import JointVisit
 from heliotrope.plant.visits.visit import ARRIVED
 
@@ -163,6 +164,40 @@ def test_only_a_mirror_before_the_plane_of_a_target_sends_its_beam_there(before:
     )
     found = beam_of(plant, target, design.names[0], 1e-3)
     assert isinstance(found, SentBeam) if before > 0.0 else "the front of aside" in str(found)
+
+
+@pytest.mark.parametrize(
+    ("along", "sizes"), [(1, (0.025, 0.04, 0.025)), (None, (0.025, 0.12, 0.1))]
+)
+def test_a_coarse_mirror_moves_by_two_of_its_steps(
+    along: int | None, sizes: tuple[float, ...]
+) -> None:
+    target = malan_plant(1).targets[0]
+    steps = np.array([(0.0, 0.0), (0.06, 0.02), (0.05, 0.01)])
+    known = {
+        name: SentBeam(50.0, np.eye(2), np.eye(2), 1e-8, 1.0, step)
+        for name, step in zip(NAMES, steps, strict=True)
+    }
+    layout = coded(target, known, np.zeros((3, 2)), np.arange(3), 5e-4, along)
+    np.testing.assert_allclose(np.abs(layout.moves).max(axis=(0, 2)), sizes)
+
+
+def test_a_mirror_with_steps_too_coarse_for_a_joint_visit_takes_no_part() -> None:
+    design = malan_plant(1)
+    target, beams = design.targets[0], BeamCheck(design, design.names)
+    beams.machines.clear()
+    plant: Any = SimpleNamespace(
+        field=SimpleNamespace(place=lambda _: 0),
+        design=design,
+        beams=beams,
+        sun_vector=lambda: direction(np.radians(80.0), np.radians(30.0)),
+    )
+    fine = beam_of(plant, target, design.names[0], 1e-3)
+    assert isinstance(fine, SentBeam)
+    beams.drives.table[0, :, SLOTS["rate"]] *= 200.0
+    assert "its drives move its beam in steps of" in str(
+        beam_of(plant, target, design.names[0], 1e-3)
+    )
 
 
 def test_beams_in_one_place_are_too_bright_wherever_it_is_and_those_apart_are_not() -> None:
