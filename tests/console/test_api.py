@@ -442,7 +442,7 @@ def test_a_command_has_one_record(console: LiveConsole, ask: Ask) -> None:
     ask("operator", "DELETE", "authority")
     early = ask("operator", "POST", "commands", order)
     assert early.status_code == 409
-    assert "take it first" in early.json()["detail"]
+    assert "take command first" in early.json()["detail"]
     _take(ask)
     answer = ask("operator", "POST", "commands", order)
     assert answer.status_code == 200, answer.text

@@ -55,7 +55,7 @@ def test_what_is_not_set(console: LiveConsole, ask: Ask, tokens: dict[str, str])
     assert ask("operator", "POST", "parameters", order).status_code == 403
     ask("engineer", "DELETE", "authority")
     early = ask("engineer", "POST", "parameters", order)
-    assert (early.status_code, "take it first" in early.json()["detail"]) == (409, True)
+    assert (early.status_code, "take command first" in early.json()["detail"]) == (409, True)
     assert ask("engineer", "POST", "parameters", {**order, "reason": ""}).status_code == 422
     assert ask("viewer", "GET", "heliostats/Z9/parameters").status_code == 404
     assert console.live.plant.beliefs.record(name) is None

@@ -258,7 +258,7 @@ def test_a_wrong_key_is_refused_and_noted(plant: LiveConsole) -> None:
         ("viewer", "heliostat", {"name": "nobody"}, "nobody"),
         ("viewer", "heliostat", {"name": ["P0001A"]}, "name: "),
         ("viewer", "summary", {"more": 1}, "more: "),
-        ("operator", "command", {"command": "TRACK"}, "take it first"),
+        ("operator", "command", {"command": "TRACK"}, "take command first"),
     ],
 )
 def test_calls_that_are_refused(

@@ -135,7 +135,7 @@ def test_a_command_comes_through_all_stages(tmp_path: Path) -> None:
 def test_only_the_one_authority_commands(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         plant = bench.plant
-        with pytest.raises(RefusedError, match="nobody has it; Olga must take it first"):
+        with pytest.raises(RefusedError, match="nobody has it; Olga must take command first"):
             plant.command(OPERATOR, 1, "APPROACH")
         with pytest.raises(RefusedError, match="Vera is viewer; it needs operator"):
             plant.take_authority(VIEWER)

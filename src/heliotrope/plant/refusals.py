@@ -81,7 +81,7 @@ ROLE_TOO_LOW = Refusal(
 NO_AUTHORITY = Refusal(
     "no command authority",
     "Nobody has the command authority, or it has expired.",
-    "command authority: nobody has it; {person} must take it first",
+    "command authority: nobody has it; {person} must take command first",
     "Take command, then give the command again.",
 )
 OTHER_AUTHORITY = Refusal(
