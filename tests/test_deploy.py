@@ -68,6 +68,38 @@ def test_every_refusal_is_in_the_handbook_and_on_the_page() -> None:
     assert [name for name in names_of if f"| {name} |" not in page] == []
 
 
+def test_every_reason_why_it_does_not_go_on_is_in_the_handbook() -> None:
+    text = section(r"## Why does it not go on\?")
+    room = ROOT / "src" / "heliotrope" / "plant" / "operations"
+    reasons = {"it is starting"}
+    for name, functions in (
+        ("automatic.py", ("_why_not", "_why_idle", "_why_waiting")),
+        ("raising.py", ("why_not",)),
+    ):
+        for node in ast.walk(ast.parse((room / name).read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef) and node.name in functions:
+                ends = [end for end in ast.walk(node) if isinstance(end, ast.Return)]
+                parts = [part for end in ends for part in ast.walk(end)]
+                texts = [p.value for p in parts if isinstance(p, ast.Constant)]
+                reasons |= {text.strip() for text in texts if len(text) > 2}
+    assert len(reasons) > 10
+    assert [reason for reason in sorted(reasons) if reason not in text] == []
+
+
+def test_every_law_of_retries_is_in_the_handbook_and_on_the_page_of_the_plant() -> None:
+    page = (ROOT / "docs" / "explanation" / "plant.md").read_text(encoding="utf-8")
+    table = page.partition("## What is tried again\n")[2].partition("\n## ")[0]
+    told = section(r"## Why does it not go on\?")
+    laws = {}
+    for path in (ROOT / "src" / "heliotrope").rglob("*.py"):
+        source = path.read_text(encoding="utf-8")
+        laws |= dict(re.findall(r'^(\w+) = RetryLaw\(\n    "([^"]+)"', source, re.M))
+        assert source.count("= RetryLaw(") == len(re.findall(r"^\w+ = RetryLaw\(", source, re.M))
+    assert len(laws) >= 7
+    assert [name for name in laws if f"(`{name}`)" not in table] == []
+    assert [work for work in laws.values() if work not in told] == []
+
+
 def test_alarms_are_raised_from_the_table_only() -> None:
     """No place in the code names an alarm by a text of its own."""
     found = []
