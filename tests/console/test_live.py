@@ -163,7 +163,7 @@ def test_ctl_at_the_plant_itself(ctl: Callable[..., Any], console: LiveConsole) 
     name = console.live.names[9]
     where = ("--url", "http://127.0.0.1:1/", "--data", str(console.folder))
     assert "2 of 2 clusters heard" in ctl("viewer", *where, "status").stdout
-    for what in ("alarms", "events", "packets", "holds", "schedule", "emergency", name):
+    for what in ("alarms", "events", "packets", "holds", "retries", "schedule", "emergency", name):
         shown = ctl("viewer", *where, "show", what)
         assert shown.exit_code == 0, shown.output
     stowed = ctl("operator", *where, "stow", name, "--wait", "60")
@@ -175,8 +175,18 @@ def test_ctl_at_the_plant_itself(ctl: Callable[..., Any], console: LiveConsole) 
     assert "AIM: 1" in aimed.stdout, aimed.output
     out = ctl("operator", *where, "out-of-service", name, "--reason", "washing")
     assert out.exit_code == 0, out.output
+    assert f"OUT_OF_SERVICE: 1 done ({name}: parked in stow and locked out; " in out.stdout
     assert console.call(lambda: console.live.operations.heliostat(name).hold)
+    left = ctl("operator", *where, "automatic", name)
+    assert left.exit_code == 1
+    assert left.stdout.startswith(f"AUTOMATIC: 1 refused ({name}: out of service: washing (")
     assert ctl("operator", *where, "give-back", name).exit_code == 0
+    follows = ctl("operator", *where, "automatic", name)
+    assert follows.exit_code == 0, follows.output
+    assert f"AUTOMATIC: 1 done ({name}: automatic control has it: " in follows.stdout
+    asked = ctl("operator", *where, "calibrate", name, "--wait", "0")
+    assert asked.exit_code == 0, asked.output or str(asked.exception)
+    assert asked.stdout.startswith(f"CALIBRATE: 1 waiting ({name}: it waits: "), asked.stdout
     called = ctl("viewer", *where, "emergency", "--reason", "smoke")
     assert "emergency in force" in called.stdout
     assert ctl("operator", *where, "emergency", "--withdraw").exit_code == 0
