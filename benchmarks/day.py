@@ -113,7 +113,7 @@ async def _live(count: int, minutes: float, looks: int) -> list[Row]:
     clock = VirtualClock(asyncio.get_running_loop().time, MORNING)
     rows: list[Row] = []
     design = malan_plant(count)
-    world = World(design, clock, WorldOptions(rendered=False, threads=0))
+    world = World(design, clock, WorldOptions(rendered=False))
     settings = AssemblySettings(
         AutomaticSettings(wanted=True), cycle=CYCLE, machines=MachineTables.HELD
     )

@@ -4,11 +4,13 @@ That a cycle makes a real mirror better is shown in test_plant_whole.py.
 """
 
 import asyncio
+import contextlib
 import re
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from zlib import crc32
 
@@ -480,7 +482,9 @@ class _Stuck(Visit):
     """Of a heliostat that cannot be brought home."""
 
     def __init__(self) -> None:
-        pass
+        self.heliostat = "A"
+        fine = SimpleNamespace(fine=lambda names: contextlib.nullcontext())
+        self.plant = SimpleNamespace(stepping=fine)  # type: ignore[assignment]
 
     async def home(self) -> None:
         raise RefusedError("nobody has the authority")

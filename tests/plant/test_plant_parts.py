@@ -468,6 +468,7 @@ class _Endless:
     def __init__(self, names: int) -> None:
         self.asked, self.plans, self._names = 0, 0, names
         self.running: dict[str, object] = {}
+        self.attempts = None
 
     def upcoming(self, *_: object) -> Iterator[Assignment]:
         self.plans += 1

@@ -239,7 +239,9 @@ def test_drivers_rest_again_however_a_visit_ends(out: str) -> None:
             plant.withdraw_emergency(ENGINEER)
             await asyncio.sleep(4.0)
             plant.acknowledge(ENGINEER, "operator_emergency")
-        plant.seize_authority(ENGINEER, "a test")
+        token = plant.seize_authority(ENGINEER, "a test").token
+        if out == "another's command":
+            plant.command(ENGINEER, token, "IDLE", plant.field.names)
         await until(live, lambda: all(rough(live)), 15.0)
 
     live(work, few())

@@ -276,7 +276,7 @@ def test_imperfections_are_counted_once() -> None:
 
 def test_a_record_of_a_command_that_was_given_up_belongs_to_nothing_and_says_so() -> None:
     plant = SimpleNamespace(
-        field=SimpleNamespace(live=lambda now: np.zeros(0, dtype=bool)), emergency=None
+        field=SimpleNamespace(live=lambda now: np.zeros(0, dtype=bool)), emergency=None, orders=()
     )
     for result, good in (("PARAMETERS: 1 failed (H1: not sent: too late)", True), ("done", False)):
         disk = RecordsDisk()

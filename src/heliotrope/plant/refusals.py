@@ -288,6 +288,9 @@ FLIGHT_BUSY = Refusal(
     "Give it again in a minute.",
 )
 
+#: Reasons that end by themselves within seconds.
+SOON = frozenset(kind.text for kind in (NOT_HEARD, NOT_COMPARED, PLACE_UNKNOWN, STILL_MOVING))
+
 #: All kinds of refusal, in the order of the reference.
 KINDS: tuple[Refusal, ...] = tuple(
     kind for kind in tuple(globals().values()) if isinstance(kind, Refusal)

@@ -19,13 +19,6 @@ from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import alarms
 
-#: Refusals that end by themselves within seconds: the heliostat is tried again at the next turn.
-_SOON = (
-    refusals.NOT_HEARD.text,
-    refusals.NOT_COMPARED.text,
-    refusals.PLACE_UNKNOWN.text,
-    refusals.STILL_MOVING.text,
-)
 #: Time before a heliostat whose beam has no clear way is tried again, s.
 _BLOCKED = 300.0
 #: Time after which a heliostat that can only go on from stow is sent there, s.
@@ -268,7 +261,7 @@ class Raising:
     def _block(self, wrong: Mapping[str, str], state: int) -> None:
         """Leave heliostats where they are until the sun has moved on."""
         for name, text in wrong.items():
-            if text in _SOON:
+            if text in refusals.SOON:  # it is tried again at the next turn
                 continue
             row = self._plant.field.place(name)
             self._busy_until[row], self._told_in[row] = self._plant.now() + _BLOCKED, state

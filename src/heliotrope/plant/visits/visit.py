@@ -20,6 +20,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
 from heliotrope.mechanism.drives import Drive
+from heliotrope.plant import refusals
 from heliotrope.plant.authority import Mandate, RefusedError
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
@@ -147,8 +148,19 @@ class Visit(BroughtHome):
         RefusedError
             As `obey`; or if another order has taken the heliostat out of the visit.
         """
-        mandate = self.mandate
-        ticket = self.plant.command(mandate.person, mandate.token, name, (self.heliostat,), values)
+        mandate, until = self.mandate, self.plant.now() + SILENT
+        while True:
+            try:
+                ticket = self.plant.command(
+                    mandate.person, mandate.token, name, (self.heliostat,), values
+                )
+                break
+            except BeamError as error:
+                # What ends by itself within seconds is no reason to end a visit.
+                soon = error.refusals.get(self.heliostat) in refusals.SOON
+                if not soon or self.plant.now() >= until:
+                    raise
+            await self.look()
         await self.obey(ticket, limit)
 
     async def aim(self, point: FloatArray, limit: float = 120.0) -> None:
