@@ -92,9 +92,7 @@ class Light:
 
 async def _visit(clock: VirtualClock, count: int, most: int, rows: list[Row]) -> None:
     design = watched(count, most)
-    options = WorldOptions(
-        rendered=False, threads=0, installed=partial(roughly_installed, seed=3, scale=0.03)
-    )
+    options = WorldOptions(rendered=False, installed=partial(roughly_installed, seed=3, scale=0.03))
     world = World(design, clock, options)
     work = AutomaticSettings(wanted=True, calibrate=False)
     built = PlantAssembly(

@@ -69,7 +69,7 @@ def test_the_plant_itself_photographs_calibrates_and_lists(
     name = console.live.names[46]
     with pytest.raises(HeliotropeError, match="no target with a camera 'nowhere'"):
         AtPlant(tokens["engineer"], console.folder).ask("POST", "targets/nowhere/photograph")
-    assert f"asked for: {name}" in ctl("calibrate", name, data=True)
+    assert f"CALIBRATE: 1 waiting ({name}" in ctl("calibrate", name, "--wait", "0", data=True)
     listed = json.loads(ctl("photographs", "--limit", "5", "--json", data=True))
     assert listed == ask("viewer", "GET", "photographs?limit=5").json()
     with pytest.raises(HeliotropeError, match="only known to the console"):

@@ -188,18 +188,7 @@ class PlantController:
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
         self._rivals, self._told_alarms = Rivals(self.name, self._tell), ToldAlarms()
         self._cluster_settings = ClusterSettings(self._tell, _expected(self.settings))
-        self._orders = PlantOrders(
-            clock,
-            self.authority,
-            audit,
-            disk or AtOnce(),
-            self._clusters,
-            self.name,
-            self.settings.lifetime,
-            self.settings.patience,
-            self.settings.stow_rate,
-            self._sent,
-        )
+        self._orders = self._ordering(clock, audit, disk or AtOnce())
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
         self._sync = ParameterSync(
             self.field,
@@ -219,6 +208,21 @@ class PlantController:
         self._named_at, self._slow_at = dict.fromkeys(members, -math.inf), -math.inf
         self._closing = asyncio.Event()
         self._last_safe: tuple[tuple[str, Act, tuple[str, ...]], Ticket] | None = None
+
+    def _ordering(self, clock: Clock, audit: Audit, disk: Disk) -> PlantOrders:
+        """Return what follows accepted commands to their ends."""
+        return PlantOrders(
+            clock,
+            self.authority,
+            audit,
+            disk,
+            self._clusters,
+            self.name,
+            self.settings.lifetime,
+            self.settings.patience,
+            self.settings.stow_rate,
+            self._sent,
+        )
 
     def _guarded(self, table: Iterable[Condition] | None) -> Sentinel:
         """Return the sentinel, with the plant's own readings of the safety table."""

@@ -316,17 +316,7 @@ class Simulation:
         self.observer = PlantObserver(
             self.begin, self.disk, SETTINGS, observers, automatic=works(plan.worlds)
         )
-        self.operator = Operator(
-            self._clock,
-            plan.seed,
-            Habits.of(plan.worlds, plan.seed),
-            self.observer,
-            self.beams,
-            fits,
-            self.pods,
-            scene.keep_outs[0][0],
-            None if self._measured else self._flux,
-        )
+        self.operator = self._new_operator(fits, scene.keep_outs[0][0])
         self.operator.quiet, self.operator.tickets = self.quiet, self.tickets
         self._exits = contextlib.ExitStack()
         self._work = self._new_work() if works(plan.worlds) else None
@@ -340,6 +330,22 @@ class Simulation:
         self._program: list[asyncio.Task[None]] = []
         for pod in self.pods:
             pod.plant = self.observer
+
+    def _new_operator(
+        self, fits: Sequence[Outfit], keep_out: tuple[float, float, float]
+    ) -> Operator:
+        """Return the persons who command."""
+        return Operator(
+            self._clock,
+            self.plan.seed,
+            Habits.of(self.plan.worlds, self.plan.seed),
+            self.observer,
+            self.beams,
+            fits,
+            self.pods,
+            keep_out,
+            None if self._measured else self._flux,
+        )
 
     def _quiet_observer(self) -> QuietObserver | None:
         """Return the observer of work; None: what is wrong from the start hinders it."""
