@@ -136,7 +136,7 @@ def test_a_persons_order_takes_one_heliostat_out_and_the_others_go_on(order: str
         results = await visit
         assert good(results, gone), results
         assert f"left the visit: Vera ordered {order}" in results[gone].text
-        assert results[gone].outcome is CalibrationOutcome.REFUSED
+        assert results[gone].outcome is CalibrationOutcome.TAKEN_OUT
         await asyncio.sleep(200.0)
         stands = {"IDLE": "IDLE", "STOW": "STOWED", "DEFOCUS": "DEFOCUSED"}.get(order, "TRACKING")
         assert here.states() == {gone: stands} | dict.fromkeys(others, "TRACKING")

@@ -5,7 +5,7 @@ import itertools
 import json
 import struct
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,7 +34,14 @@ from heliotrope.mechanism.board_items import (
 from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.plant.aims import BeamCheck, spread
 from heliotrope.plant.audit import STOPPED, AuditError, JsonLines, Record, read
-from heliotrope.plant.authority import Authority, Person, RefusedError, Role
+from heliotrope.plant.authority import (
+    Authority,
+    Mandate,
+    Person,
+    RefusedError,
+    Role,
+    TakenOutError,
+)
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoiningJob, JoinQueue
 from heliotrope.plant.links_file import PlantLinks
@@ -589,3 +596,29 @@ def test_a_mandate_outlives_its_holder_and_ends_heliostat_by_heliostat() -> None
             authority.check(egon, mandate.token, "TRACK")
     assert authority.token == 0
     assert authority.left(mandate.token, "A") == {"A"}
+
+
+@pytest.mark.parametrize(
+    ("end", "wanted"),
+    [
+        (lambda a, m: a.prevail("AB", "Vera ordered STOW"), TakenOutError),
+        (lambda a, m: a.prevail("A", "Vera ordered STOW"), RefusedError),
+        (lambda a, m: a.prevail("AB", "the safety table ordered STOW", fault=True), RefusedError),
+        (lambda a, m: m.give_up("AB"), RefusedError),
+    ],
+)
+def test_a_visit_that_orders_of_others_have_ended_says_so(
+    end: Callable[[Authority, Mandate], None], wanted: type[RefusedError]
+) -> None:
+    egon = Person("Egon", Role.ENGINEER)
+    authority = Authority(VirtualClock())
+    token = authority.take(egon).token
+
+    def visit() -> None:
+        with authority.mandate(egon, token, "AB", "target") as mandate:
+            end(authority, mandate)
+            raise RefusedError("IDLE: not accepted")
+
+    with pytest.raises(RefusedError, match="IDLE: not accepted") as raised:
+        visit()
+    assert type(raised.value) is wanted

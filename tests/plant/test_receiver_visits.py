@@ -303,7 +303,7 @@ def test_a_persons_order_takes_one_out_of_production_and_the_others_go_on() -> N
 
         here.during = stowed
         results = await here.run()
-        assert results[gone].outcome is CalibrationOutcome.REFUSED
+        assert results[gone].outcome is CalibrationOutcome.TAKEN_OUT
         assert "it left the visit: Vera ordered STOW" in results[gone].text
         # A sixth of the light has gone with it, which looks like a cloud.
         assert {results[name].verdict for name in others} == {Verdict.CLOUD}, results

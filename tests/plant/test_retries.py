@@ -16,7 +16,8 @@ from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.attempts import Attempts
-from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.authority import RefusedError, TakenOutError
+from heliotrope.plant.emergency.sentinel import _TABLE
 from heliotrope.plant.operations import Logbook
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import FRESH, PLACES, Calibrating
@@ -24,7 +25,7 @@ from heliotrope.plant.operations.raising import RAISING
 from heliotrope.plant.operations.views import CalibrationEntry, Planned
 from heliotrope.plant.schedule.scheduler import VISITS
 from heliotrope.plant.visits import CycleResult
-from heliotrope.safety import Alarm
+from heliotrope.safety import Act, Alarm
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 NAME = "P1A"
@@ -127,6 +128,58 @@ def test_what_a_person_or_an_emergency_has_ended_is_no_failure(tmp_path: Path) -
         assert await here.visit() == here.plant.field.names[:1]
         assert here.schedule.entries == []
         assert here.calibrating.retries() == ()
+
+    play(tmp_path, scene)
+
+
+def test_a_heliostat_that_a_person_orders_out_of_its_visit_has_not_failed(tmp_path: Path) -> None:
+    async def scene(here: Scene) -> None:
+        here.visits.ends = TakenOutError("it left the visit: Vera ordered STOW")
+        (name,) = await here.visit()
+        assert here.schedule.entries == []
+        assert here.calibrating.retries() == (), "nor has the target"
+        entry = here.calibrating.result(name, 0.0)
+        assert isinstance(entry, CalibrationEntry)
+        assert entry.outcome is CalibrationOutcome.TAKEN_OUT
+        # What is refused otherwise counts as ever.
+        here.visits.ends = RefusedError("it is not at its aim in fine steps within 120 s")
+        (name,) = await here.visit()
+        assert [one.heliostat for one in here.schedule.entries] == [name]
+
+    play(tmp_path, scene)
+
+
+def test_an_order_that_a_heliostat_has_caused_is_its_failure(tmp_path: Path) -> None:
+    async def scene(here: Scene) -> None:
+        plant, names = here.plant, here.plant.field.names
+        first, second, *others = names
+        plant.release_authority(OPERATOR, here.token)
+        token = plant.take_authority(ENGINEER).token
+        with plant.authority.mandate(ENGINEER, token, names, "target") as mandate:
+            # A beam where none may be, by a wrong parameter or a faulty board.
+            plant._sentinel.send_safe(_TABLE, Act.DEFOCUS, (first,), "keep_out_predicted")
+            plant.stow("Vera", (second,))
+            assert mandate.taken.keys() == {first, second}
+            assert mandate.blameless == {second}
+            plant.raise_emergency("Vera")
+            assert mandate.blameless == {second, *others}
+
+    play(tmp_path, scene)
+
+
+@pytest.mark.parametrize("taken", [True, False])
+def test_only_the_others_of_a_joint_visit_have_failed(tmp_path: Path, taken: bool) -> None:
+    async def scene(here: Scene) -> None:
+        names = here.plant.field.names[:3]
+        out = CalibrationOutcome.TAKEN_OUT if taken else CalibrationOutcome.REFUSED
+        outcomes = (out, CalibrationOutcome.NOT_VERIFIED, CalibrationOutcome.CALIBRATED)
+
+        async def work(tell: object) -> tuple[CycleResult, ...]:
+            del tell
+            return tuple(CycleResult(n, o, "x") for n, o in zip(names, outcomes, strict=True))
+
+        await here.calibrating._together(names, "target", here.token, work)
+        assert [one.heliostat for one in here.schedule.entries] == list(names[taken:])
 
     play(tmp_path, scene)
 

@@ -56,6 +56,8 @@ class CalibrationOutcome(StrEnum):
     #: In a joint visit no beam was proven to be its own.
     NOT_PROVEN = "not_proven"
     REFUSED = "refused"
+    #: An order that the mirror had not caused took it out of the visit: a person's, an emergency.
+    TAKEN_OUT = "taken_out"
     ERROR = "error"
     #: Unchanged for a reason that was not kept.
     UNCHANGED = "unchanged"

@@ -34,7 +34,12 @@ __all__ = [
     "Person",
     "RefusedError",
     "Role",
+    "TakenOutError",
 ]
+
+
+class TakenOutError(RefusedError):
+    """The end of a visit whose heliostats orders of others have taken out of it."""
 
 
 class Role(IntEnum):
@@ -153,6 +158,8 @@ class Mandate:
         Names of the heliostats that it is for; those that were taken out are missing.
     taken
         Why others were taken out, by name.
+    blameless
+        Those of them that an order took out which they had not caused: a person's, an emergency.
     ended
         Why all commands under it are refused; "" while it is valid.
     """
@@ -162,14 +169,26 @@ class Mandate:
     where: str
     heliostats: set[str]
     taken: dict[str, str] = field(default_factory=dict)
+    blameless: set[str] = field(default_factory=set)
     ended: str = ""
 
-    def take_out(self, heliostats: Iterable[str], why: str) -> tuple[str, ...]:
-        """Take heliostats out, ``why`` saying who ordered what; return those that were in it."""
+    def take_out(
+        self, heliostats: Iterable[str], why: str, *, fault: bool = False
+    ) -> tuple[str, ...]:
+        """Take heliostats out, ``why`` saying who ordered what; return those that were in it.
+
+        With ``fault`` the heliostats have caused the order themselves.
+        """
         names = tuple(name for name in heliostats if name in self.heliostats)
         self.heliostats.difference_update(names)
         self.taken.update(dict.fromkeys(names, f"it left the visit: {why}"))
+        if not fault:
+            self.blameless.update(names)
         return names
+
+    def give_up(self, heliostats: Iterable[str]) -> None:
+        """Let heliostats take part no longer, by the visit's own decision."""
+        self.heliostats.difference_update(heliostats)
 
     def refused(self, heliostats: Iterable[str]) -> dict[str, str]:
         """Return the heliostats that may not be commanded under it, and their reasons."""
@@ -348,6 +367,8 @@ class Authority:
         ------
         RefusedError
             If the role is too low, or the person does not have the authority.
+        TakenOutError
+            If the visit is refused and orders of others have left it no heliostat.
         """
         person.must_be(Role.ENGINEER, "visit")
         self.keep(person, token)
@@ -356,6 +377,10 @@ class Authority:
         self._mandates[made.token] = made
         try:
             yield made
+        except RefusedError as error:
+            if made.blameless and not made.heliostats:
+                raise TakenOutError(str(error)) from error
+            raise
         finally:
             made.ended = made.ended or "the visit has ended"
             del self._mandates[made.token]
@@ -370,10 +395,10 @@ class Authority:
         """Return the open mandate of each heliostat that is in a visit, by name."""
         return {name: each for each in self._mandates.values() for name in each.heliostats}
 
-    def prevail(self, heliostats: Sequence[str], why: str) -> None:
-        """Take heliostats out of the visits that they are in; ``why`` says who ordered what."""
+    def prevail(self, heliostats: Sequence[str], why: str, *, fault: bool = False) -> None:
+        """Take heliostats out of the visits that they are in; see `Mandate.take_out`."""
         for each in self._mandates.values():
-            each.take_out(heliostats, why)
+            each.take_out(heliostats, why, fault=fault)
 
     def end_mandates(self, person: Person, why: str) -> None:
         """End the mandates that a person gave; their visits take the beams off."""

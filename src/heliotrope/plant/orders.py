@@ -167,6 +167,7 @@ class PlantOrders:
         note: str = "",
         *,
         late: bool = False,
+        fault: bool = False,
         store: tuple[Work, Work] | None = None,
     ) -> Ticket:
         """Accept a command and give its record to the disk; see `when_recorded`.
@@ -179,6 +180,8 @@ class PlantOrders:
             For the record and the ticket.
         late
             Whether the record may be written later: DEFOCUS and STOW wait for nothing.
+        fault
+            Whether the heliostats have caused the order; see `Mandate.take_out`.
         store
             Work of the disk that stores what the command assigns, in one piece with its record, and
             work that takes it back if the command is not sent in the end.
@@ -196,7 +199,8 @@ class PlantOrders:
         ticket = Ticket(identity, what, heliostats, self._clock, self._patience)
         if late:
             self._overtake(frozenset(heliostats), what)
-            self._authority.prevail(heliostats, f"{who} ordered {what}{note and f' ({note})'}")
+            why = f"{who} ordered {what}{note and f' ({note})'}"
+            self._authority.prevail(heliostats, why, fault=fault)
             self._owed.append(lambda: self._audit.begin(entry))
         else:
             self._record(ticket, entry, store)

@@ -197,7 +197,10 @@ class Sentinel:
 
         An ordinary STOW of many goes ``in_turn``, but at once while an emergency holds.
         """
-        ticket = self._orders.accept((*giver, act.name), (), heliostats, note, late=True)
+        # Short of an emergency, the table sends off those that something is wrong with.
+        ticket = self._orders.accept(
+            (*giver, act.name), (), heliostats, note, late=True, fault=giver is _TABLE
+        )
         if in_turn and act is Act.STOW and not self.on:
             heliostats = self._orders.stow_in_turn(ticket, heliostats)
         else:

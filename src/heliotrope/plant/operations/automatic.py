@@ -369,7 +369,8 @@ class AutomaticControl:
         found = self._calibrating.result(name, since)
         if isinstance(found, str):
             return Step(found, Stage.REFUSED)
-        stages = dict.fromkeys(_AS_WANTED, Stage.DONE) | {CalibrationOutcome.REFUSED: Stage.REFUSED}
+        broken = (CalibrationOutcome.REFUSED, CalibrationOutcome.TAKEN_OUT)
+        stages = dict.fromkeys(_AS_WANTED, Stage.DONE) | dict.fromkeys(broken, Stage.REFUSED)
         return Step(f"at {found.target}: {found.text}", stages.get(found.outcome, Stage.FAILED))
 
     def _why_waiting(self, name: str, visits: bool) -> str:

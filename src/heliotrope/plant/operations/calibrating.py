@@ -13,7 +13,7 @@ from heliotrope.errors import HeliotropeError
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
-from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.authority import Person, RefusedError, TakenOutError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.foresight import Foreseeing
@@ -36,6 +36,12 @@ PLACES = RetryLaw(
     longest=600.0,
     rest=3600.0,
     alarm=alarms.VISITS_FAIL,
+)
+#: Outcomes of visits that were broken off.
+_BROKEN = (
+    CalibrationOutcome.REFUSED,
+    CalibrationOutcome.TAKEN_OUT,
+    CalibrationOutcome.ERROR,
 )
 #: A heliostat that was on a target leaves it to all others for this time, s.
 FRESH = 600.0
@@ -277,14 +283,15 @@ class Calibrating:
             work = self._cycle.search if search else self._cycle.run
             result = await work(person, token, name, target, tell)
         except RefusedError as error:
-            result = CycleResult(name, CalibrationOutcome.REFUSED, str(error))
+            result = CycleResult(name, _outcome(error), str(error))
             blameless = self._interrupted(token)
         except HeliotropeError as error:
             text, blameless = f"{type(error).__name__}: {error}", True
             result = CycleResult(name, CalibrationOutcome.ERROR, text)
         finally:
             self._running.pop(target, None)
-        self._note_place(target, result.text if blameless else "", token)
+        if result.outcome is not CalibrationOutcome.TAKEN_OUT:
+            self._note_place(target, result.text if blameless else "", token)
         self._conclude(target, result, truth, begun, sigma, blameless=blameless)
         return (name,)
 
@@ -324,8 +331,7 @@ class Calibrating:
         )
         # One that is broken off, or came to nothing, does not tell how long a visit takes.
         if any(result.new > 0 for result in results):
-            out = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)
-            moved = sum(result.outcome not in out for result in results)
+            moved = sum(result.outcome not in _BROKEN for result in results)
             self._scheduler.shone(moved, lit, self._now() - begun)
         odd = () if self._interrupted(token) else self._production.concluded(results)
         for name in odd:
@@ -354,7 +360,7 @@ class Calibrating:
         try:
             results = await visit(tell)
         except RefusedError as error:
-            said = str(error)
+            outcome, said = _outcome(error), str(error)
         except HeliotropeError as error:
             outcome, said = CalibrationOutcome.ERROR, f"{type(error).__name__}: {error}"
         finally:
@@ -362,7 +368,7 @@ class Calibrating:
         if said:
             results = tuple(CycleResult(name, outcome, said) for name in names)
         clouds = [result for result in results if result.verdict is Verdict.CLOUD]
-        if place != self.receiver:
+        if place != self.receiver and outcome is not CalibrationOutcome.TAKEN_OUT:
             self._note_place(
                 place, said or (clouds[0].text if 2 * len(clouds) > len(results) else ""), token
             )
@@ -460,10 +466,11 @@ class Calibrating:
             self._parties.concluded(result)
         self._book.conclude(entry)
         # The schedule plans visits to targets: one in production that brings nothing is no failure,
-        # nor is one that the camera, a cloud or a person has ended, and a beam that is looked for
-        # in several joint visits has not failed yet.
+        # nor is one that the camera, a cloud or an order of others has ended, and a beam that is
+        # looked for in several joint visits has not failed yet.
         looked = joint and self._parties is not None and self._parties.again(result)
         blameless |= refused or result.verdict is Verdict.CLOUD
+        blameless |= result.outcome is CalibrationOutcome.TAKEN_OUT
         if good or not (lit or looked or blameless):
             self._scheduler.done(entry)
         # A joint visit that was refused as a whole is one event, and not one of each heliostat.
@@ -473,3 +480,9 @@ class Calibrating:
         if self._pictures is not None:
             self._pictures.conclude(entry)
         return entry
+
+
+def _outcome(error: RefusedError) -> CalibrationOutcome:
+    """Return the outcome of a visit that ended so."""
+    taken = isinstance(error, TakenOutError)
+    return CalibrationOutcome.TAKEN_OUT if taken else CalibrationOutcome.REFUSED

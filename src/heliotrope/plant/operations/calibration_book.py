@@ -22,6 +22,8 @@ from heliotrope.plant.operations.views import CalibrationEntry, QualityPoint, Si
 _POINTS, _RESULTS = 4000, 2000
 #: Number of heliostats whose priors give the error of an uncalibrated one.
 _SAMPLE = 100
+#: Outcomes without a calibration that are no failures.
+_NO_FAILURE = (CalibrationOutcome.UNCHANGED, CalibrationOutcome.TAKEN_OUT)
 
 
 class CalibrationBook:
@@ -84,7 +86,7 @@ class CalibrationBook:
         if np.isfinite(entry.measured):
             # The normal is off by half as much as the beam.
             self.measured[row] = 0.5 * entry.measured
-        self.failed += not (entry.good or entry.outcome is CalibrationOutcome.UNCHANGED)
+        self.failed += not (entry.good or entry.outcome in _NO_FAILURE)
         self.results.append(entry)
 
     def refresh(self) -> None:

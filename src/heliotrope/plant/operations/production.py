@@ -120,6 +120,7 @@ class ProductionVisits:
 
         Where less than half of the beams are proven, the light is to blame and not the mirrors.
         """
+        results = [r for r in results if r.outcome is not CalibrationOutcome.TAKEN_OUT]
         now, seen = self._plant.now(), [r.heliostat for r in results if r.verdict is None]
         good = [r for r in results if r.new > 0 or r.outcome is CalibrationOutcome.NOT_VERIFIED]
         if good:

@@ -30,7 +30,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
-from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.authority import Mandate, Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.fitting import (
     Believed,
@@ -113,6 +113,13 @@ class CycleResult:
             measured=self.measured,
             before=self.before,
         )
+
+
+def refused(mandate: Mandate, heliostat: str, text: str) -> CycleResult:
+    """Return the result of a heliostat that was refused, or taken out of its visit."""
+    taken = heliostat in mandate.blameless
+    outcome = CalibrationOutcome.TAKEN_OUT if taken else CalibrationOutcome.REFUSED
+    return CycleResult(heliostat, outcome, text)
 
 
 @dataclass(frozen=True)
@@ -312,7 +319,7 @@ class CalibrationCycle:
         try:
             return await self._learn(visit, proof, tell, confirm, least, None)
         except RefusedError as error:
-            return CycleResult(visit.heliostat, CalibrationOutcome.REFUSED, str(error))
+            return refused(visit.mandate, visit.heliostat, str(error))
 
     async def _learn(
         self,

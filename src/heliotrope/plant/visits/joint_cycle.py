@@ -30,7 +30,7 @@ from heliotrope.lcu import states
 from heliotrope.plant.attempts import Attempts, RetryLaw
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
+from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult, refused
 from heliotrope.plant.visits.first_layout import newcomers
 from heliotrope.plant.visits.fitting import first_model
 from heliotrope.plant.visits.gathering import Gathering, Waiting
@@ -203,9 +203,8 @@ class JointCycle:
         with plant.authority.mandate(person, token, names, target) as mandate:
             first = self.first(names, place)
             layout, wrong = self._arranged(place, names)
-            results = {name: _refused(name, text) for name, text in wrong.items()}
-            for name in wrong:
-                mandate.heliostats.discard(name)
+            results = {name: refused(mandate, name, text) for name, text in wrong.items()}
+            mandate.give_up(wrong)
             if layout.names:
                 async with Returned(plant, mandate, layout.names, place):
                     joint = JointVisit(plant, mandate, layout.names, place)
@@ -251,7 +250,7 @@ class JointCycle:
                 await joint.go(layout.start(), self._cycle.settings.arrival)
                 await self._photograph(joint, layout, empty, taken, tell)
                 tell(f"{len(joint.names)} on the way back")
-            lost = {name: _refused(name, text) for name, text in joint.lost.items()}
+            lost = {name: refused(joint.mandate, name, text) for name, text in joint.lost.items()}
             proven, others = await self._separated(joint, layout, empty, taken, tell)
         return proven, lost | others
 
@@ -482,7 +481,7 @@ class JointCycle:
         try:
             return await self._cycle.learn(visit, taken, confirming=confirming, least=least)
         except RefusedError as error:
-            return _refused(name, str(error))
+            return refused(visit.mandate, name, str(error))
         except HeliotropeError as error:
             text = f"{type(error).__name__}: {error}"
             return CycleResult(name, CalibrationOutcome.ERROR, text)
@@ -505,10 +504,6 @@ def _error(waiting: Waiting, sun: FloatArray, target: Target) -> float:
         current=visit.plant.field.counts(np.array([visit.row])),
     )
     return float(found.rms[0])
-
-
-def _refused(name: str, text: str) -> CycleResult:
-    return CycleResult(name, CalibrationOutcome.REFUSED, text)
 
 
 def _not_proven(name: str, beam: SeparatedBeam) -> CycleResult:

@@ -239,6 +239,7 @@ class JointVisit(BroughtHome):
         finally:
             self._away -= set(names)
             if left := left - taken.keys():
+                self.mandate.give_up(left)
                 self.plant.defocus(
                     f"joint visit of {self.mandate.person.name}", tuple(sorted(left))
                 )

@@ -33,7 +33,12 @@ from heliotrope.lcu import states
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult, Production
+from heliotrope.plant.visits.calibration_cycle import (
+    CalibrationCycle,
+    CycleResult,
+    Production,
+    refused,
+)
 from heliotrope.plant.visits.joint_visit import JointVisit, Returned
 from heliotrope.plant.visits.neighbours import Standing
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
@@ -135,16 +140,16 @@ class ReceiverCycle:
         plant = self._plant
         names = tuple(dict.fromkeys(heliostats))
         made, wrong = arranged_on(plant, self.face, names, self.settings)
-        results = {name: _refused(name, text) for name, text in wrong.items()}
         moving = made.layout.names
         with plant.authority.mandate(person, token, moving, self.face.name) as mandate:
+            results = {name: refused(mandate, name, text) for name, text in wrong.items()}
             if moving:
                 joint = JointVisit(plant, mandate, moving, self.face)
                 with plant.stepping.fine(moving), plant.movements.ending(moving):
                     taken = await self._photograph(joint, made, await self._steady(tell), tell)
                 tell("back to the aims")
                 await self._settled(joint, plant.now() + _BACK, moving)
-                results |= {name: _refused(name, text) for name, text in joint.lost.items()}
+                results |= {n: refused(mandate, n, text) for n, text in joint.lost.items()}
                 results |= await self._learn(joint, made, taken, tell)
         return tuple(results[name] for name in names)
 
@@ -314,7 +319,7 @@ class ReceiverCycle:
             try:
                 return await self._cycle.learn(visit, taken, production=seen)
             except RefusedError as error:
-                return _refused(name, str(error))
+                return refused(joint.mandate, name, str(error))
             except HeliotropeError as error:
                 text = f"{type(error).__name__}: {error}"
                 return CycleResult(name, CalibrationOutcome.ERROR, text)
@@ -369,10 +374,6 @@ def _stack_of(pictures: Sequence[TargetLight]) -> Stack:
     values = np.stack([picture.values for picture in pictures]).astype(np.float64)
     seen = np.logical_and.reduce([picture.seen for picture in pictures])
     return Stack(values, first.step, first.first, seen)
-
-
-def _refused(name: str, text: str) -> CycleResult:
-    return CycleResult(name, CalibrationOutcome.REFUSED, text)
 
 
 def _not_proven(name: str, verdict: Verdict, other: str = "") -> CycleResult:

@@ -347,5 +347,6 @@ class Visit(BroughtHome):
                 await self.command("IDLE", limit=60.0)
         except (RefusedError, asyncio.CancelledError):
             if self.heliostat not in self.mandate.taken:
+                self.mandate.give_up((self.heliostat,))
                 self.plant.defocus(f"visit of {self.mandate.person.name}", (self.heliostat,))
             raise

@@ -43,7 +43,11 @@ RETRIES = 14
 #: visit broke off: so many, or all of the field but one.
 BARREN = 5
 #: Results of visits that broke off: what they brought is not counted.
-_BROKEN = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)
+_BROKEN = (
+    CalibrationOutcome.REFUSED,
+    CalibrationOutcome.TAKEN_OUT,
+    CalibrationOutcome.ERROR,
+)
 
 
 @dataclass(frozen=True)
