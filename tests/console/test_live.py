@@ -193,7 +193,7 @@ def test_ctl_at_the_plant_itself(ctl: Callable[..., Any], console: LiveConsole) 
     console.calm()
     for words, text in (
         (("show", "accounts"), "leave out --data"),
-        (("stow", name), "needs operator"),
+        (("resume",), "needs operator"),
         (("show", "nobody"), "nobody"),
     ):
         assert text in str(ctl("viewer", *where, *words).exception)
