@@ -15,7 +15,7 @@ from heliotrope.mechanism.drives import SLOTS
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.authority import Mandate, Person, Role
 from heliotrope.plant.beam_watch import BeamError
-from heliotrope.plant.visits.joint_layout import SentBeam, _places, _too_bright, beam_of, coded
+from heliotrope.plant.visits.joint_layout import SentBeam, _places, _too_bright, beams_of, coded
 from heliotrope.plant.visits.joint_visit import JointVisit
 from heliotrope.plant.visits.visit import ARRIVED
 
@@ -162,8 +162,10 @@ def test_only_a_mirror_before_the_plane_of_a_target_sends_its_beam_there(before:
         beams=beams,
         sun_vector=lambda: direction(np.radians(180.0), np.radians(60.0)),
     )
-    found = beam_of(plant, target, design.names[0], 1e-3)
-    assert isinstance(found, SentBeam) if before > 0.0 else "the front of aside" in str(found)
+    name = design.names[0]
+    sent, blocked = beams_of(plant, target, {name: 1e-3})
+    assert list(sent if before > 0.0 else blocked) == [name]
+    assert blocked.get(name, "").endswith("" if before > 0.0 else "the front of aside")
 
 
 @pytest.mark.parametrize(
@@ -192,12 +194,11 @@ def test_a_mirror_with_steps_too_coarse_for_a_joint_visit_takes_no_part() -> Non
         beams=beams,
         sun_vector=lambda: direction(np.radians(80.0), np.radians(30.0)),
     )
-    fine = beam_of(plant, target, design.names[0], 1e-3)
-    assert isinstance(fine, SentBeam)
+    errors = {design.names[0]: 1e-3}
+    assert list(beams_of(plant, target, errors)[0]) == [design.names[0]]
     beams.drives.table[0, :, SLOTS["rate"]] *= 200.0
-    assert "its drives move its beam in steps of" in str(
-        beam_of(plant, target, design.names[0], 1e-3)
-    )
+    blocked = beams_of(plant, target, errors)[1]
+    assert "its drives move its beam in steps of" in blocked[design.names[0]]
 
 
 def test_beams_in_one_place_are_too_bright_wherever_it_is_and_those_apart_are_not() -> None:

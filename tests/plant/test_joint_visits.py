@@ -27,14 +27,14 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.authority import RefusedError
-from heliotrope.plant.operations.calibrating import Calibrating
+from heliotrope.plant.operations.calibrating import Calibrating, TrueErrors
 from heliotrope.plant.operations.parties import Parties
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import PictureRow, Planned
 from heliotrope.plant.schedule.scheduler import VISITS
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits import CycleResult, JointCycle
-from heliotrope.plant.visits.joint_layout import arranged, error_on
+from heliotrope.plant.visits.joint_layout import arranged, errors_on
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.stacks import Exposed
 from support.joint_scene import Scene, joint, spoil
@@ -285,8 +285,8 @@ def test_who_is_not_known_well_enough_or_would_be_too_bright_has_no_place() -> N
         book, everyone = here.live.operations.automatic.book, np.arange(len(here.names))
         on_target = np.hypot(book.error_on(target, everyone), np.sqrt(2.0) * JointSettings().visit)
         for row, one in enumerate(here.names):
-            error = error_on(plant, target, one, JointSettings())
-            assert on_target[row] == pytest.approx(error), "one by one, and all at once"
+            error = errors_on(plant, target, [one], JointSettings())
+            assert on_target[row] == pytest.approx(error[one]), "one by one, and all at once"
         layout, wrong = arranged(plant, target, here.names, JointSettings())
         assert list(wrong) == [name]
         assert "known to" in wrong[name]
@@ -561,7 +561,12 @@ def test_who_was_disproved_goes_alone_and_has_an_alarm_until_it_is_seen() -> Non
     assert "C" not in asyncio.run(made.chosen("left", ready, follow))
 
 
-def calibrating_of(made: Parties, event: Callable[..., None], done: list[str]) -> Calibrating:
+def calibrating_of(
+    made: Parties,
+    event: Callable[..., None],
+    done: list[str],
+    truth: Callable[[], np.ndarray] = lambda: np.full(6, np.nan),
+) -> Calibrating:
     """Automatic control of joint visits whose outcome a test writes."""
     plant = made._plant
     plant.clock = SimpleNamespace(utc=lambda: START)  # type: ignore[misc]
@@ -577,7 +582,7 @@ def calibrating_of(made: Parties, event: Callable[..., None], done: list[str]) -
         ),
         book,  # type: ignore[arg-type]
         silent,  # type: ignore[arg-type]
-        SimpleNamespace(now=lambda row: np.nan),  # type: ignore[arg-type]
+        TrueErrors(plant, truth),
         lambda: (),
         parties=made,
     )
@@ -596,9 +601,16 @@ def test_what_a_joint_visit_disproves_is_an_alarm_when_it_ends() -> None:
 
     made.cycle.run = run  # type: ignore[method-assign]
     done = list[str]()
-    calibrating = calibrating_of(made, lambda *_: None, done)
+    errors = iter((np.arange(6.0), np.arange(6.0, 12.0)))
+    calibrating = calibrating_of(made, lambda *_: None, done, lambda: next(errors))
     calibrating.ask_together(("A", "B", "C"), "left")
     assert asyncio.run(calibrating.visit("left", ready, ENGINEER, 1)) == ("A", "B", "C")
+    assert list(errors) == [], "the whole field, once before the visit and once after it"
+    shown = [calibrating._last[name] for name in "ABC"]
+    assert [entry.truth_before for entry in shown] == [0.0, 1.0, 2.0]
+    assert [entry.truth_after for entry in shown] == pytest.approx(
+        [6.0, np.nan, np.nan], nan_ok=True
+    )
     assert alarms.active() == [("B", True)]
     assert made.alone(ready).tolist() == [False, True, False, False, False, False]
     assert done == ["A", "B"], "a cloud is no failure of a mirror"

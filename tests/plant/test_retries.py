@@ -79,7 +79,7 @@ class Scene:
             event=lambda *_: None, keep=lambda *_: None, take_alarm=self.alarms.append
         )
         book: Any = SimpleNamespace(error=np.zeros(len(self.plant.field)), conclude=lambda _: None)
-        unknown: Any = SimpleNamespace(now=lambda row: np.nan)
+        unknown: Any = SimpleNamespace(now=lambda: np.full(64, np.nan))
         self.first: frozenset[str] = frozenset()
         made: Any = (self.plant, silent, self.visits, self.schedule, book, silent, unknown)
         self.calibrating = Calibrating(*made, lambda: self.first)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from heliotrope.plant.operations import calibration_book
 from heliotrope.plant.operations.calibrating import Calibrating
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.keeping import Keeping
@@ -104,13 +105,8 @@ def beams_nowhere(patch: pytest.MonkeyPatch) -> None:
 
 def twice_the_error(patch: pytest.MonkeyPatch) -> None:
     """The error of the beam is shown as that of the normal."""
-    expected = CalibrationBook._expected
-
-    def double(self: Any, *given: Any) -> Any:
-        rows, error = expected(self, *given)
-        return rows, 2.0 * error
-
-    patch.setattr(CalibrationBook, "_expected", double)
+    expected = calibration_book.expected_errors
+    patch.setattr(calibration_book, "expected_errors", lambda *given: 2.0 * expected(*given))
 
 
 def never_out(patch: pytest.MonkeyPatch) -> None:

@@ -106,11 +106,11 @@ class TrueErrors:
             self._known = now, self._truth()
         return self._known[1]
 
-    def now(self, row: int) -> float:
-        """Return the present error of one heliostat, rad; NaN if it is unknown."""
+    def now(self) -> FloatArray:
+        """Return the present errors of all heliostats, rad, (N,); NaN if they are unknown."""
         self._known = None
         found = self.all()
-        return math.nan if found is None else float(found[row])
+        return np.full(len(self._plant.field), np.nan) if found is None else found
 
 
 class Calibrating:
@@ -277,7 +277,7 @@ class Calibrating:
         if self._pictures is not None:
             self._pictures.begin(name)
         row = self._plant.field.place(name)
-        truth, sigma = self._truth.now(row), float(self._book.error[row])
+        truth, sigma = float(self._truth.now()[row]), float(self._book.error[row])
         blameless = False
         try:
             work = self._cycle.search if search else self._cycle.run
@@ -292,7 +292,8 @@ class Calibrating:
             self._running.pop(target, None)
         if result.outcome is not CalibrationOutcome.TAKEN_OUT:
             self._note_place(target, result.text if blameless else "", token)
-        self._conclude(target, result, truth, begun, sigma, blameless=blameless)
+        after = float(self._truth.now()[row]) if result.outcome.calibrated else math.nan
+        self._conclude(target, result, (truth, after), begun, sigma, blameless=blameless)
         return (name,)
 
     async def _party(self, target: str, ready: npt.NDArray[np.bool_]) -> tuple[str, ...]:
@@ -354,8 +355,8 @@ class Calibrating:
         tell("on the way")
         if self._pictures is not None:
             self._pictures.begin_together(place)
-        truth = [self._truth.now(field.place(name)) for name in names]
-        sigma = [float(self._book.error[field.place(name)]) for name in names]
+        rows = [field.place(name) for name in names]
+        before, sigma = self._truth.now()[rows], self._book.error[rows]
         outcome, said = CalibrationOutcome.REFUSED, ""
         try:
             results = await visit(tell)
@@ -372,9 +373,12 @@ class Calibrating:
             self._note_place(
                 place, said or (clouds[0].text if 2 * len(clouds) > len(results) else ""), token
             )
+        good = [result.outcome.calibrated for result in results]
+        after = np.where(good, self._truth.now()[rows], np.nan)
+        truths = zip(before.tolist(), after.tolist(), strict=True)
         entries = [
-            self._conclude(place, result, true, begun, expected, joint=True, refused=bool(said))
-            for result, true, expected in zip(results, truth, sigma, strict=True)
+            self._conclude(place, result, truth, begun, expected, joint=True, refused=bool(said))
+            for result, truth, expected in zip(results, truths, sigma.tolist(), strict=True)
         ]
         if self._pictures is not None:
             self._pictures.conclude_together(place, entries)
@@ -432,7 +436,7 @@ class Calibrating:
         self,
         target: str,
         result: CycleResult,
-        truth: float,
+        truth: tuple[float, float],
         begun: float,
         sigma: float,
         *,
@@ -451,8 +455,7 @@ class Calibrating:
             result.after,
             result.measured,
             float(self._book.error[row]),
-            truth,
-            self._truth.now(row) if good else math.nan,
+            *truth,
             self._plant.beliefs.count(result.heliostat),
             result.new,
             "; ".join((result.text, *result.rejected[:2])),

@@ -1,22 +1,18 @@
 """The calibration of every heliostat, for people: predicted and measured errors over time."""
 
 from collections import deque
-from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.record import (
-    CalibrationOutcome,
-    HeliostatCalibration,
-    covariances_at,
-)
+from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.calibration.uncertainty import expected_error, precision
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import CalibrationEntry, QualityPoint, SightingView
+from heliotrope.plant.visits.expected_errors import expected_errors
 
 #: Numbers of points of the quality over time, and of results, that are held.
 _POINTS, _RESULTS = 4000, 2000
@@ -94,49 +90,25 @@ class CalibrationBook:
         self._predict(list(self._plant.beliefs))
 
     def _predict(self, records: list[HeliostatCalibration]) -> None:
-        rows, error = self._expected(records, None)
-        self.error[rows] = 0.5 * error
+        if self._dark:
+            return
+        rows = np.array([self._plant.field.place(r.heliostat) for r in records], dtype=np.intp)
+        names = [record.heliostat for record in records]
+        self.error[rows] = 0.5 * expected_errors(self._plant, names, self._aims(rows))
 
     def error_on(self, target: Target, rows: npt.NDArray[np.intp]) -> FloatArray:
         """Return the expected errors of n beams on a target now, rad RMS (2-D), (n,).
 
         NaN for rows of the field without a calibration, and while it is dark.
         """
-        known = [self._plant.beliefs.record(self._plant.field.names[row]) for row in rows]
-        found = dict(zip(*self._expected([r for r in known if r], target.center), strict=True))
-        return np.array([found.get(row, np.nan) for row in rows])
+        if self._dark:
+            return np.full(len(rows), np.nan)
+        names = [self._plant.field.names[row] for row in rows]
+        return expected_errors(self._plant, names, np.broadcast_to(target.center, (len(rows), 3)))
 
-    def _expected(
-        self, records: Sequence[HeliostatCalibration], aim: FloatArray | None
-    ) -> tuple[npt.NDArray[np.intp], FloatArray]:
-        """Return rows of the field and beam errors there, rad RMS (2-D); none while it is dark.
-
-        Each goes to a point (3,), or to its aim in operation.
-        """
-        light, found = self._plant.sun_vector(), [np.zeros(0)]
-        where = [np.zeros(0, dtype=np.intp)]
-        if not light[2] > 0.0:
-            return where[0], found[0]
-        now = self._plant.clock.utc().timestamp()
-        # Heliostats of one group with the same parameters are computed together.
-        parts: dict[tuple[int, tuple[str, ...]], list[HeliostatCalibration]] = {}
-        for record in records:
-            group = self._plant.design.find(record.heliostat)[0]
-            parts.setdefault((id(group), record.names), []).append(record)
-        for (_, names), members in parts.items():
-            group = self._plant.design.find(members[0].heliostat)[0]
-            places = np.array([group.index(r.heliostat) for r in members], dtype=np.intp)
-            values = np.stack([record.values for record in members])
-            rows = np.array([self._plant.field.place(r.heliostat) for r in members], dtype=np.intp)
-            covariance = covariances_at(members, now)
-            parameters = dict(zip(names, values.T, strict=True))
-            mechanism = group.mechanism[places].with_parameters(parameters)
-            points = self._aims(rows) if aim is None else np.broadcast_to(aim, (len(rows), 3))
-            where.append(rows)
-            here = self._plant.field.counts(rows)
-            expected = expected_error(mechanism, names, covariance, light, points, current=here)
-            found.append(expected.rms)
-        return np.concatenate(where), np.concatenate(found)
+    @property
+    def _dark(self) -> bool:
+        return not self._plant.sun_vector()[2] > 0.0
 
     def _aims(self, rows: npt.NDArray[np.intp]) -> FloatArray:
         names = [self._plant.field.names[row] for row in rows]

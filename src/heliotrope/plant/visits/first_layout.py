@@ -13,12 +13,18 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.plan.on_target import LOOKS, search_places
-from heliotrope.calibration.uncertainty import expected_error, precision
 from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.visits.joint_layout import Layout, SentBeam, beam_of, coded, error_on
+from heliotrope.plant.visits.joint_layout import (
+    Layout,
+    SentBeam,
+    beams_of,
+    bells,
+    coded,
+    errors_on,
+)
 
 #: A beam keeps this many of its standard deviations from the border, and those of its place.
 _BORDER, _PLACED = 1.5, 1.5
@@ -53,24 +59,10 @@ def newcomers(
     missed
         Joint first visits in which a beam was not found, by heliostat.
     """
-    wrong: dict[str, str] = {}
-    sent: dict[str, SentBeam] = {}
-    sun = plant.sun_vector()
-    for name in heliostats:
-        error = error_on(plant, target, name, settings)
-        if error is None:
-            present, names = plant.beliefs.present(name), model[name]
-            prior = np.linalg.inv(precision(plant.beliefs.nominal(name), names))[0]
-            here = plant.field.counts(np.array([plant.field.place(name)]))
-            expected = expected_error(present, names, prior, sun, target.center, current=here)
-            error = float(expected.rms[0])
-        found = beam_of(plant, target, name, error) if np.isfinite(error) else "out of its reach"
-        if isinstance(found, str):
-            wrong[name] = found
-        elif len(sent) == settings.first:
-            wrong[name] = f"{settings.first} heliostats are on {target.name} already"
-        else:
-            sent[name] = found
+    sent, wrong = beams_of(plant, target, errors_on(plant, target, heliostats, settings, model))
+    for name in list(sent)[settings.first :]:
+        wrong[name] = f"{settings.first} heliostats are on {target.name} already"
+        del sent[name]
     while len(sent) > 1 and _brightest(target, sent, _places(target, sent)) > settings.brightest:
         wrong[sent.popitem()[0]] = (
             f"the light on {target.name} might exceed {settings.brightest:g} suns"
@@ -105,19 +97,15 @@ def _brightest(target: Target, sent: Mapping[str, SentBeam], places: FloatArray)
     corners = target.plane_coordinates(target.corners)
     x, y = (np.linspace(low, high, _ACROSS) for low, high in zip(*_ends(corners), strict=True))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    mean, variance = np.zeros((2, len(points)))
-    for beam, place in zip(sent.values(), places, strict=True):
-        spread = beam.variance * np.eye(2)
-        own = beam.power**2 / (4.0 * np.pi * float(np.sqrt(np.linalg.det(beam.likely))))
-        mean += beam.power * _bell(points - place, beam.likely + spread)
-        variance += own * _bell(points - place, 0.5 * beam.likely + spread)
+    beams = tuple(sent.values())
+    power = np.array([beam.power for beam in beams])
+    likely = np.array([beam.likely for beam in beams])
+    spread = np.array([beam.variance for beam in beams])[:, None, None] * np.eye(2)
+    own = power**2 / (4.0 * np.pi * np.sqrt(np.linalg.det(likely)))
+    mean = power @ bells(points, places, likely + spread)
+    variance = own @ bells(points, places, 0.5 * likely + spread)
     return float((mean + _ABOVE * np.sqrt(variance)).max())
 
 
 def _ends(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     return corners.min(axis=0), corners.max(axis=0)
-
-
-def _bell(away: FloatArray, moments: FloatArray) -> FloatArray:
-    form = np.einsum("ni,ij,nj->n", away, np.linalg.inv(moments), away)
-    return np.asarray(np.exp(-0.5 * form) / (2.0 * np.pi * np.sqrt(np.linalg.det(moments))))

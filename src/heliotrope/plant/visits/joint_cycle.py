@@ -34,7 +34,7 @@ from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleRes
 from heliotrope.plant.visits.first_layout import newcomers
 from heliotrope.plant.visits.fitting import first_model
 from heliotrope.plant.visits.gathering import Gathering, Waiting
-from heliotrope.plant.visits.joint_layout import Layout, arranged, error_on, verifying
+from heliotrope.plant.visits.joint_layout import Layout, arranged, errors_on, verifying
 from heliotrope.plant.visits.joint_visit import JointVisit, Returned
 from heliotrope.plant.visits.neighbours import Standing
 from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
@@ -218,9 +218,8 @@ class JointCycle:
 
     def first(self, heliostats: Sequence[str], target: Target) -> bool:
         """Return whether a visit is one of own codes: some are new, or not known well enough."""
-        errors = [error_on(self._plant, target, name, self.settings) for name in heliostats]
-        known = self.settings.known
-        return bool(self.settings.first) and any(e is None or not e <= known for e in errors)
+        errors = errors_on(self._plant, target, heliostats, self.settings).values()
+        return bool(self.settings.first) and not all(e <= self.settings.known for e in errors)
 
     def having_place(self, heliostats: Sequence[str], target: str) -> tuple[str, ...]:
         """Return those of some heliostats that have a place in a visit now."""

@@ -6,16 +6,15 @@ overlap share a code, so that few photographs are needed. The light of all of th
 below what the target may take.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.uncertainty import expected_error
 from heliotrope.field.joint_visits import MOST_MOVEMENT, JointSettings
 from heliotrope.field.target import Target
-from heliotrope.geometry import FloatArray, bisector
+from heliotrope.geometry import FloatArray, bisector, tangent_axes
 from heliotrope.imaging.coded import (
     ExpectedBeam,
     coded_movements,
@@ -23,6 +22,7 @@ from heliotrope.imaging.coded import (
 )
 from heliotrope.optics.beam import beam_sigma
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.visits.expected_errors import expected_errors
 from heliotrope.plant.visits.resolution import LEAST_STEPS, beam_steps
 
 #: Slope error of a mirror's surface that is assumed for the width of its beam, rad.
@@ -44,11 +44,11 @@ def moments_on(
     target: Target,
     vertex: FloatArray,
     normal: FloatArray,
-    width: float,
-    height: float,
+    width: npt.ArrayLike,
+    height: npt.ArrayLike,
     flat: float = 1.0,
 ) -> FloatArray:
-    """Return the second moments of a beam on a target, m², (2, 2).
+    """Return the second moments of beams on a target, m², (..., 2, 2).
 
     The image of the sun, widened by the mirror's slopes, and the mirror itself, seen along the
     beam.
@@ -58,25 +58,25 @@ def moments_on(
     target
         The target.
     vertex, normal
-        Of the mirror, ENU, m, and its unit normal, (3,).
+        Of the mirrors, ENU, m, and their unit normals, (..., 3).
     width, height
-        Of the mirror, m.
+        Of the mirrors, m, (...).
     flat
-        Share of its size that the beam has: 1 for a flat mirror, near 0 for one that is canted and
+        Share of its size that each beam has: 1 for a flat mirror, near 0 for one that is canted and
         curved for this distance.
     """
-    way = np.asarray(target.center) - vertex
-    slant = float(np.linalg.norm(way))
-    ray = way / slant
-    right = np.cross((0.0, 0.0, 1.0), normal)
-    size = float(np.linalg.norm(right))
-    right = right / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])
-    sides = flat * np.stack([width * right, height * np.cross(normal, right)]) / np.sqrt(12.0)
-    sun = float(beam_sigma(slant, slope=_SLOPE))
-    spread = sun**2 * (np.eye(3) - np.outer(ray, ray)) + sides.T @ sides
+    path = np.asarray(target.center) - vertex
+    slant = np.linalg.norm(path, axis=-1)
+    ray = path / slant[..., None]
+    size = flat * np.stack([np.asarray(width), np.asarray(height)], axis=-1) / np.sqrt(12.0)
+    sides = size[..., None] * tangent_axes(normal)
+    sun = beam_sigma(slant, slope=_SLOPE)[..., None, None]
+    across = np.eye(3) - ray[..., :, None] * ray[..., None, :]
+    spread = sun**2 * across + np.swapaxes(sides, -1, -2) @ sides
     # Along the beam onto the plane of the target.
-    onto = target.axes @ (np.eye(3) - np.outer(ray, target.normal) / float(ray @ target.normal))
-    return np.asarray(onto @ spread @ onto.T)
+    along = ray[..., :, None] * target.normal / (ray @ target.normal)[..., None, None]
+    onto = target.axes @ (np.eye(3) - along)
+    return np.asarray(onto @ spread @ np.swapaxes(onto, -1, -2))
 
 
 @dataclass(frozen=True)
@@ -159,14 +159,15 @@ def arranged(
     settings
         See `JointSettings`.
     """
-    wrong: dict[str, str] = {}
-    known: dict[str, SentBeam] = {}
-    for name in heliostats:
-        found = _known(plant, target, name, settings)
-        if isinstance(found, str):
-            wrong[name] = found
-        else:
-            known[name] = found
+    errors = errors_on(plant, target, heliostats, settings)
+    blocked = {
+        name: why
+        for name, error in errors.items()
+        if (why := _unknown(plant, name, error, settings))
+    }
+    sure = {name: error for name, error in errors.items() if name not in blocked}
+    known, wrong = beams_of(plant, target, sure)
+    wrong |= blocked
     for name in list(known)[settings.most :]:
         wrong[name] = f"{settings.most} heliostats are on {target.name} already"
         del known[name]
@@ -199,14 +200,10 @@ def verifying(
     own
         Whether each has a code of its own.
     """
-    wrong: dict[str, str] = {}
-    known: dict[str, SentBeam] = {}
-    for name, error in errors.items():
-        found = beam_of(plant, target, name, float(np.hypot(error, np.sqrt(2.0) * settings.visit)))
-        if isinstance(found, str):
-            wrong[name] = found
-        else:
-            known[name] = found
+    again = np.sqrt(2.0) * settings.visit
+    known, wrong = beams_of(
+        plant, target, {name: float(np.hypot(error, again)) for name, error in errors.items()}
+    )
     places, dazzling = _darkened(target, known, settings)
     code = np.arange(len(known)) if own else _shared(known, places, along=_UP)
     return coded(target, known, places, code, settings.movement, along=_UP), wrong, dazzling
@@ -226,63 +223,87 @@ def _darkened(
     return np.zeros((0, 2)), tuple(dazzling)
 
 
-def _known(
-    plant: PlantController, target: Target, name: str, settings: JointSettings
-) -> SentBeam | str:
-    error = error_on(plant, target, name, settings)
-    if error is None:
+def _unknown(
+    plant: PlantController, name: str, error: float, settings: JointSettings
+) -> str | None:
+    """Return why a beam with an expected error on its target is not known well enough, if so."""
+    if plant.beliefs.record(name) is None:
         return "it has no calibration yet; it is calibrated alone first"
-    if not error <= settings.known:
+    if error > settings.known:
         return (
             f"its beam is known to {1e3 * error:.1f} mrad only, the limit is "
             f"{1e3 * settings.known:g} mrad; it is calibrated alone first"
         )
-    return beam_of(plant, target, name, error)
+    return None
 
 
-def error_on(
-    plant: PlantController, target: Target, name: str, settings: JointSettings
-) -> float | None:
-    """Return the expected error of a beam on a target, rad RMS (2-D); None if never calibrated."""
-    record = plant.beliefs.record(name)
-    if record is None:
-        return None
-    covariance = record.covariance_at(plant.clock.utc().timestamp())
-    expected = expected_error(
-        plant.beliefs.present(name),
-        record.names,
-        covariance,
-        plant.sun_vector(),
-        target.center,
-        current=plant.field.counts(np.array([plant.field.place(name)])),
-    )
-    return float(np.hypot(expected.rms[0], np.sqrt(2.0) * settings.visit))
+def errors_on(
+    plant: PlantController,
+    target: Target,
+    heliostats: Sequence[str],
+    settings: JointSettings,
+    model: Mapping[str, tuple[str, ...]] | None = None,
+) -> dict[str, float]:
+    """Return the expected errors of beams on a target, rad RMS (2-D), by heliostat.
+
+    NaN for one that cannot reach it, or was never calibrated and has no ``model``; see
+    `expected_errors`.
+    """
+    aims = np.broadcast_to(target.center, (len(heliostats), 3))
+    found = expected_errors(plant, heliostats, aims, model)
+    # The priors of a heliostat that was never calibrated hold what is drawn anew at each visit.
+    known = np.array([plant.beliefs.record(name) is not None for name in heliostats])
+    found = np.hypot(found, known * np.sqrt(2.0) * settings.visit)
+    return dict(zip(heliostats, found.tolist(), strict=True))
 
 
-def beam_of(plant: PlantController, target: Target, name: str, error: float) -> SentBeam | str:
-    """Return what is known of a beam with an expected error (rad RMS, 2-D), or why it cannot be."""
-    row, (group, place) = plant.field.place(name), plant.design.find(name)
-    vertex = np.asarray(plant.beams.armature.origin_1[row], dtype=np.float64)
-    way = target.center - vertex
-    slant = float(np.linalg.norm(way))
-    sun = plant.sun_vector()
-    if not float(way @ target.normal) < 0.0:
-        return f"it does not see the front of {target.name}"
-    slanted = abs(float(way @ target.normal)) / slant
-    step = beam_steps(plant, row, target, sun, np.asarray(target.center))
-    if (coarse := LEAST_STEPS * float(step.max()) * slanted / slant) > MOST_MOVEMENT:
-        return (
-            f"its drives move its beam in steps of {1e3 * coarse / LEAST_STEPS:.1f} mrad, the "
-            f"limit is {1e3 * MOST_MOVEMENT / LEAST_STEPS:g} mrad; it is calibrated alone"
-        )
-    normal = bisector(sun, way / slant)
-    width, height = float(group.width[place]), float(group.height[place])
+def beams_of(
+    plant: PlantController, target: Target, errors: Mapping[str, float]
+) -> tuple[dict[str, SentBeam], dict[str, str]]:
+    """Return what is known of beams, and why the others cannot be on a target, by heliostat.
+
+    Parameters
+    ----------
+    plant, target
+        Knows mirrors and the sun; and the target.
+    errors
+        Expected error of each beam, rad RMS (2-D); NaN where it does not reach the target.
+    """
+    field, center = plant.field, np.asarray(target.center)
+    paths = {n: center - plant.beams.armature.origin_1[field.place(n)] for n in errors}
+    blocked = {
+        name: f"it does not see the front of {target.name}"
+        for name, path in paths.items()
+        if not float(path @ target.normal) < 0.0
+    }
+    lost = (name for name, error in errors.items() if not np.isfinite(error))
+    blocked |= dict.fromkeys(lost, "out of its reach")
+    names = [name for name in errors if name not in blocked]
+    if not names:
+        return {}, blocked
+    rows = np.array([field.place(name) for name in names], dtype=np.intp)
+    path, error = np.stack([paths[n] for n in names]), np.array([errors[n] for n in names])
+    slant, sun = np.linalg.norm(path, axis=-1), plant.sun_vector()
+    slanted = np.abs(path @ target.normal) / slant
+    step = beam_steps(plant, rows, target, sun, np.broadcast_to(center, path.shape))
+    normal = bisector(sun, path / slant[:, None])
+    width, height = plant.beams.mirrors.width[rows], plant.beams.mirrors.height[rows]
     variance = 0.5 * (error * slant / slanted) ** 2
-    power = _REFLECTED * width * height * float(normal @ sun)
+    power = _REFLECTED * width * height * (normal @ sun)
     wide, likely = (
-        moments_on(target, vertex, normal, width, height, flat) for flat in (1.0, _CURVED)
+        moments_on(target, center - path, normal, width, height, flat) for flat in (1.0, _CURVED)
     )
-    return SentBeam(slant, wide, likely, variance, power, step)
+    sent: dict[str, SentBeam] = {}
+    for k, coarse in enumerate(LEAST_STEPS * step.max(axis=-1) * slanted / slant):
+        if coarse > MOST_MOVEMENT:
+            blocked[names[k]] = (
+                f"its drives move its beam in steps of {1e3 * coarse / LEAST_STEPS:.1f} mrad, the "
+                f"limit is {1e3 * MOST_MOVEMENT / LEAST_STEPS:g} mrad; it is calibrated alone"
+            )
+        else:
+            figures = float(variance[k]), float(power[k])
+            sent[names[k]] = SentBeam(float(slant[k]), wide[k], likely[k], *figures, step[k])
+    return sent, blocked
 
 
 def _places(target: Target, known: Mapping[str, SentBeam]) -> FloatArray:
@@ -311,13 +332,25 @@ def _too_bright(known: Mapping[str, SentBeam], places: FloatArray, limit: float)
     """
     if len(known) < 2:
         return ""
-    light = np.zeros(len(places))
-    for beam, place in zip(known.values(), places, strict=True):
-        away = places - place
-        form = np.einsum("mi,ij,mj->m", away, np.linalg.inv(beam.likely), away)
-        peak = beam.power / (2.0 * np.pi * float(np.sqrt(np.linalg.det(beam.likely))))
-        light += peak * np.exp(-0.5 * form)
+    power = np.array([beam.power for beam in known.values()])
+    light = power @ bells(places, places, np.array([beam.likely for beam in known.values()]))
     return list(known)[int(np.argmax(light))] if light.max() > limit else ""
+
+
+def bells(points: FloatArray, places: FloatArray, moments: FloatArray) -> FloatArray:
+    """Return the light of M beams of power 1 at n points of their target, 1/m², (M, n).
+
+    Parameters
+    ----------
+    points, places
+        m right of and above the centre, (n, 2) and (M, 2).
+    moments
+        Second moments of the beams, m², (M, 2, 2).
+    """
+    away = points - places[:, None]
+    form = np.einsum("mni,mij,mnj->mn", away, np.linalg.inv(moments), away)
+    size = 2.0 * np.pi * np.sqrt(np.linalg.det(moments))
+    return np.asarray(np.exp(-0.5 * form) / size[:, None])
 
 
 def _shared(

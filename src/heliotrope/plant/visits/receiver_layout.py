@@ -10,13 +10,13 @@ from math import erf, sqrt
 
 import numpy as np
 
-from heliotrope.calibration.uncertainty import expected_error
 from heliotrope.field.receiver_visits import MOST_MOVEMENT, ReceiverSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, bisector
 from heliotrope.imaging.coded import ExpectedBeam, coded_movements
 from heliotrope.lcu import states
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.visits.expected_errors import expected_errors
 from heliotrope.plant.visits.joint_layout import Layout, moments_on
 from heliotrope.plant.visits.resolution import LEAST_STEPS, beam_steps
 
@@ -76,8 +76,20 @@ def arranged_on(
     """
     wrong: dict[str, str] = {}
     known: dict[str, _Beam] = {}
+    tracking = plant.field.among((states.TRACKING,), plant.now())
     for name in heliostats:
-        found = _known(plant, face, name, settings)
+        if not tracking[plant.field.place(name)]:
+            wrong[name] = f"it does not track {face.name}"
+        elif plant.beliefs.record(name) is None:
+            wrong[name] = "it has no calibration yet; it is calibrated on a target first"
+    able = [name for name in heliostats if name not in wrong]
+    rows = np.array([plant.field.place(name) for name in able], dtype=np.intp)
+    points = zip(able, plant.aims[rows], strict=True)
+    aims = np.array([plant.movements.aim(name, aim) for name, aim in points]).reshape(-1, 3)
+    steps = beam_steps(plant, rows, face, plant.sun_vector(), aims).max(axis=-1)
+    errors = np.hypot(expected_errors(plant, able, aims), sqrt(2.0) * settings.visit)
+    for name, *figures in zip(able, aims, steps.tolist(), errors.tolist(), strict=True):
+        found = _known(plant, face, name, settings, *figures)
         if isinstance(found, str):
             wrong[name] = found
         else:
@@ -104,14 +116,15 @@ def production(plant: PlantController, face: Target) -> float:
 
 
 def _known(
-    plant: PlantController, face: Target, name: str, settings: ReceiverSettings
+    plant: PlantController,
+    face: Target,
+    name: str,
+    settings: ReceiverSettings,
+    aim: FloatArray,
+    step: float,
+    error: float,
 ) -> _Beam | str:
-    record, row = plant.beliefs.record(name), plant.field.place(name)
-    if not plant.field.among((states.TRACKING,), plant.now())[row]:
-        return f"it does not track {face.name}"
-    if record is None:
-        return "it has no calibration yet; it is calibrated on a target first"
-    aim = np.array(plant.movements.aim(name, plant.aims[row]))
+    row = plant.field.place(name)
     vertex = np.asarray(plant.beams.armature.origin_1[row], dtype=np.float64)
     way = aim - vertex
     slant = float(np.linalg.norm(way))
@@ -119,7 +132,7 @@ def _known(
         return f"it does not see the front of {face.name}"
     sun = plant.sun_vector()
     slanted = abs(float(way @ face.normal)) / slant
-    least = LEAST_STEPS * float(beam_steps(plant, row, face, sun, aim).max())
+    least = LEAST_STEPS * step
     if (coarse := least * slanted / slant) > MOST_MOVEMENT:
         return (
             f"its drives move its beam in steps of {1e3 * coarse / LEAST_STEPS:.1f} mrad, the "
@@ -129,10 +142,6 @@ def _known(
     if not face.holds(aim + size * _ENDS @ face.axes).all():
         return f"its aim is less than {size:.2f} m inside the edge of {face.name}"
     normal = bisector(sun, way / slant)
-    covariance = record.covariance_at(plant.clock.utc().timestamp())
-    present, here = plant.beliefs.present(name), plant.field.counts(np.array([row]))
-    expected = expected_error(present, record.names, covariance, sun, aim, current=here)
-    error = float(np.hypot(expected.rms[0], sqrt(2.0) * settings.visit))
     if not error <= settings.known:
         return (
             f"its beam is known to {1e3 * error:.1f} mrad only, the limit is "

@@ -1,12 +1,15 @@
 """How finely the drives of a heliostat move its beam on a target."""
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, reflect
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.controller import PlantController
+
+Rows = npt.NDArray[np.intp]
 
 #: A coded movement has at least this many of the steps in which a beam follows its aim. The ends of
 #: a movement are each off by half a step at most, so its size is off by a quarter; a beam that
@@ -17,18 +20,18 @@ _STRAIGHT = 10.0
 
 
 def beam_slopes(
-    plant: PlantController, row: int, target: Target, sun: FloatArray, counts: FloatArray
+    plant: PlantController, row: int | Rows, target: Target, sun: FloatArray, counts: FloatArray
 ) -> FloatArray:
-    """Return how far a step of each drive moves a beam on the plane of a target, ENU, m, (2, 3).
+    """Return how far a step of each drive moves beams on a target, ENU, m, (..., 2, 3).
 
     Parameters
     ----------
     plant, row
-        The plant, and the row of the heliostat.
+        The plant, and rows of heliostats, (...).
     target, sun
         The target, and the unit vector to the sun, (3,).
     counts
-        Step counts of the drives, (2,).
+        Step counts of the drives, (..., 2).
     """
     drives = Drive(plant.beams.drives.table[row])
     armature = Armature(plant.beams.armature.table[row])
@@ -38,26 +41,31 @@ def beam_slopes(
         return np.asarray(target.intersect(vertex, reflect(sun, normal)))
 
     here = point(counts)
-    return np.stack([here - point(counts - step) for step in _STRAIGHT * np.eye(2)]) / _STRAIGHT
+    moved = [here - point(counts - step) for step in _STRAIGHT * np.eye(2)]
+    return np.stack(moved, axis=-2) / _STRAIGHT
 
 
 def beam_steps(
-    plant: PlantController, row: int, target: Target, sun: FloatArray, aim: FloatArray
+    plant: PlantController, rows: Rows, target: Target, sun: FloatArray, aims: FloatArray
 ) -> FloatArray:
-    """Return the steps in which a beam follows its aim, m right and up on the target, (2,).
+    """Return the steps in which beams follow their aims, m right and up on the target, (K, 2).
 
     In fine stepping a drive stops at whole counts. One that has play follows a goal that goes down
     only once it has gone by the lead (`AxisLimits.lead`).
 
     Parameters
     ----------
-    plant, row, target, sun
+    plant, target, sun
         As for `beam_slopes`.
-    aim
-        Of the beam, ENU, m, (3,).
+    rows, aims
+        Rows of the heliostats, (K,), and aims of their beams, ENU, m, (K, 3).
     """
-    counts = plant.beams.poses(np.array([row]), aim[None], sun).best_counts[0]
-    slopes = np.abs(beam_slopes(plant, row, target, sun, counts) @ target.axes.T)
-    machine = plant.beams.machines.get(plant.beams.names[row])
-    each = [1, 1] if machine is None else [max(1, axis.lead) for axis in machine.axes]
-    return np.asarray(np.nan_to_num(np.array(each) @ slopes))
+    counts = plant.beams.poses(rows, aims, sun).best_counts
+    slopes = np.abs(beam_slopes(plant, rows, target, sun, counts) @ target.axes.T)
+    machines = [plant.beams.machines.get(plant.beams.names[row]) for row in rows]
+    each = [
+        (1, 1) if machine is None else [max(1, axis.lead) for axis in machine.axes]
+        for machine in machines
+    ]
+    leads = np.array(each, dtype=np.float64).reshape(-1, 1, 2)
+    return np.asarray(np.nan_to_num((leads @ slopes)[:, 0]))
