@@ -171,7 +171,7 @@ def test_heliostats_in_doubt_are_visited_before_others(
             silent = SimpleNamespace(
                 event=lambda *_: None, keep=lambda *_: None, take_alarm=lambda alarm: None
             )
-            unknown = SimpleNamespace(now=lambda row: math.nan)
+            unknown = SimpleNamespace(now=lambda: np.full(len(plant.field), math.nan))
             calibrating = Calibrating(
                 plant,
                 silent,

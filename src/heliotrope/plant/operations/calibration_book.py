@@ -113,7 +113,7 @@ class CalibrationBook:
     def _aims(self, rows: npt.NDArray[np.intp]) -> FloatArray:
         names = [self._plant.field.names[row] for row in rows]
         given = self._plant.default_aims(names)
-        return np.stack([given[name] for name in names])
+        return np.array([given[name] for name in names], dtype=np.float64).reshape(-1, 3)
 
     def installed(self) -> float:
         """Return the tracking error that the priors allow an uncalibrated heliostat, rad."""
