@@ -33,6 +33,7 @@ from heliotrope.mechanism.board_items import (
 )
 from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.plant.aims import BeamCheck, spread
+from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.audit import STOPPED, AuditError, JsonLines, Record, read
 from heliotrope.plant.authority import (
     Authority,
@@ -52,6 +53,7 @@ from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.plant.ordered import Ordered
 from heliotrope.plant.schedule.choice import Assignment
 from heliotrope.plant.schedule.plant_schedule import STEPS, PlantSchedule
+from heliotrope.plant.schedule.scheduler import VISITS
 from heliotrope.plant.settings import clusters_of
 from heliotrope.plant.tickets import Ticket
 from support.lcu_machines import STANDBY, STOW, heliostat, items_of_heliostat
@@ -475,7 +477,7 @@ class _Endless:
     def __init__(self, names: int) -> None:
         self.asked, self.plans, self._names = 0, 0, names
         self.running: dict[str, object] = {}
-        self.attempts = None
+        self.attempts = Attempts(VISITS)
 
     def upcoming(self, *_: object) -> Iterator[Assignment]:
         self.plans += 1
