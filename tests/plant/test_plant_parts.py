@@ -589,7 +589,11 @@ def test_a_mandate_outlives_its_holder_and_ends_heliostat_by_heliostat() -> None
         assert mandate.refused("AB") == {"B": "it left the visit: Vera ordered IDLE"}
         assert authority.lost(mandate.token, "AB") == authority.left(mandate.token, "AB") == {"B"}
         authority.release(vera, taken)
-        assert authority.token not in (0, own, taken)
+        last = authority.token
+        assert last not in (0, own, taken)
+        assert authority.take(egon).token == last, "his visit alone goes on: nothing changes"
+        authority.release(egon, last)
+        assert authority.token not in (0, last)
         authority.end_mandates(egon, "automatic control has been stopped")
         assert authority.present(mandate.token) == 0
         assert authority.lost(mandate.token, "A") == {"A"}

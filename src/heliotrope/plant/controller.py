@@ -549,9 +549,9 @@ class PlantController:
         RefusedError
             See `Authority.take`.
         """
-        before = self.authority.token
+        before = self.authority.grant
         grant = self.authority.take(person)
-        if grant.token != before:
+        if before is None:
             self.note(person, "AUTHORITY", "taken")
         return grant
 
