@@ -555,6 +555,9 @@ def test_a_heliostat_that_was_ordered_off_while_it_was_out_and_heard_is_not_lost
     # Sent out again: what was seen out after that is lost if it leaves.
     ordered.sent("REFOCUS", ("A",), 21.0)
     assert not ordered.off(np.full(6, 22.0), 22.0).any()
+    # C refuses IDLE, because it goes to stow by itself; then its visit turns it away.
+    ordered.refused(("C",), 21.5)
+    ordered.sent("DEFOCUS", ("C",), 21.6)
     ordered.sent("STOW", ("E", "F"), 22.0)
     ordered.follows_loss(("F",))
     assert ordered.off(np.full(6, 22.5), 22.5).tolist() == 4 * [False] + [True, False]
