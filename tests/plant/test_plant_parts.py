@@ -33,6 +33,7 @@ from heliotrope.mechanism.board_items import (
 )
 from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.plant.aims import BeamCheck, spread
+from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.audit import STOPPED, AuditError, JsonLines, Record, read
 from heliotrope.plant.authority import (
     Authority,
@@ -52,6 +53,7 @@ from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.plant.ordered import Ordered
 from heliotrope.plant.schedule.choice import Assignment
 from heliotrope.plant.schedule.plant_schedule import STEPS, PlantSchedule
+from heliotrope.plant.schedule.scheduler import VISITS
 from heliotrope.plant.settings import clusters_of
 from heliotrope.plant.tickets import Ticket
 from support.lcu_machines import STANDBY, STOW, heliostat, items_of_heliostat
@@ -475,7 +477,7 @@ class _Endless:
     def __init__(self, names: int) -> None:
         self.asked, self.plans, self._names = 0, 0, names
         self.running: dict[str, object] = {}
-        self.attempts = None
+        self.attempts = Attempts(VISITS)
 
     def upcoming(self, *_: object) -> Iterator[Assignment]:
         self.plans += 1
@@ -553,6 +555,9 @@ def test_a_heliostat_that_was_ordered_off_while_it_was_out_and_heard_is_not_lost
     # Sent out again: what was seen out after that is lost if it leaves.
     ordered.sent("REFOCUS", ("A",), 21.0)
     assert not ordered.off(np.full(6, 22.0), 22.0).any()
+    # C refuses IDLE, because it goes to stow by itself; then its visit turns it away.
+    ordered.refused(("C",), 21.5)
+    ordered.sent("DEFOCUS", ("C",), 21.6)
     ordered.sent("STOW", ("E", "F"), 22.0)
     ordered.follows_loss(("F",))
     assert ordered.off(np.full(6, 22.5), 22.5).tolist() == 4 * [False] + [True, False]
@@ -587,7 +592,11 @@ def test_a_mandate_outlives_its_holder_and_ends_heliostat_by_heliostat() -> None
         assert mandate.refused("AB") == {"B": "it left the visit: Vera ordered IDLE"}
         assert authority.lost(mandate.token, "AB") == authority.left(mandate.token, "AB") == {"B"}
         authority.release(vera, taken)
-        assert authority.token not in (0, own, taken)
+        last = authority.token
+        assert last not in (0, own, taken)
+        assert authority.take(egon).token == last, "his visit alone goes on: nothing changes"
+        authority.release(egon, last)
+        assert authority.token not in (0, last)
         authority.end_mandates(egon, "automatic control has been stopped")
         assert authority.present(mandate.token) == 0
         assert authority.lost(mandate.token, "A") == {"A"}

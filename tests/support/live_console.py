@@ -97,6 +97,7 @@ class LiveConsole:
         marks: Path | None = None,
         work: AutomaticSettings | None = None,
         given: frozenset[str] = frozenset(),
+        together: bool = False,
     ) -> None:
         self.folder, self.address = folder, ""
         self._made, self._child = (heliostats, speed), child
@@ -107,6 +108,7 @@ class LiveConsole:
             boards=boards,
             work=work or AutomaticSettings(wanted=True),
             plant=PlantSettings(given=given),
+            together=together,
         )
         self._ready, self._over = threading.Event(), threading.Event()
         self._problem: BaseException | None = None

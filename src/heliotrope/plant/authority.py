@@ -445,10 +445,12 @@ class Authority:
         return token
 
     def _give(self, person: Person) -> Grant:
-        now = self._clock.monotonic()
-        self._last_kept = self.changed_at = now
-        self._grant = Grant(person, self._drawn(), now, now)
-        self._own = 0
+        """Give the authority; whose visits alone go on keeps the token that they go on with."""
+        now, token = self._clock.monotonic(), self._own
+        if not token or any(each.person != person for each in self._mandates.values()):
+            token, self.changed_at = self._drawn(), now
+        self._last_kept = now
+        self._grant, self._own = Grant(person, token, now, now), 0
         return self._grant
 
     def _give_up(self) -> None:

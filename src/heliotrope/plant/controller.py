@@ -389,6 +389,8 @@ class PlantController:
         if stage is Stage.ACKNOWLEDGED:
             self._agreement.obeyed(ticket.name, ticket.accepted_at, part, now)
             self._ways.ordered.taken(ticket.name, part, now)
+        elif stage is Stage.REFUSED:
+            self._ways.ordered.refused(part, now)
         elif stage is Stage.DONE and ticket.name in KINDS:
             self._given.done(ticket, part)
             for name in self.wanted.missing.keys() & part:
@@ -549,9 +551,9 @@ class PlantController:
         RefusedError
             See `Authority.take`.
         """
-        before = self.authority.token
+        before = self.authority.grant
         grant = self.authority.take(person)
-        if grant.token != before:
+        if before is None:
             self.note(person, "AUTHORITY", "taken")
         return grant
 

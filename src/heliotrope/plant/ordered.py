@@ -55,6 +55,8 @@ class Ordered:
         self._shown = {kind: np.full(len(field), -np.inf) for kind in kinds}
         #: When heliostats that were out were ordered off, and when out, monotonic s, (N,).
         self._off_at, self._out_at = np.full(len(field), -np.inf), np.full(len(field), -np.inf)
+        #: When they last refused a command, monotonic s, (N,).
+        self._refused_at = np.full(len(field), -np.inf)
         #: Whether the order off was acknowledged, (N,).
         self._obeyed = np.zeros(len(field), dtype=np.bool_)
 
@@ -62,14 +64,20 @@ class Ordered:
         """Note an order that has been sent."""
         rows = self._rows(name, heliostats)
         if name in OFF:
-            # One that is silent, or off already, may have left before: then the order is no cause.
+            # One that is silent, off already, or has refused a command since it was last heard, may
+            # have left before: then the order is no cause.
             gone = np.isin(self._field.rows["state"][rows], _GONE)
             gone &= self._out_at[rows] + _TAKEN_WITHIN <= self._field.heard[rows]
+            gone |= self._refused_at[rows] > self._field.heard[rows]
             gone |= ~self._field.live(now)[rows] | (self._off_at[rows] > self._out_at[rows])
             self._off_at[rows[~gone]], self._obeyed[rows[~gone]] = now, False
         elif name in _OUT:
             self._out_at[rows] = now
         self._note(name, rows, now + _TAKEN_WITHIN)
+
+    def refused(self, heliostats: Sequence[str], now: float) -> None:
+        """Note that heliostats have refused a command: they may no longer be where they seem."""
+        self._refused_at[[self._field.index[each] for each in heliostats]] = now
 
     def follows_loss(self, heliostats: Sequence[str]) -> None:
         """Note that heliostats were ordered off because something was lost: see `off`."""
@@ -108,7 +116,8 @@ class Ordered:
 
         It is the last order that they were sent, or it was sent after they were last ``seen`` out,
         monotonic s, (N,). An order to one that was silent, or fell silent before it acknowledged
-        it, or was off already, does not count: it may have left by itself. Nor does an order of the
+        it, or was off already, or had refused a command since it was last heard, does not count: it
+        may have left by itself. Nor does an order of the
         safety table to a whole cluster, which is silent, or has lost the time.
         """
         self._off_at[~self._field.live(now) & ~self._obeyed] = -np.inf

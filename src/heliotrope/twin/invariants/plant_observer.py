@@ -208,6 +208,9 @@ class PlantObserver:
         elif token == 0 and (holder is None or now - holder[2] > _AT_ONCE):
             self.gave_way(now)
         elif token not in self.old and token != 0:
+            if holder is not None and now - self._granted_at <= _AT_ONCE:
+                self.old[token] = now  # of the plant's own while nobody had it, just before
+                return
             if self._by_itself():
                 self._end(now)
             self.granted(AUTOMATIC, token, now, seized=False)
