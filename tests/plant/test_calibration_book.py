@@ -69,6 +69,14 @@ class Scene:
         return self.beliefs.take(record)
 
 
+def test_nothing_is_predicted_of_mirrors_that_were_never_calibrated() -> None:
+    scene = Scene()
+    book = CalibrationBook(cast("PlantController", scene), "malan8")
+    book.refresh()
+    assert np.isnan(book.error).all()
+    assert np.isnan(book.error_on(scene.design.targets[0], np.arange(len(scene.field)))).all()
+
+
 def test_the_predicted_error_grows_until_the_mirror_is_measured_again() -> None:
     scene = Scene()
     book, errors = CalibrationBook(cast("PlantController", scene), "malan8"), []
