@@ -163,11 +163,14 @@ def test_calibrate_now_is_for_operators(field: LiveConsole, enter: Callable[[str
         assert button.count() == (role == "operator")
     # The bar says how far it is, and at last the result.
     matches = "text => RegExp(text).test(document.querySelector('.hx-bar .hx-said').textContent)"
-    field.until(lambda: field.live.operations.heliostat(name).state in ("IDLE", "TRACKING"))
+    control = field.live.operations.automatic
+    field.call(lambda: control.want([name], wanted=True))
     button.click()
     page.wait_for_function(
         matches, arg=f"CALIBRATE: 1 (waiting|acknowledged) .{name}: (it waits: |at )"
     )
+    # In a field that other tests command its turn may never come: it ends when it is withdrawn.
+    field.call(lambda: control.want([name], wanted=False))
     page.wait_for_function(
         matches, arg=f"CALIBRATE: 1 (done|failed|refused) .{name}: (at .*: |withdrawn: )"
     )
