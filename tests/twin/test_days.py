@@ -126,6 +126,14 @@ def test_a_mirror_that_automatic_control_has_tracks_again() -> None:
     for state, miss in ((states.IDLE, 0.0), (states.TRACKING, 9.0), (states.DEFOCUSED, 0.0)):
         with pytest.raises(InvariantError, match=r"invariant L3 .* has not tracked the receiver"):
             progress(state, TRACKS_WITHIN + 2.0, miss=miss)
+    # Only the person who has locked a mirror gives it back, and a lock ends only as one.
+
+    def locks(observer: ProgressObserver) -> None:
+        observer.commanded("LOCK", ("H1",))
+
+    progress(states.LOCKED, TRACKS_WITHIN + 9.0, begins=locks)
+    with pytest.raises(InvariantError, match="invariant L3"):
+        progress(states.IDLE, TRACKS_WITHIN + 2.0, begins=locks)
 
 
 def test_a_persons_emergency_and_what_is_out_of_service_outlive_a_restart() -> None:

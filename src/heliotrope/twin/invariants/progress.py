@@ -199,7 +199,8 @@ class ProgressObserver:
             there = name in self._dark or board.miss(sun, RECEIVER) <= OFF
             tracks = board.state == states.TRACKING and there
             saw = "automatic control has it, and it has not tracked the receiver"
-            away = mine and not tracks
+            left = name in self._locked and board.state == states.LOCKED
+            away = mine and not tracks and not left  # a person's lock is the person's to give back
             self._within(("tracks", name), away, now, TRACKS_WITHIN, name, saw, L3)
             for target in self._targets.values():
                 lights = mine and board.state == states.TRACKING and self._on(board, target, sun)

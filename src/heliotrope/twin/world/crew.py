@@ -4,12 +4,15 @@ They do what people do, and do it at instants that matter: when a visit is on it
 photographs, while a mirror is locked for its parameters, while the beams are taken apart. Two of
 them may act at once. Whoever looks after the field withdraws emergencies, presses Resume, and gives
 the field back to automatic control, some time later. On one day in two everybody goes to lunch for
-good, and automatic control has the rest of the day.
+good, and automatic control has the rest of the day. A run may plan what they do instead
+(`CrewAct`).
 """
 
 import asyncio
 import contextlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import inf
 
 from heliotrope.lcu import states
 from heliotrope.plant.authority import Person, RefusedError, Role
@@ -46,6 +49,28 @@ WEIGHTS = {
 }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class CrewAct:
+    """An act of a person that a run plans.
+
+    Attributes
+    ----------
+    what
+        A key of `WEIGHTS`.
+    moment
+        One of `MOMENTS`, for which the person waits.
+    after
+        Time from the moment to the act, s.
+    person
+        Who acts.
+    """
+
+    what: str
+    moment: str = ANY_TIME
+    after: float = 0.0
+    person: Person = ENGINEER
+
+
 class Crew:
     """The persons of a working day.
 
@@ -59,10 +84,20 @@ class Crew:
         Length of the day, s.
     rough
         Whether the engineer lets all heliostats step roughly in the morning.
+    planned
+        Their acts, one after another; None: all is drawn. The field is looked after in any case.
     """
 
-    def __init__(self, acts: Acts, boards: Sequence[Board], seconds: float, *, rough: bool) -> None:
-        self._rough = rough
+    def __init__(
+        self,
+        acts: Acts,
+        boards: Sequence[Board],
+        seconds: float,
+        *,
+        rough: bool,
+        planned: Sequence[CrewAct] | None = None,
+    ) -> None:
+        self._rough, self._planned = rough, planned
         self._acts, self._boards, self._chance = acts, tuple(boards), acts.chance
         self._begin = acts.now()
         share = _LEFT if self._chance.random() < _LEAVE else 1.0
@@ -78,6 +113,9 @@ class Crew:
                 await self._acts.once(operations, ENGINEER, "ROUGH", (1.0,))
         async with asyncio.TaskGroup() as group:
             group.create_task(self._cares())
+            if self._planned is not None:
+                group.create_task(self._follows(self._planned))
+                return
             for person in (OPERATOR, ENGINEER, SCRIPT):
                 group.create_task(self._acts_as(person))
 
@@ -113,9 +151,19 @@ class Crew:
             with contextlib.suppress(RefusedError):
                 await self._does(what, operations, person)
 
-    async def _moment(self, wanted: str) -> None:
-        """Wait until a visit is at a stage, for a minute at most."""
-        until = self._acts.now() + _PATIENCE
+    async def _follows(self, planned: Sequence[CrewAct]) -> None:
+        """Act as planned, each time as soon as the moment comes."""
+        for each in planned:
+            await self._moment(each.moment, inf)
+            await asyncio.sleep(each.after)
+            while (operations := self._acts.present()) is None:
+                await asyncio.sleep(_LOOK)
+            with contextlib.suppress(RefusedError):
+                await self._does(each.what, operations, each.person)
+
+    async def _moment(self, wanted: str, patience: float = _PATIENCE) -> None:
+        """Wait until a visit is at a stage, for a time at most, s."""
+        until = self._acts.now() + patience
         while self._acts.now() < until and wanted not in self._moments():
             await asyncio.sleep(_LOOK)
 

@@ -56,7 +56,7 @@ from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
 from heliotrope.twin.true_mirrors import mirrors_of
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.acts import Acts
-from heliotrope.twin.world.crew import CREW, Crew
+from heliotrope.twin.world.crew import CREW, Crew, CrewAct
 from heliotrope.twin.world.damage import Damage
 from heliotrope.twin.world.design import MIRROR, design_of, wanted_of
 from heliotrope.twin.world.faults import Fault
@@ -133,6 +133,8 @@ class RunPlan:
         Faults of the run; None: drawn from the seed.
     worlds
         Names of `WORLDS` that this run adds to the usual one.
+    acts
+        Acts of the persons of a day ("days"); None: drawn from the seed.
 
     Raises
     ------
@@ -147,6 +149,7 @@ class RunPlan:
     only: tuple[str, ...] = ()
     faults: tuple[Fault, ...] | None = None
     worlds: tuple[str, ...] = ()
+    acts: tuple[CrewAct, ...] | None = None
 
     def __post_init__(self) -> None:
         checked(self.worlds)
@@ -371,7 +374,8 @@ class Simulation:
         watch, names = self._new_watch(work, together=together), tuple(boards)
         acts = Acts(work, self.operator, self.observer, self.beams, watch, names, clock, plan.seed)
         if DAYS in plan.worlds:
-            return Working(work, Crew(acts, self.boards, plan.seconds, rough=self._coarse), watch)
+            crew = Crew(acts, self.boards, plan.seconds, rough=self._coarse, planned=plan.acts)
+            return Working(work, crew, watch)
         return Working(work, Shift(acts, PARTY_PAUSE if together else SHIFT_PAUSE), watch)
 
     def _new_watch(self, work: Work, *, together: bool) -> Watch:
