@@ -516,8 +516,9 @@ class PlantOrders:
         # A report without heliostats is about all of them.
         part = part if progress.heliostats else under.heliostats
         if self._crossed(under, progress.stage):
-            early = set(under.ticket.unacknowledged()).intersection(part)
-            self._again.append((under, tuple(early)))
+            waiting = set(under.ticket.unacknowledged())
+            early = tuple(name for name in part if name in waiting)
+            self._again.append((under, early))
             part = tuple(name for name in part if name not in early)
         under.ticket.advance(part, progress.stage, progress.text)
         return under.ticket, part

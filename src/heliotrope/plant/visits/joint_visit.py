@@ -284,8 +284,11 @@ class Returned:
     async def _back(self) -> None:
         plant = self._plant
         idle = plant.field.among((states.IDLE,), plant.now())
-        names = self._aims.keys() & self._mandate.heliostats
-        back = {name: self._aims[name] for name in names if idle[plant.field.place(name)]}
+        back = {
+            name: aim
+            for name, aim in self._aims.items()
+            if name in self._mandate.heliostats and idle[plant.field.place(name)]
+        }
         if back:
             joint = JointVisit(plant, self._mandate, back, self._target)
             await joint.aim(back)
