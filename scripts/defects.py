@@ -27,6 +27,7 @@ def found(number: int) -> tuple[str, str, str, float, float]:
 
     Invariant and seed are "" if no seed finds it.
     """
+    from heliotrope.twin.invariants.invariants import named
     from heliotrope.twin.world.simulation import run
     from support.twin_defects import DEFECTS
 
@@ -38,7 +39,7 @@ def found(number: int) -> tuple[str, str, str, float, float]:
         broken = outcome.violation
         if broken is not None and broken.number in defect.numbers:
             took = time.process_time() - begin
-            return defect.name, str(broken.number), str(seed), broken.at, took
+            return defect.name, named(broken.number), str(seed), broken.at, took
     return defect.name, "", "", 0.0, time.process_time() - begin
 
 

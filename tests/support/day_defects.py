@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from heliotrope.links.messages import Stage
 from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.authority import Authority
 from heliotrope.plant.giving_back import GivingBack
@@ -17,8 +18,12 @@ from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.permission import Permission
 from heliotrope.plant.stepping import Stepping
+from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.visits import joint_layout, receiver_layout
 from heliotrope.plant.visits.visit import Visit
+from heliotrope.twin.invariants.invariants import L1, L2, L3, L4
+from heliotrope.twin.world.crew import ANY_TIME, LOCKED, CrewAct
+from heliotrope.twin.world.faults import Fault
 
 Plant = Callable[[pytest.MonkeyPatch], None]
 
@@ -38,13 +43,6 @@ def command_ends_visits(patch: pytest.MonkeyPatch) -> None:
 
 def locks_kept(patch: pytest.MonkeyPatch) -> None:
     """Whatever breaks a visit off leaves a heliostat locked for its parameters."""
-
-    async def nothing(self: Any) -> None:
-        del self
-
-    @contextmanager
-    def no(*_: object) -> Iterator[None]:
-        yield
 
     patch.setattr(GivingBack, "_unlock", lambda self, now: None)
     unlock = Visit._unlock
@@ -80,6 +78,17 @@ def rough_in_a_visit(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Permission, "_visited", lambda self, token, names: {})
 
 
+def done_at_once(patch: pytest.MonkeyPatch) -> None:
+    """A STOW is done when it is acknowledged."""
+    advance = Ticket.advance
+
+    def hasty(self: Any, heliostats: Any, stage: Stage, *rest: Any) -> None:
+        early = self.name == "STOW" and stage is Stage.ACKNOWLEDGED
+        advance(self, heliostats, Stage.DONE if early else stage, *rest)
+
+    patch.setattr(Ticket, "advance", hasty)
+
+
 def not_tracked_again(patch: pytest.MonkeyPatch) -> None:
     """Automatic control leaves heliostats at standby."""
 
@@ -92,3 +101,35 @@ def not_tracked_again(patch: pytest.MonkeyPatch) -> None:
 def back_in_service_by_a_restart(patch: pytest.MonkeyPatch) -> None:
     """A new program does not know what is out of service."""
     patch.setattr(Keeping, "lockouts", lambda self: {})
+
+
+def _when(moment: str, what: str, after: float = 0.0) -> tuple[CrewAct, ...]:
+    return (CrewAct(what, moment, after),)
+
+
+#: A mirror goes out of service, and the plant's program ends a moment later.
+RESTART = (Fault("plant_crash", 23.3, 5.0, 0, 0.5),)
+#: Invariants that may find it, name, defect, the acts of persons, the faults, the length of the
+#: day, s, whether it is slow, and the seed that found it.
+ROWS: tuple[
+    tuple[
+        tuple[int, ...], str, Plant, tuple[CrewAct, ...], tuple[Fault, ...], float, bool, int
+    ],
+    ...,
+] = (
+    ((16,), "taking command ends a visit", command_ends_visits,
+     _when("photograph", "duty", 1.0), (), 420.0, True, 1),
+    ((L1,), "a visit's lock is not given back", locks_kept,
+     _when(LOCKED, "emergency"), (), 420.0, False, 1),
+    ((16,), "movements below the resolution", movements_below_the_resolution,
+     (), (), 420.0, True, 8),
+    ((L2,), "retries without an end", endless_retries, (), (), 840.0, True, 18),
+    ((16,), "ROUGH to all reaches a visit", rough_in_a_visit,
+     _when("photograph", "rough", 1.0), (), 420.0, True, 8),
+    ((L2,), "a STOW is done when it is acknowledged", done_at_once,
+     _when(ANY_TIME, "off", 60.0), (), 240.0, False, 2),
+    ((L3,), "automatic control leaves mirrors at standby", not_tracked_again,
+     (), (), 660.0, False, 1),
+    ((L4,), "a restart puts back in service", back_in_service_by_a_restart,
+     _when(ANY_TIME, "hold", 19.0), RESTART, 240.0, False, 0),
+)  # fmt: skip

@@ -25,9 +25,10 @@ from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant import aims
 from heliotrope.safety import evaluation
 from heliotrope.twin.boards import outfit
+from heliotrope.twin.world.crew import CrewAct
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.simulation import RunPlan
-from support import plant_defects, quiet_defects, report_defects, work_defects
+from support import day_defects, plant_defects, quiet_defects, report_defects, work_defects
 
 #: The plant stands still for a minute when mirrors track.
 STILL = (Fault("plant_silent", 110.0, 60.0, 0, 0.5),)
@@ -53,10 +54,12 @@ class Defect:
     first: int = 0
     slow: bool = False
     worlds: tuple[str, ...] = ()
+    acts: tuple[CrewAct, ...] | None = None
 
     def plan(self, seed: int) -> RunPlan:
         """Where it is looked for."""
-        return RunPlan(seed, self.seconds, 3, self.pause, self.only, self.faults, self.worlds)
+        given = self.seconds, 3, self.pause, self.only, self.faults, self.worlds, self.acts
+        return RunPlan(seed, *given)
 
 
 def _lease_by_any_frame(patch: pytest.MonkeyPatch) -> None:
@@ -420,6 +423,9 @@ DEFECTS = (
     *(Defect(numbers, name, defect, faults=faults, worlds=("visits",), slow=slow,
              first=first)
       for numbers, name, defect, faults, slow, first in work_defects.ROWS),
+    *(Defect(numbers, name, defect, faults=faults, seconds=seconds, worlds=("days",), acts=acts,
+             slow=slow, first=first)
+      for numbers, name, defect, acts, faults, seconds, slow, first in day_defects.ROWS),
     *(Defect((16,), name, defect, faults=(), worlds=worlds, slow=slow)
       for name, defect, worlds, slow in quiet_defects.ROWS),
     *(Defect((16,), name, defect, seconds=180.0, worlds=worlds, slow=slow,

@@ -25,7 +25,7 @@ from heliotrope.twin.invariants.invariants import (
     named,
 )
 from heliotrope.twin.invariants.progress import LOCKED_WITHIN, TRACKS_WITHIN, ProgressObserver
-from heliotrope.twin.invariants.results import BARREN, RETRIES, ResultObserver
+from heliotrope.twin.invariants.results import BARREN, RETRIES, SEARCHES, ResultObserver
 from heliotrope.twin.invariants.tickets import OVER_WITHIN, TicketObserver
 from heliotrope.twin.world.scene import scene_of
 from heliotrope.twin.world.simulation import RunPlan, run
@@ -211,7 +211,7 @@ def visited(count: int, *, asks: int = 0, outcome: str = "not_proven", names: in
     observer.__dict__["_noted"] = lambda *_: None
     for i in range(names):
         accounts[f"H{i}"] = SimpleNamespace(
-            kept=0, last=0, version=0, told=0, before=None, vain=0, pictures=[]
+            kept=0, last=0, version=0, told=0, before=None, vain=0, searched=0, pictures=[]
         )
     beliefs = SimpleNamespace(record=lambda _: None, seen=lambda _: None, present=lambda _: None)
     operations: Any = SimpleNamespace(plant=SimpleNamespace(beliefs=beliefs))
@@ -234,6 +234,10 @@ def test_visits_that_bring_nothing_end(monkeypatch: pytest.MonkeyPatch) -> None:
     visited(3 * RETRIES, asks=RETRIES)
     with pytest.raises(InvariantError, match=rf"invariant L2 .* {RETRIES + 1} visits in a row"):
         visited(RETRIES + 1)
+    visited(SEARCHES, outcome="no_beam")
+    visited(3 * SEARCHES, outcome="no_beam", asks=SEARCHES)
+    with pytest.raises(InvariantError, match=rf"invariant L2 .* in vain {SEARCHES + 1} times"):
+        visited(SEARCHES + 1, outcome="no_beam")
 
 
 # -- whole days --------------------------------------------------------------------------------

@@ -7,13 +7,15 @@ fail; measurements come while some are not calibrated (16). One that stays at st
 lie across its way must be named. What a visit has taken is given back: no mirror stays LOCKED
 without a visit, a person or an emergency that has it (L1). One that automatic control has tracks
 the receiver, or is in a visit, within a time (L3). An emergency, and what is out of service,
-outlive a restart (L4). All times are the observer's own.
+outlive a restart (L4). Whoever takes the command authority ends no visit, and a mirror that is
+photographed steps finely, whatever a person sets (16). All times are the observer's own.
 """
 
 from collections import Counter
 from collections.abc import Collection, Sequence, Set
 from math import asin, inf, radians
 
+from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
@@ -42,8 +44,14 @@ LOCKED_WITHIN = 60.0
 #: that leave stow one each second need three. While some are not calibrated, a measurement comes
 #: within this, s.
 TRACKS_WITHIN, MEASURED_WITHIN = 240.0, 300.0
-#: Names of the alarms that a part of the work has failed, and that a way from stow is not free.
-FAILED, BLOCKED = "work", "beam_blocked"
+#: A visit goes on after a person has taken the command authority: it does not break off within
+#: this, s.
+GOES_ON = 3.0
+#: Names of the alarms that a part of the work has failed, that a way from stow is not free, and
+#: that nobody had the command authority for a while.
+FAILED, BLOCKED, NOBODY = "work", "beam_blocked", "authority_lost"
+#: What the stages of visits with photographs have in them.
+PHOTOGRAPH = "photograph "
 
 
 class ProgressObserver:
@@ -64,8 +72,8 @@ class ProgressObserver:
     lowest
         Elevation of the sun below which the field belongs at stow, rad.
     dark
-        Heliostats of which the plant file is wrong: their beams go beside the receiver and the
-        targets, and nobody can know.
+        Heliostats whose beams nobody can see, or know: the plant file is wrong about them, so that
+        they go beside the receiver and the targets, or the mirror is covered.
 
     Attributes
     ----------
@@ -95,6 +103,7 @@ class ProgressObserver:
         self._up: bool | None = None
         self._locked: set[str] = set()
         self._calibrates, self._measured = True, 0.0
+        self._took_at, self._begun = -inf, dict[str, tuple[str, ...]]()
         self._emergency = self._called = self._ended = False
 
     def _check(self, good: bool, now: float, subject: str, saw: str, number: int = 16) -> None:
@@ -119,6 +128,12 @@ class ProgressObserver:
         elif what == "UNLOCK":
             self._locked.difference_update(heliostats)
 
+    def took(self, operations: Operations, now: float) -> None:
+        """Note that a person has taken the command authority."""
+        running = operations.calibration().running
+        self._took_at = now
+        self._begun = {run.target: run.heliostats for run in running if run.target in self._targets}
+
     def switched(self, *, on: bool) -> None:
         """Note that a person has switched calibration on or off."""
         self._calibrates = on
@@ -132,6 +147,7 @@ class ProgressObserver:
         self._ended, self._calibrates = True, True
         self._since.clear()
         self._given.clear()
+        self._begun.clear()
 
     def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
         """Note that a person has taken heliostats out of service, or given them back."""
@@ -179,6 +195,10 @@ class ProgressObserver:
         running = operations.calibration().running
         visited = {name for run in running for name in run.heliostats}
         self._visits(running, now)
+        lost = any(row.condition == NOBODY and row.active for row in rows)
+        well = not (operations.plant.emergency_on or operations.automatic.waits or lost)
+        self._go_on(operations, self._given & quiet if well else set(), now)
+        self._step_finely(running, quiet, sun, now)
         stowed = {n for n, board in self._boards.items() if board.state == states.STOWED}
         blocked = {row.subject for row in rows if row.condition == BLOCKED and row.active}
         stowed -= blocked if self._across else set()
@@ -251,6 +271,36 @@ class ProgressObserver:
             saw = f"a restart has put back in service: {', '.join(lost)}"
             self._check(not lost, now, "plant", saw, L4)
         self._emergency = on
+
+    def _go_on(self, operations: Operations, untouched: Set[str], now: float) -> None:
+        """Check that no visit of untouched mirrors breaks off when a person takes command."""
+        view = operations.calibration()
+        if now - self._took_at > GOES_ON:
+            self._begun.clear()
+        for place, names in list(self._begun.items()):
+            if any(run.heliostats == names for run in view.running):
+                continue
+            del self._begun[place]
+            ends = {entry.heliostat: entry.outcome for entry in reversed(view.results)}
+            off = all(ends.get(name) is CalibrationOutcome.REFUSED for name in names)
+            saw = f"a person took the command authority {now - self._took_at:.1f} s ago, and "
+            saw += f"a visit of {', '.join(names)}, which nobody has touched, has broken off"
+            self._check(not (off and untouched >= set(names)), now, place, saw)
+
+    def _step_finely(
+        self, running: Sequence[Running], quiet: Set[str], sun: FloatArray, now: float
+    ) -> None:
+        """Check that the mirrors whose beams are photographed on a target step finely."""
+        for run in running:
+            target = self._targets.get(run.target)
+            if target is None or PHOTOGRAPH not in run.stage:
+                continue
+            for name in self._given & quiet & set(run.heliostats):
+                board = self._boards[name]
+                lit = board.state == states.TRACKING and self._on(board, target, sun)
+                rough = board.node is not None and board.node.controller.motion.rough > 0
+                saw = f"it is photographed on {run.target}, and steps roughly"
+                self._check(not (lit and rough), now, name, saw)
 
     def _measures(
         self, operations: Operations, working: Sequence[str], *, may: bool, now: float

@@ -39,6 +39,9 @@ SHARE, ERROR_WITHIN = 0.05, 2e-5
 #: Visits of one mirror in a row that may bring nothing, for which no person has asked: nine joint
 #: ones in which its beam is looked for, and some alone.
 RETRIES = 14
+#: Visits alone in a row in which a beam may be searched for in vain, for which no person has asked:
+#: the plant's program rests for longer than a day of `days` after each.
+SEARCHES = 3
 #: Results in a row, of mirrors that photographs show, that do not all bring nothing though no
 #: visit broke off: so many, or all of the field but one.
 BARREN = 5
@@ -71,6 +74,7 @@ class _Account:
     told: int = 0  # version at its last result
     before: Mechanism | None = None
     vain: int = 0  # visits in a row that brought nothing
+    searched: int = 0  # visits in a row in which no beam was found by a search
 
 
 class ResultObserver:
@@ -89,7 +93,8 @@ class ResultObserver:
     zero
         POSIX time at 0 s of the clock.
     dark
-        Heliostats of which the plant file is wrong, so that no photograph shows their beams.
+        Heliostats of which the plant file is wrong, or whose mirror is covered, so that no
+        photograph shows their beams.
     together
         Whether heliostats are measured at once: that one lamp or cloud spoils all is seldom.
 
@@ -133,7 +138,7 @@ class ResultObserver:
     def asked(self, heliostats: Sequence[str]) -> None:
         """Note that a person wants heliostats calibrated now, whatever came of it before."""
         for name in heliostats:
-            self._accounts[name].vain = 0
+            self._accounts[name].vain = self._accounts[name].searched = 0
 
     def look(self, operations: Operations | None, now: float) -> None:
         """Judge what is new since the last look; None: the plant's program does not run."""
@@ -166,7 +171,7 @@ class ResultObserver:
             self._check(version >= account.version, now, name, saw)
             saw = f"a new program knows {count} sightings, that before it {account.kept}"
             self._check(count >= account.kept or version == 0, now, name, saw)
-            account.last, account.told = count, version
+            account.last, account.told, account.searched = count, version, 0
         elif count > account.kept and seen is not None:
             new = seen.sightings.take(np.arange(account.kept, count))
             self._photographs(name, new, seen.targets[account.kept :], now)
@@ -220,6 +225,10 @@ class ResultObserver:
         account.vain = 0 if entry.new else account.vain + 1
         saw = f"{account.vain} visits in a row have brought nothing, the last: {entry.text}"
         self._check(account.vain <= RETRIES, now, name, saw, L2)
+        missed = entry.outcome is CalibrationOutcome.NO_BEAM
+        account.searched = account.searched + 1 if missed else 0
+        saw = f"its beam was searched for in vain {account.searched} times in a row"
+        self._check(account.searched <= SEARCHES, now, name, saw, L2)
         if name not in self._dark:
             self._barren = 0 if entry.new else self._barren + 1
             saw = f"{self._barren} results in a row have brought nothing, the last: {entry.text}"

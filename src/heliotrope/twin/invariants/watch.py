@@ -57,6 +57,11 @@ class Watch:
         """Note that a person has raised an emergency, or that it was cleared."""
         self.progress.emergency(on=on)
 
+    def took(self, operations: Operations, now: float) -> None:
+        """Note that a person has taken the command authority."""
+        self.day.on_duty(now)
+        self.progress.took(operations, now)
+
     def switched(self, *, on: bool) -> None:
         """Note that a person switches calibration on or off."""
         self.progress.switched(on=on)

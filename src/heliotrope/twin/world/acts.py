@@ -175,7 +175,7 @@ class Acts:
         grant = operations.plant.authority.grant
         its = grant.token if grant is not None and grant.holder == AUTOMATIC else 0
         self._observer.gave_way(self.now(), its)
-        self._watch.day.on_duty(self.now())
+        self._watch.took(operations, self.now())
         if reason:
             token = operations.seize_authority(person, reason).token
             self.acted("has seized the command authority", person)

@@ -171,7 +171,9 @@ class LyingCamera:
 
     def _wavered(self, target: Target, shot: Shot, heliostat: str) -> Shot:
         """Return a photograph of the beam turned by the wind."""
-        mirror = next(each for each in self._sight.mirrors() if each.heliostat == heliostat)
+        mirrors = {each.heliostat: each for each in self._sight.mirrors()}
+        if (mirror := mirrors.get(heliostat)) is None:  # it is covered
+            return shot
         slant = float(np.linalg.norm(target.center - mirror.vertex))
         return replace(
             shot,

@@ -53,7 +53,7 @@ from heliotrope.twin.invariants.tickets import TicketObserver
 from heliotrope.twin.invariants.visits import VisitObserver
 from heliotrope.twin.invariants.watch import Watch
 from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
-from heliotrope.twin.true_mirrors import mirrors_of
+from heliotrope.twin.true_mirrors import TrueMirror, mirrors_of
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.acts import Acts
 from heliotrope.twin.world.crew import CREW, Crew, CrewAct
@@ -74,6 +74,7 @@ from heliotrope.twin.world.worlds import (
     Habits,
     PodErrors,
     checked,
+    covered_by,
     drawn,
     knows_boards,
     measured,
@@ -364,7 +365,13 @@ class Simulation:
         """Return automatic control with its persons and its observer."""
         plan, clock = self.plan, self._clock
         boards = {board.outfit.name: board for board in self.boards}
-        mirrors = mirrors_of(boards, MIRROR, MIRROR)
+        all_mirrors = mirrors_of(boards, MIRROR, MIRROR)
+        self._covered = covered_by(tuple(boards), plan.worlds, plan.seed)
+
+        def mirrors() -> Sequence[TrueMirror]:
+            """Return the mirrors that throw light."""
+            return [each for each in all_mirrors() if each.heliostat not in self._covered]
+
         sight = FieldSnapshot(clock, mirrors, lambda: self.sun(clock.monotonic()))
         lights, together = "lights" in plan.worlds, parties(plan.worlds)
         kind = DAY_WORK if DAYS in plan.worlds else LIT_WORK if lights else USUAL_WORK
@@ -380,9 +387,10 @@ class Simulation:
 
     def _new_watch(self, work: Work, *, together: bool) -> Watch:
         begin, boards, targets = self.begin, self.boards, self._scene.targets
+        dark = self._astray | self._covered
         zero = self._clock.utc().timestamp() - self._clock.monotonic()
         results = ResultObserver(
-            begin, boards, work.records, self.sun, zero, self._astray, together=together
+            begin, boards, work.records, self.sun, zero, dark, together=together
         )
         work.camera.told = results.photographed
         persons = [person.name for person in CREW]
@@ -400,7 +408,7 @@ class Simulation:
                 together=together,
                 across=drawn(self.plan.worlds),
                 lowest=lowest,
-                dark=self._astray,
+                dark=dark,
             ),
             ShownObserver(
                 begin, boards, self._homes, targets, self.observer, persons, self._astray

@@ -56,6 +56,8 @@ RARE, RARE_SHARE = ("lights", "clock", "site", "addresses"), 0.04
 #: Shares of days with motors that step coarsely, and with heliostats of which the plant file is
 #: wrong; by how much, rad of the mirror.
 _COARSE, _UNSURVEYED, _BESIDE = 1.0 / 3.0, 1.0 / 3.0, (0.018, 0.022)
+#: Share of the days on which a mirror is covered: it throws no light.
+_COVERED = 0.25
 #: Share of the runs of `mixed` that are a working day, and nothing else.
 DAYS_SHARE = 0.1
 
@@ -219,6 +221,14 @@ def surveyed(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[O
         items = {**fit.items, **items_of(mechanism, fit.machine)}
         found[i] = replace(fit, causes=causes, mechanism=mechanism, items=items)
     return found
+
+
+def covered_by(names: Sequence[str], worlds: Sequence[str], seed: int) -> frozenset[str]:
+    """Return the heliostats of which the mirror is covered: one on one day in four."""
+    chance = random.Random(f"covers {seed}")
+    if DAYS not in worlds or chance.random() >= _COVERED:
+        return frozenset()
+    return frozenset({chance.choice(list(names))})
 
 
 def wrong_items(fit: Outfit, others: Sequence[Outfit], chance: random.Random) -> dict[str, bytes]:
