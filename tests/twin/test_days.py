@@ -27,9 +27,9 @@ from heliotrope.twin.invariants.invariants import (
 from heliotrope.twin.invariants.progress import LOCKED_WITHIN, TRACKS_WITHIN, ProgressObserver
 from heliotrope.twin.invariants.results import BARREN, RETRIES, SEARCHES, ResultObserver
 from heliotrope.twin.invariants.tickets import OVER_WITHIN, TicketObserver
-from heliotrope.twin.world.scene import scene_of
+from heliotrope.twin.world.scene import TARGETS, scene_of
 from heliotrope.twin.world.simulation import RunPlan, run
-from heliotrope.twin.world.worlds import DAY, DAYS, DAYS_SHARE, length_of, mixed
+from heliotrope.twin.world.worlds import DAY, DAYS, DAYS_SHARE, covered_by, length_of, mixed
 
 #: High enough for every day, above no limit.
 ZENITH = np.array([0.0, 0.0, 1.0])
@@ -58,6 +58,14 @@ def test_a_day_is_some_of_any_and_has_its_own_length() -> None:
     assert length_of((DAYS,), None) == DAY
     assert length_of((DAYS,), 0.5) == 1800.0
     assert length_of(("visits",), None) == 360.0
+
+
+def test_on_some_days_a_mirror_is_covered() -> None:
+    names = tuple(f"H{i}" for i in range(6))
+    days = [covered_by(names, (DAYS,), seed) for seed in range(200)]
+    assert 0.15 < sum(map(bool, days)) / 200 < 0.35
+    assert {len(some) for some in days} == {0, 1}
+    assert not any(covered_by(names, ("parties",), seed) for seed in range(200))
 
 
 def test_people_call_invariants_of_liveness_by_their_names() -> None:
@@ -134,6 +142,42 @@ def test_a_mirror_that_automatic_control_has_tracks_again() -> None:
     progress(states.LOCKED, TRACKS_WITHIN + 9.0, begins=locks)
     with pytest.raises(InvariantError, match="invariant L3"):
         progress(states.IDLE, TRACKS_WITHIN + 2.0, begins=locks)
+
+
+def watched(stage: str, *, rough: int = 0, gone: bool = False, touched: bool = False) -> None:
+    """Observe a visit of a mirror that is on its target, after a person has taken command."""
+    target, one = TARGETS[0], board(states.TRACKING)
+    one.node = SimpleNamespace(controller=SimpleNamespace(motion=SimpleNamespace(rough=rough)))
+    run = SimpleNamespace(target=target.name, heliostats=("H1",), heliostat="H1", stage=stage)
+    seen = SimpleNamespace(running=(run,), results=())
+    operations = plant(calibration=lambda: seen)
+    observer = ProgressObserver(0.0, [one], (target,), together=True, across=False)
+    observer.given(("H1",))
+    observer.took(operations, 0.0)
+    observer.look(operations, {"H1"}, ZENITH, 0.5, governs=True)
+    if gone:
+        entry = SimpleNamespace(
+            heliostat="H1", target=target.name, outcome=CalibrationOutcome.REFUSED,
+            at=1.0, new=0, good=False,
+        )  # fmt: skip
+        seen.running, seen.results = (), (entry,)
+    if touched:
+        observer.taken(("H1",))
+    observer.look(operations, {"H1"}, ZENITH, 1.0, governs=True)
+
+
+def test_a_visit_goes_on_whoever_takes_command() -> None:
+    watched("on the way")
+    watched("on the way", gone=True, touched=True)
+    with pytest.raises(InvariantError, match=r"invariant 16 .* of H1, which nobody has touched"):
+        watched("on the way", gone=True)
+
+
+def test_a_mirror_that_is_photographed_steps_finely() -> None:
+    watched("photograph 1 of 8")
+    watched("on the way", rough=1)
+    with pytest.raises(InvariantError, match=r"invariant 16 .* and steps roughly"):
+        watched("photograph 1 of 8", rough=1)
 
 
 def test_a_persons_emergency_and_what_is_out_of_service_outlive_a_restart() -> None:
