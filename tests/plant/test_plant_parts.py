@@ -556,8 +556,10 @@ def test_a_heliostat_that_was_ordered_off_while_it_was_out_and_heard_is_not_lost
     ordered.sent("REFOCUS", ("A",), 21.0)
     assert not ordered.off(np.full(6, 22.0), 22.0).any()
     # C refuses IDLE, because it goes to stow by itself; then its visit turns it away.
-    ordered.refused(("C",), 21.5)
+    ordered.refused("IDLE", ("C",), 21.5)
     ordered.sent("DEFOCUS", ("C",), 21.6)
+    # E refuses APPROACH because it tracks: it is where it seems.
+    ordered.refused("APPROACH", ("E",), 21.5)
     ordered.sent("STOW", ("E", "F"), 22.0)
     ordered.follows_loss(("F",))
     assert ordered.off(np.full(6, 22.5), 22.5).tolist() == 4 * [False] + [True, False]

@@ -390,7 +390,7 @@ class PlantController:
             self._agreement.obeyed(ticket.name, ticket.accepted_at, part, now)
             self._ways.ordered.taken(ticket.name, part, now)
         elif stage is Stage.REFUSED:
-            self._ways.ordered.refused(part, now)
+            self._ways.ordered.refused(ticket.name, part, now)
         elif stage is Stage.DONE and ticket.name in KINDS:
             self._given.done(ticket, part)
             for name in self.wanted.missing.keys() & part:

@@ -75,9 +75,16 @@ class Ordered:
             self._out_at[rows] = now
         self._note(name, rows, now + _TAKEN_WITHIN)
 
-    def refused(self, heliostats: Sequence[str], now: float) -> None:
-        """Note that heliostats have refused a command: they may no longer be where they seem."""
-        self._refused_at[[self._field.index[each] for each in heliostats]] = now
+    def refused(self, name: str, heliostats: Sequence[str], now: float) -> None:
+        """Note that heliostats have refused a command: they may no longer be where they seem.
+
+        A refusal that the reported state explains, such as of APPROACH in TRACKING, says nothing.
+        """
+        rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
+        state = self._field.rows["state"]
+        leads_on = f" {name} " in states.TABLE
+        odd = [r for r in rows if not leads_on or states.transition(int(state[r]), name)]
+        self._refused_at[odd] = now
 
     def follows_loss(self, heliostats: Sequence[str]) -> None:
         """Note that heliostats were ordered off because something was lost: see `off`."""
