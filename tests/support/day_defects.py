@@ -123,7 +123,7 @@ ROWS: tuple[
      _when(LOCKED, "emergency"), (), 420.0, False, 1),
     ((16,), "movements below the resolution", movements_below_the_resolution,
      (), (), 420.0, True, 8),
-    ((L2,), "retries without an end", endless_retries, (), (), 840.0, True, 18),
+    ((L2,), "retries without an end", endless_retries, (), (), 840.0, True, 14),
     ((16,), "ROUGH to all reaches a visit", rough_in_a_visit,
      _when("photograph", "rough", 1.0), (), 420.0, True, 8),
     ((L2,), "a STOW is done when it is acknowledged", done_at_once,
