@@ -276,7 +276,10 @@ def test_imperfections_are_counted_once() -> None:
 
 def test_a_record_of_a_command_that_was_given_up_belongs_to_nothing_and_says_so() -> None:
     plant = SimpleNamespace(
-        field=SimpleNamespace(live=lambda now: np.zeros(0, dtype=bool)), emergency=None, orders=()
+        field=SimpleNamespace(live=lambda now: np.zeros(0, dtype=bool)),
+        emergency=None,
+        orders=(),
+        authority=SimpleNamespace(visited=dict),
     )
     for result, good in (("PARAMETERS: 1 failed (H1: not sent: too late)", True), ("done", False)):
         disk = RecordsDisk()
@@ -295,8 +298,9 @@ def test_a_record_of_a_command_that_was_given_up_belongs_to_nothing_and_says_so(
 def test_a_lease_of_automatic_control_may_leave_after_a_person_has_the_authority() -> None:
     """Simulated run 990686: it took the authority and gave way before it leased with it."""
 
-    def leased(token: int, told: int) -> None:
+    def leased(token: int, told: int, visited: float = -1.0) -> None:
         observer = PlantObserver(0.0, RecordsDisk(), SETTINGS, [], automatic=True)
+        observer._visited_at = visited
         observer.gave_way(1.0, told)
         observer.granted(ENGINEER, 8, 1.0, seized=False)
         for now in (1.0, 1.2):
@@ -304,6 +308,7 @@ def test_a_lease_of_automatic_control_may_leave_after_a_person_has_the_authority
 
     leased(8, 7)
     leased(7, 7)
+    leased(6, 0, 0.9)  # the plant's own, under which a visit went on
     for token, told in ((6, 7), (7, 0)):
         with pytest.raises(InvariantError, match="given the authority, which engineer had"):
             leased(token, told)

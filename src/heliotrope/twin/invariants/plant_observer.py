@@ -98,7 +98,7 @@ class PlantObserver:
         self._clusters, self._automatic = clusters, automatic
         self._accounts = {a.name: a for each in clusters for a in each.accounts}
         self._holder: tuple[Person, int, float] | None = None
-        self._granted_at = float("-inf")
+        self._granted_at = self._visited_at = float("-inf")
         #: When a command that was refused for other reasons may have renewed the authority.
         self._perhaps = float("-inf")
         self._accepted: Counter[tuple[str, str]] = Counter()
@@ -208,8 +208,9 @@ class PlantObserver:
         elif token == 0 and (holder is None or now - holder[2] > _AT_ONCE):
             self.gave_way(now)
         elif token not in self.old and token != 0:
-            if holder is not None and now - self._granted_at <= _AT_ONCE:
-                self.old[token] = now  # of the plant's own while nobody had it, just before
+            just, visited = now - self._granted_at, now - self._visited_at
+            if holder is not None and just <= _AT_ONCE and visited <= 2.0 * _AT_ONCE:
+                self.old[token] = now  # a visit went on with it while nobody had it, just before
                 return
             if self._by_itself():
                 self._end(now)
@@ -395,6 +396,8 @@ class PlantObserver:
         self._boards(now)
         if plant is None:
             return
+        if plant.authority.visited():
+            self._visited_at = now
         # A beam that goes back to its aim on the receiver waits for its turn to join.
         waits = {ticket.identity for ticket in plant.orders if not ticket.sent}
         self._own.update(dict.fromkeys(self._own.keys() & waits, now))
