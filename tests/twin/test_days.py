@@ -207,9 +207,11 @@ def ticket(stage: Stage | None, *, finished: bool, name: str = "STOW") -> Any:
     )  # fmt: skip
 
 
-def ticked(one: Any, at: float, *, was: bool = True) -> None:
+def ticked(one: Any, at: float, *, was: bool = True, stowed: bool = False) -> None:
     """Observe a ticket some time after it was accepted."""
-    account: Any = SimpleNamespace(state=states.LOCKED, was_in=lambda wanted, since: was)
+    account: Any = SimpleNamespace(
+        state=states.FAULT, was_in=lambda wanted, since: was, stands_at_stow=lambda: stowed
+    )
     observer = TicketObserver(0.0, {"H1": account})
     observer.accepted(one, 1.0)
     observer.look(1.0 + at, runs=True)
@@ -221,8 +223,11 @@ def test_a_ticket_ends_and_is_done_only_where_the_mirror_is() -> None:
     ticked(ticket(None, finished=False, name="PARAMETERS"), OVER_WITHIN + 9.0)
     with pytest.raises(InvariantError, match=r"invariant L2 .* STOW: 1 waiting after 301 s"):
         ticked(ticket(Stage.ACKNOWLEDGED, finished=False), OVER_WITHIN + 1.0)
-    with pytest.raises(InvariantError, match=r"invariant L2 .* STOW of H1 is done; it is LOCKED"):
+    ticked(ticket(Stage.DONE, finished=True), 5.0, was=False, stowed=True)
+    with pytest.raises(InvariantError, match=r"invariant L2 .* STOW of H1 is done; it is FAULT"):
         ticked(ticket(Stage.DONE, finished=True), 5.0, was=False)
+    with pytest.raises(InvariantError, match=r"invariant L2 .* DEFOCUS of H1 is done; it is FAULT"):
+        ticked(ticket(Stage.DONE, finished=True, name="DEFOCUS"), 5.0, was=False, stowed=True)
 
 
 def alarmed(kind: str, *, rest: float, began: float = 0.0) -> None:

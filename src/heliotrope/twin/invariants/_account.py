@@ -19,6 +19,8 @@ SLOT, PAUSE = 0.05, 0.5
 SERVED = 2.0
 #: Braking takes half a second at most; after this only the axis whose turn it is may move, s.
 BRAKING = 1.0
+#: True position of a mirror at stow, to within this many steps.
+NEAR_STOW = 5000
 
 
 def fingerprint(board: Board, *, gate: bool, clock: bool) -> dict[str, object]:
@@ -55,6 +57,11 @@ def fingerprint(board: Board, *, gate: bool, clock: bool) -> dict[str, object]:
         if gate and clock:
             found |= {"epoch": own.gate.replay.epoch, "count": own.gate.replay.count}
     return found
+
+
+def steps_from_stow(board: Board) -> int:
+    """Return how far the axes of a board stand from stow in truth, steps of the farther one."""
+    return max(abs(axis.turned - stow) for axis, stow in zip(board.axes, STOW, strict=True))
 
 
 class HeliostatAccount:
@@ -220,6 +227,10 @@ class HeliostatAccount:
         """Return the stow position that its journal holds, steps."""
         one, two = unpack("<ii", self._items["stow"])
         return one, two
+
+    def stands_at_stow(self) -> bool:
+        """Whether its axes stand at the stow position in truth, not only by its counts."""
+        return steps_from_stow(self.board) <= NEAR_STOW
 
     def rate(self, axis: int, count: int, now: float) -> str:
         """Take steps handed to a timer now; return what is wrong with their rate, or ""."""

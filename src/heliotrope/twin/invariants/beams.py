@@ -20,7 +20,8 @@ from heliotrope.mechanism.tracking import TrackingStatus, track
 from heliotrope.plant.controller import PlantController
 from heliotrope.safety import Act, Alarm, alarms
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, STANDBY, STOW, Ball
+from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, STANDBY, Ball
+from heliotrope.twin.invariants._account import NEAR_STOW, steps_from_stow
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Violation
 
 Point = tuple[float, ...]
@@ -35,8 +36,6 @@ SETTLE = 10.0
 NAMED_WITHIN, OFF_WITHIN = 10.0, 30.0
 #: A mirror that is done is off the receiver or at stow this long after the proof, s.
 DONE_WITHIN = 5.0
-#: True position of a mirror at stow, to within this many steps.
-NEAR_STOW = 5000
 #: Mirrors that leave within this time leave together, s; orders this old explain it.
 TOGETHER = 10.0
 #: Longest time from sending an order to join to its execution, s: its life, and late on the bus.
@@ -495,7 +494,7 @@ class BeamObserver:
                 continue
             away = mirror.state < 0 or mirror.ordered_at > order.at + 1.0
             if order.act is Act.STOW:
-                off = max(abs(a.turned - s) for a, s in zip(board.axes, STOW, strict=True))
+                off = steps_from_stow(board)
                 saw, good = f"{off} steps from stow", off <= NEAR_STOW
             else:
                 miss = board.miss(sun, RECEIVER)
