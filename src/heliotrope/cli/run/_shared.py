@@ -380,7 +380,8 @@ async def stow(live: PlantAssembly, at_once: asyncio.Event, lines: Lines) -> boo
     waiting = asyncio.ensure_future(at_once.wait())
     left: set[asyncio.Future[Any]] = {stowing, waiting}
     while left == {stowing, waiting}:
-        lines.print(f"stowing {_on_the_way(live)}; Ctrl-C again ends at once")
+        if going := _on_the_way(live):
+            lines.print(f"{going}; Ctrl-C again ends at once")
         _, left = await asyncio.wait(left, timeout=_SAID, return_when=asyncio.FIRST_COMPLETED)
     waiting.cancel()
     stowing.cancel()
@@ -394,11 +395,15 @@ async def stow(live: PlantAssembly, at_once: asyncio.Event, lines: Lines) -> boo
 
 
 def _on_the_way(live: PlantAssembly) -> str:
-    """Return how many heliostats are not stowed yet, and how long they take."""
-    count, seconds = live.to_stow()
-    # To ten seconds: the ways round volumes are longer than the axes' turns.
-    about = f"about {max(10.0, 10.0 * math.ceil(0.1 * seconds)):.0f} s"
-    return f"{count:,} heliostats, {about if math.isfinite(seconds) else 'of unknown position'}"
+    """Return how many heliostats go to stow, from which states, and for how long; "" if none do."""
+    found, seconds = live.to_stow()
+    if not found:
+        return ""
+    counts = ", ".join(f"{count:,} {state.lower()}" for state, count in found.items())
+    # To ten seconds: the paths round volumes are longer than the axes' turns.
+    known = math.isfinite(seconds)
+    about = f"about {max(1, math.ceil(0.1 * seconds)) * 10} s" if known else "of unknown position"
+    return f"stowing {sum(found.values()):,} heliostats ({counts}), {about}"
 
 
 def line(live: PlantAssembly) -> str:
