@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 import webbrowser
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -162,11 +162,15 @@ def _missing(error: ImportError) -> InputError:
 
 
 @contextlib.contextmanager
-def computing() -> Iterator[WorkerProcesses]:
-    """Begin the processes that compute for a plant, and load what the plant itself computes."""
+def computing(*loads: Callable[[], None]) -> Iterator[WorkerProcesses]:
+    """Begin the processes that compute for a plant, and load what its loop computes.
+
+    ``loads`` load what the loop computes beside the plant itself.
+    """
     with contextlib.closing(WorkerProcesses()) as worker:
         worker.start(warm.computing)
-        warm.controlling()
+        for load in (warm.controlling, *loads):
+            load()
         yield worker
 
 
