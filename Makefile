@@ -30,7 +30,7 @@ run: $(STAMP)  ## run a plant of 10,000 heliostats in simulation until Ctrl-C: O
 	@$(BIN)/heliotrope run $(OPTIONS)
 
 test: $(STAMP)  ## run the tests in parallel
-	@bash scripts/packages.sh & $(BIN)/python -m heliotrope.warm; warm=$$?; wait; exit $$warm
+	@bash scripts/packages.sh & $(BIN)/python -m heliotrope.warm && $(BIN)/python -m heliotrope.twin.warm; warm=$$?; wait; exit $$warm
 	@HELIOTROPE_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow" -q
 
 soak: $(STAMP)  ## run the slow tests, then 2,000 simulated runs (an hour or two; goes on): RUNS=100

@@ -110,11 +110,12 @@ def breaking() -> None:
 
 
 def following() -> None:
-    """Learn on from a sighting, and ask for the resolution of drives."""
+    """Learn on from a sighting, and ask for the resolution of drives and the derivatives."""
     from heliotrope.calibration.learn import stream
 
     mechanism, seen = _case()
     mechanism.drives.radians_per_count(seen.counts)
+    mechanism.jacobian(seen.counts, ("tilt_north",))
     hyper, data = _drifting()
     stream.update(stream.begin(hyper), data.jacobian[0], data.value[0], 0.0)
 

@@ -1,11 +1,8 @@
 """How ``heliotrope run`` ends: real processes, a viewer at the live stream, and Ctrl-C."""
 
 import asyncio
-import re
 import signal
 import sqlite3
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -15,8 +12,8 @@ import pytest
 
 from heliotrope.console.client import Client
 from heliotrope.console.stream import RemoteError
+from support.program import MAIN, Program
 
-MAIN = "from heliotrope.cli import main; main()"
 #: A plant whose loop hangs: it says when it has begun, and after the first signal.
 HANGS = """
 import asyncio
@@ -33,41 +30,6 @@ async def main():
 asyncio.run(main())
 """
 PASSWORD = "a password of one's own"
-
-
-class Program:
-    """A program in a process; its lines are read as they are asked for."""
-
-    def __init__(self, *words: str) -> None:
-        self.text = ""
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", *words],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-
-    def says(self, pattern: str) -> re.Match[str]:
-        """Read lines until one matches."""
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.text += line
-            if found := re.search(pattern, line):
-                return found
-        raise AssertionError(f"no {pattern!r} in\n{self.text}")
-
-    def ends(self) -> int:
-        """Read the rest, and return the exit code."""
-        assert self.process.stdout is not None
-        self.text += self.process.stdout.read()
-        return self.process.wait(60.0)
-
-    def close(self) -> None:
-        """Kill it, if it runs."""
-        self.process.kill()
-        self.process.wait()
-        if self.process.stdout is not None:
-            self.process.stdout.close()
 
 
 def children(number: int) -> list[int]:

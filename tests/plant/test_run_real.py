@@ -288,7 +288,9 @@ def test_a_real_plant_over_tcp_mqtt_and_its_own_bus(
     assert code == 0, text
     # Ctrl-C stows whom it can, and names the others.
     assert set(states(lines).values()) == {"STOWED"}
-    assert re.search(r"\nstowing \d heliostats, about \d+ s; Ctrl-C again ends at once\n", text)
+    assert re.search(
+        r"\nstowing \d heliostats \(\d tracking.*\), about \d+ s; Ctrl-C again ends at once\n", text
+    )
     assert "not in stow: H7 silent, H8 silent" in text
     assert "1 of 4 clusters silent: K4 (" in text
     assert text.endswith("ended\n")

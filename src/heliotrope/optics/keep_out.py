@@ -19,6 +19,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere, Volume
 from heliotrope.geometry import FloatArray, as_float, as_vectors, direction, normalize
+from heliotrope.jit import as_input
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import TrackingStatus, track
@@ -43,9 +44,9 @@ def clearance(points: npt.ArrayLike, volumes: Sequence[Volume]) -> FloatArray:
     """Return signed distances (..., V) of points (..., 3) from volumes, m; negative inside."""
     p = as_vectors(points, "points")
     table, corners = _packed(volumes)
-    flat = np.ascontiguousarray(p.reshape(-1, 3))
+    flat = p.reshape(-1, 3)
     out = np.empty((len(flat), len(volumes)))
-    kernels.distances(table, corners, flat, out)
+    kernels.distances(*map(as_input, (table, corners, flat)), out)
     return out.reshape(*p.shape[:-1], len(volumes))
 
 
@@ -93,19 +94,8 @@ def find_entries(given: Beams, volumes: Sequence[Volume], *, dni: float = NOMINA
     table, corners = _packed(volumes)
     shape = (len(given), len(volumes))
     first, last = np.empty(shape), np.empty(shape)
-    radius, near, spread = given.mirrors.arrays()
-    kernels.enter(
-        table,
-        corners,
-        given.origin,
-        given.direction,
-        given.reach,
-        radius,
-        near,
-        spread,
-        first,
-        last,
-    )
+    inputs = (table, corners, given.origin, given.direction, given.reach, *given.mirrors.arrays())
+    kernels.enter(*map(as_input, inputs), first, last)
     strongest = _strongest(given.mirrors, first, last, dni)
     names = tuple(v.name for v in volumes)
     return Entries(names, first, last, given.point(first), strongest)
@@ -209,26 +199,15 @@ def sweep(
         raise InputError(f"path: {len(joints)} paths for {len(rows)} heliostats")
     if not (np.isfinite(resolution) and resolution > 0.0):
         raise InputError(f"resolution {resolution} rad must be above 0")
-    s = np.ascontiguousarray(np.broadcast_to(normalize(sun, "sun"), (count, 3)))
+    s = np.broadcast_to(normalize(sun, "sun"), (count, 3))
     table, corners = _packed(volumes)
     every = mirrors.broadcast(count)
     found = np.empty((count, len(volumes), 8))
-    radius, near, spread = every.arrays()
-    poses = kernels.move(
-        table,
-        corners,
-        _rows(rows, count),
-        _rows(joints, count),
-        s,
-        reaches(reach, count),
-        radius,
-        near,
-        spread,
-        resolution,
-        found,
-    )
+    far = reaches(reach, count)
+    inputs = (table, corners, _rows(rows, count), _rows(joints, count), s, far, *every.arrays())
+    poses = kernels.move(*map(as_input, inputs), resolution, found)
     first = found[..., 1]
-    last = _leaving(found, table, corners, every, reaches(reach, count))
+    last = _leaving(found, table, corners, every, far)
     return Sweep(
         tuple(v.name for v in volumes),
         found[..., 0],
@@ -253,10 +232,8 @@ def _leaving(
         hit = np.flatnonzero(np.isfinite(last[:, v]))
         end = np.empty((2, len(hit), 1))
         pose = found[hit, v]
-        given = np.ascontiguousarray(pose[:, 2:5]), np.ascontiguousarray(pose[:, 5:8]), reach[hit]
-        kernels.enter(
-            table[v : v + 1], corners, *given, radius[hit], near[hit], spread[hit], end[0], end[1]
-        )
+        beams = (pose[:, 2:5], pose[:, 5:8], reach[hit], radius[hit], near[hit], spread[hit])
+        kernels.enter(*map(as_input, (table[v : v + 1], corners, *beams)), end[0], end[1])
         last[hit, v] = np.fmax(last[hit, v], end[1, :, 0])
     return last
 
@@ -478,4 +455,4 @@ def _head(row: FloatArray, kind: int, center: FloatArray, bound: float) -> None:
 
 
 def _rows(array: FloatArray, count: int) -> FloatArray:
-    return np.ascontiguousarray(np.broadcast_to(array, (count, *array.shape[1:])))
+    return as_float(np.broadcast_to(array, (count, *array.shape[1:])))

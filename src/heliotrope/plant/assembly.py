@@ -8,6 +8,7 @@ with the others.
 import asyncio
 import contextlib
 import math
+from collections import Counter
 from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -49,12 +50,15 @@ from heliotrope.store.records import StoreError
 CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model="auto")
 #: Age from which a silent heliostat is not waited for at the end, s.
 SILENT = 10.0
+#: Time after which one that is held and has not moved is not waited for either, s: large plants ask
+#: for step counts every five seconds.
+_STANDS = 15.0
 #: Period of reading the sensors, s.
 _SENSED = 0.5
 #: The audit has changed limits in this name.
 _PLANT_FILE = Person("plant file", Role.ENGINEER)
-#: States from which no order leads to stow: people have to see to the heliostat.
-_STUCK = (states.FAULT, states.LOCKED, states.UNCONFIGURED)
+#: States that STOW does not change: only their motion shows whether such heliostats obey.
+_HELD = (states.FAULT, states.LOCKED, states.UNCONFIGURED)
 
 
 class MachineTables(Enum):
@@ -163,6 +167,8 @@ class PlantAssembly:
             joint=joint,
             receiver=receiver,
         )
+        #: When each heliostat last moved, or was ordered to, on its way to stow at the end.
+        self._moved_at = np.full(len(self.names), math.inf)
         self._record_limits()
         if chosen.machines is not MachineTables.UNKNOWN:
             self._rest_on_machines()
@@ -288,36 +294,37 @@ class PlantAssembly:
     async def stowed(self, limit: float = 300.0) -> bool:
         """Stow the field; return whether every heliostat is stowed.
 
-        It waits ``limit`` s at most, and only for heliostats that are heard and can be stowed by
-        an order; `left` names the others.
+        It waits ``limit`` s at most, and only for heliostats on their way (`to_stow`); `left` names
+        the others.
         """
         await self.operations.automatic.halt()
-        self.plant.stow("plant's end")
+        ticket, rows = self.plant.stow("plant's end"), self.plant.field
         until = self.clock.monotonic() + limit
-        while self.clock.monotonic() < until:
-            now = self.clock.monotonic()
-            there = self.plant.field.live(now) & at_stow(self.plant.field.rows)
-            if (there | self._hopeless(now)).all():
-                return bool(there.all())
+        self._moved_at[:], before = self.clock.monotonic(), rows.posed.copy()
+        while (now := self.clock.monotonic()) < until and self._on_the_way(now).any():
+            unheard = [rows.place(name) for name in ticket.unacknowledged()]
+            self._moved_at[unheard] = self._moved_at[(rows.posed != before).any(axis=-1)] = now
+            before = rows.posed.copy()
             await asyncio.sleep(0.25)
-        return False
+        return not self.left()
 
-    def _hopeless(self, now: float) -> npt.NDArray[np.bool_]:
-        """Return which heliostats it is useless to wait for, (N,)."""
+    def _on_the_way(self, now: float) -> npt.NDArray[np.bool_]:
+        """Return the heliostats that an order leads to stow and that are not there, (N,)."""
         rows = self.plant.field
-        silent = rows.age(now) > SILENT
-        return np.asarray(silent | rows.among(_STUCK, now))
+        away = (rows.age(now) <= SILENT) & ~(rows.live(now) & at_stow(rows.rows))
+        stands = rows.among(_HELD, now) & (now - self._moved_at > _STANDS)
+        return np.asarray(away & ~stands)
 
-    def to_stow(self) -> tuple[int, float]:
-        """Return how many heliostats are not stowed, and about how long they take to stow.
+    def to_stow(self) -> tuple[dict[str, int], float]:
+        """Return the heliostats on their way to stow, and about how long they take.
 
         Returns
         -------
-            Heliostats that can be stowed by an order, and s: both axes of the furthest one turn, in
-            turn, after those that are sent before it. NaN if their positions are unknown.
+            Their number in each state, and s: both axes of the furthest one turn, in turn, after
+            those that are sent before it. NaN if their positions are unknown.
         """
         rows, now = self.plant.field, self.clock.monotonic()
-        away = np.flatnonzero(~(rows.among((states.STOWED,), now) | self._hopeless(now)))
+        away = np.flatnonzero(self._on_the_way(now))
         machines, turns = self.plant.beams.machines, [math.nan]
         for row in away:
             machine = machines.get(rows.names[row])
@@ -325,7 +332,9 @@ class PlantAssembly:
                 way = np.abs(rows.posed[row] - machine.stow)
                 turns.append(float((way / [axis.rate for axis in machine.axes]).sum()))
         rate = self.plant.settings.stow_rate
-        return len(away), float(np.fmax.reduce(turns)) + (len(away) / rate if rate else 0.0)
+        seconds = float(np.fmax.reduce(turns)) + (len(away) / rate if rate else 0.0)
+        found = Counter(states.STATES[state] for state in rows.rows["state"][away])
+        return dict(found.most_common()), seconds
 
     def left(self) -> str:
         """Return which heliostats are not stowed, in words; "" if all are."""

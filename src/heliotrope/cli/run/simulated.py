@@ -21,6 +21,7 @@ from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAsse
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.learner import LearnerProcess
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.twin import warm
 from heliotrope.twin.live import CYCLE, PacedLoop, World, WorldOptions
 
 
@@ -53,7 +54,7 @@ async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
         machines=MachineTables.HELD,
     )
     ending = begin(design, shown)
-    with computing() as worker, store(shown) as (keeper, folder):
+    with computing(warm.moving) as worker, store(shown) as (keeper, folder):
         options = WorldOptions(
             choice.seed, rendered=not choice.exact, worker=worker, boards=choice.boards
         )
