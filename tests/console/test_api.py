@@ -637,7 +637,8 @@ def test_holds(ask: Ask, console: LiveConsole) -> None:
     assert (ticket["command"], ticket["finished"]) == ("OUT_OF_SERVICE", False)
     assert ticket["steps"][name].startswith("on its way to stow: ")
     found = ask("viewer", "GET", "holds")
-    assert [one["heliostat"] for one in found.json()] == [name]
+    locked = [(one["kind"], one["name"], one["who"]) for one in found.json()]
+    assert locked == [("heliostat", name, "operator")]
     until = time.monotonic() + 90.0
     while not ticket["finished"]:
         assert time.monotonic() < until, ticket
@@ -648,7 +649,18 @@ def test_holds(ask: Ask, console: LiveConsole) -> None:
     assert ask("viewer", "GET", f"heliostats/{name}").json()["state"] == "STOWED"
     assert isinstance(ask("viewer", "GET", "retries").json(), list)
     assert "being painted" in ask("viewer", "GET", f"heliostats/{name}").json()["hold"]
-    assert ask("operator", "POST", "holds/release", {"heliostats": [name]}).json() == []
+    # Another person's lock on it too: it stays out until both are returned.
+    target = console.live.operations.targets[0]
+    both = {"heliostats": [name], "targets": [target], "reason": "a ladder"}
+    assert ask("engineer", "POST", "holds", both).status_code == 200
+    left = ask("operator", "POST", "holds/release", {"heliostats": [name]}).json()
+    assert [(one["name"], one["who"]) for one in left] == [(name, "engineer"), (target, "engineer")]
+    refused = ask("operator", "POST", "holds/release", {"heliostats": [name]})
+    assert refused.status_code == 409
+    assert "operator has no lock on" in refused.text
+    assert ask("engineer", "POST", "holds/release", {}).status_code == 422
+    back = {"heliostats": [name], "targets": [target]}
+    assert ask("engineer", "POST", "holds/release", back).json() == []
 
 
 def test_an_emergency_of_a_viewer(console: LiveConsole, ask: Ask) -> None:

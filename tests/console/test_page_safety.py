@@ -234,8 +234,8 @@ def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
     page.click(".hx-tabs >> text=Schedule")
     row = page.locator(f".hx-schedule tr:has-text('{name}'):has-text('washing')")
     assert "STOWED" in row.inner_text()
-    row.locator("text=Give back").click()
-    page.click("dialog >> text='Give back'")
+    row.locator("text=Return lock").click()
+    page.click("dialog >> text='Return lock'")
     page.wait_for_function("heliotrope.store.out.every((one) => !one)")
     page.wait_for_function("!document.querySelector('.hx-legend .hx-out')")
 

@@ -427,17 +427,87 @@ def test_a_heliostat_out_of_service_is_moved_by_nobody() -> None:
         # What is safe passes.
         for safe in (shown.defocus, shown.stow):
             assert not safe(OPERATOR, (name,)).blocked
-        # Its owner or an engineer gives it back; then it goes up again.
+        # Another person's lock holds too: both must be returned before it goes up again.
         other = Person("Otto", Role.OPERATOR)
-        for act in (lambda: shown.unhold(other, (name,)), lambda: shown.hold(other, (name,), "x")):
-            with pytest.raises(RefusedError, match="its owner or an engineer"):
-                act()
+        with pytest.raises(
+            RefusedError, match=r"Otto has no lock on \S+, which is locked: washing"
+        ):
+            shown.unhold(other, (name,))
+        shown.hold(other, (name,), "a new gear")
         shown.unhold(OPERATOR, (name,))
+        assert [(lock.name, lock.who) for lock in shown.holds()] == [(name, "Otto")]
+        assert shown.heliostat(name).hold.startswith("a new gear (Otto")
+        with pytest.raises(RefusedError, match="out of service: a new gear"):
+            shown.command(ENGINEER, token, "UNLOCK", (name,))
+        with pytest.raises(RefusedError, match=r"remove Otto's lock: Olga is"):
+            shown.unhold(OPERATOR, (name,), owner="Otto", reason="ill")
+        with pytest.raises(RefusedError, match="a reason is needed"):
+            shown.unhold(ENGINEER, (name,), owner="Otto")
+        shown.unhold(ENGINEER, (name,), owner="Otto", reason="he has gone home")
+        assert any("removed Otto's lock (a new gear" in e.text for e in shown.events())
         assert shown.holds() == ()
         shown.release_authority(ENGINEER, token)
         shown.give_back(OPERATOR)
         await asyncio.sleep(200.0)
         assert _states(plant)[0] == "TRACKING"
+
+    live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0))
+
+
+def test_a_lock_on_a_target_receiver_or_the_tower_keeps_beams_away() -> None:
+    async def work(plant: LivePlant) -> None:
+        shown = plant.operations
+        await asyncio.sleep(200.0)
+        token = shown.take_authority(ENGINEER).token
+
+        async def held(seconds: float) -> None:
+            """Let time pass while a person keeps the command."""
+            for _ in range(int(seconds / 3.0)):
+                shown.keep_authority(ENGINEER, token)
+                await asyncio.sleep(3.0)
+
+        await held(3.0)
+        one = plant.names[0]
+        shown.aim_at(ENGINEER, token, (one,), "left")
+        await held(30.0)
+        # Only the beam that is aimed at the target leaves it, and none comes.
+        assert shown.hold(OPERATOR, (), "marks", targets=("left",)).heliostats == (one,)
+        await held(120.0)
+        assert _states(plant) == ["STOWED", "TRACKING", "TRACKING", "TRACKING"]
+        for heliostat in plant.names[:2]:
+            with pytest.raises(RefusedError, match=r"target left is locked: marks \(Olga"):
+                shown.aim_at(ENGINEER, token, (heliostat,), "left")
+        shown.command(ENGINEER, token, "APPROACH", (one,))
+        await held(60.0)
+        with pytest.raises(RefusedError, match="target left is locked"):
+            shown.command(ENGINEER, token, "TRACK", (one,))
+        with pytest.raises(RefusedError, match="target left is locked"):
+            shown.calibrate(ENGINEER, plant.names[1], "left")
+        shown.unhold(OPERATOR, targets=("left",))
+        # The receiver, and then the tower.
+        shown.aim_at(ENGINEER, token, (one,), "receiver")
+        await held(5.0)
+        shown.command(ENGINEER, token, "TRACK", (one,))
+        await held(60.0)
+        assert _states(plant) == ["TRACKING"] * 4
+        shown.hold(OPERATOR, (), "a hose", receivers=("receiver",))
+        await held(120.0)
+        assert _states(plant) == ["STOWED"] * 4
+        assert shown.command(ENGINEER, token, "APPROACH", (one,)).blocked == {}
+        shown.hold(ENGINEER, (), "climbing", tower=True)
+        await held(120.0)
+        assert _states(plant) == ["STOWED"] * 4
+        shown.unhold(OPERATOR, receivers=("receiver",))
+        with pytest.raises(RefusedError, match=r"the tower is locked: climbing \(Egon"):
+            shown.command(ENGINEER, token, "APPROACH", (one,))
+        # Automatic control waits for it too, and goes on afterwards.
+        shown.release_authority(ENGINEER, token)
+        shown.give_back(OPERATOR)
+        await asyncio.sleep(60.0)
+        assert _states(plant) == ["STOWED"] * 4
+        shown.unhold(ENGINEER, tower=True)
+        await asyncio.sleep(240.0)
+        assert _states(plant) == ["TRACKING"] * 4
 
     live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0))
 

@@ -3,7 +3,6 @@
 import asyncio
 import errno
 import itertools
-import math
 import os
 import time
 from collections import deque
@@ -19,7 +18,7 @@ from heliotrope.links.messages import Command, Emergency, Lease, Stage
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.assigned import AssignedFile
 from heliotrope.plant.audit import read
-from heliotrope.plant.lockouts import Lockout
+from heliotrope.plant.lockouts import Kind, Lockout
 from heliotrope.safety import Act
 from support.midsummer import DayClock
 from support.plant_bench import ENGINEER, OPERATOR, Bench, SlowDisk, running
@@ -173,7 +172,7 @@ def test_what_was_proven_is_proven_again_after_the_wait(tmp_path: Path) -> None:
         disk.delay = 1.0
         approach = plant.command(OPERATOR, token, "APPROACH", ("P1A", "P1B"))
         aim = plant.aim(OPERATOR, token, AIM)
-        plant.out_of_service["P1A"] = Lockout("P1A", OPERATOR.name, "washing", 0.0, math.nan)
+        plant.lockouts.put([Lockout(Kind.HELIOSTAT, "P1A", OPERATOR.name, "washing", 0.0)])
         await bench.wait(1.2)
         assert [m.heliostats for _, m in sent(bench, "APPROACH")] == [("P1B",)]
         assert "washing" in approach.refusals["P1A"]

@@ -20,7 +20,14 @@ from heliotrope.store import audit, tables
 from heliotrope.store.database import Database
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.people import People
-from heliotrope.store.records import AuditEntry, CampaignEntry, Event, PlannedVisit, VisitEntry
+from heliotrope.store.records import (
+    AuditEntry,
+    CampaignEntry,
+    Event,
+    Hold,
+    PlannedVisit,
+    VisitEntry,
+)
 
 FILE = Path(__file__).with_name("data") / "written_0002.json"
 NAMES = ("A1", "Größe/2")
@@ -118,9 +125,10 @@ def fill(keeper: Keeper) -> None:
     keeper.record_alarm("wind", "mast", "warning", "", 2.5, active=False)
     keeper.record_acknowledgement("wind", "mast", "anna", 3.0)
     keeper.record_alarm("rain", "", Severity.ALARM, "rain", 4.0, active=True)
-    keeper.hold(["A1", "Größe/2"], "broken", "anna", 5.0, until=50.0)
-    keeper.unhold(["A1"], "ben", 6.0)
-    keeper.hold(["B"], "for good", "ben", 7.0)
+    holds = [Hold("heliostat", name, "broken", "anna", 5.0, 50.0) for name in NAMES]
+    keeper.hold(holds)
+    keeper.unhold(holds[:1], "ben", 6.0)
+    keeper.hold([Hold("heliostat", "B", "for good", "ben", 7.0)])
     keeper.do(lambda c: audit.begin(c, AUDIT))
     keeper.do(lambda c: audit.finish(c, "p-1", "done", "t2"))
     keeper.do(lambda c: audit.change_points(c, POINTS, {}))

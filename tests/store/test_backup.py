@@ -27,6 +27,7 @@ from heliotrope.store.records import (
     CampaignEntry,
     Event,
     FlightEntry,
+    Hold,
     LearningEntry,
     OutlookEntry,
     PlannedVisit,
@@ -65,7 +66,7 @@ def fill(keeper: Keeper, seen: Sightings, key_file: Path) -> None:
     keeper.record_outlook(OutlookEntry(1.0, "{}"))
     keeper.record_event(Event(1.0, "test", "hello", values={"x": float("nan")}))
     keeper.record_alarm("wind", "", "alarm", "too much", 1.0, active=True)
-    keeper.hold(["B"], "broken", "anna", 5.0)
+    keeper.hold([Hold("heliostat", "B", "broken", "anna", 5.0)])
     keeper.writer.do(lambda c: begin(c, AuditEntry("p-1", "anna", "operator", "AIM", "t", (1.0,))))
     keeper.writer.do(lambda c: change_points(c, {"AIM": {"A": (1.0, 2.0, 3.0)}}, {}))
     keeper.writer.do(lambda c: c.execute(tables.about.insert().values(name="plant", value="x")))

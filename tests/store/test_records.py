@@ -272,19 +272,22 @@ class TestSchedule:
         self, place: str | Path, opened: Callable[..., Keeper]
     ) -> None:
         keeper = opened(place)
-        keeper.hold(["A", "B", "A"], "drive replaced", "anna", 10.0, until=50.0)
-        keeper.hold(["B"], "mirror broken", "ben", 20.0)
-        keeper.hold(["C"], "for a moment", "ben", 20.0)
-        keeper.unhold(["C", "never held"], "anna", 30.0)
-        wanted = {
-            "A": Hold("A", "drive replaced", "anna", 10.0, 50.0),
-            "B": Hold("B", "mirror broken", "ben", 20.0),
-        }
-        assert keeper.holds(40.0) == wanted
+        annas = [
+            Hold("heliostat", name, "drive replaced", "anna", 10.0, 50.0) for name in ("A", "B")
+        ]
+        bens = Hold("heliostat", "B", "mirror broken", "ben", 20.0)
+        later = Hold("heliostat", "A", "a new gear", "anna", 25.0)
+        tower = Hold("tower", "tower", "for a moment", "ben", 20.0)
+        keeper.hold([*annas, bens, tower])
+        keeper.hold([later])
+        keeper.unhold([tower, Hold("heliostat", "never held", "", "ben", 0.0)], "anna", 30.0)
+        wanted = {later, annas[1], bens}
+        assert set(keeper.holds()) == wanted
         keeper.close()
         again = opened(place)
-        assert again.holds(40.0) == wanted
-        assert list(again.holds(50.0)) == ["B"]
+        assert set(again.holds()) == wanted
+        again.unhold([annas[1]], "eva", 60.0)
+        assert set(again.holds()) == {later, bens}
 
 
 class TestEventsAndAlarms:

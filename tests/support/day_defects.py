@@ -100,7 +100,7 @@ def not_tracked_again(patch: pytest.MonkeyPatch) -> None:
 
 def back_in_service_by_a_restart(patch: pytest.MonkeyPatch) -> None:
     """A new program does not know what is out of service."""
-    patch.setattr(Keeping, "lockouts", lambda self: {})
+    patch.setattr(Keeping, "lockouts", lambda self: ())
 
 
 def _when(moment: str, what: str, after: float = 0.0) -> tuple[CrewAct, ...]:

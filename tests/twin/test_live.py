@@ -378,7 +378,7 @@ def test_what_was_learnt_outlasts_the_program(tmp_path: Path) -> None:
         # The next program, and boards that know nothing.
         idle = replace(EXACT, work=AutomaticSettings(calibrate=True))
         second = LivePlant(design, clock, idle, records=keeper)
-        assert [hold.heliostat for hold in second.operations.holds()] == ["R001-002"]
+        assert [hold.name for hold in second.operations.holds()] == ["R001-002"]
         assert second.operations.calibration().done == len(known)
         rows = [second.plant.field.place(name) for name in known]
         async with second.running():

@@ -20,6 +20,13 @@ app = typer.Typer(help="Look at and command a running plant.", no_args_is_help=T
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Whom = Annotated[list[str] | None, typer.Argument(help="Heliostats.", show_default=False)]
 All = Annotated[bool, typer.Option("--all", help="The whole field.")]
+LockedTargets = Annotated[
+    list[str] | None, typer.Option("--target", help="Target; repeat it.", show_default=False)
+]
+LockedReceivers = Annotated[
+    list[str] | None, typer.Option("--receiver", help="Receiver; repeat it.", show_default=False)
+]
+LockedTower = Annotated[bool, typer.Option("--tower", help="The tower: all heliostats.")]
 #: Status of an answer that asks for the code of a second factor.
 _NEEDS_CODE = 428
 Wait = Annotated[float, typer.Option("--wait", help="Longest wait for the end, s; 0: none.")]
@@ -596,15 +603,18 @@ def reading(
 @app.command("out-of-service")
 def out_of_service(
     context: typer.Context,
-    heliostats: Annotated[list[str], typer.Argument(help="Heliostats.")],
     reason: Annotated[str, typer.Option(help="Reason, shown to everybody.")],
+    heliostats: Whom = None,
+    targets: LockedTargets = None,
+    receivers: LockedReceivers = None,
+    tower: LockedTower = False,
     hours: Annotated[
         float | None, typer.Option(help="Hours until they are expected back.", show_default=False)
     ] = None,
     wait: Wait = 600.0,
 ) -> None:
-    """Take heliostats out of service; wait until they are parked in stow and locked out."""
-    order = {"heliostats": heliostats, "reason": reason, "hours": hours}
+    """Put your lock on heliostats, targets, receivers or the tower; wait until all is parked."""
+    order = {**_places(heliostats, targets, receivers, tower), "reason": reason, "hours": hours}
     with _client(context) as client:
         _follow_all(client, [client.ask("POST", "holds", order)], wait)
 
@@ -612,11 +622,30 @@ def out_of_service(
 @app.command("give-back")
 def give_back(
     context: typer.Context,
-    heliostats: Annotated[list[str], typer.Argument(help="Heliostats.")],
+    heliostats: Whom = None,
+    targets: LockedTargets = None,
+    receivers: LockedReceivers = None,
+    tower: LockedTower = False,
+    owner: Annotated[
+        str, typer.Option(help="As an engineer: whose lock to remove; needs --reason.")
+    ] = "",
+    reason: Annotated[str, typer.Option(help="Why another person's lock is removed.")] = "",
 ) -> None:
-    """Give heliostats back to service, each by its name; nothing moves."""
+    """Return your locks; nothing moves. In service again once nobody's lock is left."""
+    order = {**_places(heliostats, targets, receivers, tower), "owner": owner, "reason": reason}
     with _client(context) as client:
-        print_json(client.ask("POST", "holds/release", {"heliostats": heliostats}))
+        print_json(client.ask("POST", "holds/release", order))
+
+
+def _places(
+    heliostats: list[str] | None,
+    targets: list[str] | None,
+    receivers: list[str] | None,
+    tower: bool,
+) -> dict[str, object]:
+    """Return what a person locks or gives back, as the API takes it."""
+    named = {"heliostats": heliostats, "targets": targets, "receivers": receivers}
+    return {key: list(names or ()) for key, names in named.items()} | {"tower": tower}
 
 
 @app.command()

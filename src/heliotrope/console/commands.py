@@ -243,14 +243,17 @@ async def give_reading(console: Here, who: Engineer, name: Named, order: orders.
 
 @router.post("/holds", response_model=models.TicketState, tags=["commands"])
 async def hold(console: Here, who: Operator, order: orders.HoldOrder) -> models.TicketState:
-    """Take heliostats out of service: they go to stow, and nobody moves them.
+    """Lock heliostats, targets, receivers or the tower: heliostats concerned stow, and stay there.
 
-    Done where a heliostat is parked in stow.
+    Each person has a lock of their own. Done where a heliostat is parked in stow.
     """
     return models.TicketState(**await console.plant.ask("hold", who.person, **order.model_dump()))
 
 
 @router.post("/holds/release", response_model=models.many(models.Lockout), tags=["commands"])
 async def unhold(console: Here, who: Operator, order: orders.GivenBack) -> JSONResponse:
-    """Give heliostats back to service by their names; nothing moves."""
+    """Return your locks, or remove an owner's as an engineer; nothing moves.
+
+    What is locked is in service again when nobody's lock is left.
+    """
     return answer(await console.plant.ask("unhold", who.person, **order.model_dump()))

@@ -100,7 +100,7 @@ class Commands:
             raise UnknownNameError("command (points are given by aim and standby)", name, known)
         numbers = whole(values, row[3], name)
         names = tuple(dict.fromkeys(heliostats)) or self._field.names
-        out = self._permission.locked_out(name, names)
+        out = self._permission.locked_out(name, names, self._destined(name, names))
         others = tuple(n for n in names if n not in out)
         clear, wrong = self.examine(name, numbers, others, token)
         blocked = {**wrong, **out}
@@ -129,7 +129,7 @@ class Commands:
         name, left = ticket.name, ticket.waiting(heliostats)
         if again and left:
             self._permission.refuse_now(name, left)
-            out = self._permission.still_locked_out(name, left)
+            out = self._permission.still_locked_out(name, left, self._destined(name, left))
             others = tuple(n for n in left if n not in out)
             left, wrong = self.examine(name, numbers, others, token)
             ticket.block({**wrong, **out})
@@ -239,6 +239,10 @@ class Commands:
     def _places(self, names: Sequence[str]) -> npt.NDArray[np.intp]:
         return np.array([self._field.place(name) for name in names], dtype=np.intp)
 
+    def _destined(self, name: str, names: Sequence[str]) -> FloatArray | None:
+        """Return the aims (K, 3) to which a command sends beams; None: it sends them to none."""
+        return self._aims(self._places(names)) if name in JOINING else None
+
     def _aims(self, rows: npt.NDArray[np.intp]) -> FloatArray:
         return np.asarray(self._ways.points.aims[rows])
 
@@ -246,7 +250,8 @@ class Commands:
         self, name: str, points: Mapping[str, npt.ArrayLike]
     ) -> tuple[tuple[str, ...], npt.NDArray[np.intp], FloatArray, dict[str, str]]:
         """Return heliostats, rows (K,) and points (K, 3), and which are out of service, and why."""
-        out = self._permission.locked_out(name, points)
+        wanted = points_of(name, points) if name == "AIM" else None
+        out = self._permission.locked_out(name, points, wanted)
         points = {n: point for n, point in points.items() if n not in out}
         rows = self._places(tuple(points))
         return tuple(points), rows, points_of(name, points), out

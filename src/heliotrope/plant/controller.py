@@ -59,7 +59,7 @@ from heliotrope.plant.given import Given
 from heliotrope.plant.giving_back import GivingBack
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.joining import JoinDispatcher, JoinQueue
-from heliotrope.plant.lockouts import Lockout
+from heliotrope.plant.lockouts import Lockouts
 from heliotrope.plant.locks import Locks
 from heliotrope.plant.movements import Movements
 from heliotrope.plant.orders import PlantOrders
@@ -123,8 +123,8 @@ class PlantController:
         The last alarms, oldest first.
     name
         Name of this run of the plant: UTC of its start, and random digits.
-    out_of_service
-        Heliostats that only EMERGENCY, DEFOCUS and STOW move, by name; see `Lockout`.
+    lockouts
+        Locks of persons; EMERGENCY, DEFOCUS and STOW pass them.
     aims, standbys
         Points where the beams are sent, ENU, m, (N, 3); NaN where there is none.
     movements, locks, stepping
@@ -167,7 +167,7 @@ class PlantController:
         self.beams = BeamCheck(design, self.field.names, volumes, eyes)
         self.beliefs = Beliefs(design)
         self.beliefs.subscribe(self._believe)
-        self.out_of_service: dict[str, Lockout] = {}
+        self.lockouts = Lockouts(design)
         points = Points(self.field.names, assigned)
         self.aims, self.standbys = points.aims, points.standbys
         self.movements = Movements(design.receivers, self.beams.armature)
@@ -265,7 +265,7 @@ class PlantController:
             self._identities,
             self._sync,
             self.doubts,
-            self.out_of_service,
+            self.lockouts,
             self._given,
         )
 

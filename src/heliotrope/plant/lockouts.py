@@ -1,34 +1,57 @@
-"""Heliostats out of service: locked out for somebody at the mirror.
+"""Locks of persons: heliostats out of service, and targets, receivers and towers under work.
 
-A heliostat that is out of service stays in stow. Nobody moves it, neither a person nor automatic
-control nor a command to a group, until it is given back by name. EMERGENCY, DEFOCUS and STOW pass.
+Each person has a lock of their own, as lockout-tagout asks for: what is locked is back in service
+when the last lock is returned. A heliostat that is locked stays in stow: nobody moves it, neither a
+person nor automatic control nor a command to a group. To a locked target or receiver no beam is
+sent; under a locked tower no heliostat leaves stow. EMERGENCY, DEFOCUS and STOW pass.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
 
 #: Commands that move nothing: they may be given to a heliostat out of service.
 STILL = frozenset({"LOCK", "LOCK_AIM", "ROUGH", "ZERO", "PARAMETERS"})
+#: Name of the tower among what is locked.
+TOWER = "tower"
+#: A beam whose aim is this close to the edge of a locked surface counts as on it, m.
+_BESIDE = 2.0
+
+
+class Kind(StrEnum):
+    """What a person locks."""
+
+    HELIOSTAT = "heliostat"
+    TARGET = "target"
+    RECEIVER = "receiver"
+    TOWER = "tower"
 
 
 @dataclass(frozen=True)
 class Lockout:
-    """A heliostat out of service.
+    """One person's lock on a heliostat, a target, a receiver or the tower.
 
     Attributes
     ----------
-    heliostat
-        Its name.
+    kind, name
+        What is locked; the tower's name is "tower".
     who, reason
-        Person who took it out, and why.
+        Person who locked it, and why.
     since, until
         When, and the time at which it is expected back, POSIX s; NaN if none was given. It stays
-        out of service after that time too.
+        locked after that time too.
     """
 
-    heliostat: str
+    kind: Kind
+    name: str
     who: str
     reason: str
     since: float
@@ -41,13 +64,96 @@ class Lockout:
         return f"{self.reason} ({self.who}, since {_time(self.since)}{back})"
 
 
-def locked_out(
-    out: Mapping[str, Lockout], command: str, heliostats: Iterable[str]
-) -> dict[str, str]:
-    """Return which heliostats a command must not move, and why."""
-    if command in STILL or not out:
-        return {}
-    return {name: f"out of service: {out[name].text}" for name in heliostats if name in out}
+class Lockouts:
+    """All locks of persons on a plant.
+
+    Parameters
+    ----------
+    design
+        The plant, with its targets and receivers.
+    """
+
+    def __init__(self, design: Plant) -> None:
+        self._locks: dict[tuple[Kind, str], dict[str, Lockout]] = {}
+        self._surfaces = {
+            (kind, surface.name): surface
+            for kind, surfaces in (
+                (Kind.TARGET, design.targets),
+                (Kind.RECEIVER, design.receivers),
+            )
+            for surface in surfaces
+        }
+
+    def __iter__(self) -> Iterator[Lockout]:
+        return (lock for locks in self._locks.values() for lock in locks.values())
+
+    def __contains__(self, heliostat: object) -> bool:
+        return (Kind.HELIOSTAT, heliostat) in self._locks
+
+    @property
+    def heliostats(self) -> tuple[str, ...]:
+        """The heliostats that are locked themselves."""
+        return tuple(name for kind, name in self._locks if kind is Kind.HELIOSTAT)
+
+    def put(self, locks: Iterable[Lockout]) -> None:
+        """Put locks; a person's new lock replaces their own one before."""
+        for lock in locks:
+            self._locks.setdefault((lock.kind, lock.name), {})[lock.who] = lock
+
+    def remove(self, kind: Kind, name: str, who: str) -> None:
+        """Remove one person's lock, if there is one."""
+        locks = self._locks.get((kind, name), {})
+        locks.pop(who, None)
+        if not locks:
+            self._locks.pop((kind, name), None)
+
+    def on(self, kind: Kind, name: str) -> tuple[Lockout, ...]:
+        """Return the locks on something, in the order in which they were put."""
+        return tuple(self._locks.get((kind, name), {}).values())
+
+    def text(self, kind: Kind, name: str) -> str:
+        """Return the locks on something in one line, "" if there are none."""
+        return "; ".join(lock.text for lock in self.on(kind, name))
+
+    def closed(self, points: FloatArray) -> dict[str, npt.NDArray[np.bool_]]:
+        """Return which points (K, 3), ENU, m, lie on locked surfaces, by the reason."""
+        found = {}
+        for kind, name in self._locks:
+            surface = self._surfaces.get((kind, name))
+            if surface is not None:
+                reach = 0.5 * math.hypot(surface.width, surface.height) + _BESIDE
+                near = np.linalg.norm(points - surface.center, axis=-1) <= reach
+                found[f"{kind} {name} is locked: {self.text(kind, name)}"] = np.asarray(near)
+        return found
+
+    def blocked(
+        self, command: str, heliostats: Collection[str], points: FloatArray | None = None
+    ) -> dict[str, str]:
+        """Return the heliostats that a command must not move, and the reasons.
+
+        Parameters
+        ----------
+        command
+            Its name.
+        heliostats
+            Names (K).
+        points
+            Where it sends their beams, ENU, m, (K, 3); None: to no surface.
+        """
+        if command in STILL or not self._locks:
+            return {}
+        reasons: dict[str, str] = {}
+        if points is not None:
+            names = tuple(heliostats)
+            for text, on in self.closed(points).items():
+                reasons |= {names[i]: text for i in np.flatnonzero(on)}
+        if tower := self.text(Kind.TOWER, TOWER):
+            reasons |= dict.fromkeys(heliostats, f"the tower is locked: {tower}")
+        return reasons | {
+            name: f"out of service: {self.text(Kind.HELIOSTAT, name)}"
+            for name in heliostats
+            if name in self
+        }
 
 
 def _time(at: float) -> str:

@@ -15,7 +15,7 @@ from heliotrope.plant.emergency import Sentinel
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.given import Given
 from heliotrope.plant.identity import Identities
-from heliotrope.plant.lockouts import Lockout, locked_out
+from heliotrope.plant.lockouts import Lockouts
 from heliotrope.plant.ordered import JOINING, MOTIONS
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.parameters import ParameterSync
@@ -49,8 +49,8 @@ class Permission:
         Whether new motion may begin now.
     identities, sync, doubts
         Whether a heliostat is what it seems to be.
-    out_of_service
-        Heliostats that nobody moves, by name.
+    lockouts
+        Locks of persons.
     given
         Points that were given, and whether they were taken.
     """
@@ -65,13 +65,13 @@ class Permission:
         identities: Identities,
         sync: ParameterSync,
         doubts: Doubts,
-        out_of_service: Mapping[str, Lockout],
+        lockouts: Lockouts,
         given: Given,
     ) -> None:
         self._field, self._authority, self._orders = field, authority, orders
         self._sentinel, self._rivals = sentinel, rivals
         self._identities, self._sync, self._doubts = identities, sync, doubts
-        self._out, self._given = out_of_service, given
+        self._lockouts, self._given = lockouts, given
 
     def able(
         self, name: str, names: tuple[str, ...], token: int = 0
@@ -145,13 +145,17 @@ class Permission:
         wrong = self._sync.differing(names) | self._identities.barred(names)
         return wrong | self._doubts.barred(names, points) if name == "AIM" else wrong
 
-    def still_locked_out(self, name: str, heliostats: Collection[str]) -> dict[str, str]:
-        """Return which heliostats are out of service, and why."""
-        return locked_out(self._out, name, heliostats)
+    def still_locked_out(
+        self, name: str, heliostats: Collection[str], points: FloatArray | None = None
+    ) -> dict[str, str]:
+        """Return the heliostats that persons' locks keep from a command; see `Lockouts.blocked`."""
+        return self._lockouts.blocked(name, heliostats, points)
 
-    def locked_out(self, name: str, heliostats: Collection[str]) -> dict[str, str]:
-        """Return which heliostats are out of service, and why; refuse if all of them are."""
-        out = self.still_locked_out(name, heliostats)
+    def locked_out(
+        self, name: str, heliostats: Collection[str], points: FloatArray | None = None
+    ) -> dict[str, str]:
+        """Return the heliostats that persons' locks keep from a command; refuse if all are."""
+        out = self.still_locked_out(name, heliostats, points)
         if out and len(out) == len(heliostats):
             first, more = next(iter(out)), f" and {len(out) - 1} more" if len(out) > 1 else ""
             raise refusals.OUT_OF_SERVICE.error(

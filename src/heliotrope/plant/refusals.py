@@ -132,13 +132,13 @@ OUT_OF_SERVICE = Refusal(
     "out of service",
     "The heliostat is out of service, and the command would move it.",
     "{what} {heliostat}{more}: {reason}",
-    "Make sure that nobody is at the mirror, then give it back by name. DEFOCUS and STOW pass.",
+    "Each owner makes sure that nobody is there, then returns their lock. DEFOCUS and STOW pass.",
 )
 NOT_OWNER = Refusal(
     "not the owner",
-    "A heliostat that another person took out of service is given back or taken out again.",
-    "{what}: {heliostat} is out of service: {text}; its owner or an engineer gives it back",
-    "Ask the owner or an engineer.",
+    "A person gives back what only others have locked.",
+    "{what}: {who} has no lock on {name}, which is locked: {text}",
+    "Each person returns their own lock; an engineer may remove another's by the owner's name.",
 )
 NOT_ACKNOWLEDGED = Refusal(
     "not acknowledged",

@@ -421,25 +421,18 @@ class Keeper:
 
     # -- holds ---------------------------------------------------------------------------
 
-    def hold(
-        self,
-        heliostats: Sequence[str],
-        reason: str,
-        person: str,
-        at: float,
-        until: float | None = None,
-    ) -> None:
-        """Hold heliostats back from the schedule; a new hold replaces the one before."""
-        names = list(dict.fromkeys(heliostats))
-        first = self._take_numbers(tables.hold, len(names))
-        new = {name: Hold(name, reason, person, at, until) for name in names}
+    def hold(self, holds: Sequence[Hold]) -> None:
+        """Keep locks; a person's new lock replaces their own one before."""
+        new = {_locked(hold): hold for hold in holds}
+        first = self._take_numbers(tables.hold, len(new))
         made = [
             rows.row_of(tables.hold, hold, number=first + i, ended=None, ended_by="")
             for i, hold in enumerate(new.values())
         ]
 
         def work(connection: Connection) -> None:
-            _end_holds(connection, names, person, at)
+            for hold in new.values():
+                _end_hold(connection, hold, hold.person, hold.since)
             rows.insert(connection, tables.hold, made)
 
         with self._mine:
@@ -447,17 +440,21 @@ class Keeper:
             # A new dictionary: a reader of the old one sees one consistent state.
             self._holds = {**self._holds, **new}
 
-    def unhold(self, heliostats: Sequence[str], person: str, at: float) -> None:
-        """Return heliostats to the schedule."""
-        names = list(dict.fromkeys(heliostats))
-        with self._mine:
-            self.writer.put(lambda c: _end_holds(c, names, person, at))
-            gone = set(names)
-            self._holds = {n: held for n, held in self._holds.items() if n not in gone}
+    def unhold(self, holds: Sequence[Hold], person: str, at: float) -> None:
+        """End locks; ``person`` is who has removed them, ``at`` when, POSIX s."""
+        gone = {_locked(hold): hold for hold in holds}
 
-    def holds(self, at: float) -> dict[str, Hold]:
-        """Return the holds at a time, by heliostat."""
-        return {n: h for n, h in self._holds.items() if h.until is None or at < h.until}
+        def work(connection: Connection) -> None:
+            for hold in gone.values():
+                _end_hold(connection, hold, person, at)
+
+        with self._mine:
+            self.writer.put(work)
+            self._holds = {k: hold for k, hold in self._holds.items() if k not in gone}
+
+    def holds(self) -> tuple[Hold, ...]:
+        """Return the locks that stand."""
+        return tuple(self._holds.values())
 
     def exchange_limits(self, numbers: Mapping[str, float]) -> dict[str, float]:
         """Keep the numbers of the safety table in force; return those of the run before, or {}."""
@@ -519,16 +516,21 @@ def _last_versions(connection: Connection) -> dict[str, int]:
     return {name: int(version) for name, version in connection.execute(query)}
 
 
-def _standing_holds(connection: Connection) -> dict[str, Hold]:
+def _locked(hold: Hold) -> tuple[str, str, str]:
+    """Return what is locked, and by whom: of these there is one standing lock."""
+    return hold.kind, hold.name, hold.person
+
+
+def _standing_holds(connection: Connection) -> dict[tuple[str, str, str], Hold]:
     query = select(tables.hold).where(tables.hold.c.ended.is_(None))
-    return {held.heliostat: held for held in rows.records(connection, Hold, query)}
+    return {_locked(held): held for held in rows.records(connection, Hold, query)}
 
 
-def _end_holds(connection: Connection, names: Sequence[str], person: str, at: float) -> None:
+def _end_hold(connection: Connection, hold: Hold, person: str, at: float) -> None:
     h = tables.hold.c
-    for k in range(0, len(names), _MANY):
-        part = and_(h.heliostat.in_(names[k : k + _MANY]), h.ended.is_(None))
-        connection.execute(update(tables.hold).where(part).values(ended=at, ended_by=person))
+    same = and_(h.kind == hold.kind, h.name == hold.name, h.person == hold.person)
+    part = and_(same, h.ended.is_(None))
+    connection.execute(update(tables.hold).where(part).values(ended=at, ended_by=person))
 
 
 def _check_severity(severity: str) -> None:

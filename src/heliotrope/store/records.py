@@ -124,19 +124,22 @@ class AlarmEntry:
 
 @dataclass(frozen=True)
 class Hold:
-    """A heliostat that the schedule leaves alone.
+    """One person's lock on a heliostat, a target, a receiver or the tower.
 
     Attributes
     ----------
-    heliostat, reason, person
-        Name, reason, and person who holds it.
+    kind, name
+        What is locked: "heliostat", "target", "receiver" or "tower", and its name.
+    reason, person
+        Why, and whose lock it is.
     since
         POSIX s.
     until
-        End, POSIX s; None: until `Records.unhold`.
+        When it is expected back, POSIX s; None if unknown. It stands until `Records.unhold`.
     """
 
-    heliostat: str
+    kind: str
+    name: str
     reason: str
     person: str
     since: float
@@ -415,23 +418,16 @@ class Records(Protocol):
         """Record that a person acknowledged an alarm."""
         ...
 
-    def hold(
-        self,
-        heliostats: Sequence[str],
-        reason: str,
-        person: str,
-        at: float,
-        until: float | None = None,
-    ) -> None:
-        """Hold heliostats back from the schedule; a new hold replaces the one before."""
+    def hold(self, holds: Sequence[Hold]) -> None:
+        """Keep locks; a person's new lock replaces their own one before."""
         ...
 
-    def unhold(self, heliostats: Sequence[str], person: str, at: float) -> None:
-        """Return heliostats to the schedule."""
+    def unhold(self, holds: Sequence[Hold], person: str, at: float) -> None:
+        """End locks; ``person`` is who has removed them, ``at`` when, POSIX s."""
         ...
 
-    def holds(self, at: float) -> dict[str, Hold]:
-        """Return the holds at a time, by heliostat."""
+    def holds(self) -> tuple[Hold, ...]:
+        """Return the locks that stand."""
         ...
 
     def exchange_limits(self, numbers: Mapping[str, float]) -> dict[str, float]:

@@ -339,7 +339,8 @@ hold = Table(
     "hold",
     metadata,
     _number(),
-    _text("heliostat"),
+    _text("kind"),
+    _text("name"),
     _text("reason"),
     _text("person"),
     _real("since", needed=True),
@@ -349,7 +350,9 @@ hold = Table(
 )
 Index(
     "uq_hold_standing",
-    hold.c.heliostat,
+    hold.c.kind,
+    hold.c.name,
+    hold.c.person,
     unique=True,
     sqlite_where=hold.c.ended.is_(None),
     postgresql_where=hold.c.ended.is_(None),

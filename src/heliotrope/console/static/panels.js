@@ -330,9 +330,22 @@ export function logs(box) {
 
 const minute = (at) => (at ? new Date(1e3 * at).toISOString().slice(5, 16).replace("T", " ") : "–");
 const stateOf = (name) => h("span", { className: store.stateName(store.index.get(name)) === "STOWED" ? "good" : "bad" }, store.stateName(store.index.get(name)));
+// What is locked: a heliostat by its bare name, else with its kind.
+const lockedName = (one) => (one.kind === "heliostat" || one.kind === "tower" ? one.name : `${one.kind} ${one.name}`);
+const places = (kind, name) => (kind === "tower" ? { tower: true } : { [`${kind}s`]: [name] });
+// Each person returns their own lock; an engineer may remove another's by the owner's name.
 async function giveBack(one) {
-  const sure = await ask(`Give ${one.heliostat} back to service? ${one.who} took it out: ${one.reason}. Make sure that nobody is at the mirror.`, [], "Give back");
-  if (sure) await act(() => api("POST", "holds/release", { heliostats: [one.heliostat] }), `give back ${one.heliostat}`);
+  const own = one.who === me.name, name = lockedName(one);
+  const v = own ? await ask(`Return your lock on ${name} (${one.reason})? Make sure that you and your tools are away.`, [], "Return lock")
+    : await ask(`Remove the lock of ${one.who} on ${name} (${one.reason})? Make sure that ${one.who} is not there.`, [{ name: "reason", label: "Why its owner cannot return it" }], "Remove lock");
+  if (v) await act(() => api("POST", "holds/release", { ...places(one.kind, one.name), ...(own ? {} : { owner: one.who, reason: v.reason }) }), `return the lock on ${name}`);
+}
+async function lockPlace() {
+  const { targets, receivers } = store.field;
+  const named = new Map([...targets.map((name) => [`target ${name}`, ["target", name]]), ...receivers.map((name) => [`receiver ${name}`, ["receiver", name]]), ["tower", ["tower", "tower"]]]);
+  const v = await ask("Lock a target, a receiver or the tower? Heliostats whose beams are aimed there stow, and none comes until everybody has returned their lock; under a locked tower all stow.", [
+    { name: "place", label: "Place", options: [...named.keys()] }, { name: "reason", label: "Reason" }, { name: "hours", label: "Expected back in (hours)", type: "number", value: "4", required: false }], "Lock");
+  if (v) await act(() => api("POST", "holds", { ...places(...named.get(v.place)), reason: v.reason, hours: Number(v.hours) || null }), `lock ${v.place}`);
 }
 
 export function schedule(box) {
@@ -349,9 +362,10 @@ export function schedule(box) {
         ["Then", (r) => r.following]], retries.slice(0, 100), (r) => look(r.subject))
         : h("p", { className: "hx-hint" }, "Nothing."),
       h("h3", {}, "Out of service"),
-      holds.length ? table([["Heliostat", (r) => r.heliostat], ["State", (r) => stateOf(r.heliostat)], ["Owner", (r) => r.who], ["Since", (r) => minute(r.since)],
+      canCommand() ? h("button", { className: "hx-button", onclick: lockPlace }, "Lock a target, receiver or the tower…") : "",
+      holds.length ? table([["Locked", lockedName], ["State", (r) => (r.kind === "heliostat" ? stateOf(r.name) : "–")], ["Owner", (r) => r.who], ["Since", (r) => minute(r.since)],
         ["Expected back", (r) => h("span", { className: r.until && r.until < store.head.utc ? "warn" : "" }, r.until ? minute(r.until) : "–", r.until && r.until < store.head.utc ? " overdue" : "")], ["Why", (r) => r.reason],
-        ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => giveBack(r) }, "Give back…") : "")]], holds, (r) => look(r.heliostat))
+        ["", (r) => (r.who === me.name || me.role === "engineer" ? h("button", { className: "hx-button", onclick: () => giveBack(r) }, r.who === me.name ? "Return lock…" : "Remove lock…") : "")]], holds, (r) => r.kind === "heliostat" && look(r.name))
         : h("p", { className: "hx-hint" }, "None."));
   }, { every: 5 });
 }

@@ -1,6 +1,5 @@
 """The table of calls: least role, arguments, and the work done in the plant's loop."""
 
-import math
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any
@@ -144,12 +143,12 @@ def _learn(desk: Desk, who: Person, given: orders.OneGroup, _: bytes) -> Any:
 
 
 def _hold(desk: Desk, who: Person, given: orders.HoldOrder, _: bytes) -> Any:
-    hours = math.nan if given.hours is None else given.hours
-    return desk.tickets.put(desk.operations.hold(who, given.heliostats, given.reason, hours))
+    order = given.model_dump(exclude_none=True)
+    return desk.tickets.put(desk.operations.hold(who, **order))
 
 
 def _unhold(desk: Desk, who: Person, given: orders.GivenBack, _: bytes) -> Any:
-    desk.operations.unhold(who, given.heliostats)
+    desk.operations.unhold(who, **given.model_dump())
     return desk.operations.holds()
 
 

@@ -3,7 +3,7 @@
 Lists of points travel as names in the arguments and coordinates in the blob; see `points_of`.
 """
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -231,18 +231,32 @@ class Acknowledged(Strict):
     subject: Words = ""
 
 
-class HoldOrder(SomeHeliostats):
-    """Heliostats to take out of service, the reason, and the hours until they are expected back."""
+class _Places(SomeHeliostats):
+    """Heliostats by their names, targets, receivers, or the tower; at least one of them."""
 
-    heliostats: Annotated[list[Name], Field(min_length=1, max_length=200_000)]
+    targets: Names = []
+    receivers: Names = []
+    tower: bool = False
+
+    @model_validator(mode="after")
+    def _named(self) -> Self:
+        if not (self.heliostats or self.targets or self.receivers or self.tower):
+            raise ValueError("names nothing; give heliostats, targets, receivers or the tower")
+        return self
+
+
+class HoldOrder(_Places):
+    """What to take out of service, the reason, and the hours until it is expected back."""
+
     reason: Words
     hours: Annotated[float, Field(gt=0.0, le=8760.0)] | None = None
 
 
-class GivenBack(Strict):
-    """Heliostats to give back to service, each by its name."""
+class GivenBack(_Places):
+    """What to give back to service; an engineer may name the ``owner`` whose lock to remove."""
 
-    heliostats: Annotated[list[Name], Field(min_length=1, max_length=200_000)]
+    owner: Words = ""
+    reason: Words = ""
 
 
 class Switch(Strict):

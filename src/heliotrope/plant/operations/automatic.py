@@ -25,6 +25,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.lockouts import Kind
 from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, TrueErrors
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.errands import Step
@@ -244,10 +245,13 @@ class AutomaticControl:
         if not wanted:
             self._withdraw(heliostats or self._plant.field.names, "a person has taken it away")
 
-    def hold(self, person: Person, heliostats: Sequence[str], reason: str, hours: float) -> None:
-        """Take heliostats out of service; see `Operations.hold`."""
-        self.service.take(person, heliostats, reason, hours)
-        self._withdraw(heliostats, f"{person.name} has taken it out of service")
+    def hold(
+        self, person: Person, places: Sequence[tuple[Kind, str]], reason: str, hours: float
+    ) -> tuple[str, ...]:
+        """Lock places for a person; return the heliostats that stow. See `Operations.hold`."""
+        names = self.service.take(person, places, reason, hours)
+        self._withdraw(names, f"{person.name} has taken it out of service")
+        return names
 
     def drop(self, heliostats: Sequence[str], why: str) -> None:
         """Give up what persons asked for of heliostats."""
@@ -269,6 +273,9 @@ class AutomaticControl:
         """Calibrate a heliostat before all others; see `Operations.calibrate`."""
         if target:
             self._plant.design.target(target)
+            if why := self.service.closed(target):
+                why = f"target {target} is locked: {why}"
+                raise refusals.NO_CALIBRATION.error(heliostat=heliostat, why=why)
         names = tuple(dict.fromkeys((heliostat, *together)))
         for name in names:
             self._check_calibration(name)
@@ -320,12 +327,14 @@ class AutomaticControl:
             Names.
         """
         idle, visiting = self._why_idle(), self._visiting()
-        field, out, age = self._plant.field, self._plant.out_of_service, self._plant.now() - since
+        field, age = self._plant.field, self._plant.now() - since
+        rows = [field.place(name) for name in heliostats]
+        out = self._plant.lockouts.blocked("TRACK", heliostats, self._plant.aims[rows])
         able, state = self._raising.able(), field.rows["state"]
         steps = {}
         for name in heliostats:
             if name in out:
-                steps[name] = Step(f"out of service: {out[name].text}", Stage.REFUSED)
+                steps[name] = Step(out[name], Stage.REFUSED)
             elif not self._raising.wanted[field.place(name)]:
                 text = "automatic control does not have it any more"
                 steps[name] = Step(text, Stage.REFUSED)
@@ -607,7 +616,7 @@ class AutomaticControl:
 
     def _visits(self, calibrating: Calibrating, target: str) -> Callable[[], Awaitable[None]]:
         async def visit() -> None:
-            if self._why_not():
+            if self._why_not() or self.service.closed(target):
                 return
             for name in await calibrating.visit(target, self._ready(), AUTOMATIC, self._token):
                 self._raising.release(name)

@@ -12,10 +12,11 @@ from heliotrope.calibration.record import HeliostatCalibration, Identities
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.flights import TakenFlight
-from heliotrope.plant.lockouts import Lockout
+from heliotrope.plant.lockouts import Kind, Lockout
 from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.store.records import (
     FlightEntry,
+    Hold,
     KeptSightings,
     LearningEntry,
     OutlookEntry,
@@ -197,29 +198,32 @@ class Keeping:
 
     # -- heliostats out of service, and events ---------------------------------------------
 
-    def lockouts(self) -> dict[str, Lockout]:
-        """Return the heliostats that are out of service, those past their time included."""
+    def lockouts(self) -> tuple[Lockout, ...]:
+        """Return the locks of persons that stand, those past their time included."""
         if self._records is None:
-            return {}
-        found = {}
-        for name, hold in self._records.holds(-np.inf).items():
-            if name in self._names:
-                until = np.nan if hold.until is None else hold.until
-                found[name] = Lockout(name, hold.person, hold.reason, hold.since, until)
-        return found
+            return ()
+        return tuple(
+            Lockout(
+                Kind(hold.kind),
+                hold.name,
+                hold.person,
+                hold.reason,
+                hold.since,
+                np.nan if hold.until is None else hold.until,
+            )
+            for hold in self._records.holds()
+            if hold.kind != Kind.HELIOSTAT or hold.name in self._names
+        )
 
-    def lock_out(
-        self, heliostats: Sequence[str], reason: str, who: str, at: float, until: float
-    ) -> None:
-        """Keep that heliostats are out of service; ``until`` is NaN without an end."""
+    def lock_out(self, lockouts: Sequence[Lockout]) -> None:
+        """Keep locks."""
         if self._records is not None:
-            end = until if np.isfinite(until) else None
-            self._records.hold(heliostats, reason, who, at, end)
+            self._records.hold([_hold(each) for each in lockouts])
 
-    def put_back(self, heliostats: Sequence[str], who: str, at: float) -> None:
-        """Keep that heliostats are in service again."""
+    def put_back(self, lockouts: Sequence[Lockout], who: str, at: float) -> None:
+        """Keep that locks have been removed."""
         if self._records is not None:
-            self._records.unhold(heliostats, who, at)
+            self._records.unhold([_hold(each) for each in lockouts], who, at)
 
     def forget(self, now: float, days: float) -> None:
         """Remove events older than some days, once a day; ``now`` in POSIX s."""
@@ -231,3 +235,9 @@ class Keeping:
             kept.forget_events(now - days * _DAY)
         except StoreError as error:
             self.lost = str(error)
+
+
+def _hold(lockout: Lockout) -> Hold:
+    until = lockout.until if np.isfinite(lockout.until) else None
+    kind, name = lockout.kind.value, lockout.name
+    return Hold(kind, name, lockout.reason, lockout.who, lockout.since, until)

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from heliotrope import sun
 from heliotrope.calibration.flights import parse_flight
-from heliotrope.errors import UnknownNameError
+from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
@@ -32,7 +32,7 @@ from heliotrope.plant.attempts import Retry
 from heliotrope.plant.authority import Grant, Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
-from heliotrope.plant.lockouts import Lockout
+from heliotrope.plant.lockouts import TOWER, Kind, Lockout
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.errands import Errands
@@ -459,53 +459,117 @@ class Operations:
         return self.automatic.plan(limit)
 
     def holds(self) -> tuple[Lockout, ...]:
-        """Return the heliostats out of service."""
+        """Return the locks of persons on heliostats, targets, receivers and the tower."""
         return self.automatic.service.out
 
     def hold(
-        self, person: Person, heliostats: Sequence[str], reason: str, hours: float = math.nan
+        self,
+        person: Person,
+        heliostats: Sequence[str] = (),
+        reason: str = "",
+        hours: float = math.nan,
+        *,
+        targets: Sequence[str] = (),
+        receivers: Sequence[str] = (),
+        tower: bool = False,
     ) -> Ticket:
-        """Take heliostats out of service: they go to stow, and nobody moves them.
+        """Lock heliostats, targets, receivers or the tower for a person, with a lock of their own.
 
-        The ticket is done where a heliostat is parked in stow and locked out.
+        Locked heliostats go to stow, and nobody moves them; so do those whose beams are aimed at a
+        locked target or receiver, and all under a locked tower. What is locked is back in service
+        when everybody has returned their lock. The ticket is done where a heliostat is parked.
 
         Parameters
         ----------
         person
-            Their owner until they are given back.
-        heliostats, reason
-            Names, and why.
+            The owner of the lock.
+        heliostats, targets, receivers, tower
+            What to lock.
+        reason
+            Why.
         hours
-            Time after which they are expected back; NaN if unknown. They stay out after it too.
+            Time after which it is expected back; NaN if unknown. It stays locked after it too.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer or gives no reason, or another person took one out.
+            If the person is a viewer or gives no reason.
         UnknownNameError
-            If there is no such heliostat.
+            If there is no such heliostat, target or receiver.
         """
         _operator(person, "out of service")
         if not reason.strip():
             raise refusals.REASON_MISSING.error(what="out of service")
-        self.automatic.hold(person, heliostats, reason, hours)
-        self._tell(person, f"{_some(heliostats)} out of service: {reason}", "command")
-        names, progress = tuple(dict.fromkeys(heliostats)), self.automatic.service.progress
-        return self.errands.begin("OUT_OF_SERVICE", names, progress, _PARKED)
+        places = self._places(heliostats, targets, receivers, tower=tower)
+        names = self.automatic.hold(person, places, reason, hours)
+        self._tell(person, f"{_named(places)} out of service: {reason}", "command")
+        return self.errands.begin("OUT_OF_SERVICE", names, self.automatic.service.progress, _PARKED)
 
-    def unhold(self, person: Person, heliostats: Sequence[str]) -> None:
-        """Give heliostats back to service by their names; nothing moves.
+    def unhold(
+        self,
+        person: Person,
+        heliostats: Sequence[str] = (),
+        *,
+        targets: Sequence[str] = (),
+        receivers: Sequence[str] = (),
+        tower: bool = False,
+        owner: str = "",
+        reason: str = "",
+    ) -> None:
+        """Return a person's own locks; nothing moves.
+
+        An engineer may remove those of an ``owner`` who cannot, by name and with a reason.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer, or neither the owner nor an engineer.
+            If the person is a viewer, has no lock there while others have, or removes another's
+            without being an engineer or without a reason.
         UnknownNameError
-            If there is no such heliostat.
+            If there is no such heliostat, target or receiver.
         """
         _operator(person, "give back")
-        self.automatic.service.give_back(person, heliostats)
-        self._tell(person, f"{_some(heliostats)} back in service", "command")
+        places = self._places(heliostats, targets, receivers, tower=tower)
+        other = owner not in ("", person.name)
+        if other:
+            person.must_be(Role.ENGINEER, f"remove {owner}'s lock")
+        if other and not reason.strip():
+            raise refusals.REASON_MISSING.error(what=f"remove {owner}'s lock")
+        removed = self.automatic.service.give_back(person, places, owner)
+        for lock in removed if other else ():
+            text = f"removed {lock.who}'s lock ({lock.text}): {reason}"
+            self._tell(person, f"{_named([(lock.kind, lock.name)])}: {text}", "command")
+        locks = self.plant.lockouts
+        still = [place for place in places if locks.on(*place)]
+        back = [place for place in places if not locks.on(*place)]
+        if back:
+            self._tell(person, f"{_named(back)} back in service", "command")
+        for kind, name in still:
+            text = f"{person.name} has returned a lock; it stays locked: {locks.text(kind, name)}"
+            self._tell(person, f"{_named([(kind, name)])}: {text}", "command")
+
+    def _places(
+        self,
+        heliostats: Sequence[str],
+        targets: Sequence[str],
+        receivers: Sequence[str],
+        *,
+        tower: bool,
+    ) -> list[tuple[Kind, str]]:
+        """Return what is locked or given back, by kind and name."""
+        for name in heliostats:
+            self.plant.field.place(name)
+        for name in targets:
+            self.design.target(name)
+        for name in receivers:
+            self.design.receiver(name)
+        places = [(Kind.HELIOSTAT, name) for name in dict.fromkeys(heliostats)]
+        places += [(Kind.TARGET, name) for name in dict.fromkeys(targets)]
+        places += [(Kind.RECEIVER, name) for name in dict.fromkeys(receivers)]
+        places += [(Kind.TOWER, TOWER)] if tower else []
+        if not places:
+            raise InputError("no heliostat, target, receiver or tower is named; name one")
+        return places
 
     # -- the authority ---------------------------------------------------------------------
 
@@ -711,6 +775,12 @@ class Operations:
 def _some(heliostats: Sequence[str]) -> str:
     more = f" and {len(heliostats) - 3} more" if len(heliostats) > 3 else ""
     return ", ".join(heliostats[:3]) + more
+
+
+def _named(places: Sequence[tuple[Kind, str]]) -> str:
+    """Return what is locked in words; heliostats by their bare names."""
+    bare = (Kind.HELIOSTAT, Kind.TOWER)
+    return _some([name if kind in bare else f"{kind} {name}" for kind, name in places])
 
 
 def _act(name: str) -> Act:

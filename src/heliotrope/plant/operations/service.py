@@ -1,7 +1,7 @@
-"""Taking heliostats out of service and giving them back."""
+"""Locks of persons: taking heliostats, targets, receivers and the tower out of service."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -11,9 +11,9 @@ from heliotrope.lcu import states
 from heliotrope.links.messages import Stage
 from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, RetryLaw
-from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.authority import Person
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.lockouts import Lockout
+from heliotrope.plant.lockouts import TOWER, Kind, Lockout, Lockouts
 from heliotrope.plant.operations.errands import Step
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.safety import Alarm, alarms
@@ -40,7 +40,7 @@ _SWITCHED_OFF = 1 << meanings.FLAGS.index("LOCAL_SWITCH")
 
 
 class Service:
-    """The heliostats out of service.
+    """What persons have locked, and the heliostats that are in stow for it.
 
     Parameters
     ----------
@@ -61,52 +61,87 @@ class Service:
         self, plant: PlantController, keeping: Keeping, tell: Callable[[Alarm], None]
     ) -> None:
         self._plant, self._keeping, self.attempts = plant, keeping, Attempts(PARKING, tell)
-        plant.out_of_service.update(keeping.lockouts())
+        plant.lockouts.put(keeping.lockouts())
         #: Since when each has been out of service and not been seen in stow, monotonic s.
-        self._unparked = dict.fromkeys(plant.out_of_service, -math.inf)
+        self._unparked = dict.fromkeys(self._concerned(plant.lockouts), -math.inf)
 
     @property
     def out(self) -> tuple[Lockout, ...]:
-        """The heliostats out of service."""
-        return tuple(self._plant.out_of_service.values())
+        """The locks of persons."""
+        return tuple(self._plant.lockouts)
 
     def rows(self) -> npt.NDArray[np.bool_]:
-        """Return which heliostats are out of service, (N,)."""
-        found = np.zeros(len(self._plant.field), dtype=np.bool_)
-        found[[self._plant.field.place(name) for name in self._plant.out_of_service]] = True
+        """Return which heliostats persons' locks keep in stow, (N,).
+
+        They are locked themselves, their beams are aimed at something that is, or the tower is.
+        """
+        locks, field = self._plant.lockouts, self._plant.field
+        found = np.full(len(field), bool(locks.on(Kind.TOWER, TOWER)))
+        found[[field.place(name) for name in locks.heliostats]] = True
+        for near in locks.closed(self._plant.aims).values():
+            found |= near
         return found
 
-    def take(self, person: Person, heliostats: Sequence[str], reason: str, hours: float) -> None:
-        """Take heliostats out of service, and send them to stow; see `Operations.hold`."""
-        for name in heliostats:
-            self._plant.field.place(name)
-        self._check_owner(person, heliostats, "out of service")
+    def closed(self, target: str) -> str:
+        """Return why no beam may be sent to a target, "" if one may."""
+        locks = self._plant.lockouts
+        return locks.text(Kind.TARGET, target) or locks.text(Kind.TOWER, TOWER)
+
+    def take(
+        self, person: Person, places: Sequence[tuple[Kind, str]], reason: str, hours: float
+    ) -> tuple[str, ...]:
+        """Lock places for a person, and stow the heliostats concerned; return their names.
+
+        See `Operations.hold`.
+        """
         since = self._utc()
-        until = since + 3600.0 * hours
-        for name in heliostats:
-            lockout = Lockout(name, person.name, reason, since, until)
-            self._plant.out_of_service[name] = lockout
-        self._unparked.update(dict.fromkeys(heliostats, self._plant.now()))
-        self._stow(person.name, heliostats)
-        self._keeping.lock_out(heliostats, reason, person.name, since, until)
+        locks = [
+            Lockout(kind, name, person.name, reason, since, since + 3600.0 * hours)
+            for kind, name in places
+        ]
+        self._plant.lockouts.put(locks)
+        concerned = self._concerned(locks)
+        self._unparked.update(dict.fromkeys(concerned, self._plant.now()))
+        if concerned:
+            self._stow(person.name, concerned)
+        self._keeping.lock_out(locks)
+        return concerned
 
-    def give_back(self, person: Person, heliostats: Sequence[str]) -> None:
-        """Give heliostats back to service; nothing moves. See `Operations.unhold`."""
-        for name in heliostats:
-            self._plant.field.place(name)
-        self._check_owner(person, heliostats, "give back")
-        for name in heliostats:
-            self._plant.out_of_service.pop(name, None)
-        for name in heliostats:
-            self._unparked.pop(name, None)
+    def _concerned(self, lockouts: Iterable[Lockout]) -> tuple[str, ...]:
+        """Return the heliostats that must be in stow under some locks."""
+        locks, field = Lockouts(self._plant.design), self._plant.field
+        locks.put(lockouts)
+        if locks.on(Kind.TOWER, TOWER):
+            return field.names
+        found = np.zeros(len(field), dtype=np.bool_)
+        found[[field.place(name) for name in locks.heliostats]] = True
+        for near in locks.closed(self._plant.aims).values():
+            found |= near & ~field.among((states.STOWED,), self._plant.now())
+        return tuple(field.names[row] for row in np.flatnonzero(found))
+
+    def give_back(
+        self, person: Person, places: Sequence[tuple[Kind, str]], owner: str = ""
+    ) -> tuple[Lockout, ...]:
+        """Remove the locks of a person, or of another ``owner``; nothing moves.
+
+        Returns those removed; see `Operations.unhold`.
+        """
+        locks, who = self._plant.lockouts, owner or person.name
+        removed = []
+        for kind, name in places:
+            own = [lock for lock in locks.on(kind, name) if lock.who == who]
+            if not own and locks.on(kind, name):
+                text = locks.text(kind, name)
+                raise refusals.NOT_OWNER.error(what="give back", name=name, who=who, text=text)
+            removed += own
+        for lock in removed:
+            locks.remove(lock.kind, lock.name, lock.who)
+        still = frozenset(self._concerned(locks))
+        for name in [name for name in self._unparked if name not in still]:
+            del self._unparked[name]
             self.attempts.done(name)
-        self._keeping.put_back(heliostats, person.name, self._utc())
-
-    def _check_owner(self, person: Person, heliostats: Sequence[str], what: str) -> None:
-        out = self._plant.out_of_service
-        others = [name for name in heliostats if name in out and out[name].who != person.name]
-        if others and person.role < Role.ENGINEER:
-            raise refusals.NOT_OWNER.error(what=what, heliostat=others[0], text=out[others[0]].text)
+        self._keeping.put_back(removed, person.name, self._utc())
+        return tuple(removed)
 
     def park(self) -> None:
         """Send heliostats to stow that were taken out and have not been seen there yet.
@@ -142,7 +177,7 @@ class Service:
 
     def _step(self, name: str) -> Step:
         field, now = self._plant.field, self._plant.now()
-        if name not in self._plant.out_of_service:
+        if not self.rows()[field.place(name)]:
             return Step("it was given back to service", Stage.REFUSED)
         if name not in self._unparked:
             off = int(field.rows["flags"][field.place(name)]) & _SWITCHED_OFF

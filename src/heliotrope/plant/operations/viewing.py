@@ -10,6 +10,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.lockouts import Kind
 from heliotrope.plant.operations.automatic import AutomaticControl
 from heliotrope.plant.operations.views import (
     STALE_STATE,
@@ -128,7 +129,8 @@ class Viewer:
         shown = plant.field.of(name, plant.now())
         node = plant.field.rows[row]
         told = shown.live and int(node["supply_mv"]) != _UNTOLD
-        truth, hold = automatic.truth.all(), plant.out_of_service.get(name)
+        truth = automatic.truth.all()
+        hold = plant.lockouts.text(Kind.HELIOSTAT, name)
         width, height = self.sizes[row]
         return HeliostatView(
             name,
@@ -156,7 +158,7 @@ class Viewer:
             automatic.book.history(name),
             automatic.book.results_of(name),
             next((p for p in automatic.plan(50) if p.heliostat == name), None),
-            "" if hold is None else hold.text,
+            hold,
         )
 
     def _drives(self, row: int) -> tuple[DriveView, ...]:

@@ -266,7 +266,7 @@ class ProgressObserver:
             saw = "a person's emergency held when the last program ended, and the new one goes on"
             good = on or bool(operations.automatic.waits) or not self._called
             self._check(good, now, "plant", saw, L4)
-            out = {lockout.heliostat for lockout in operations.holds()}
+            out = {lockout.name for lockout in operations.holds()}
             lost = sorted(self._out.keys() - out)
             saw = f"a restart has put back in service: {', '.join(lost)}"
             self._check(not lost, now, "plant", saw, L4)

@@ -101,9 +101,10 @@ class Acts:
             operations.resume(ENGINEER)
             self.acted("resumed")
         names = tuple(name for name in self.names if name not in self._left)
-        out = {lockout.heliostat for lockout in operations.holds()}
-        if back := sorted(out - self._left):
-            operations.unhold(ENGINEER, back)
+        out = {lock.name: lock.who for lock in operations.holds() if lock.name in self.names}
+        if back := sorted(out.keys() - self._left):
+            for name in back:
+                operations.unhold(ENGINEER, [name], owner=out[name], reason="the day ends")
             self.acted("back in service")
             self._watch.held(back, self.now(), out=False)
         operations.give_back(ENGINEER, names)
