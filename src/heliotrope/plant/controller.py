@@ -516,6 +516,12 @@ class PlantController:
         """
         return self._safe(who, Act.STOW, heliostats)
 
+    def locked_for(self, heliostat: str) -> str:
+        """Return why a heliostat that is LOCKED is so, since when and until when, in words."""
+        mandate = self.authority.visited().get(heliostat)
+        visit = "" if mandate is None else f"the visit to {mandate.where} of {mandate.person.name}"
+        return self.locks.reason(heliostat, visit)
+
     def waits_to_stow(self, heliostat: str) -> bool:
         """Return whether a heliostat waits for its turn to go to stow."""
         return bool(self._orders.to_stow((heliostat,)))
