@@ -119,7 +119,8 @@ RESTART = (Fault("plant_crash", 23.3, 5.0, 0, 0.5),)
 #: day, s, whether it is slow, and the seed that found it.
 ROWS: tuple[
     tuple[
-        tuple[int, ...], str, Plant, tuple[CrewAct, ...], tuple[Fault, ...] | None, float, bool, int
+        tuple[int, ...], str, Plant, tuple[CrewAct, ...] | None, tuple[Fault, ...] | None,
+        float, bool, int,
     ],
     ...,
 ] = (
@@ -128,7 +129,7 @@ ROWS: tuple[
     ((L1,), "a visit's lock is not given back", locks_kept,
      _when(LOCKED, "emergency"), (), 420.0, False, 1),
     ((L1,), "a restart forgets a visit's lock", locks_forgotten_by_a_restart,
-     (), None, 840.0, True, 20),
+     None, None, 840.0, True, 20),
     ((16,), "movements below the resolution", movements_below_the_resolution,
      (), (), 420.0, True, 8),
     ((L2,), "retries without an end", endless_retries, (), (), 840.0, True, 14),
