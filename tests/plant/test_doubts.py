@@ -132,7 +132,7 @@ class Chooser:
     def __init__(self, bench: Bench, *rest: str) -> None:
         self.names, self.rest = bench.plant.field.names, rest
         self.entries: list[CalibrationEntry] = []
-        self.attempts = Attempts(VISITS)
+        self.attempts, self.reason = Attempts(VISITS), ""
 
     def next(self, target: str, ready: Mask) -> Chosen | None:
         del target

@@ -36,7 +36,7 @@ class InOrder:
     """A schedule in which all ready heliostats are due, in the order of the field."""
 
     def __init__(self, names: Sequence[str]) -> None:
-        self.names, self.attempts = names, Attempts(VISITS)
+        self.names, self.attempts, self.reason = names, Attempts(VISITS), ""
         self.entries: list[CalibrationEntry] = []
 
     def next(self, target: str, ready: np.ndarray, beside: bool = False) -> Planned | None:

@@ -14,6 +14,7 @@ from heliotrope.links.messages import Stage
 from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.authority import Authority
 from heliotrope.plant.giving_back import GivingBack
+from heliotrope.plant.locks import Locks
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.permission import Permission
@@ -52,6 +53,11 @@ def locks_kept(patch: pytest.MonkeyPatch) -> None:
             await unlock(self)
 
     patch.setattr(Visit, "_unlock", unlocked)
+
+
+def locks_forgotten_by_a_restart(patch: pytest.MonkeyPatch) -> None:
+    """A new program does not know what visits of the last one have locked."""
+    patch.setattr(Locks, "recall", lambda self, held, now: None)
 
 
 def movements_below_the_resolution(patch: pytest.MonkeyPatch) -> None:
@@ -113,7 +119,8 @@ RESTART = (Fault("plant_crash", 23.3, 5.0, 0, 0.5),)
 #: day, s, whether it is slow, and the seed that found it.
 ROWS: tuple[
     tuple[
-        tuple[int, ...], str, Plant, tuple[CrewAct, ...], tuple[Fault, ...], float, bool, int
+        tuple[int, ...], str, Plant, tuple[CrewAct, ...] | None, tuple[Fault, ...] | None,
+        float, bool, int,
     ],
     ...,
 ] = (
@@ -121,6 +128,8 @@ ROWS: tuple[
      _when("photograph", "duty", 1.0), (), 420.0, True, 1),
     ((L1,), "a visit's lock is not given back", locks_kept,
      _when(LOCKED, "emergency"), (), 420.0, False, 1),
+    ((L1,), "a restart forgets a visit's lock", locks_forgotten_by_a_restart,
+     None, None, 840.0, True, 20),
     ((16,), "movements below the resolution", movements_below_the_resolution,
      (), (), 420.0, True, 8),
     ((L2,), "retries without an end", endless_retries, (), (), 840.0, True, 14),

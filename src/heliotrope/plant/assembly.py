@@ -356,12 +356,18 @@ class _WhereAwake:
 
     def __init__(self, schedule: Scheduling, cameras: Cameras) -> None:
         self._schedule, self._cameras = schedule, cameras
-        self.attempts = schedule.attempts
+        self.attempts, self._asleep = schedule.attempts, ""
+
+    @property
+    def reason(self) -> str:
+        return self._asleep or self._schedule.reason
 
     def next(
         self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False
     ) -> Planned | None:
-        if not self._cameras.awake(target):
+        awake = self._cameras.awake(target)
+        self._asleep = "" if awake else f"the camera of target {target} is silent"
+        if not awake:
             return None
         return self._schedule.next(target, ready, beside)
 

@@ -7,13 +7,17 @@ file is always there.
 
 A local controller may refuse a point, or never get it. So the points before are kept too until it
 has acknowledged the new one: a program that starts anew then knows where a beam may still be.
+
+What visits hold (`HELD`) is kept beside the points, and is on the disk before it is taken too: a
+program that starts anew gives it back (`giving_back`).
 """
 
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -31,11 +35,18 @@ KINDS = ("AIM", "STANDBY")
 BEFORE = 4
 #: Kinds under which they are stored, the latest first.
 EARLIER = {kind: tuple(f"{kind}-{i}" for i in range(1, BEFORE + 1)) for kind in KINDS}
+#: What visits hold, by kind: when they locked a heliostat (POSIX s, then zeros), the aim to which
+#: its beam goes back (ENU, m), and that it steps roughly when no visit needs it (zeros).
+HELD = ("LOCKED", "LENT", "ROUGH")
+#: A record of what no visit holds is removed after this time, s: the command that takes it may be
+#: on its way until then.
+_TAKEN_WITHIN = 5.0
 VERSION = 1
 
 Rows = npt.NDArray[np.intp]
-#: Points by kind; None: there is none any more.
-_Changes = dict[str, dict[str, tuple[float, ...] | None]]
+#: Points by kind and heliostat; None: there is none any more.
+Held = Mapping[str, Mapping[str, tuple[float, ...] | None]]
+NOTHING: Held = MappingProxyType({})
 
 
 class AssignedError(HeliotropeError):
@@ -86,8 +97,9 @@ class AssignedFile:
             raise FormatError(
                 self.path, f"holds no assigned points of version {VERSION}; remove it"
             )
-        earlier = [kind for kinds in EARLIER.values() for kind in kinds if kind in document]
-        return {kind: self._places(kind, document.get(kind)) for kind in (*KINDS, *earlier)}
+        others = (*(kind for kinds in EARLIER.values() for kind in kinds), *HELD)
+        found = (*KINDS, *(kind for kind in others if kind in document))
+        return {kind: self._places(kind, document.get(kind)) for kind in found}
 
     def _places(self, kind: str, rows: object) -> Places:
         if not isinstance(rows, dict):
@@ -146,6 +158,8 @@ class Points:
     earlier
         By kind, the points before that a local controller may still have, the latest first,
         (`BEFORE`, N, 3); NaN where there is none: the assigned point was taken.
+    held
+        What visits held when the last program ended, by kind (`HELD`) and heliostat.
     """
 
     def __init__(self, names: Sequence[str], store: Assigned | None) -> None:
@@ -157,7 +171,9 @@ class Points:
             name: self.earlier[kind][i] for kind in KINDS for i, name in enumerate(EARLIER[kind])
         }
         #: The points in the store; only work of the disk changes them.
-        self._stored: dict[str, Places] = {kind: {} for kind in every}
+        self._stored: dict[str, Places] = {kind: {} for kind in (*every, *HELD)}
+        #: Since when a record of `HELD` has stood for nothing, monotonic s.
+        self._idle: dict[tuple[str, str], float] = {}
         #: Points that were taken since the store was last told, by kind, each with its mark.
         self._taken: dict[str, dict[str, tuple[tuple[float, ...], object]]]
         self._taken = {kind: {} for kind in KINDS}
@@ -167,8 +183,10 @@ class Points:
         for kind, places in ({} if store is None else store.read()).items():
             for name, point in places.items():
                 if name in index:
-                    every[kind][index[name]] = point
                     self._stored[kind][name] = point
+                    if kind in every:
+                        every[kind][index[name]] = point
+        self.held = {kind: dict(self._stored[kind]) for kind in HELD}
 
     def assign(self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray) -> None:
         """Assign points (K, 3) to heliostats (K,); they must be stored (`storing`)."""
@@ -199,12 +217,13 @@ class Points:
         return found
 
     def storing(
-        self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray
+        self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray, held: Held = NOTHING
     ) -> tuple[Work, Work]:
         """Return work of a disk that stores points (K, 3) of heliostats (K,), and its reverse.
 
-        Both raise `AssignedError` if they cannot be stored. The reverse leaves points alone that
-        were replaced meanwhile; it may be done again.
+        ``held`` is stored in the same piece; see `holding`. Both raise `AssignedError` if they
+        cannot be stored. The reverse leaves points alone that were replaced meanwhile; it may be
+        done again.
         """
         new = {self._names[i]: tuple(p) for i, p in zip(rows, points.tolist(), strict=True)}
         present = self._arrays[kind][rows]
@@ -215,12 +234,15 @@ class Points:
         kinds, mark = (kind, *EARLIER[kind]), object()
         old: dict[str, list[tuple[float, ...] | None]] = {}
 
-        def keep(chains: Mapping[str, Sequence[tuple[float, ...] | None]]) -> None:
-            self._keep({k: {n: c[i] for n, c in chains.items()} for i, k in enumerate(kinds)})
+        def keep(
+            chains: Mapping[str, Sequence[tuple[float, ...] | None]], more: Held = NOTHING
+        ) -> None:
+            each = {k: {n: c[i] for n, c in chains.items()} for i, k in enumerate(kinds)}
+            self._keep({**more, **each})
 
         def store() -> None:
             old.update({n: [self._stored[k].get(n) for k in kinds] for n in new})
-            keep({n: _followed(old[n], point, before[n]) for n, point in new.items()})
+            keep({n: _followed(old[n], point, before[n]) for n, point in new.items()}, held)
             self._marks[kind].update(dict.fromkeys(new, mark))
 
         def take_back() -> None:
@@ -239,7 +261,7 @@ class Points:
         taken, self._taken = self._taken, {kind: {} for kind in KINDS}
 
         def settle() -> None:
-            changes: _Changes = {}
+            changes: dict[str, dict[str, tuple[float, ...] | None]] = {}
             for kind, places in taken.items():
                 known, marks = self._stored[kind], self._marks[kind]
                 names = [
@@ -254,7 +276,42 @@ class Points:
 
         return settle
 
-    def _keep(self, changes: _Changes) -> None:
+    def holding(self, held: Held) -> tuple[Work, Work]:
+        """Return work of a disk that stores what visits hold, and its reverse.
+
+        None stands for what a visit holds no longer. Only what differs is written. Both raise
+        `AssignedError` if it cannot be stored.
+        """
+        old: dict[str, dict[str, tuple[float, ...] | None]] = {}
+
+        def store() -> None:
+            for kind, values in held.items():
+                known = self._stored[kind]
+                old[kind] = {n: known.get(n) for n, v in values.items() if known.get(n) != v}
+            if any(old.values()):
+                self._keep({k: {n: held[k][n] for n in names} for k, names in old.items()})
+
+        def take_back() -> None:
+            if any(old.values()):
+                self._keep(old)
+
+        return store, take_back
+
+    def released(self, held: Mapping[str, Collection[str]], now: float) -> Work | None:
+        """Return work of a disk that forgets what visits hold no longer, if any.
+
+        ``held`` are the heliostats of which they hold something, by kind; ``now`` is monotonic s.
+        """
+        gone = {(k, n) for k, names in held.items() for n in self._stored[k].keys() - set(names)}
+        self._idle = {each: self._idle.get(each, now) for each in gone}
+        due = [each for each, since in self._idle.items() if now - since >= _TAKEN_WITHIN]
+        if not due:
+            return None
+        for each in due:
+            del self._idle[each]
+        return self.holding({k: {n: None for kind, n in due if kind == k} for k in held})[0]
+
+    def _keep(self, changes: Held) -> None:
         """Store points by kind and heliostat."""
         places = {k: dict(known) for k, known in self._stored.items()}
         for kind, points in changes.items():

@@ -9,11 +9,12 @@ import numpy.typing as npt
 
 from heliotrope.errors import UnknownNameError
 from heliotrope.field.plant import Plant
+from heliotrope.files.disk import Work
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages as wire
 from heliotrope.lcu import states
 from heliotrope.mechanism.board_items import Wanted
-from heliotrope.plant.assigned import grouped, points_of
+from heliotrope.plant.assigned import NOTHING, Held, grouped, points_of
 from heliotrope.plant.authority import Authority, Person
 from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.field_state import FieldState
@@ -104,7 +105,9 @@ class Commands:
         others = tuple(n for n in names if n not in out)
         clear, wrong = self.examine(name, numbers, others, token)
         blocked = {**wrong, **out}
-        ticket = self._permission.accept(person, token, name, numbers, names, blocked=blocked)
+        accept = self._permission.accept
+        store = self._lock_record(clear, token) if name == "LOCK" else None
+        ticket = accept(person, token, name, numbers, names, store=store, blocked=blocked)
         if name not in SETTINGS:
             # A heliostat that still waits to join must not undo a later command.
             self._joining.drop(f"superseded by {name}", frozenset(names))
@@ -144,6 +147,11 @@ class Commands:
             waits = name in JOINING or in_slices(name, left)
             send = self._join if waits else self._orders.command
             send(ticket, name, numbers, left, token)
+
+    def _lock_record(self, heliostats: tuple[str, ...], token: int) -> tuple[Work, Work]:
+        """Return work that stores whose lock it is, before it is taken; and its reverse."""
+        visit = self._authority.mandate_of(token) is not None
+        return self._ways.points.holding(self._locks.record(heliostats, visit=visit))
 
     def _note_lock(self, heliostats: tuple[str, ...], token: int) -> None:
         """Note whose lock it is: a visit's, which the plant opens in the end, or a person's."""
@@ -205,7 +213,12 @@ class Commands:
         groups = grouped(names, wanted)
         values = next(iter(groups)) if len(groups) == 1 else ()
         all_names, note = (*names, *out), f"{len(groups)} points"
-        store = self._ways.points.storing(name, rows, wanted)
+        held: Held = NOTHING
+        if name == "AIM" and visit:
+            held = self._movements.record(names, self._aims(rows), wanted)
+        elif name == "AIM":
+            held = {"LENT": dict.fromkeys(names)}
+        store = self._ways.points.storing(name, rows, wanted, held)
         ticket = self._permission.accept(person, token, name, values, all_names, note, store, out)
         self.when_recorded(ticket, names, wanted, token, assign)
         return ticket
@@ -227,10 +240,19 @@ class Commands:
             return frozenset(names)
 
         all_names, note = (*names, *out), f"{len(names)} coded movements"
+        store = self._ways.points.holding(self._movements.record(names, aims, wanted))
         accept = self._permission.accept
-        ticket = accept(person, token, "AIM", (), all_names, note, blocked=out)
+        ticket = accept(person, token, "AIM", (), all_names, note, store, out)
         self.when_recorded(ticket, names, wanted, token, assign)
         return ticket
+
+    def storing(self, name: str, names: Sequence[str], wanted: FloatArray) -> tuple[Work, Work]:
+        """Return work that stores points (K, 3) before they are assigned, and its reverse."""
+        return self._ways.points.storing(name, self._places(names), wanted)
+
+    def holding(self, held: Held) -> tuple[Work, Work]:
+        """Return work that stores what a visit takes, and its reverse; see `Points.holding`."""
+        return self._ways.points.holding(held)
 
     def assign(self, name: str, names: Sequence[str], wanted: FloatArray) -> None:
         """Assign points (K, 3) to heliostats, before they are sent."""

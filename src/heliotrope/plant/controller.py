@@ -172,9 +172,11 @@ class PlantController:
         self.aims, self.standbys = points.aims, points.standbys
         self.movements = Movements(design.receivers, self.beams.armature)
         resting = (name for name, each in self.beams.machines.items() if each.rests)
-        self.stepping = Stepping(self.field, resting)
+        self.stepping = Stepping(self.field, resting, points.held["ROUGH"])
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, self.beams.machines)
-        self.locks = Locks(self.field, self._ways.ordered)
+        self.locks = Locks(self.field, self._ways.ordered, lambda: clock.utc().timestamp())
+        self.locks.recall(points.held["LOCKED"], clock.monotonic())
+        self.movements.recall(points.held["LENT"])
         self._agreement = self._compared(points)
         self._clusters = Clusters(members, links, clock, self.counters)
         self._identities = Identities(
@@ -435,9 +437,19 @@ class PlantController:
             self._orders.pay()
         if slow:
             self._slow_at = now
-            if work := self._ways.points.settling():
-                self._orders.owe(work)
+            points, held = self._ways.points, self._held()
+            for work in (points.settling(), points.released(held, now)):
+                if work is not None:
+                    self._orders.owe(work)
             self._sync.beat(now, token, not self._sentinel.refusal(self.field.clusters))
+
+    def _held(self) -> dict[str, frozenset[str]]:
+        """Return the heliostats of which visits hold something, by kind (`assigned.HELD`)."""
+        return {
+            "LOCKED": self.locks.names,
+            "LENT": self.movements.names,
+            "ROUGH": self.stepping.lent,
+        }
 
     def _tell(self, alarm: Alarm) -> None:
         self.alarms.append(alarm)
@@ -503,6 +515,12 @@ class PlantController:
         Many go one after the other, see `PlantSettings.stow_rate`; an emergency sends all at once.
         """
         return self._safe(who, Act.STOW, heliostats)
+
+    def locked_for(self, heliostat: str) -> str:
+        """Return why a heliostat that is LOCKED is so, since when and until when, in words."""
+        mandate = self.authority.visited().get(heliostat)
+        visit = "" if mandate is None else f"the visit to {mandate.where} of {mandate.person.name}"
+        return self.locks.reason(heliostat, visit)
 
     def waits_to_stow(self, heliostat: str) -> bool:
         """Return whether a heliostat waits for its turn to go to stow."""

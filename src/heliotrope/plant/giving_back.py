@@ -117,7 +117,8 @@ class GivingBack:
 
         note = f"{len(names)} beams go back to their aims"
         try:
-            ticket = self._orders.accept((*_PLANT, "AIM"), (), names, note)
+            store = self._commands.storing("AIM", names, wanted)
+            ticket = self._orders.accept((*_PLANT, "AIM"), (), names, note, store=store)
         except AuditError:
             return
         self._movements.sent(ticket, now)
@@ -152,7 +153,8 @@ class GivingBack:
             values = (float(rough),)
             try:
                 self._permission.refuse_now("ROUGH", names)
-                ticket = self._orders.accept((*_PLANT, "ROUGH"), values, names, note)
+                store = None if rough else self._commands.holding(self._stepping.record(names))
+                ticket = self._orders.accept((*_PLANT, "ROUGH"), values, names, note, store=store)
             except (RefusedError, AuditError):
                 continue
             self._orders.when_recorded(ticket, partial(self._send_step, ticket, values, token))

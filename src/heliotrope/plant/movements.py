@@ -17,6 +17,7 @@ import numpy.typing as npt
 from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.armature import Armature
+from heliotrope.plant.assigned import Held, Places
 from heliotrope.plant.tickets import Ticket
 
 #: Longest distance of a beam from its aim, rad: below that at which `pointing_disagrees` trips.
@@ -111,12 +112,25 @@ class Movements:
 
         A heliostat that gets its own aim back, or had none, goes nowhere later.
         """
-        for name, present, point in zip(names, aims, wanted, strict=True):
-            aim = np.array(self.aim(name, present))
-            if np.isfinite(aim).all() and not np.array_equal(aim, point):
-                self._moved[name] = _Moved(aim, token, np.inf, small=False)
+        for name, aim in self.record(names, aims, wanted)["LENT"].items():
+            if aim is not None:
+                self._moved[name] = _Moved(np.array(aim), token, np.inf, small=False)
             else:
                 self._moved.pop(name, None)
+
+    def recall(self, held: Places) -> None:
+        """Send beams back to the aims from which visits of an earlier program moved them."""
+        for name, aim in held.items():
+            self._moved[name] = _Moved(np.array(aim), 0, -np.inf, small=False)
+
+    def record(self, names: Sequence[str], aims: FloatArray, wanted: FloatArray) -> Held:
+        """Return what is to be stored before a visit gives aims ``wanted``; see `lend`."""
+        found: dict[str, tuple[float, ...] | None] = {}
+        for name, present, point in zip(names, aims, wanted, strict=True):
+            aim = np.array(self.aim(name, present))
+            goes_back = np.isfinite(aim).all() and not np.array_equal(aim, point)
+            found[name] = tuple(aim.tolist()) if goes_back else None
+        return {"LENT": found}
 
     def small(self, names: Sequence[str]) -> frozenset[str]:
         """Return the heliostats that were moved a little: on the way back they need no turn."""

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from heliotrope.lcu import names as meanings
+from heliotrope.plant.assigned import Held
 from heliotrope.plant.field_state import FieldState
 
 _ROUGH = 1 << meanings.FLAGS.index("ROUGH")
@@ -32,13 +33,15 @@ class Stepping:
     rests
         Heliostats whose drivers rest by the plant file. One that takes microsteps when it is first
         heard was left so by an earlier run of the plant, and is ordered to step roughly.
+    held
+        Other heliostats that a visit of an earlier program has ordered to take fine steps.
     """
 
-    def __init__(self, field: FieldState, rests: Iterable[str]) -> None:
-        self._field = field
+    def __init__(self, field: FieldState, rests: Iterable[str], held: Iterable[str] = ()) -> None:
+        self._field, self._rests = field, frozenset(rests)
         #: Visits that need fine steps, by heliostat; heliostats that step roughly without one.
         self._needed = Counter[str]()
-        self._rough = set(rests)
+        self._rough = {*self._rests, *held}
         #: Heliostats that may not step as they must.
         self._open = set(self._rough)
         self._sent_at: dict[str, float] = {}
@@ -64,6 +67,15 @@ class Stepping:
             self._open.update(heliostats)
         else:
             self._rough.difference_update(heliostats)
+
+    @property
+    def lent(self) -> frozenset[str]:
+        """The heliostats that step roughly again after a visit, though not by the plant file."""
+        return frozenset(self._open & self._rough - self._rests)
+
+    def record(self, heliostats: Iterable[str]) -> Held:
+        """Return what is to be stored before heliostats are ordered to take fine steps."""
+        return {"ROUGH": {n: (0.0, 0.0, 0.0) for n in heliostats if n in self.lent}}
 
     def coarse(self, heliostats: Iterable[str], now: float) -> tuple[str, ...]:
         """Return the heliostats that are not known to take fine steps."""

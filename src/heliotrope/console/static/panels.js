@@ -107,6 +107,7 @@ function heliostatView(one) {
       one.truth_error !== null ? ["True error (twin)", `${mrad(one.truth_error)} mrad`] : null,
       ["Supply voltage", one.supply === null ? "–" : `${number(one.supply, 1)} V`], ["Temperature", one.temperature === null ? "–" : `${number(one.temperature, 0)} °C`],
       ["Next measurement", one.planned ? `${clock(one.planned.at)} on ${one.planned.target}` : "not planned"],
+      one.locked ? ["Locked", one.locked, "warn"] : null,
       one.hold ? ["Out of service", `${one.hold}; ${one.state === "STOWED" || one.flags.includes("AT_STOW") ? "in stow" : "NOT IN STOW"}${one.flags.includes("LOCAL_SWITCH") ? "; confirmed at the mirror" : ""}`, "warn"] : null,
       one.flags.includes("LOCAL_SWITCH") ? ["Switch at the mirror", "drives off: nothing moves it", "warn"] : null]),
     h("h3", {}, "Drives"),
@@ -352,8 +353,9 @@ export function schedule(box) {
   const body = h("div");
   box.append(body);
   return refreshed(async () => {
-    const [plan, retries, holds] = await Promise.all([api("GET", "schedule?limit=50"), api("GET", "retries"), api("GET", "holds")]);
+    const [plan, retries, holds, progress] = await Promise.all([api("GET", "schedule?limit=50"), api("GET", "retries"), api("GET", "holds"), api("GET", "calibration")]);
     body.replaceChildren(h("h3", {}, "Next measurements"),
+      progress.reason || progress.choice ? h("p", { className: "hx-hint" }, `Automatic control: ${progress.reason || progress.choice}`) : "",
       plan.length ? table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target], ["Gain (mrad)", (r) => mrad(r.gain), "num"], ["Why", (r) => r.reason]], plan, (r) => look(r.heliostat))
         : h("p", { className: "hx-hint" }, "No measurement is planned."),
       h("h3", {}, `Tried again, or given up (${count(retries.length)})`),

@@ -462,6 +462,7 @@ class AutomaticControl:
             () if self._calibrating is None else self._calibrating.asked,
             () if self._foresight is None else tuple(self._foresight.points),
             () if self._foresight is None else self._foresight.outlooks,
+            "" if self._calibrating is None else self._calibrating.choice,
         )
 
     def plan(self, limit: int) -> tuple[Planned, ...]:

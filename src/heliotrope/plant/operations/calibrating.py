@@ -60,6 +60,11 @@ class Scheduling(Foreseeing, Protocol):
 
     attempts: Attempts
 
+    @property
+    def reason(self) -> str:
+        """Why the last choice was made, or why there was none; "" before the first."""
+        ...
+
     def next(
         self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False
     ) -> Planned | None:
@@ -240,6 +245,11 @@ class Calibrating:
             *self._places.shown(now),
             *(() if lit is None else lit.attempts.shown(now)),
         )
+
+    @property
+    def choice(self) -> str:
+        """Why the last visit was chosen, or why there was none; "" before the first."""
+        return self._scheduler.reason
 
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> tuple[Planned, ...]:
         """Return the coming visits of the ready heliostats, (N,)."""

@@ -159,6 +159,7 @@ class Viewer:
             automatic.book.results_of(name),
             next((p for p in automatic.plan(50) if p.heliostat == name), None),
             hold,
+            plant.locked_for(name) if shown.live and node["state"] == states.LOCKED else "",
         )
 
     def _drives(self, row: int) -> tuple[DriveView, ...]:

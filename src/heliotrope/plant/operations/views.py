@@ -171,6 +171,8 @@ class HeliostatView:
         Its next visit, if one is planned.
     hold
         Why it is out of service, who took it out, and when it is expected back; "" if it is not.
+    locked
+        Why it is LOCKED, by which visit, since when and until when; "" if it is not.
     """
 
     name: str
@@ -199,6 +201,7 @@ class HeliostatView:
     results: tuple["CalibrationEntry", ...]
     planned: Planned | None
     hold: str
+    locked: str
 
 
 @dataclass(frozen=True)
@@ -450,6 +453,8 @@ class CalibrationView:
         Errors of all heliostats over time, oldest first.
     outlooks
         Predictions of these for this day: the first of the day, and the last.
+    choice
+        Why automatic control chose the last visit, or why it begins none; "" before its first.
     """
 
     on: bool
@@ -463,6 +468,7 @@ class CalibrationView:
     asked: tuple[str, ...] = ()
     field: tuple[FieldPoint, ...] = ()
     outlooks: tuple[Outlook, ...] = ()
+    choice: str = ""
 
 
 @dataclass(frozen=True)

@@ -103,6 +103,11 @@ class PlantSchedule:
         self._sent[target].append(assignment.heliostat)
         return _planned(assignment)
 
+    @property
+    def reason(self) -> str:
+        """Why the last choice was made, or why there was none; "" before the first."""
+        return self.scheduler.reason
+
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[Planned]:
         """Return the coming visits; a new plan grows at each call while the old one is shown."""
         now = self._plant.now()

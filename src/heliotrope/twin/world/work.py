@@ -86,7 +86,7 @@ class _Rounds:
     def __init__(self, names: Sequence[str], clock: Clock) -> None:
         self._names, self._clock = names, clock
         self._last = dict.fromkeys(names, -1)
-        self.attempts = Attempts(VISITS)
+        self.attempts, self.reason = Attempts(VISITS), "in turn"
         self._count = 0
 
     def next(

@@ -1,0 +1,282 @@
+"""What a visit holds when the plant's program ends: a new program gives it back, once."""
+
+from collections.abc import Awaitable, Callable
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from heliotrope.lcu import names as meanings
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.assigned import HELD, AssignedFile, Points
+from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.lockouts import Lockout
+from heliotrope.plant.locks import CERTAIN
+from support.plant_bench import OPERATOR, Bench, running
+
+ENGINEER = Person("Egon", Role.ENGINEER)
+NAME = "P1A"
+AIM, ON_TARGET = (0.1, 0.2, 16.5), (4.0, 0.0, 14.0)
+AT_STOW = 1 << meanings.FLAGS.index("AT_STOW")
+ROUGH = 1 << meanings.FLAGS.index("ROUGH")
+STAGES = ("locked", "parameters", "read back", "unlocked")
+Scene = Callable[[Bench], Awaitable[None]]
+
+
+class Mirror:
+    """What the local controller of `NAME` does: LOCK holds until UNLOCK, also through STOW."""
+
+    def __init__(self, state: int, flags: int = 0) -> None:
+        self.state, self.flags, self.rough = state, flags, False
+        self.orders: list[str] = []
+
+    def join(self, bench: Bench) -> None:
+        cluster = bench.cluster_of(NAME)
+        row, obey = cluster.names.index(NAME), cluster._obey
+
+        async def obeyed(identity: str, name: str, heliostats: tuple[str, ...]) -> None:
+            await obey(identity, name, heliostats)
+            if NAME in (heliostats or cluster.names):
+                self.take(name)
+            show()
+
+        def show() -> None:
+            cluster.rows["state"][row] = self.state
+            cluster.rows["flags"][row] = self.flags | (ROUGH if self.rough else 0)
+
+        cluster._obey = obeyed  # type: ignore[method-assign]
+        show()
+
+    def take(self, name: str) -> None:
+        self.orders.append(name)
+        locked = self.state == states.LOCKED
+        if name == "STOW":
+            self.flags |= AT_STOW
+            self.state = states.LOCKED if locked else states.STOWED
+        elif name == "UNLOCK":
+            self.state = states.STOWED if self.flags & AT_STOW else states.IDLE
+        elif name == "LOCK":
+            self.state = states.LOCKED
+        elif name == "TRACK" and not locked:
+            self.state = states.TRACKING
+        elif name == "IDLE" and not locked:
+            self.state = states.IDLE
+        elif name == "ROUGH":
+            self.rough = False
+
+
+def play(mirror: Mirror, store: AssignedFile, scene: Scene, *, later: float = 0.0) -> None:
+    """Run a plant's program from its start until a scene is over; its visits are not ended."""
+
+    async def main(clock: VirtualClock) -> None:
+        begun = VirtualClock(clock.monotonic, clock.utc() + timedelta(seconds=later))
+        folder = store.path.parent / f"run-{later}"
+        folder.mkdir(exist_ok=True)
+        bench = Bench(begun, folder, seed=1 + int(later > 0.0), assigned=store)
+        mirror.join(bench)
+        async with running(bench):
+            await scene(bench)
+
+    run_virtual(main)
+
+
+async def locked_by_a_visit(bench: Bench, stage: str = "locked") -> list[object]:
+    """Let a visit come to a stage of its push; return what keeps it from ending."""
+    plant, token = bench.plant, await bench.commanded(ENGINEER)
+    entered = plant.authority.mandate(ENGINEER, token, (NAME,), "left")
+    mandate = entered.__enter__()
+    steps = STAGES.index(stage)
+    assert await plant.command(ENGINEER, mandate.token, "LOCK", (NAME,)).end(5.0)
+    if steps >= 1:
+        items = {"address": b"\x01\x00"}
+        plant._orders.parameters(
+            plant._orders.accept(("Egon", "engineer", "PARAMETERS"), (), (NAME,)),
+            NAME,
+            items,
+            mandate.token,
+        )
+    if steps >= 2:
+        await plant.stored(NAME)
+    if steps >= 3:
+        assert await plant.command(ENGINEER, mandate.token, "UNLOCK", (NAME,)).end(5.0)
+    return [entered]
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> AssignedFile:
+    return AssignedFile(tmp_path / "assigned.json")
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_new_program_opens_the_lock_of_a_visit(store: AssignedFile, stage: str) -> None:
+    mirror, kept = Mirror(states.IDLE), list[object]()
+
+    async def before(bench: Bench) -> None:
+        kept.append(await locked_by_a_visit(bench, stage))
+        assert NAME in store.read()["LOCKED"], "it is on the disk before the order is sent"
+
+    async def after(bench: Bench) -> None:
+        plant = bench.plant
+        await bench.wait(10.0)
+        assert mirror.orders == [], "nothing moves by itself at the start"
+        if mirror.state == states.LOCKED:
+            text = "a visit that the plant's program did not survive has left it locked (since "
+            assert plant.locked_for(NAME).startswith(text)
+        token = await bench.commanded()
+        for _ in range(30):
+            await bench.wait(1.0)
+            plant.authority.keep(OPERATOR, token)
+        assert not plant.locks.names
+        assert store.read()["LOCKED"] == {}
+
+    play(mirror, store, before)
+    was, mirror.orders = mirror.state, []
+    play(mirror, store, after, later=20.0)
+    if was == states.LOCKED:
+        assert (mirror.orders, mirror.state) == (["STOW", "UNLOCK"], states.STOWED)
+    else:
+        assert mirror.orders == []
+
+
+@pytest.mark.parametrize("when", ["after the visit", "in the visit"])
+def test_a_persons_lock_stays(store: AssignedFile, when: str) -> None:
+    mirror, kept = Mirror(states.IDLE), list[object]()
+
+    async def before(bench: Bench) -> None:
+        if when == "in the visit":
+            kept.append(await locked_by_a_visit(bench))
+            token = bench.plant.authority.token
+        else:
+            token = await bench.commanded(ENGINEER)
+        assert await bench.plant.command(ENGINEER, token, "LOCK", (NAME,)).end(5.0)
+        assert not store.path.exists() or NAME not in store.read()["LOCKED"]
+
+    async def after(bench: Bench) -> None:
+        token = await bench.commanded()
+        for _ in range(30):
+            await bench.wait(1.0)
+            bench.plant.authority.keep(OPERATOR, token)
+        text = "locked by an order; it stays locked until a person gives UNLOCK"
+        assert bench.plant.locked_for(NAME) == text
+
+    play(mirror, store, before)
+    mirror.orders = []
+    play(mirror, store, after, later=20.0)
+    assert (mirror.orders, mirror.state) == ([], states.LOCKED)
+
+
+@pytest.mark.parametrize("later", [-60.0, CERTAIN + 60.0])
+def test_a_lock_from_an_old_store_is_left_to_a_person(store: AssignedFile, later: float) -> None:
+    """Somebody may have locked it since the store was copied."""
+    mirror, kept = Mirror(states.IDLE), list[object]()
+
+    async def before(bench: Bench) -> None:
+        kept.append(await locked_by_a_visit(bench))
+
+    async def after(bench: Bench) -> None:
+        token = await bench.commanded()
+        for _ in range(30):
+            await bench.wait(1.0)
+            bench.plant.authority.keep(OPERATOR, token)
+        assert mirror.orders == []
+        assert "ask, then give UNLOCK" in bench.plant.locked_for(NAME)
+        assert await bench.plant.command(OPERATOR, token, "UNLOCK", (NAME,)).end(5.0)
+        for _ in range(10):
+            await bench.wait(1.0)
+            bench.plant.authority.keep(OPERATOR, token)
+        assert store.read()["LOCKED"] == {}
+
+    play(mirror, store, before)
+    mirror.orders = []
+    play(mirror, store, after, later=later)
+    assert mirror.orders == ["UNLOCK"]
+
+
+@pytest.mark.parametrize("flags", [0, AT_STOW])
+def test_one_that_is_out_of_service_is_opened_at_stow(store: AssignedFile, flags: int) -> None:
+    mirror, kept = Mirror(states.IDLE, flags), list[object]()
+
+    async def before(bench: Bench) -> None:
+        kept.append(await locked_by_a_visit(bench))
+
+    async def after(bench: Bench) -> None:
+        bench.plant.out_of_service[NAME] = Lockout(NAME, "Vera", "a new motor", 0.0)
+        token = await bench.commanded()
+        for _ in range(20):
+            await bench.wait(1.0)
+            bench.plant.authority.keep(OPERATOR, token)
+
+    play(mirror, store, before)
+    mirror.orders = []
+    play(mirror, store, after, later=20.0)
+    orders = ["UNLOCK"] if flags else ["STOW", "UNLOCK"]
+    assert (mirror.orders, mirror.state) == (orders, states.STOWED)
+
+
+def test_a_new_program_sends_a_beam_back_to_its_aim(store: AssignedFile) -> None:
+    mirror, kept = Mirror(states.IDLE), list[object]()
+
+    async def before(bench: Bench) -> None:
+        plant, token = bench.plant, await bench.commanded(ENGINEER)
+        assert await plant.aim(ENGINEER, token, {NAME: AIM}).end(5.0)
+        entered = plant.authority.mandate(ENGINEER, token, (NAME,), "left")
+        mandate = entered.__enter__()
+        kept.append(entered)
+        for point in (ON_TARGET, (4.1, 0.0, 14.0)):
+            assert await plant.aim(ENGINEER, mandate.token, {NAME: point}).end(5.0)
+        assert store.read()["LENT"] == {NAME: AIM}
+
+    async def after(bench: Bench) -> None:
+        plant, row = bench.plant, bench.plant.field.place(NAME)
+        await bench.wait(3.0)
+        assert plant.aims[row].tolist() == [4.1, 0.0, 14.0]
+        token = await bench.commanded()
+        for _ in range(12):
+            await bench.wait(1.0)
+            plant.authority.keep(OPERATOR, token)
+        np.testing.assert_array_equal(plant.aims[row], AIM)
+        assert (store.read()["LENT"], store.read()["AIM"]) == ({}, {NAME: AIM})
+
+    play(mirror, store, before)
+    play(mirror, store, after, later=20.0)
+    assert mirror.orders[-1] == "AIM"
+
+
+def test_only_changes_of_what_is_held_are_written() -> None:
+    class Counting:
+        count = 0
+
+        def read(self) -> dict[str, dict[str, tuple[float, ...]]]:
+            return {}
+
+        def keep(self, points: object) -> None:
+            del points
+            self.count += 1
+
+    store = Counting()
+    points, lent = Points(("A", "B"), store), {"LENT": {"A": AIM}}
+    for _ in range(3):
+        points.holding(lent)[0]()
+    points.holding({"LOCKED": {"A": None}})[0]()
+    assert store.count == 1
+    nothing = dict.fromkeys(HELD, frozenset[str]())
+    held = {**nothing, "LENT": frozenset({"A"})}
+    assert all(points.released(held, float(at)) is None for at in range(20))
+    assert points.released(nothing, 20.0) is None, "the order may be on its way"
+    work = points.released(nothing, 25.0)
+    assert work is not None
+    work()
+    assert store.count == 2
+    assert points.released(nothing, 40.0) is None
+
+
+def test_an_order_that_is_not_sent_leaves_what_was_held(store: AssignedFile) -> None:
+    points = Points(("A",), store)
+    points.holding({"LOCKED": {"A": (5.0, 0.0, 0.0)}})[0]()
+    keep, take_back = points.holding({"LOCKED": {"A": None}})
+    keep()
+    assert store.read()["LOCKED"] == {}
+    take_back()
+    assert Points(("A",), store).held["LOCKED"] == {"A": (5.0, 0.0, 0.0)}
