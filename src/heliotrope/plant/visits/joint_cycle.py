@@ -55,8 +55,9 @@ _FIRST = 1
 #: Photographs that may wait to be read while the next is taken.
 _UNREAD = 2
 #: Verdicts on a new mirror whose beam may be beside the target: light that does not move at its
-#: place may be another one's.
-_NOT_FOUND = (Verdict.FAINT, Verdict.ELSEWHERE, Verdict.STUCK)
+#: place may be another one's, and where all beams are beside it, the target is as dark as under a
+#: cloud.
+_NOT_FOUND = (Verdict.FAINT, Verdict.ELSEWHERE, Verdict.STUCK, Verdict.CLOUD)
 #: Joint visits that have not proven a heliostat; one whose beam may be beside the target comes
 #: again, and aims at another place beside it.
 JOINT = RetryLaw(
