@@ -536,7 +536,13 @@ def test_a_beam_that_is_looked_for_comes_again_and_a_cloud_is_no_mirrors_fault()
     made.concluded(cloud)
     assert made.again(faint)
     assert not made.alone(ready).any()
-    assert made.cycle.attempts.counts == {"A": 1}
+    assert made.cycle.attempts.counts == {"A": 1, "C": 1}
+    for _ in range(2 * LOOKS):
+        made.concluded(cloud)
+        assert not made.alone(ready).any()
+    for _ in range(LOOKS):
+        made.concluded(replace(cloud, heliostat="F"))  # it has a calibration
+    assert made.cycle.attempts.counts == {"A": 1, "C": LOOKS - 1}
 
 
 def test_two_targets_share_the_new_heliostats() -> None:
