@@ -56,6 +56,10 @@ COLUMNS = {
         "split", "contender", "heliostats", "tested", "median_of_medians_mrad",
         "mean_of_medians_mrad", "processor_s_per_heliostat", "error_ratio", "time_ratio",
     },
+    "prototype": {
+        "seed", "start_utc", "heliostats", "calibrated", "calibrated_15_after_s",
+        "true_median_mrad", "longest_pause_s", "not_calibrated",
+    },
     "commission": {
         "case", "visits", "sightings", "never_measured", "later_mirrors_an_hour_and_target",
         "goal_after_h_of_sun", "predicted_50_90_mrad", "believed_50_90_mrad", "true_50_90_mrad",

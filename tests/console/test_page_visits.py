@@ -15,7 +15,7 @@ pytestmark = NEEDS_BROWSER
 @pytest.fixture
 def field(tmp_path: Path) -> Iterator[LiveConsole]:
     """Twelve new heliostats that go to the targets together, at eight times real time."""
-    made = LiveConsole(tmp_path, 12, speed=8.0, together=True, keep_outs=())
+    made = LiveConsole(tmp_path, 12, speed=8.0, together=True)
     yield made
     made.close()
 

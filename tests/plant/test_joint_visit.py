@@ -12,12 +12,13 @@ from heliotrope.geometry import direction
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism.drives import SLOTS
+from heliotrope.plant import refusals
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.authority import Mandate, Person, Role
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.visits.joint_layout import SentBeam, _places, _too_bright, beams_of, coded
 from heliotrope.plant.visits.joint_visit import JointVisit
-from heliotrope.plant.visits.visit import ARRIVED
+from heliotrope.plant.visits.visit import ARRIVED, SILENT
 
 NAMES = ("A", "B", "C")
 
@@ -91,12 +92,12 @@ def test_the_order_is_given_again_without_those_that_it_is_refused_for() -> None
         return Order()
 
     async def scene(visit: Any, _: VirtualClock) -> None:
-        await visit._obeyed(order, NAMES, 60.0)
+        await visit._obeyed("AIM", order, NAMES, 60.0)
 
     visit = play(dict.fromkeys(NAMES, 0.0), scene)
     assert asked == [NAMES, ("A", "C")]
     assert visit.names == ("A", "C")
-    assert visit.lost == {"B": "B: its beam enters the walkway"}
+    assert visit.lost == {"B": "AIM B: its beam enters the walkway"}
 
 
 def test_a_refusal_that_names_none_of_them_ends_the_visit() -> None:
@@ -105,18 +106,62 @@ def test_a_refusal_that_names_none_of_them_ends_the_visit() -> None:
 
     async def scene(visit: Any, _: VirtualClock) -> None:
         with pytest.raises(BeamError, match="another's"):
-            await visit._obeyed(order, NAMES, 60.0)
+            await visit._obeyed("AIM", order, NAMES, 60.0)
 
     assert play(dict.fromkeys(NAMES, 0.0), scene).names == NAMES
 
 
 def test_who_does_not_obey_in_time_drops_out_with_the_reason() -> None:
     async def scene(visit: Any, _: VirtualClock) -> None:
-        await visit._obeyed(lambda _: Order(("A",), {"C": "not in this state"}), NAMES, 60.0)
+        await visit._obeyed("AIM", lambda _: Order(("A",), {"C": "not in this state"}), NAMES, 60.0)
 
     visit = play(dict.fromkeys(NAMES, 0.0), scene)
     assert visit.names == ("B",)
-    assert visit.lost == {"A": "A: AIM not done in 60 s", "C": "C: not in this state"}
+    assert visit.lost == {
+        "A": "AIM A: not done within 60 s",
+        "C": "AIM C: not in this state",
+    }
+
+
+@pytest.mark.parametrize("accepted", [False, True])
+def test_an_order_refused_for_a_reason_that_passes_is_given_again(accepted: bool) -> None:
+    asked: list[tuple[str, ...]] = []
+
+    async def scene(visit: Any, clock: VirtualClock) -> None:
+        begin = clock.monotonic()
+
+        def order(names: tuple[str, ...]) -> Order:
+            asked.append(names)
+            if "B" not in names or clock.monotonic() - begin > 3.0:
+                return Order()
+            wrong = {"B": refusals.STILL_MOVING.text}
+            if not accepted:
+                raise BeamError("IDLE", wrong)
+            return Order((), wrong)
+
+        await visit._obeyed("IDLE", order, NAMES, 60.0)
+
+    visit = play(dict.fromkeys(NAMES, 0.0), scene)
+    assert visit.names == NAMES
+    assert asked[0] == NAMES
+    assert asked[-1] == (("B",) if accepted else NAMES)
+
+
+def test_a_reason_that_does_not_pass_in_time_ends_a_members_visit() -> None:
+    took = []
+
+    async def scene(visit: Any, clock: VirtualClock) -> None:
+        begin = clock.monotonic()
+
+        def order(names: tuple[str, ...]) -> Order:
+            return Order((), {"B": refusals.PLACE_UNKNOWN.text} if "B" in names else {})
+
+        await visit._obeyed("IDLE", order, NAMES, 60.0)
+        took.append(clock.monotonic() - begin)
+
+    visit = play(dict.fromkeys(NAMES, 0.0), scene)
+    assert visit.lost == {"B": f"IDLE B: {refusals.PLACE_UNKNOWN.text}"}
+    assert SILENT <= took[0] < SILENT + 1.0
 
 
 def test_two_rows_in_place_are_waited_for_and_who_is_not_there_by_then_drops_out() -> None:
@@ -138,11 +183,20 @@ def test_two_rows_in_place_are_waited_for_and_who_is_not_there_by_then_drops_out
 def test_who_does_not_go_to_standby_at_the_end_is_taken_off_the_target() -> None:
     sent: list[tuple[str, ...]] = []
 
-    async def scene(visit: Any, _: VirtualClock) -> None:
+    async def scene(visit: Any, clock: VirtualClock) -> None:
         field, visit._away = visit.plant.field, set(NAMES)
         field.place, field.live = NAMES.index, lambda _: np.ones(len(NAMES), dtype=bool)
         field.rows = {"state": np.full(len(NAMES), states.TRACKING)}
-        visit.plant.command = lambda *_: Order(("A",), {"C": "not in this state"})
+        begin = clock.monotonic()
+
+        def command(*given: Any) -> Order:
+            moves = clock.monotonic() - begin < 3.0
+            wrong = {"C": "not in this state"} | (
+                {"B": refusals.STILL_MOVING.text} if moves else {}
+            )
+            return Order(("A",), {name: wrong[name] for name in given[-1] if name in wrong})
+
+        visit.plant.command = command
         visit.plant.defocus = lambda _, names: sent.append(names)
         await visit.home()
 

@@ -445,6 +445,23 @@ def test_parties_leave_every_second_visit_to_those_without_a_calibration() -> No
     assert asyncio.run(made.chosen("left", ready, follow)) == ("A", "B", "C", "D", "E")
 
 
+@pytest.mark.parametrize("verdict", [Verdict.FAINT, Verdict.CLOUD])
+def test_a_new_beam_that_leaves_the_target_dark_is_searched_at_another_place(
+    verdict: Verdict,
+) -> None:
+    made, _, _ = parties(2e-3, first=2)
+    unknown, known = (
+        CycleResult(name, CalibrationOutcome.NOT_PROVEN, "x", verdict=verdict) for name in "AF"
+    )
+    made.cycle._plant.beliefs.record = {"F": 1}.get  # type: ignore[method-assign]
+    made.cycle.note(unknown)
+    assert made.cycle.attempts.counts == {"A": 1}
+    assert made.again(unknown)
+    made.cycle.note(known)
+    alone = () if verdict is Verdict.CLOUD else ("F",)
+    assert tuple(made.cycle.attempts.given_up) == alone
+
+
 def test_a_party_is_chosen_while_the_target_waits_for_nothing() -> None:
     made, _, ready = parties(2e-3, first=0)
 
@@ -519,7 +536,13 @@ def test_a_beam_that_is_looked_for_comes_again_and_a_cloud_is_no_mirrors_fault()
     made.concluded(cloud)
     assert made.again(faint)
     assert not made.alone(ready).any()
-    assert made.cycle.attempts.counts == {"A": 1}
+    assert made.cycle.attempts.counts == {"A": 1, "C": 1}
+    for _ in range(2 * LOOKS):
+        made.concluded(cloud)
+        assert not made.alone(ready).any()
+    for _ in range(LOOKS):
+        made.concluded(replace(cloud, heliostat="F"))  # it has a calibration
+    assert made.cycle.attempts.counts == {"A": 1, "C": LOOKS - 1}
 
 
 def test_two_targets_share_the_new_heliostats() -> None:

@@ -7,11 +7,13 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from heliotrope.geometry import direction
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.operations import Logbook
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.losses import Losses
@@ -84,6 +86,36 @@ def test_only_what_cannot_go_on_is_sent_to_stow(tmp_path: Path) -> None:
         bench.cluster_of(OTHER).set(states.STOWED, OTHER)
         await bench.wait(2.0)
         assert await stuck() == []
+
+    play(tmp_path, scene)
+
+
+def test_a_cluster_that_may_not_move_keeps_no_other_at_stow(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        bad, good = bench.cluster_of(NAME), bench.cluster_of(OTHER)
+        for cluster in bench.clusters.values():
+            cluster.set(states.STOWED)
+        token = await bench.commanded(ENGINEER)
+        bad.late = 86_400.0
+        for _ in range(15):
+            plant.authority.keep(ENGINEER, token)
+            await bench.wait(1.0)
+        assert plant.held(plant.field.names).keys() == set(bad.names)
+        log = Logbook(bench.clock)
+        raising = Raising(plant, log, ENGINEER, most=99, patience=60.0, clearance=0.0, wanted=True)
+        await raising.step(token, frozenset, np.zeros(len(plant.field), dtype=np.bool_))
+        await bench.wait(2.0)
+        assert [message.heliostats or good.names for message in good.commands("APPROACH")] == [
+            good.names
+        ]
+        assert not any(row.condition == "beam_blocked" for row in log.alarms())
+        # A person's order to both goes to those that may move, and names the others.
+        plant.authority.keep(ENGINEER, token)
+        ticket = plant.command(ENGINEER, token, "APPROACH", (NAME, OTHER))
+        assert ticket.refusals[NAME].startswith("cluster_time_differs")
+        with pytest.raises(RefusedError, match="APPROACH: not accepted now: cluster_time_differs"):
+            plant.command(ENGINEER, token, "APPROACH", (NAME,))
 
     play(tmp_path, scene)
 

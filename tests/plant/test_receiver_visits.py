@@ -476,6 +476,29 @@ def test_those_whose_errors_may_be_largest_are_measured_first_and_then_wait() ->
     assert made.asked == ("A",)
 
 
+def test_one_that_is_refused_again_and_again_goes_to_a_target() -> None:
+    made, clock = chooser()
+    ready = np.ones(6, dtype=np.bool_)
+    no_report = CycleResult("D", CalibrationOutcome.REFUSED, "no report shows where it is now")
+    visit = [told("A"), told("B"), told("C"), no_report]
+    for _ in range(2):
+        assert made.concluded(visit) == ()
+        clock.at += 7200.0
+        assert "D" in made.chosen(ready)
+    (retry,) = made.mirrors.shown(clock.at)
+    assert (retry.subject, retry.count, retry.reason) == ("D", 2, no_report.text)
+    assert made.concluded(visit) == ("D",)
+    clock.at += 7200.0
+    assert "D" not in made.chosen(ready)
+    clock.at += 86_400.0
+    assert "D" in made.chosen(ready)
+    assert made.concluded([told(name) for name in "ABCD"]) == ()
+    assert not made.mirrors.counts
+    # A visit that measures nobody is not the mirror's failure.
+    assert made.concluded([replace(no_report, heliostat=name) for name in "ABCD"]) == ()
+    assert not made.mirrors.counts
+
+
 def test_the_odd_ones_go_to_a_target_unless_the_light_is_to_blame() -> None:
     made, clock = chooser()
     odd = [told("A"), told("B"), told("C", Verdict.FAINT, 0), told("D", Verdict.EXCHANGED, 0)]

@@ -93,7 +93,6 @@ class LiveConsole:
         boards: bool = False,
         child: Patience | None = None,
         settings: ConsoleSettings | None = None,
-        keep_outs: tuple[Box, ...] = (GATE,),
         marks: Path | None = None,
         work: AutomaticSettings | None = None,
         given: frozenset[str] = frozenset(),
@@ -102,7 +101,7 @@ class LiveConsole:
         self.folder, self.address = folder, ""
         self._made, self._child = (heliostats, speed), child
         self._settings = settings or ConsoleSettings(port=0, page=page)
-        self._keep_outs, self._marks = keep_outs, marks
+        self._marks = marks
         self._options = LiveOptions(
             rendered=rendered,
             boards=boards,
@@ -135,7 +134,7 @@ class LiveConsole:
         now = time.time()
         for role in ROLES:
             self.keeper.people.add(role, _secrets.hash_password(PASSWORD), role, now)
-        design = replace(malan_plant(heliostats), keep_outs=self._keep_outs)
+        design = replace(malan_plant(heliostats), keep_outs=(GATE,))
         self.live = LivePlant(
             design,
             clock,

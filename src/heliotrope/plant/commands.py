@@ -131,7 +131,6 @@ class Commands:
         """
         name, left = ticket.name, ticket.waiting(heliostats)
         if again and left:
-            self._permission.refuse_now(name, left)
             out = self._permission.still_locked_out(name, left, self._destined(name, left))
             others = tuple(n for n in left if n not in out)
             left, wrong = self.examine(name, numbers, others, token)

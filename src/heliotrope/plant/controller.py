@@ -845,6 +845,10 @@ class PlantController:
         """Return why unverified parameters may not lead a beam to a point (3,), "" if they may."""
         return self._ways.misled(heliostat, point)
 
+    def held(self, heliostats: Sequence[str]) -> Mapping[str, str]:
+        """Return the heliostats in whose clusters no new motion may begin now, and the reasons."""
+        return self._permission.held("APPROACH", heliostats)
+
     def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
         return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
 

@@ -89,6 +89,7 @@ class Permission:
         RefusedError
             If none may; the reason of the whole plant or of a cluster comes before their own.
         """
+        held = self.held(name, names)
         wrong = {} if name == "LOCK" else self._identities.barred(names)
         if name in SETTINGS:
             wrong = wrong | self._visited(token, names)
@@ -102,9 +103,11 @@ class Permission:
         elif name in _STILL:
             for row in _SENT_OFF:
                 wrong |= self._sentinel.barred(names, row)
+        wrong |= held
         if wrong and len(wrong) == len(names):
+            if len(held) < len(names):
+                raise BeamError(name, wrong)
             self.refuse_now(name, names)
-            raise BeamError(name, wrong)
         return tuple(n for n in names if n not in wrong), wrong
 
     def _visited(self, token: int, names: tuple[str, ...]) -> dict[str, str]:
@@ -188,7 +191,7 @@ class Permission:
         for each in heliostats:
             self._field.place(each)
         self._authority.check(person, token, name)
-        self.refuse_now(name, heliostats)
+        self.refuse_now(name, [each for each in heliostats if each not in blocked])
         mandate = self._authority.mandate_of(token)
         if mandate is not None:
             wrong = mandate.refused(heliostats)
@@ -210,9 +213,31 @@ class Permission:
         return ticket
 
     def refuse_now(self, name: str, heliostats: Sequence[str]) -> None:
-        """Refuse a command where no new motion may begin now."""
-        rows = [self._field.place(n) for n in heliostats]
-        clusters = {self._field.clusters[self._field.cluster[row]] for row in rows}
-        reason = "" if name == "LOCK" else self._sentinel.refusal(clusters)
-        if reason := reason or self._rivals.refusal(clusters):
+        """Refuse a command where no new motion may begin now.
+
+        Raises
+        ------
+        BeamError
+            If it may begin in some of their clusters.
+        RefusedError
+            If it may begin in none.
+        """
+        held = self.held(name, heliostats)
+        if held and len(held) < len(set(heliostats)):
+            raise BeamError(name, held)
+        for reason in held.values():
             raise refusals.NOT_NOW.error(what=name, reason=reason)
+
+    def held(self, name: str, heliostats: Collection[str]) -> dict[str, str]:
+        """Return the heliostats in whose clusters no new motion may begin now, and the reasons."""
+        field = self._field
+        cluster = {n: field.clusters[field.cluster[field.place(n)]] for n in heliostats}
+        reasons = {each: self._refusal(name, each) for each in set(cluster.values())}
+        if not any(reasons.values()):
+            return {}
+        return {n: reasons[each] for n, each in cluster.items() if reasons[each]}
+
+    def _refusal(self, name: str, cluster: str) -> str:
+        """Return why no new motion may begin in a cluster, "" if it may; all take LOCK."""
+        reason = "" if name == "LOCK" else self._sentinel.refusal((cluster,))
+        return reason or self._rivals.refusal((cluster,))

@@ -243,7 +243,7 @@ class Calibrating:
             *self._scheduler.attempts.shown(self._now()),
             *(() if joint is None else joint.cycle.attempts.shown(now)),
             *self._places.shown(now),
-            *(() if lit is None else lit.attempts.shown(now)),
+            *(() if lit is None else (*lit.attempts.shown(now), *lit.mirrors.shown(now))),
         )
 
     @property

@@ -30,6 +30,16 @@ RECEIVER = RetryLaw(
     rest=3600.0,
     alarm=alarms.VISITS_FAIL,
 )
+#: Receiver visits that a heliostat was refused for, or that an error broke off, while they measured
+#: others.
+MIRROR = RetryLaw(
+    "receiver visit",
+    3,
+    0.0,
+    "it goes to a target alone; one receiver visit a day until then",
+    rest=16.0 * 3600.0,
+)
+_BROKEN = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)
 #: Verdicts after which a heliostat is looked at on a target.
 _ODD = (Verdict.STUCK, Verdict.EXCHANGED, Verdict.ELSEWHERE, Verdict.JOINED, Verdict.FAINT)
 
@@ -52,6 +62,8 @@ class ProductionVisits:
         As given.
     attempts
         Visits that came to nothing, by receiver.
+    mirrors
+        Visits from which a heliostat was left out, by heliostat.
     """
 
     def __init__(
@@ -63,7 +75,7 @@ class ProductionVisits:
     ) -> None:
         self._plant, self._book, self.cycle = plant, book, cycle
         self._asked: list[tuple[str, ...]] = []
-        self.attempts = Attempts(RECEIVER, tell)
+        self.attempts, self.mirrors = Attempts(RECEIVER, tell), Attempts(MIRROR)
         #: When each heliostat was measured last, monotonic s.
         self._at = np.full(len(plant.field), -np.inf)
 
@@ -109,6 +121,7 @@ class ProductionVisits:
         # The book has errors of the normal; a beam is off by twice as much.
         due = lit & (2.0 * self._book.error <= _SURE * settings.known)
         due &= now - self._at >= settings.every
+        due[[field.place(name) for name in self.mirrors.waiting(now)]] = False
         if not self.attempts.due(self.surface, now) or int(due.sum()) < settings.least:
             return ()
         rows = np.flatnonzero(due)
@@ -119,6 +132,7 @@ class ProductionVisits:
         """Note a visit's results; return the heliostats that are to be looked at on a target.
 
         Where less than half of the beams are proven, the light is to blame and not the mirrors.
+        One that was refused too often while others were measured goes to a target, too.
         """
         results = [r for r in results if r.outcome is not CalibrationOutcome.TAKEN_OUT]
         now, seen = self._plant.now(), [r.heliostat for r in results if r.verdict is None]
@@ -130,8 +144,16 @@ class ProductionVisits:
         self._at[[self._plant.field.place(name) for name in seen]] = now
         if 2 * len(good) < len(results):
             return ()
+        for result in results:
+            if result.outcome in _BROKEN:
+                self.mirrors.failed(result.heliostat, result.text, now)
+            else:
+                self.mirrors.done(result.heliostat)
+        given_up = self.mirrors.given_up
         return tuple(
             result.heliostat
             for result in results
-            if result.verdict in _ODD or result.outcome is CalibrationOutcome.NOT_VERIFIED
+            if result.verdict in _ODD
+            or result.outcome is CalibrationOutcome.NOT_VERIFIED
+            or result.heliostat in given_up
         )

@@ -203,7 +203,9 @@ class Raising:
         self._look_at_blocked()
         busy = (self._busy_until >= now) & (self._told_in == plant.field.rows["state"])
         free = self.wanted & ~busy & ~resting
-        free[[plant.field.place(name) for name in visiting()]] = False
+        # A cluster that may begin no motion, as one with a wrong clock, keeps no other waiting.
+        out = (*visiting(), *plant.held(plant.field.names))
+        free[[plant.field.place(name) for name in out]] = False
         strayed = (states.TRACKING, "IDLE", self._on_targets(plant.aims))
         here = np.ones(len(free), dtype=np.bool_)
         for state, name, where in (

@@ -471,8 +471,12 @@ class CalibrationCycle:
             return ()
         async with visit.locked():
             items, mandate = {item: wanted[item] for item in missing}, visit.mandate
-            ticket = plant.parameters(mandate.person, mandate.token, name, items, confirmed=why)
-            await visit.obey(ticket, 60.0)
+            person, token = mandate.person, mandate.token
+            await visit.obey(
+                "PARAMETERS",
+                lambda _: plant.parameters(person, token, name, items, confirmed=why),
+                60.0,
+            )
             left = differing(wanted, await plant.stored(name))
             if left:
                 raise RefusedError(

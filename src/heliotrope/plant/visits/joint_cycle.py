@@ -150,12 +150,19 @@ class JointCycle:
         return 0 < self.attempts.counts.get(heliostat, 0) < LOOKS
 
     def note(self, result: CycleResult) -> None:
-        """Note the result of a visit, joint or alone: whether the heliostat may come together."""
+        """Note the result of a visit, joint or alone: whether the heliostat may come together.
+
+        Where the beams of all new mirrors are beside the target, it is as dark as under a cloud:
+        they are looked for at the next place, but no cloud ends the search.
+        """
         name, now, text = result.heliostat, self._plant.now(), result.text
         new = self._plant.beliefs.record(name) is None
         if result.new:
             self.attempts.done(name)
-        elif result.verdict in _NOT_FOUND and new:
+        elif new and (
+            result.verdict in _NOT_FOUND
+            or (result.verdict is Verdict.CLOUD and self.attempts.counts.get(name, 0) < LOOKS - 1)
+        ):
             self.attempts.failed(name, text, now)
         elif (
             result.verdict not in (None, Verdict.CLOUD)

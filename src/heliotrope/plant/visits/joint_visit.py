@@ -17,11 +17,13 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
-from heliotrope.plant.authority import Mandate, RefusedError
-from heliotrope.plant.beam_watch import BeamError
+from heliotrope.plant.authority import Mandate, Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.tickets import Ticket
-from heliotrope.plant.visits.visit import BroughtHome, Visit
+from heliotrope.plant.visits.visit import BroughtHome, Order, Visit, carried_out
+
+#: Gives heliostats points, by name, for a person with a token.
+Pointing = Callable[[Person, int, Mapping[str, FloatArray]], Ticket]
 
 #: Longest time of an order, and of the way to standby, s.
 _ORDER, _HOME = 60.0, 120.0
@@ -118,48 +120,43 @@ class JointVisit(BroughtHome):
         # the field is raised, so all wait at standby.
         self._away |= set(self.visits)
         tracking = self.missing(states.IDLE)
-        await self._obeyed(lambda names: self._command("IDLE", names), tracking, limit)
+        await self._obeyed("IDLE", self._command("IDLE"), tracking, limit)
         await self.aim(points, limit)
         await self.track(limit)
         await self._arrived(limit)
 
     async def track(self, limit: float = _ORDER) -> None:
         """Let those at standby that take part track their aims."""
-        idle = self.missing(states.TRACKING)
-        await self._obeyed(lambda names: self._command("TRACK", names), idle, limit)
+        await self._obeyed("TRACK", self._command("TRACK"), self.missing(states.TRACKING), limit)
 
     async def aim(self, points: Mapping[str, FloatArray], limit: float = _ORDER) -> None:
-        """Give aims to those that take part; who may not have its aim drops out."""
+        """Give aims to those that take part; those that may not have theirs drop out."""
+        await self._pointed(self.plant.aim, points, limit)
+
+    async def move(self, points: Mapping[str, FloatArray], limit: float) -> None:
+        """Move beams a little beside their aims; those that may not be moved drop out."""
+        await self._pointed(self.plant.move, points, limit)
+
+    async def _pointed(
+        self, give: Pointing, points: Mapping[str, FloatArray], limit: float
+    ) -> None:
+        person, token = self.mandate.person, self.mandate.token
         wanted = [name for name in self.names if name in points]
+        await self._obeyed(
+            "AIM", lambda some: give(person, token, {n: points[n] for n in some}), wanted, limit
+        )
 
-        def ordered(names: tuple[str, ...]) -> Ticket:
-            mandate, some = self.mandate, {name: points[name] for name in names}
-            return self.plant.aim(mandate.person, mandate.token, some)
-
-        await self._obeyed(ordered, wanted, limit)
-
-    def _command(self, name: str, heliostats: tuple[str, ...]) -> Ticket:
-        return self.plant.command(self.mandate.person, self.mandate.token, name, heliostats)
+    def _command(self, name: str) -> Order:
+        """Return what gives a command to some heliostats."""
+        person, token, plant = self.mandate.person, self.mandate.token, self.plant
+        return lambda some: plant.command(person, token, name, some)
 
     async def _obeyed(
-        self, order: Callable[[tuple[str, ...]], Ticket], heliostats: Iterable[str], limit: float
+        self, what: str, order: Order, heliostats: Iterable[str], limit: float
     ) -> None:
-        """Give an order; drop those that it is refused for, or that do not carry it out."""
-        names = tuple(heliostats)
-        while names:
-            try:
-                ticket = order(names)
-                break
-            except BeamError as error:
-                if not set(error.refusals) & set(names):
-                    raise
-                self.drop({n: f"{n}: {text}" for n, text in error.refusals.items()})
-                names = tuple(name for name in names if name in self.visits)
-        else:
-            return
-        if not await ticket.end(limit):
-            late = dict.fromkeys(ticket.waiting(names), f"{ticket.name} not done in {limit:g} s")
-            self.drop({n: f"{n}: {text}" for n, text in (late | ticket.refusals).items()})
+        """Give an order; those that do not carry it out drop out, see `carried_out`."""
+        failed = await carried_out(self.plant, order, heliostats, limit, self.look)
+        self.drop({name: f"{what} {name}: {why}" for name, why in failed.items()})
 
     async def _arrived(self, limit: float) -> None:
         """Wait until all stay at their aims in two rows; who does not arrive drops out.
@@ -227,12 +224,8 @@ class JointVisit(BroughtHome):
         on = tuple(n for n in names if live[field.place(n)] and heard[n] in _ON)
         left = {n for n in names if n not in on and not (live[field.place(n)] and heard[n] in _OFF)}
         try:
-            if on:
-                ticket = self._command("IDLE", on)
-                await ticket.end(_HOME)
-                left |= set(ticket.waiting(on)) | set(ticket.refusals)
-        except BeamError as error:
-            left |= set(error.refusals)
+            failed = await carried_out(self.plant, self._command("IDLE"), on, _HOME, self.look)
+            left |= failed.keys()
         except (RefusedError, asyncio.CancelledError):
             left |= set(names)
             raise

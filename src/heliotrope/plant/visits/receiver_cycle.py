@@ -31,7 +31,6 @@ from heliotrope.imaging.coded import (
 from heliotrope.imaging.targets.view import posed_view
 from heliotrope.lcu import states
 from heliotrope.plant.authority import Person, RefusedError
-from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.calibration_cycle import (
     CalibrationCycle,
@@ -183,7 +182,7 @@ class ReceiverCycle:
             if number == needed:
                 break
             tell(f"photograph {number + 1} of {needed}, {len(joint.names)} beams")
-            await self._move(joint, made.layout.points(number))
+            await joint.move(made.layout.points(number), _ORDER)
             begin = plant.now()
             await self._settled(joint, begin + self.settings.settle)
             picture = await noting(joint.look, self._light())
@@ -200,25 +199,6 @@ class ReceiverCycle:
                 if number == needed // 2:
                     taken.standing = Standing.of(plant.field)
         return taken
-
-    async def _move(self, joint: JointVisit, points: dict[str, FloatArray]) -> None:
-        """Move the beams of those that take part; who may not be moved drops out."""
-        while names := joint.names:
-            try:
-                ticket = self._plant.move(
-                    joint.mandate.person,
-                    joint.mandate.token,
-                    {name: points[name] for name in names},
-                )
-            except BeamError as error:
-                if not set(error.refusals) & set(names):
-                    raise
-                joint.drop({n: f"{n}: {text}" for n, text in error.refusals.items()})
-                continue
-            if not await ticket.end(_ORDER):
-                late = dict.fromkeys(ticket.waiting(names), f"not moved within {_ORDER:g} s")
-                joint.drop({n: f"{n}: {text}" for n, text in (late | ticket.refusals).items()})
-            return
 
     async def _settled(
         self, joint: JointVisit, until: float, moving: Sequence[str] | None = None

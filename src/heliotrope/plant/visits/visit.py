@@ -9,7 +9,7 @@ import asyncio
 import math
 from abc import ABC, abstractmethod
 from bisect import bisect_right
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from contextlib import asynccontextmanager, suppress
 from typing import Self
 
@@ -26,12 +26,68 @@ from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.tickets import Ticket
 
+#: Gives an order to some heliostats.
+Order = Callable[[tuple[str, ...]], Ticket]
+
 #: A mirror has arrived when both axes are this close (rad) to their goals, in two rows running.
 ARRIVED = 3e-4
-#: Longest silence of a mirror after a command is done, s.
+#: Longest silence of a mirror after a command is done, and longest time for which a reason that
+#: ends by itself may hold an order up, s.
 SILENT = 10.0
 #: Time between looks at the field, s.
 _LOOK = 0.25
+
+
+async def carried_out(
+    plant: PlantController,
+    order: Order,
+    heliostats: Iterable[str],
+    limit: float,
+    look: Callable[[], Awaitable[None]],
+) -> dict[str, str]:
+    """Give heliostats an order and wait until it is done; return those that fail, and why.
+
+    What ends by itself within seconds ends no visit: a heliostat that is refused for such a reason
+    (`refusals.SOON`) gets the order again, until nothing has changed for `SILENT` s.
+
+    Parameters
+    ----------
+    plant, heliostats
+        The plant, and the names.
+    order
+        Gives the order to some of them.
+    limit
+        Time in which it must be done once it is accepted, s.
+    look
+        Waits a little between two attempts.
+
+    Raises
+    ------
+    RefusedError
+        If the plant refuses every motion; or as ``look``.
+    """
+    failed: dict[str, str] = {}
+    left, until = tuple(heliostats), plant.now() + SILENT
+    while left:
+        try:
+            ticket = order(left)
+        except BeamError as error:
+            refused = {name: error.refusals[name] for name in left if name in error.refusals}
+            if not refused:
+                raise
+            others = tuple(name for name in left if name not in refused)
+        else:
+            await ticket.end(limit)
+            late = dict.fromkeys(ticket.waiting(left), f"not done within {limit:g} s")
+            refused, others = late | ticket.refusals, ()
+            until = until if len(refused) == len(left) else plant.now() + SILENT
+        waits = plant.now() < until
+        soon = {name for name, why in refused.items() if waits and why in refusals.SOON}
+        failed |= {name: why for name, why in refused.items() if name not in soon}
+        left = tuple(name for name in left if name in soon or name in others)
+        if soon:
+            await look()
+    return failed
 
 
 class BroughtHome(ABC):
@@ -119,55 +175,44 @@ class Visit(BroughtHome):
             raise RefusedError(f"{shown}; it cannot be commanded")
         return int(self.plant.field.rows["state"][self.row])
 
-    async def obey(self, ticket: Ticket, limit: float) -> None:
-        """Wait until a command is done and the field's table shows a row from after its end.
+    async def obey(self, what: str, order: Order, limit: float) -> None:
+        """Give an order, and wait until it is done and a report is from after its end.
+
+        Parameters
+        ----------
+        what, order
+            The command, for people; and what gives it; see `carried_out`.
+        limit
+            s.
 
         Raises
         ------
         RefusedError
-            If it is refused, or not done within ``limit`` s, or nothing is heard after it.
+            If it is refused, or not done within ``limit`` s, or nothing is heard after it; or if
+            another order has taken the heliostat out of the visit.
         """
-        if not await ticket.end(limit):
-            raise RefusedError(f"{self.heliostat}: {ticket.text}")
+        if failed := await carried_out(self.plant, order, self.names, limit, self.look):
+            raise BeamError(what, failed)
         # The row in the table may be older than the end of the command.
         ended = self.plant.now()
         while self.plant.field.heard[self.row] <= ended:
             if self.plant.now() - ended > SILENT:
-                raise RefusedError(
-                    f"{self.heliostat}: not heard within {SILENT:g} s after {ticket.name}"
-                )
+                raise RefusedError(f"{self.heliostat}: not heard within {SILENT:g} s after {what}")
             await self.look()
 
     async def command(
         self, name: str, values: tuple[float, ...] = (), limit: float = 120.0
     ) -> None:
-        """Give the heliostat a command and wait until it is done; see `obey`.
-
-        Raises
-        ------
-        RefusedError
-            As `obey`; or if another order has taken the heliostat out of the visit.
-        """
-        mandate, until = self.mandate, self.plant.now() + SILENT
-        while True:
-            try:
-                ticket = self.plant.command(
-                    mandate.person, mandate.token, name, (self.heliostat,), values
-                )
-                break
-            except BeamError as error:
-                # What ends by itself within seconds is no reason to end a visit.
-                soon = error.refusals.get(self.heliostat) in refusals.SOON
-                if not soon or self.plant.now() >= until:
-                    raise
-            await self.look()
-        await self.obey(ticket, limit)
+        """Give the heliostat a command and wait until it is done; see `obey`."""
+        person, token, plant = self.mandate.person, self.mandate.token, self.plant
+        await self.obey(name, lambda some: plant.command(person, token, name, some, values), limit)
 
     async def aim(self, point: FloatArray, limit: float = 120.0) -> None:
         """Give the heliostat an aim and wait until it has taken it; see `obey`."""
-        mandate = self.mandate
-        ticket = self.plant.aim(mandate.person, mandate.token, {self.heliostat: point})
-        await self.obey(ticket, limit)
+        person, token, plant = self.mandate.person, self.mandate.token, self.plant
+        await self.obey(
+            "AIM", lambda some: plant.aim(person, token, dict.fromkeys(some, point)), limit
+        )
 
     @asynccontextmanager
     async def locked(self) -> AsyncIterator[None]:
