@@ -304,7 +304,7 @@ def test_a_lease_of_automatic_control_may_leave_after_a_person_has_the_authority
         observer.gave_way(1.0, told)
         observer.granted(ENGINEER, 8, 1.0, seized=False)
         for now in (1.0, 1.2):
-            observer.posted(4, Lease(token, 5.0, 60.0, "one"), now)
+            observer.posted((), Lease(token, 5.0, 60.0, "one"), now)
 
     leased(8, 7)
     leased(7, 7)

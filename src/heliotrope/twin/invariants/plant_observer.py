@@ -57,6 +57,9 @@ _OPERATORS = (
     "SEARCH",
 )  # fmt: skip
 _JOINING = ("TRACK", "REFOCUS", "SEARCH")
+#: Commands that move a heliostat or hold it, and those that leave it to whoever has it.
+_MOTIONS = ("APPROACH", "IDLE", "LOCK", *_JOINING)
+_SETTINGS = ("LOCK_AIM", "ROUGH")
 
 
 class PlantObserver:
@@ -105,6 +108,8 @@ class PlantObserver:
         self._recorded: Counter[tuple[str, str]] = Counter()
         self._looked = 0  # records already counted
         self._obeyed: dict[str, float] = {}
+        self._taken: dict[str, float] = {}  # what the holder has commanded, and since when
+        self._aimed: dict[str, float] = {}
         self._noted_at: dict[tuple[str, str], float] = {}
         self._following: dict[str, float] = {}  # tickets whose record may follow
         self._awaited: dict[str, tuple[float, str, str]] = {}  # tickets accepted on a slow disk
@@ -150,6 +155,7 @@ class PlantObserver:
         if self._holder is not None:
             self._void(self._holder[1], now)
         self._holder, self._perhaps = None, float("-inf")
+        self._taken.clear()
 
     def _void(self, token: int, now: float) -> None:
         self.old[token] = now
@@ -258,6 +264,10 @@ class PlantObserver:
         else:
             self._awaited[ticket.identity] = now, person.name, what
         self._accepted[person.name, what] += 1
+        if what not in _SETTINGS:
+            for name in ticket.heliostats:
+                if name not in ticket.refusals:
+                    self._taken.setdefault(name, now)
         self._count(now)
 
     def refused(self, person: Person, token: int, what: str, reason: str, now: float) -> None:
@@ -324,8 +334,8 @@ class PlantObserver:
 
     # -- messages --------------------------------------------------------------------------
 
-    def posted(self, members: int, message: Message, now: float) -> None:
-        """Judge a message before it goes to a cluster with a number of heliostats."""
+    def posted(self, members: Sequence[str], message: Message, now: float) -> None:
+        """Judge a message before it goes to a cluster with some heliostats."""
         if self._automatic and isinstance(message, Lease | Command | Parameters):
             self._leased(message.token, now)
         if not isinstance(message, Command | Parameters | Emergency):
@@ -341,9 +351,34 @@ class PlantObserver:
         record = self._disk.records.get(identity)
         good = record is not None and record.what == what
         self.check(11, good, now, f"{what} {message.identity} is sent before its record is kept")
-        if isinstance(message, Command) and what in _JOINING:
-            self._posted.append((now, len(message.heliostats) or members))
+        if not isinstance(message, Command):
+            return
+        whom = message.heliostats or members
+        if what == "AIM":
+            self._aimed.update(dict.fromkeys(whom, now))
+        if what in _MOTIONS and record is not None and record.who.endswith(AUTOMATIC.name):
+            self._spares_taken(what, whom, now)
+        if what in _JOINING:
+            self._posted.append((now, len(whom)))
             self._bounded(self._posted, 0.0, now, f"are sent {what}")
+
+    def _spares_taken(self, what: str, heliostats: Sequence[str], now: float) -> None:
+        """Check that automatic control moves no heliostat that the holder has commanded.
+
+        Its visits go on beside a person's command, with the other heliostats. What was on its way
+        when the person commanded may still leave.
+        """
+        holder = self._live(now)
+        if holder is None or holder[0] == AUTOMATIC:
+            return
+        for name in heliostats:
+            passed = now - self._taken.get(name, now)
+            saw = f"automatic control sends {name} {what}; {holder[0].name} took it {passed:.1f} s"
+            self.check(4, passed <= _AT_ONCE, now, f"{saw} ago")
+
+    def aimed(self, name: str) -> float:
+        """Return when an aim was last sent to a heliostat, s; -inf if never."""
+        return self._aimed.get(name, float("-inf"))
 
     def _bounded(
         self, joined: "deque[tuple[float, int]]", slack: float, now: float, how: str
