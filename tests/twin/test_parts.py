@@ -410,7 +410,7 @@ def test_an_alarm_of_a_sensor_outlives_a_frozen_plant_but_not_a_killed_one() -> 
 
 def test_what_a_killed_plant_still_posts_is_not_judged() -> None:
     """Simulated run 911645: a visit that is cancelled takes its beam off the target."""
-    posted: list[int] = []
+    posted: list[tuple[str, ...]] = []
 
     async def main(clock: VirtualClock) -> None:
         pod = SimpleNamespace(addresses={"H1": 1})
@@ -422,7 +422,7 @@ def test_what_a_killed_plant_still_posts_is_not_judged() -> None:
         await ear.posted(data, 1.0)
 
     run_virtual(main)
-    assert posted == [1]
+    assert posted == [("H1",)]
 
 
 def test_no_observer_takes_a_table_from_the_code_that_it_observes() -> None:
