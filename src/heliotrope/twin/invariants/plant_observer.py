@@ -24,8 +24,9 @@ from heliotrope.twin.records import RecordsDisk
 #: A status waits up to a second, may be in transit for another, and ages are rounded: a value may
 #: be shown this much younger than it is, s.
 YOUNGER = 2.2
-#: A record that may follow its command is there within this, s.
-RECORD_WITHIN = 2.0
+#: A record that may follow its command is there within this, s; the plant's own order waits for
+#: its turn no longer than this, s: with a mirror every two seconds the field has joined before.
+RECORD_WITHIN, TURN_WITHIN = 2.0, 60.0
 #: An order to turn away that is repeated within this is the same one, s.
 MOMENT = 0.3
 #: How long a cluster may accept a void token: until the last lease with it has arrived and has
@@ -102,6 +103,7 @@ class PlantObserver:
         self._accounts = {a.name: a for each in clusters for a in each.accounts}
         self._holder: tuple[Person, int, float] | None = None
         self._granted_at = self._visited_at = float("-inf")
+        self._from_nobody = False  # nobody had the authority when the holder took it
         #: When a command that was refused for other reasons may have renewed the authority.
         self._perhaps = float("-inf")
         self._accepted: Counter[tuple[str, str]] = Counter()
@@ -113,7 +115,8 @@ class PlantObserver:
         self._noted_at: dict[tuple[str, str], float] = {}
         self._following: dict[str, float] = {}  # tickets whose record may follow
         self._awaited: dict[str, tuple[float, str, str]] = {}  # tickets accepted on a slow disk
-        self._own: dict[str, float] = {}  # the plant's own records without a message yet
+        #: The plant's own records without a message yet: since when, and when they last waited.
+        self._own: dict[str, tuple[float, float]] = {}
         self._sent: set[str] = set()
         self._posted: deque[tuple[float, int]] = deque(maxlen=400)
         self._joined: deque[tuple[float, int]] = deque(maxlen=400)
@@ -177,6 +180,7 @@ class PlantObserver:
             self._end(now)
         self.check(4, good, now, saw)
         self._holder, self._granted_at = (person, token, now), now
+        self._from_nobody = before is None
 
     def kept(self, now: float) -> None:
         """Note that the holder has renewed it."""
@@ -215,7 +219,8 @@ class PlantObserver:
             self.gave_way(now)
         elif token not in self.old and token != 0:
             just, visited = now - self._granted_at, now - self._visited_at
-            if holder is not None and just <= _AT_ONCE and visited <= 2.0 * _AT_ONCE:
+            own = self._from_nobody and just <= _AT_ONCE and visited <= 2.0 * _AT_ONCE
+            if holder is not None and own:
                 self.old[token] = now  # a visit went on with it while nobody had it, just before
                 return
             if self._by_itself():
@@ -435,7 +440,12 @@ class PlantObserver:
             self._visited_at = now
         # A beam that goes back to its aim on the receiver waits for its turn to join.
         waits = {ticket.identity for ticket in plant.orders if not ticket.sent}
-        self._own.update(dict.fromkeys(self._own.keys() & waits, now))
+        # That it does is the plant's word, and believed for as long as turns may take.
+        for identity in self._own.keys() & waits:
+            since = self._own[identity][0]
+            saw = f"record {identity} has waited for its turn for {now - since:.0f} s"
+            self.check(11, now - since <= TURN_WITHIN, now, saw)
+            self._own[identity] = since, now
         well_since = max(self._disk.well_since, self._stood_at)
         if now - well_since > RECORD_WITHIN and not (self._disk.full or self._disk.busy(now)):
             self._complete(now)
@@ -450,7 +460,7 @@ class PlantObserver:
                 continue  # it tells nobody; `posted` wants a record of all that it sends
             if record.who in _OWN:
                 if record.identity not in self._sent:
-                    self._own[record.identity] = now
+                    self._own[record.identity] = now, now
                 continue
             key = (record.who, record.what)
             self._recorded[key] += 1
@@ -477,7 +487,7 @@ class PlantObserver:
                 del self._following[identity]
                 good = identity in self._disk.records
                 self.check(11, good, now, f"order {identity} has no record {now - at:.1f} s later")
-        for identity, at in list(self._own.items()):
+        for identity, (_, at) in list(self._own.items()):
             if now - max(at, self._hung_at) > RECORD_WITHIN:
                 del self._own[identity]
                 # A command that waited too long for the disk is given up; its record says so.
