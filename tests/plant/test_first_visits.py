@@ -28,6 +28,7 @@ CYCLE = CycleSettings(least=3, sigma=2e-4)
 ROUGH = 0.5
 #: Light on a target that three of six beams exceed, suns.
 DIM = 2.6
+MRAD = 1e-3
 _CALIBRATED, _NOT_VERIFIED = CalibrationOutcome.CALIBRATED, CalibrationOutcome.NOT_VERIFIED
 
 
@@ -75,8 +76,14 @@ def test_new_mirrors_are_calibrated_and_verified_together() -> None:
         assert all(results[name].new == 2 for name in good), "seen, and verified"
         rows = [here.names.index(name) for name in good]
         assert before[rows].min() > 1e-3
-        # On the target they are known; the receiver is 60 m from there: 0.11 to 0.34 by the seed.
-        assert np.median(here.live.errors()[rows]) < 0.4 * np.median(before[rows])
+        # On the target they are known; at the receiver, 60 m from there, as well as two sightings
+        # of one place tell. Over 24 installations the median was 0.4 to 1.7 mrad, before 2 to 10,
+        # and none of 96 mirrors missed by more than 1.03 of what its calibration states.
+        after = here.live.errors()[rows]
+        assert np.median(after) < 1.8 * MRAD
+        await asyncio.sleep(2.0)  # until the next frame
+        stated = here.live.operations.frame().error[rows]
+        assert (after < 1.3 * stated).all(), (after, stated)
         for name in good:
             assert len(plant.beliefs.seen(name)) == 2  # type: ignore[arg-type]
             assert await stored(here, name) != ()

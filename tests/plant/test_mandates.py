@@ -18,7 +18,7 @@ from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.operations.automatic import AUTOMATIC
 from heliotrope.plant.visits import CycleResult, CycleSettings
 from support.joint_scene import Scene, joint
-from support.visit_scene import ENGINEER, believe
+from support.visit_scene import ENGINEER, left_to_work
 
 VERA = Person("Vera", Role.ENGINEER)
 CALIBRATED = CalibrationOutcome.CALIBRATED
@@ -262,10 +262,7 @@ def test_rough_stepping_waits_for_those_in_a_visit() -> None:
 def test_automatic_control_goes_on_after_a_person_and_its_visits_are_no_losses(word: str) -> None:
     async def scene(here: Scene) -> None:
         plant, operations = here.live.plant, here.live.operations
-        believe(here.live, 1e-3)
-        plant.release_authority(ENGINEER, here.token)
-        operations.give_back(ENGINEER)
-        operations.automatic.switch(on=True)
+        left_to_work(here)
         await until(here, lambda: any(_stages(here, word)))
         token = operations.take_authority(VERA).token
         here.staying = stays(here, VERA, token)  # type: ignore[attr-defined]
@@ -296,11 +293,8 @@ def _stages(here: Scene, word: str) -> list[str]:
 
 def test_a_true_loss_during_a_visit_is_a_loss() -> None:
     async def scene(here: Scene) -> None:
-        plant, operations = here.live.plant, here.live.operations
-        believe(here.live, 1e-3)
-        plant.release_authority(ENGINEER, here.token)
-        operations.give_back(ENGINEER)
-        operations.automatic.switch(on=True)
+        operations = here.live.operations
+        left_to_work(here)
         await until(here, lambda: any(_stages(here, "photograph 2 ")))
         # The boards lose their sun, and turn away by themselves.
         here.live.field.order("DEFOCUS")
@@ -403,11 +397,8 @@ def test_a_loss_of_many_ends_the_visits_of_automatic_control() -> None:
     """Simulated run 7200013: a visit that had just begun sent a beam to its target after it."""
 
     async def scene(here: Scene) -> None:
-        plant, operations = here.live.plant, here.live.operations
-        believe(here.live, 1e-3)
-        plant.release_authority(ENGINEER, here.token)
-        operations.give_back(ENGINEER)
-        operations.automatic.switch(on=True)
+        operations = here.live.operations
+        left_to_work(here)
         await until(here, lambda: any(_stages(here, "photograph 2 ")))
         operations.automatic._losses._wait("many were lost")
         await until(here, lambda: not operations.calibration().running, 30.0)

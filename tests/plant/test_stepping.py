@@ -1,7 +1,7 @@
 """Fine steps for a visit: Malan's prototype, whose drivers rest, so that it steps roughly."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -13,15 +13,14 @@ from heliotrope.field.example import roughly_installed
 from heliotrope.field.plant import Plant
 from heliotrope.field.stellenbosch import prototype
 from heliotrope.lcu import names as meanings
-from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism.drives import SLOTS
 from heliotrope.mechanism.machine import Machine
 from heliotrope.mechanism.machine import Stepping as Stepped
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.stepping import Stepping
 from heliotrope.twin.live.boards import BoardField
-from support.live import LiveOptions, LivePlant
-from support.visit_scene import ENGINEER, START
+from support.live import LiveOptions, LivePlant, play
+from support.visit_scene import ENGINEER
 
 MRAD = 1e-3
 ROUGH = 1 << meanings.FLAGS.index("ROUGH")
@@ -118,19 +117,6 @@ def test_drivers_that_rest_are_not_left_on_by_an_earlier_run() -> None:
     assert modes.due(9.0, 7) == {}
 
 
-def live(
-    work: Callable[[LivePlant], Awaitable[None]], design: Plant, options: LiveOptions = OPTIONS
-) -> None:
-    """Run a plant with boards and automatic control in virtual time beside some work."""
-
-    async def main(clock: VirtualClock) -> None:
-        async with LivePlant(design, clock, options).running() as plant:
-            await work(plant)
-            await plant.end()
-
-    run_virtual(main, start=START)
-
-
 def rough(plant: LivePlant) -> list[bool]:
     """Return whether each board steps roughly, in truth."""
     assert isinstance(plant.field, BoardField)
@@ -176,7 +162,7 @@ def test_the_prototype_is_calibrated_jointly_though_its_full_steps_are_coarse() 
         await until(plant, lambda: precise(plant) >= 10, 60.0)
         assert any(rough(plant)), "they step roughly again where no visit needs them"
 
-    live(work, prototype(), replace(OPTIONS, seed=3))
+    play(work, prototype(), replace(OPTIONS, seed=3))
 
 
 def few(coarse: int = 0) -> Plant:
@@ -219,7 +205,7 @@ def test_mirrors_of_unlike_resolution_are_calibrated_in_one_visit() -> None:
         assert np.ptp(good) < 10.0, "one visit calibrates all"
         await until(plant, lambda: precise(plant) >= 4, 60.0)
 
-    live(work, few(coarse=3), replace(OPTIONS, installed=partial(roughly_installed, scale=0.5)))
+    play(work, few(coarse=3), replace(OPTIONS, installed=partial(roughly_installed, scale=0.5)))
 
 
 @pytest.mark.parametrize("out", ["emergency", "another's command", "halt"])
@@ -244,4 +230,4 @@ def test_drivers_rest_again_however_a_visit_ends(out: str) -> None:
             plant.command(ENGINEER, token, "IDLE", plant.field.names)
         await until(live, lambda: all(rough(live)), 15.0)
 
-    live(work, few())
+    play(work, few(), OPTIONS)

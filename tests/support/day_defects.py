@@ -23,7 +23,7 @@ from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.visits import joint_layout, receiver_layout
 from heliotrope.plant.visits.visit import Visit
 from heliotrope.twin.invariants.invariants import L1, L2, L3, L4
-from heliotrope.twin.world.crew import ANY_TIME, LOCKED, CrewAct
+from heliotrope.twin.world.crew import ANY_TIME, LOCKED, SCRIPT, CrewAct
 from heliotrope.twin.world.faults import Fault
 
 Plant = Callable[[pytest.MonkeyPatch], None]
@@ -84,6 +84,11 @@ def rough_in_a_visit(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Permission, "_visited", lambda self, token, names: {})
 
 
+def taken_by_nobody(patch: pytest.MonkeyPatch) -> None:
+    """A person's command takes no heliostat out of the visit that it is in."""
+    patch.setattr(Authority, "prevail", lambda self, names, why, fault=False: None)
+
+
 def done_at_once(patch: pytest.MonkeyPatch) -> None:
     """A STOW is done when it is acknowledged."""
     advance = Ticket.advance
@@ -135,6 +140,8 @@ ROWS: tuple[
     ((L2,), "retries without an end", endless_retries, (), (), 840.0, True, 14),
     ((16,), "ROUGH to all reaches a visit", rough_in_a_visit,
      _when("photograph", "rough", 1.0), (), 420.0, True, 8),
+    ((4,), "a visit keeps what a person has taken", taken_by_nobody,
+     (CrewAct("duty", "on the way", 1.0, SCRIPT),), (), 420.0, False, 1),
     ((L2,), "a STOW is done when it is acknowledged", done_at_once,
      _when(ANY_TIME, "off", 60.0), (), 240.0, False, 2),
     ((L3,), "automatic control leaves mirrors at standby", not_tracked_again,

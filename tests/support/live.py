@@ -126,6 +126,23 @@ class LivePlant:
         return await self.assembly.stowed(limit)
 
 
+def play(
+    work: Callable[[LivePlant], Awaitable[None]],
+    design: Plant,
+    options: LiveOptions,
+    records: Records | None = None,
+    start: datetime = START,
+) -> None:
+    """Run a plant in virtual time beside some work."""
+
+    async def main(clock: VirtualClock) -> None:
+        async with LivePlant(design, clock, options, records=records).running() as plant:
+            await work(plant)
+            await plant.end()
+
+    run_virtual(main, start=start)
+
+
 def live(
     work: Callable[[LivePlant], Awaitable[None]],
     settings: AutomaticSettings,
@@ -141,11 +158,8 @@ def live(
     plant = plant or PlantSettings()
     options = LiveOptions(rendered=False, threads=0, work=settings, plant=plant)
 
-    async def main(clock: VirtualClock) -> None:
-        made = LivePlant(replace(design, groups={"azel": group}), clock, options, records=records)
-        async with made.running() as plant:
-            await asyncio.sleep(4.0)
-            await work(plant)
-            await plant.end()
+    async def later(made: LivePlant) -> None:
+        await asyncio.sleep(4.0)
+        await work(made)
 
-    run_virtual(main, start=start)
+    play(later, replace(design, groups={"azel": group}), options, records, start)

@@ -53,6 +53,15 @@ def believe(live: LivePlant, sigma: float) -> None:
         live.plant.beliefs.take(record)
 
 
+def left_to_work(made: VisitScene) -> None:
+    """Take all mirrors for calibrated to 1 mrad, and leave the field to automatic control."""
+    live = made.live
+    believe(live, 1e-3)
+    live.plant.release_authority(ENGINEER, made.token)
+    live.operations.give_back(ENGINEER)
+    live.operations.automatic.switch(on=True)
+
+
 async def raised(live: LivePlant, limit: float = 600.0) -> None:
     """Let automatic control raise the field; return when all track, and it has halted."""
     until = live.clock.monotonic() + limit

@@ -46,10 +46,10 @@ def standing(turned: float, name: str = "H01") -> Board:
     return board
 
 
-def last_look(turned: float, until: float) -> float:
+def last_look(turned: float, until: float, unsurveyed: tuple[str, ...] = ()) -> float:
     """Look at such a mirror; return when."""
     board = standing(turned)
-    observer = BeamObserver(0.0, {"C1": [board]}, lambda now: SUN, ())
+    observer = BeamObserver(0.0, {"C1": [board]}, lambda now: SUN, (), None, unsurveyed)
     for message in (Command("a", "AIM", RECEIVER), Command("t", "TRACK")):
         observer.sent(message, ("H01",), 0.0)
     observer.resumed(("H01",), "TRACK", 0.0)
@@ -66,6 +66,17 @@ def test_a_beam_is_astray_once_its_drives_could_have_brought_it(turned: float) -
     last_look(turned, SETTLE + NAMED_WITHIN + needs)
     with pytest.raises(InvariantError, match=r"H01: TRACKING, its beam .* and no alarm names it"):
         last_look(turned, SETTLE + NAMED_WITHIN + needs + 2.0)
+
+
+def test_a_beam_of_which_the_plant_file_is_wrong_is_astray_once_that_does_not_explain_it() -> None:
+    until = SETTLE + NAMED_WITHIN + 60_000.0 / LIMITS[0] + 2.0
+    assert (
+        2.0 < standing(6_000.0).miss(SUN, RECEIVER) < 8.0 < standing(60_000.0).miss(SUN, RECEIVER)
+    )
+    last_look(6_000.0, until, ("H01",))
+    for turned, unsurveyed in ((6_000.0, ()), (60_000.0, ("H01",))):
+        with pytest.raises(InvariantError, match=r"H01: TRACKING, its beam .* and no alarm"):
+            last_look(turned, until, unsurveyed)
 
 
 def rests_in_doubt(ends_at: float, named_again_at: float, until: float) -> None:

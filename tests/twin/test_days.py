@@ -12,7 +12,10 @@ import pytest
 
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.lcu import states
-from heliotrope.links.messages import Stage
+from heliotrope.links.messages import Command, Stage
+from heliotrope.plant.audit import Record
+from heliotrope.plant.authority import Person
+from heliotrope.plant.operations.automatic import AUTOMATIC
 from heliotrope.safety import Alarm, Severity
 from heliotrope.sun import vector
 from heliotrope.twin.invariants.alarms import AlarmObserver
@@ -24,11 +27,15 @@ from heliotrope.twin.invariants.invariants import (
     Violation,
     named,
 )
+from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.progress import LOCKED_WITHIN, TRACKS_WITHIN, ProgressObserver
 from heliotrope.twin.invariants.results import BARREN, RETRIES, SEARCHES, ResultObserver
 from heliotrope.twin.invariants.tickets import OVER_WITHIN, TicketObserver
+from heliotrope.twin.records import RecordsDisk
+from heliotrope.twin.world.acts import Acts
+from heliotrope.twin.world.operator import ENGINEER
 from heliotrope.twin.world.scene import TARGETS, scene_of
-from heliotrope.twin.world.simulation import RunPlan, run
+from heliotrope.twin.world.simulation import SETTINGS, RunPlan, run
 from heliotrope.twin.world.worlds import DAY, DAYS, DAYS_SHARE, covered_by, length_of, mixed
 
 #: High enough for every day, above no limit.
@@ -199,6 +206,56 @@ def test_a_persons_emergency_and_what_is_out_of_service_outlive_a_restart() -> N
         restarted(plant(), called=False, out=True)
 
 
+def test_an_emergency_that_a_person_has_acknowledged_need_not_outlive_a_restart() -> None:
+    """Simulated day 52: the plant's program ended four seconds after the end of the emergency."""
+
+    def tidied(*acknowledged: str) -> list[bool]:
+        """Return what the observers hear while the plant holds an emergency on."""
+        heard: list[bool] = []
+        acts: Any = Acts.__new__(Acts)
+        acts._operator = SimpleNamespace(clear=lambda _: set(acknowledged))
+        acts._watch = SimpleNamespace(emergency=lambda *, on: heard.append(on))
+        acts.tidies(SimpleNamespace(plant=SimpleNamespace(emergency_on=True)))
+        return heard
+
+    assert tidied("clock_jump") == []
+    assert tidied("operator_emergency") == [False]
+
+
+def commanded(
+    what: str = "TRACK",
+    *,
+    name: str = "H1",
+    by: Person = AUTOMATIC,
+    after: float = 5.0,
+    gone: bool = False,
+) -> None:
+    """Observe a command to a heliostat some time after a person has commanded H1, but not H2."""
+    disk = RecordsDisk()
+    observer = PlantObserver(0.0, disk, SETTINGS, [])
+    observer.granted(ENGINEER, 8, 0.0, seized=False)
+    taken: Any = SimpleNamespace(identity="x-1", heliostats=("H1", "H2"), refusals={"H2": "no"})
+    disk.records["x-1"] = Record("x-1", ENGINEER.name, "engineer", "IDLE", "")
+    observer.accepted(ENGINEER, 8, taken, "IDLE", 1.0)
+    now = 1.0 + after
+    if gone:
+        observer.released(ENGINEER, now)
+    disk.records["x-2"] = Record("x-2", by.name, "engineer", what, "")
+    observer.posted(("H1", "H2"), Command("x-2.1", what, (), (name,), 8, 5.0), now)
+
+
+def test_a_visit_moves_no_heliostat_that_a_person_has_taken() -> None:
+    commanded(name="H2")
+    commanded(by=ENGINEER)
+    commanded("ROUGH")
+    commanded(after=0.3)  # it was on its way
+    commanded(gone=True)
+    with pytest.raises(InvariantError, match=r"invariant 4 .* sends H1 TRACK; engineer took it"):
+        commanded()
+    with pytest.raises(InvariantError, match=r"invariant 4 .* sends H1 LOCK"):
+        commanded("LOCK")
+
+
 def ticket(stage: Stage | None, *, finished: bool, name: str = "STOW") -> Any:
     """Return a ticket of one heliostat."""
     return SimpleNamespace(
@@ -230,9 +287,20 @@ def test_a_ticket_ends_and_is_done_only_where_the_mirror_is() -> None:
         ticked(ticket(Stage.DONE, finished=True, name="DEFOCUS"), 5.0, was=False, stowed=True)
 
 
-def alarmed(kind: str, *, rest: float, began: float = 0.0) -> None:
-    """Observe an alarm at 200 s, after a fault that ended at some time."""
+def alarmed(kind: str, *, rest: float, began: float = 0.0, calls: int = 0, over: int = 0) -> None:
+    """Observe an alarm at 200 s, after a fault that ended at some time.
+
+    Before that persons have called some emergencies, of which some are over.
+    """
     observer = AlarmObserver(0.0, {"C1": [board(states.STOWED)]}, (DAYS,))
+    if began:
+        observer.ended()
+    for _ in range(calls):
+        observer.called()
+    for _ in range(over):
+        observer.alarmed(
+            Alarm("operator_emergency", "", Severity.ALARM, "it is over", active=False), 1.0
+        )
     for now in np.arange(began, 200.0, 0.5):
         observer.heard("C1", float(now))
         observer.look({"H1": rest}, {"C1"}, float(now), runs=True, writes=True)
@@ -242,11 +310,20 @@ def alarmed(kind: str, *, rest: float, began: float = 0.0) -> None:
 
 
 def test_the_plants_own_act_is_no_cause_of_an_alarm() -> None:
-    alarmed("resume_needed", rest=150.0)
-    alarmed("operator_emergency", rest=-inf)
-    for rest in (-inf, 100.0):
-        with pytest.raises(InvariantError, match=r"invariant L2 .* cause is the plant's own act"):
-            alarmed("resume_needed", rest=rest)
+    for kind, rest in (("resume_needed", 150.0), ("flux_after_emergency", 120.0)):
+        alarmed(kind, rest=rest)
+        for early in (-inf, 100.0):
+            own = r"invariant L2 .* cause is the plant's own act"
+            with pytest.raises(InvariantError, match=own):
+                alarmed(kind, rest=early)
+
+
+def test_an_emergency_has_a_person_who_has_called_it() -> None:
+    alarmed("operator_emergency", rest=-inf, calls=1)
+    alarmed("operator_emergency", rest=-inf, began=198.0)  # a new program goes on with it
+    for calls, over in ((0, 0), (1, 1)):
+        with pytest.raises(InvariantError, match=r"invariant L2 .* nobody has called one"):
+            alarmed("operator_emergency", rest=-inf, calls=calls, over=over)
 
 
 def visited(count: int, *, asks: int = 0, outcome: str = "not_proven", names: int = 1) -> None:

@@ -4,7 +4,6 @@ import asyncio
 import hashlib
 import re
 import struct
-from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,7 +13,6 @@ import pytest
 
 from heliotrope.errors import InputError
 from heliotrope.field.layouts import lay_out, malan_plant
-from heliotrope.field.plant import Plant
 from heliotrope.field.stellenbosch import prototype
 from heliotrope.field.target import Target
 from heliotrope.geometry import bisector, normalize, reflect
@@ -39,25 +37,12 @@ from heliotrope.twin.live.live import machines_of
 from heliotrope.twin.live.loop import LATE
 from heliotrope.twin.sensors import light_share
 from heliotrope.twin.true_mirrors import TrueMirror, mirrors_near
-from support.live import LiveOptions, LivePlant
+from support.live import LiveOptions, LivePlant, play
 
 MRAD = 1e-3
 START = datetime(2026, 10, 21, 7, tzinfo=UTC)
 NIGHT = datetime(2026, 10, 21, 23, tzinfo=UTC)
 EXACT = LiveOptions(rendered=False, threads=0)
-
-
-def live(
-    work: Callable[[LivePlant], Awaitable[None]], design: Plant, options: LiveOptions = EXACT
-) -> None:
-    """Run a plant in virtual time beside some work."""
-
-    async def main(clock: VirtualClock) -> None:
-        async with LivePlant(design, clock, options).running() as plant:
-            await work(plant)
-            await plant.end()
-
-    run_virtual(main, start=START)
 
 
 class Wall:
@@ -272,7 +257,7 @@ def test_a_small_plant_raises_itself_learns_and_is_stowed(key: bytes) -> None:
         # Mirrors that rose before they had the key are named until they stand again.
         assert not [r for r in plant.operations.alarms() if "bus" in r.condition and r.active]
 
-    live(work, lay_out("radial", 3), replace(EXACT, bus_key=key))
+    play(work, lay_out("radial", 3), replace(EXACT, bus_key=key))
 
 
 def test_step_counts_that_come_seldom_are_not_taken_for_new(
@@ -289,7 +274,7 @@ def test_step_counts_that_come_seldom_are_not_taken_for_new(
         assert all(entry.text.startswith("calibrated") for entry in results), results
         assert max(entry.after for entry in results) < 0.5 * MRAD
 
-    live(work, malan_plant(4))
+    play(work, malan_plant(4), EXACT)
 
 
 class Strangers:
@@ -320,7 +305,7 @@ def test_anothers_beam_is_not_taken_for_its_own(count: int) -> None:
         assert "another heliostat's beam" in first.text
         assert first.after < 0.5 * MRAD
 
-    live(work, malan_plant(1))
+    play(work, malan_plant(1), EXACT)
 
 
 @pytest.mark.slow
@@ -343,7 +328,7 @@ def test_heliostats_of_the_default_plant_fall_below_half_a_milliradian() -> None
         rows = [plant.plant.field.place(name) for name in both]
         assert np.median(plant.errors()[rows]) < 0.5 * MRAD
 
-    live(work, replace(design, groups={"azel": some}))
+    play(work, replace(design, groups={"azel": some}), EXACT)
 
 
 def test_boards_learn_as_a_vectorised_field_does() -> None:
@@ -358,7 +343,7 @@ def test_boards_learn_as_a_vectorised_field_does() -> None:
         assert view.results[-1].text.startswith("calibrated: ")
         assert await plant.stowed()
 
-    live(work, few, replace(EXACT, boards=True))
+    play(work, few, replace(EXACT, boards=True))
 
 
 def test_what_was_learnt_outlasts_the_program(tmp_path: Path) -> None:
@@ -513,7 +498,7 @@ def test_an_emergency_of_the_twin_is_proven_with_its_flux(boards: bool, key: byt
         await asyncio.sleep(10.0)
         assert not [row for row in live.operations.alarms() if "flux" in row.condition]
 
-    live(work, two, idle)
+    play(work, two, idle)
 
 
 def test_the_flux_sensor_sees_a_mirror_that_stays() -> None:

@@ -9,6 +9,7 @@ from contextvars import copy_context
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of, run_vi
 from heliotrope.links.link import LinkClosedError, SendOutcome
 from heliotrope.links.messages import Emergency, Lease, encode
 from heliotrope.plant.audit import AuditError, Record
+from heliotrope.plant.authority import Person
 from heliotrope.safety import Alarm, Severity
 from heliotrope.sun import vector
 from heliotrope.twin import invariants
@@ -29,12 +31,12 @@ from heliotrope.twin.boards.flash import NorFlash, PowerCutError
 from heliotrope.twin.boards.motors import MotorAxis
 from heliotrope.twin.boards.outfit import RECEIVER, outfits
 from heliotrope.twin.invariants.invariants import InvariantError
-from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.invariants.plant_observer import TURN_WITHIN, PlantObserver
 from heliotrope.twin.invariants.runs import RunAccount
 from heliotrope.twin.invariants.sensors import LIMITS as SENSORS
 from heliotrope.twin.invariants.sensors import SensorObserver
 from heliotrope.twin.records import RecordsDisk
-from heliotrope.twin.world.operator import ENGINEER
+from heliotrope.twin.world.operator import ENGINEER, OPERATOR
 from heliotrope.twin.world.pod import PlantEar
 from heliotrope.twin.world.scene import USUAL, scene_of
 from heliotrope.twin.world.simulation import SETTINGS, RunPlan, Simulation
@@ -295,16 +297,35 @@ def test_a_record_of_a_command_that_was_given_up_belongs_to_nothing_and_says_so(
                 observer.look(plant, 4.0)  # type: ignore[arg-type]
 
 
+def test_an_own_order_of_the_plant_waits_for_its_turn_for_a_time_only() -> None:
+    waiting = SimpleNamespace(identity="x-1", sent=False)
+    plant: Any = SimpleNamespace(
+        field=SimpleNamespace(live=lambda now: np.zeros(0, dtype=bool)),
+        emergency=None,
+        orders=(waiting,),
+        authority=SimpleNamespace(visited=dict),
+    )
+    disk = RecordsDisk()
+    observer = PlantObserver(0.0, disk, SETTINGS, [])
+    disk.records["x-1"] = Record("x-1", "plant", "plant", "TRACK", "")
+    for now in np.arange(0.0, TURN_WITHIN, 1.0):
+        observer.look(plant, float(now))
+    with pytest.raises(InvariantError, match="record x-1 has waited for its turn for 61 s"):
+        observer.look(plant, TURN_WITHIN + 1.0)
+
+
 def test_a_lease_of_automatic_control_may_leave_after_a_person_has_the_authority() -> None:
     """Simulated run 990686: it took the authority and gave way before it leased with it."""
 
-    def leased(token: int, told: int, visited: float = -1.0) -> None:
+    def leased(token: int, told: int, visited: float = -1.0, had: Person | None = None) -> None:
         observer = PlantObserver(0.0, RecordsDisk(), SETTINGS, [], automatic=True)
         observer._visited_at = visited
         observer.gave_way(1.0, told)
-        observer.granted(ENGINEER, 8, 1.0, seized=False)
+        if had is not None:
+            observer.granted(had, 5, 0.5, seized=False)
+        observer.granted(ENGINEER, 8, 1.0, seized=had is not None)
         for now in (1.0, 1.2):
-            observer.posted(4, Lease(token, 5.0, 60.0, "one"), now)
+            observer.posted((), Lease(token, 5.0, 60.0, "one"), now)
 
     leased(8, 7)
     leased(7, 7)
@@ -312,6 +333,8 @@ def test_a_lease_of_automatic_control_may_leave_after_a_person_has_the_authority
     for token, told in ((6, 7), (7, 0)):
         with pytest.raises(InvariantError, match="given the authority, which engineer had"):
             leased(token, told)
+    with pytest.raises(InvariantError, match="given the authority, which engineer had"):
+        leased(6, 0, 0.9, OPERATOR)  # the plant has no token of its own while a person commands
 
 
 def test_a_slow_disk_works_in_order_and_loses_what_waits() -> None:
@@ -410,7 +433,7 @@ def test_an_alarm_of_a_sensor_outlives_a_frozen_plant_but_not_a_killed_one() -> 
 
 def test_what_a_killed_plant_still_posts_is_not_judged() -> None:
     """Simulated run 911645: a visit that is cancelled takes its beam off the target."""
-    posted: list[int] = []
+    posted: list[tuple[str, ...]] = []
 
     async def main(clock: VirtualClock) -> None:
         pod = SimpleNamespace(addresses={"H1": 1})
@@ -422,7 +445,7 @@ def test_what_a_killed_plant_still_posts_is_not_judged() -> None:
         await ear.posted(data, 1.0)
 
     run_virtual(main)
-    assert posted == [1]
+    assert posted == [("H1",)]
 
 
 def test_no_observer_takes_a_table_from_the_code_that_it_observes() -> None:

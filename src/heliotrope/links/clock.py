@@ -10,6 +10,7 @@ to keep; the same seed gives the same run.
 """
 
 import asyncio
+import itertools
 import random
 import selectors
 import time
@@ -257,6 +258,20 @@ class _Drawn(deque[asyncio.Handle]):
         return handle
 
 
+class _NumberedTask(asyncio.Task[Any]):
+    """A task with its number as hash.
+
+    A `TaskGroup` cancels a set of tasks in the order of their hashes, which are else addresses.
+    """
+
+    def __init__(self, coro: Coroutine[Any, Any, Any], number: int, **given: Any) -> None:
+        self._number = number
+        super().__init__(coro, **given)
+
+    def __hash__(self) -> int:
+        return self._number
+
+
 class _NoWait(selectors.SelectSelector):
     """A selector that never waits: it advances the loop's time instead."""
 
@@ -308,6 +323,10 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             nothing = asyncio.Handle(lambda: None, (), self)
             nothing.cancel()
             self._ready: _Drawn = _Drawn(random.Random(seed), nothing)
+        numbers = itertools.count()
+        self.set_task_factory(
+            lambda loop, coro, **given: _NumberedTask(coro, next(numbers), loop=loop, **given)
+        )
 
     def time(self) -> float:
         """Return the virtual time in s."""

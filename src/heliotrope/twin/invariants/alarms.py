@@ -53,7 +53,12 @@ MISLED = {
 }  # fmt: skip
 #: Alarms that say that mirrors did what nobody ordered, or not what was: their only cause is
 #: a fault that has ended no longer ago than this, s. A new program goes on with earlier ones.
-UNORDERED = {"counts_doubtful": 60.0, "nodes_unacknowledged": 90.0, "resume_needed": 60.0}
+UNORDERED = {
+    "counts_doubtful": 60.0, "flux_after_emergency": 90.0, "nodes_unacknowledged": 90.0,
+    "resume_needed": 60.0,
+}  # fmt: skip
+#: The alarm of which the only cause is that a person has called an emergency.
+CALLED = "operator_emergency"
 RECALLED_WITHIN = 5.0
 #: The alarm that the records cannot be written.
 UNWRITTEN = "database_unwritable"
@@ -104,6 +109,7 @@ class AlarmObserver:
         self._well = dict.fromkeys(boards, inf)
         self._off: dict[str, float] = {}
         self._faulty: dict[str, float] = {}
+        self._called = False
 
     def _check(self, good: bool, now: float, subject: str, saw: str, number: int = 16) -> None:
         self.checks[number] += 1
@@ -125,6 +131,11 @@ class AlarmObserver:
             self._new.append(alarm)
         else:
             self._active.pop(key, None)
+            self._called &= alarm.condition != CALLED
+
+    def called(self) -> None:
+        """Note that a person has called an emergency."""
+        self._called = True
 
     def ended(self) -> None:
         """Note that the plant's program has ended, and its alarms with it."""
@@ -197,9 +208,13 @@ class AlarmObserver:
         self._check(subject in rests, now, subject, f"{saw}: there is no {subject!r}")
         sense = len(alarm.text) > len(kind) and not _NONSENSE.search(alarm.text)
         self._check(sense, now, subject, f"{saw}: that says nothing")
+        recalled = now - self._began_at <= RECALLED_WITHIN
+        if kind == CALLED and self._alone:
+            nobody = f"{saw}: nobody has called one since the last was over"
+            self._check(self._called or recalled, now, subject, nobody, L2)
         if kind in UNORDERED and self._works:
-            calm, began = now - rests[""], now - self._began_at
-            good = calm <= UNORDERED[kind] or began <= RECALLED_WITHIN
+            calm = now - rests[""]
+            good = calm <= UNORDERED[kind] or recalled
             own = f"nothing has failed for {calm:.0f} s; its cause is the plant's own act"
             self._check(good, now, subject, f"{saw}: {own}", L2)
         if kind in self._by_faults:

@@ -50,6 +50,9 @@ REPORTS = 5
 _HEARD = 1.5
 #: Half angle of the largest search of the simulated persons, rad.
 _SEARCH = 8e-3
+#: Error of the beams of which the plant file is wrong, until they are calibrated, rad: twice that
+#: of their mirrors.
+UNSURVEYED = 45e-3
 #: States in which a beam is sent to a point.
 _LIT = {states.TRACKING: "aims", states.SEARCHING: "aims", states.IDLE: "standbys"}
 _ON = (states.TRACKING, states.SEARCHING)
@@ -177,7 +180,7 @@ class BeamObserver:
         None: only persons command.
     unsurveyed
         Heliostats of which the plant file says something else than is true: until they are
-        calibrated, their beams are not where they are sent, and nobody can know.
+        calibrated, their beams are beside where they are sent, by no more than this makes.
 
     Attributes
     ----------
@@ -357,8 +360,7 @@ class BeamObserver:
             if mirror.state < 0:
                 mirror.astray_since = mirror.lit_since = mirror.inside_since = None
                 continue
-            if mirror.name not in self._unsurveyed:
-                self._placed(mirror, sun, now)
+            self._placed(mirror, sun, now)
             self._dark(mirror, sun, now)
         if self._most is None:
             self._loss(on, now)
@@ -424,6 +426,8 @@ class BeamObserver:
         slack = ASTRAY
         if mirror.state == states.SEARCHING:
             slack += _SEARCH * 150.0
+        if mirror.name in self._unsurveyed:
+            slack += UNSURVEYED * 150.0
         miss = min(
             (mirror.board.miss(sun, (p[0], p[1], p[2])) for p in points), default=float("inf")
         )

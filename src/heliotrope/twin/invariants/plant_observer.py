@@ -24,8 +24,9 @@ from heliotrope.twin.records import RecordsDisk
 #: A status waits up to a second, may be in transit for another, and ages are rounded: a value may
 #: be shown this much younger than it is, s.
 YOUNGER = 2.2
-#: A record that may follow its command is there within this, s.
-RECORD_WITHIN = 2.0
+#: A record that may follow its command is there within this, s; the plant's own order waits for
+#: its turn no longer than this, s: with a mirror every two seconds the field has joined before.
+RECORD_WITHIN, TURN_WITHIN = 2.0, 60.0
 #: An order to turn away that is repeated within this is the same one, s.
 MOMENT = 0.3
 #: How long a cluster may accept a void token: until the last lease with it has arrived and has
@@ -57,6 +58,9 @@ _OPERATORS = (
     "SEARCH",
 )  # fmt: skip
 _JOINING = ("TRACK", "REFOCUS", "SEARCH")
+#: Commands that move a heliostat or hold it, and those that leave it to whoever has it.
+_MOTIONS = ("APPROACH", "IDLE", "LOCK", *_JOINING)
+_SETTINGS = ("LOCK_AIM", "ROUGH")
 
 
 class PlantObserver:
@@ -99,16 +103,20 @@ class PlantObserver:
         self._accounts = {a.name: a for each in clusters for a in each.accounts}
         self._holder: tuple[Person, int, float] | None = None
         self._granted_at = self._visited_at = float("-inf")
+        self._from_nobody = False  # nobody had the authority when the holder took it
         #: When a command that was refused for other reasons may have renewed the authority.
         self._perhaps = float("-inf")
         self._accepted: Counter[tuple[str, str]] = Counter()
         self._recorded: Counter[tuple[str, str]] = Counter()
         self._looked = 0  # records already counted
         self._obeyed: dict[str, float] = {}
+        self._taken: dict[str, float] = {}  # what the holder has commanded, and since when
+        self._aimed: dict[str, float] = {}
         self._noted_at: dict[tuple[str, str], float] = {}
         self._following: dict[str, float] = {}  # tickets whose record may follow
         self._awaited: dict[str, tuple[float, str, str]] = {}  # tickets accepted on a slow disk
-        self._own: dict[str, float] = {}  # the plant's own records without a message yet
+        #: The plant's own records without a message yet: since when, and when they last waited.
+        self._own: dict[str, tuple[float, float]] = {}
         self._sent: set[str] = set()
         self._posted: deque[tuple[float, int]] = deque(maxlen=400)
         self._joined: deque[tuple[float, int]] = deque(maxlen=400)
@@ -150,6 +158,7 @@ class PlantObserver:
         if self._holder is not None:
             self._void(self._holder[1], now)
         self._holder, self._perhaps = None, float("-inf")
+        self._taken.clear()
 
     def _void(self, token: int, now: float) -> None:
         self.old[token] = now
@@ -171,6 +180,7 @@ class PlantObserver:
             self._end(now)
         self.check(4, good, now, saw)
         self._holder, self._granted_at = (person, token, now), now
+        self._from_nobody = before is None
 
     def kept(self, now: float) -> None:
         """Note that the holder has renewed it."""
@@ -209,7 +219,8 @@ class PlantObserver:
             self.gave_way(now)
         elif token not in self.old and token != 0:
             just, visited = now - self._granted_at, now - self._visited_at
-            if holder is not None and just <= _AT_ONCE and visited <= 2.0 * _AT_ONCE:
+            own = self._from_nobody and just <= _AT_ONCE and visited <= 2.0 * _AT_ONCE
+            if holder is not None and own:
                 self.old[token] = now  # a visit went on with it while nobody had it, just before
                 return
             if self._by_itself():
@@ -258,6 +269,10 @@ class PlantObserver:
         else:
             self._awaited[ticket.identity] = now, person.name, what
         self._accepted[person.name, what] += 1
+        if what not in _SETTINGS:
+            for name in ticket.heliostats:
+                if name not in ticket.refusals:
+                    self._taken.setdefault(name, now)
         self._count(now)
 
     def refused(self, person: Person, token: int, what: str, reason: str, now: float) -> None:
@@ -324,8 +339,8 @@ class PlantObserver:
 
     # -- messages --------------------------------------------------------------------------
 
-    def posted(self, members: int, message: Message, now: float) -> None:
-        """Judge a message before it goes to a cluster with a number of heliostats."""
+    def posted(self, members: Sequence[str], message: Message, now: float) -> None:
+        """Judge a message before it goes to a cluster with some heliostats."""
         if self._automatic and isinstance(message, Lease | Command | Parameters):
             self._leased(message.token, now)
         if not isinstance(message, Command | Parameters | Emergency):
@@ -341,9 +356,34 @@ class PlantObserver:
         record = self._disk.records.get(identity)
         good = record is not None and record.what == what
         self.check(11, good, now, f"{what} {message.identity} is sent before its record is kept")
-        if isinstance(message, Command) and what in _JOINING:
-            self._posted.append((now, len(message.heliostats) or members))
+        if not isinstance(message, Command):
+            return
+        whom = message.heliostats or members
+        if what == "AIM":
+            self._aimed.update(dict.fromkeys(whom, now))
+        if what in _MOTIONS and record is not None and record.who.endswith(AUTOMATIC.name):
+            self._spares_taken(what, whom, now)
+        if what in _JOINING:
+            self._posted.append((now, len(whom)))
             self._bounded(self._posted, 0.0, now, f"are sent {what}")
+
+    def _spares_taken(self, what: str, heliostats: Sequence[str], now: float) -> None:
+        """Check that automatic control moves no heliostat that the holder has commanded.
+
+        Its visits go on beside a person's command, with the other heliostats. What was on its way
+        when the person commanded may still leave.
+        """
+        holder = self._live(now)
+        if holder is None or holder[0] == AUTOMATIC:
+            return
+        for name in heliostats:
+            passed = now - self._taken.get(name, now)
+            saw = f"automatic control sends {name} {what}; {holder[0].name} took it {passed:.1f} s"
+            self.check(4, passed <= _AT_ONCE, now, f"{saw} ago")
+
+    def aimed(self, name: str) -> float:
+        """Return when an aim was last sent to a heliostat, s; -inf if never."""
+        return self._aimed.get(name, float("-inf"))
 
     def _bounded(
         self, joined: "deque[tuple[float, int]]", slack: float, now: float, how: str
@@ -400,7 +440,12 @@ class PlantObserver:
             self._visited_at = now
         # A beam that goes back to its aim on the receiver waits for its turn to join.
         waits = {ticket.identity for ticket in plant.orders if not ticket.sent}
-        self._own.update(dict.fromkeys(self._own.keys() & waits, now))
+        # That it does is the plant's word, and believed for as long as turns may take.
+        for identity in self._own.keys() & waits:
+            since = self._own[identity][0]
+            saw = f"record {identity} has waited for its turn for {now - since:.0f} s"
+            self.check(11, now - since <= TURN_WITHIN, now, saw)
+            self._own[identity] = since, now
         well_since = max(self._disk.well_since, self._stood_at)
         if now - well_since > RECORD_WITHIN and not (self._disk.full or self._disk.busy(now)):
             self._complete(now)
@@ -415,7 +460,7 @@ class PlantObserver:
                 continue  # it tells nobody; `posted` wants a record of all that it sends
             if record.who in _OWN:
                 if record.identity not in self._sent:
-                    self._own[record.identity] = now
+                    self._own[record.identity] = now, now
                 continue
             key = (record.who, record.what)
             self._recorded[key] += 1
@@ -442,7 +487,7 @@ class PlantObserver:
                 del self._following[identity]
                 good = identity in self._disk.records
                 self.check(11, good, now, f"order {identity} has no record {now - at:.1f} s later")
-        for identity, at in list(self._own.items()):
+        for identity, (_, at) in list(self._own.items()):
             if now - max(at, self._hung_at) > RECORD_WITHIN:
                 del self._own[identity]
                 # A command that waited too long for the disk is given up; its record says so.

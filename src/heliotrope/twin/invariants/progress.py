@@ -229,7 +229,9 @@ class ProgressObserver:
                 self._within(key, lights, now, LEFT_WITHIN, name, saw)
         busy = {run.target for run in running}
         results = operations.calibration().results
-        failed = {entry.heliostat for entry in results if not entry.good}
+        # After a failure it rests for longer than a day of "days"; one taken out has not failed.
+        whole = (e for e in results if e.outcome is not CalibrationOutcome.TAKEN_OUT)
+        failed = {entry.heliostat for entry in whole if not entry.good}
         limit = TOGETHER_WITHIN if self._together else IDLE_WITHIN
         for name in self._boards:
             up = self._boards[name].state in (states.IDLE, states.TRACKING)

@@ -75,6 +75,7 @@ class _Account:
     before: Mechanism | None = None
     vain: int = 0  # visits in a row that brought nothing
     searched: int = 0  # visits in a row in which no beam was found by a search
+    typed: bool = False  # a person has set parameters, which the plant will believe
 
 
 class ResultObserver:
@@ -140,6 +141,11 @@ class ResultObserver:
         for name in heliostats:
             self._accounts[name].vain = self._accounts[name].searched = 0
 
+    def typed(self, heliostats: Sequence[str]) -> None:
+        """Note that a person has set parameters: the next version may be theirs, no visit's."""
+        for name in heliostats:
+            self._accounts[name].typed = True
+
     def look(self, operations: Operations | None, now: float) -> None:
         """Judge what is new since the last look; None: the plant's program does not run."""
         if operations is None:
@@ -165,6 +171,10 @@ class ResultObserver:
         account, beliefs = self._accounts[name], operations.plant.beliefs
         record, seen = beliefs.record(name), beliefs.seen(name)
         count, version = 0 if seen is None else len(seen), 0 if record is None else record.version
+        if account.typed and version != account.version and record is not None and not count:
+            account.typed, account.kept = False, 0
+            account.version, account.before = version, beliefs.present(name)
+            account.last, account.told = 0, version
         if begins:
             # Sightings come back with the calibration that they led to.
             saw = f"a new program knows calibration {version}, that before it {account.version}"

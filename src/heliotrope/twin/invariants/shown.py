@@ -239,7 +239,8 @@ class ShownObserver:
         before = self._places.get(name)
         if before is None or before[0] != place or not calm:
             self._places[name] = before = place, now
-        if not calm or now - max(since, before[1]) < SETTLED:
+        aimed = self._plant.aimed(name)  # two looks may miss an aim that is taken back at once
+        if not calm or now - max(since, before[1], aimed) < SETTLED:
             return
         works = state in (states.TRACKING, states.SEARCHING)
         saw = f"{states.STATES[state]}, and its beam is shown on {place or 'nothing'}"

@@ -101,6 +101,8 @@ class VisitObserver:
                 self._believed(board, record, plant.beliefs.nominal(name)[0], sun, now)
             seen = plant.beliefs.seen(name)
             known = self._kept.get(name, 0)
+            if seen is None or len(seen.sightings) < known:
+                self._kept[name] = known = 0  # a person's parameters stand on none
             if seen is not None and len(seen.sightings) > known:
                 self._kept[name] = len(seen.sightings)
                 new = seen.sightings.take(np.arange(known, len(seen.sightings)))

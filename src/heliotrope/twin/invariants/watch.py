@@ -53,6 +53,11 @@ class Watch:
         """Note that a person wants heliostats calibrated now."""
         self.results.asked(heliostats)
 
+    def typed(self, heliostats: Sequence[str]) -> None:
+        """Note that a person has set parameters of heliostats."""
+        self.taken(heliostats)
+        self.results.typed(heliostats)
+
     def emergency(self, *, on: bool) -> None:
         """Note that a person has raised an emergency, or that it was cleared."""
         self.progress.emergency(on=on)

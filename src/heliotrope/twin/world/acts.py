@@ -7,14 +7,17 @@ see `shift` and `crew`.
 import asyncio
 import contextlib
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
+from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.operations import Operations
 from heliotrope.plant.operations.automatic import AUTOMATIC
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act
+from heliotrope.twin.boards.outfit import RECEIVER, STANDBY
+from heliotrope.twin.invariants.alarms import CALLED
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.watch import Watch
@@ -26,6 +29,8 @@ Commanding = Callable[[Operations, Person, int], None]
 #: Time until the clusters have a new token, and in which a command is done that only changes a
 #: setting, s.
 _DONE = 4.0
+#: Noise of a parameter that a person has measured, rad; and of points that persons choose, m.
+_MEASURED, _BESIDE = 3e-4, 0.5
 #: Least time on duty, s.
 _LEAST_DUTY = 2.0
 
@@ -41,8 +46,8 @@ class Acts:
         Its persons' means: clears what latches, raises emergencies.
     observer, beams, watch
         Told of each act.
-    names
-        The heliostats.
+    truth
+        True imperfections of each heliostat, rad, by name and parameter.
     clock
         True time.
     seed
@@ -51,7 +56,7 @@ class Acts:
     Attributes
     ----------
     names
-        As given.
+        The heliostats.
     chance
         Source of all that is drawn.
     """
@@ -63,13 +68,13 @@ class Acts:
         observer: PlantObserver,
         beams: BeamObserver,
         watch: Watch,
-        names: Sequence[str],
+        truth: Mapping[str, Mapping[str, float]],
         clock: Clock,
         seed: int,
     ) -> None:
         self._work, self._operator = work, operator
         self._observer, self._beams, self._watch = observer, beams, watch
-        self.names, self._clock = tuple(names), clock
+        self.names, self._truth, self._clock = tuple(truth), truth, clock
         self.chance = random.Random(f"shift {seed}")
         self._left: set[str] = set()  # what a person keeps from automatic control
         self._locked: dict[str, str] = {}  # who has locked each heliostat
@@ -92,10 +97,12 @@ class Acts:
 
     def tidies(self, operations: Operations) -> None:
         """Clear what latches, let automatic control go on, and give it the field."""
-        self._operator.clear(operations.plant)
-        if operations.plant.emergency_on:
+        taken = self._operator.clear(operations.plant)
+        holds = operations.plant.emergency_on
+        if CALLED in taken or not holds:
+            self._watch.emergency(on=False)
+        if holds:
             return
-        self._watch.emergency(on=False)
         if operations.automatic.waits:
             self._beams.released(self.now())
             operations.resume(ENGINEER)
@@ -222,11 +229,42 @@ class Acts:
         ticket = operations.aim_at(person, token, names, where)
         self.accepted(person, token, ticket, "AIM")
 
+    def points(
+        self, operations: Operations, person: Person, token: int, names: Sequence[str]
+    ) -> None:
+        """Set other standby points of some heliostats, or other aims on the receiver."""
+        what = self.chance.choice(("STANDBY", "AIM"))
+        gives, about = {
+            "STANDBY": (operations.standby, STANDBY),
+            "AIM": (operations.aim, RECEIVER),
+        }[what]
+        chosen = {
+            name: tuple(x + self.chance.uniform(-_BESIDE, _BESIDE) for x in about) for name in names
+        }
+        self._watch.taken(names)
+        self.accepted(person, token, gives(person, token, chosen), what)
+
+    def parameters(self, operations: Operations, person: Person, token: int) -> None:
+        """Set a parameter of one heliostat to what was measured at the mirror.
+
+        The reason that is given with it confirms a large change, as the plant demands.
+        """
+        name = self.chance.choice(self.names)
+        causes = self._truth[name]
+        which = self.chance.choice(sorted(causes))
+        values = {which: causes[which] + self.chance.gauss(0.0, _MEASURED)}
+        typed = operations.parameters.change
+        try:
+            ticket = typed(person, token, name, values, "measured with an inclinometer")
+        except InputError:
+            return  # beyond what an installation may be, or what it has already
+        self._watch.typed((name,))
+        self.accepted(person, token, ticket, "PARAMETERS")
+
     def accepted(self, person: Person, token: int, ticket: Ticket, what: str) -> None:
         """Report a command that the plant has accepted."""
         some = ticket.heliostats
-        if what != "PARAMETERS":
-            self.acted(f"{what} {some[0]}", person)
+        self.acted(f"{what} {some[0]}", person)
         self._observer.accepted(person, token, ticket, what, self.now())
         if what not in ("ROUGH", "PARAMETERS"):
             self._beams.resumed(some, what, self.now())

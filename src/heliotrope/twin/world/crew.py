@@ -32,8 +32,8 @@ _PAUSE, _PATIENCE = 110.0, 60.0
 _AFTER = 3.0
 #: Pause between two looks at the plant, s.
 _LOOK = 0.5
-#: Longest time on duty, of an emergency, and until somebody looks after the field, s.
-_DUTY, _EMERGENCY, _CARE = 40.0, 40.0, 40.0
+#: Longest time on duty, of an emergency, until somebody looks after the field, and of lunch, s.
+_DUTY, _EMERGENCY, _CARE, _LUNCH = 40.0, 40.0, 40.0, 60.0
 #: Share of the days on which all leave at this share of the day.
 _LEAVE, _LEFT = 0.5, 0.45
 #: Words in the stages of visits for which persons wait; a mirror is locked; and any instant.
@@ -45,7 +45,8 @@ MOMENTS = (
 #: Acts with their weights; see `Crew.acts`.
 WEIGHTS = {
     "duty": 5, "rough": 1, "seizes": 1, "leaves": 1, "off": 3, "hold": 2, "emergency": 2,
-    "calibrate": 3, "together": 1, "receiver": 1, "switch": 1,
+    "calibrate": 3, "together": 1, "receiver": 1, "switch": 1, "parameters": 2, "points": 2,
+    "lunch": 1,
 }  # fmt: skip
 
 
@@ -193,6 +194,11 @@ class Crew:
             await asyncio.sleep(chance.uniform(5.0, _CARE))
             if (later := acts.present()) is not None:
                 acts.switches(later, person, on=True)
+        elif what == "lunch":
+            await self._duty("leaves", operations, person)
+            await asyncio.sleep(chance.uniform(0.0, _LUNCH))
+            if (later := acts.present()) is not None:
+                await self._duty("duty", later, person)
         else:
             await self._duty(what, operations, person)
 
@@ -200,6 +206,10 @@ class Crew:
         """Take the command authority, and command some or all."""
         everybody = what == "rough" and person is ENGINEER
         commands = self._roughens if everybody else self._some
+        if what == "points":
+            commands = self._points
+        elif what == "parameters" and person is ENGINEER:
+            commands = self._acts.parameters
         if person is SCRIPT:
             commands = self._all
         await self._acts.duty(
@@ -219,6 +229,10 @@ class Crew:
     def _all(self, operations: Operations, person: Person, token: int) -> None:
         what = self._chance.choice(["TRACK", "IDLE", "REFOCUS", "APPROACH"])
         self._acts.command(operations, person, token, what, ())
+
+    def _points(self, operations: Operations, person: Person, token: int) -> None:
+        names = self._chance.sample(self._acts.names, self._chance.randint(1, 3))
+        self._acts.points(operations, person, token, names)
 
     def _some(self, operations: Operations, person: Person, token: int) -> None:
         """Command one heliostat, a few, or none: most look only."""

@@ -47,8 +47,10 @@ KINDS_OF_WORLDS = {
     "disk": {"disk_slow": (10, "the disk of the plant's records is slow")},
     "days": {
         "plant_crash": (6, "the plant crashes and restarts later"),
-        "gust": (1, "a gust passes"),
-        "sensor_silent": (1, "a sensor shows nothing"),
+        "cluster_crash": (2, "the cluster crashes and restarts later"),
+        "gust": (2, "a gust passes"),
+        "sensor_silent": (2, "a sensor shows nothing"),
+        "sensor_jumps": (1, "a sensor jumps"),
     },
     "sensors": {
         "sensor_stuck": (3, "a sensor shows its last value for ever"),

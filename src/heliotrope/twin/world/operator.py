@@ -27,6 +27,7 @@ from heliotrope.plant.parameters import TAKES_POSE
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import FLUX_READING, Act, alarms
 from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STANDBY, Outfit
+from heliotrope.twin.invariants.alarms import AlarmObserver
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.plant_observer import VOID_WITHIN, PlantObserver
 from heliotrope.twin.invariants.quiet import QuietObserver
@@ -88,8 +89,8 @@ class Operator:
         Number of actions of each kind.
     refusal
         Why the plant refused last.
-    quiet, tickets
-        Observer that judges whether the reason is true; None: it is not judged. Set by the owner.
+    quiet, tickets, alarms
+        Observers of reasons, tickets and alarms; None: these are not judged. Set by the owner.
     points
         Points last accepted, ENU, m, by command (AIM, STANDBY) and heliostat.
     """
@@ -113,6 +114,7 @@ class Operator:
         self.refusal = ""
         self.quiet: QuietObserver | None = None
         self.tickets: TicketObserver | None = None
+        self.alarms: AlarmObserver | None = None
         self.points: dict[tuple[str, str], Point] = {}
         self._clock, self._observer, self._flux = clock, observer, flux
         self._beams, self._habits = beams, habits
@@ -415,6 +417,8 @@ class Operator:
         self.counts["emergencies"] += 1
         self._beams.taken(self._names)  # after it none is automatic control's
         self._observer.obeyed(who.name, act.name, self._clock.monotonic())
+        if self.alarms is not None:
+            self.alarms.called()
         self._called = True
 
     def _one_safe(self, plant: PlantController) -> None:
@@ -427,10 +431,10 @@ class Operator:
         self._observer.obeyed(VIEWER.name, what, self._clock.monotonic(), ticket.identity)
         return ticket
 
-    def clear(self, plant: PlantController) -> None:
-        """Withdraw an emergency, and acknowledge all that waits for it."""
+    def clear(self, plant: PlantController) -> set[str]:
+        """Withdraw an emergency, and acknowledge all that waits for it; return what was taken."""
         self._end_emergency(plant)
-        self._acknowledge(plant)
+        return self._acknowledge(plant)
 
     def _end_emergency(self, plant: PlantController) -> None:
         if self._called:
@@ -438,8 +442,12 @@ class Operator:
             self._observer.obeyed(self._duty.name, "WITHDRAW", self._clock.monotonic())
             self._called = False
 
-    def _acknowledge(self, plant: PlantController) -> None:
-        """Acknowledge every latched condition; the engineer stands in for the supervisor."""
+    def _acknowledge(self, plant: PlantController) -> set[str]:
+        """Acknowledge every latched condition; return those for which the plant takes it.
+
+        The engineer stands in for the supervisor.
+        """
+        taken: set[str] = set()
         waiting: dict[tuple[str, str], bool] = {}
         for alarm in plant.alarms:
             doubtful = alarm.condition == alarms.COUNTS_DOUBTFUL.name
@@ -452,6 +460,8 @@ class Operator:
                     now = self._clock.monotonic()
                     self._observer.obeyed(ENGINEER.name, "ACKNOWLEDGE", now)
                     self.counts["acknowledgements"] += 1
+                    taken.add(condition)
+        return taken
 
     def _stands_right(self, name: str) -> bool:
         """Look at a mirror whose step counts are in doubt.

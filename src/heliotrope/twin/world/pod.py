@@ -292,7 +292,7 @@ class PlantEar:
         """Judge a message that the plant hands to the link, which waits while it is frozen."""
         if self._ended:
             return
-        self._plant.posted(len(self._addresses), decode(data), now)
+        self._plant.posted(tuple(self._addresses), decode(data), now)
         await self._goes.wait()
 
     async def waits(self) -> None:

@@ -322,6 +322,7 @@ class Simulation:
         )
         self.operator = self._new_operator(fits, scene.keep_outs[0][0])
         self.operator.quiet, self.operator.tickets = self.quiet, self.tickets
+        self.operator.alarms = self.alarms
         self._exits = contextlib.ExitStack()
         self._work = self._new_work() if works(plan.worlds) else None
         self._tour: Tour | None = None
@@ -378,8 +379,9 @@ class Simulation:
         machine, lowest = self._fits[0].machine, self._scene.lowest
         kind = replace(kind, together=together, lowest=lowest, machine=machine)
         work = Work(plan.seed, sight, self._exits, kind)
-        watch, names = self._new_watch(work, together=together), tuple(boards)
-        acts = Acts(work, self.operator, self.observer, self.beams, watch, names, clock, plan.seed)
+        watch = self._new_watch(work, together=together)
+        truth = {name: board.outfit.causes for name, board in boards.items()}
+        acts = Acts(work, self.operator, self.observer, self.beams, watch, truth, clock, plan.seed)
         if DAYS in plan.worlds:
             crew = Crew(acts, self.boards, plan.seconds, rough=self._coarse, planned=plan.acts)
             return Working(work, crew, watch)
