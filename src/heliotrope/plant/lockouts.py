@@ -9,8 +9,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-#: Commands that move nothing: they may be given to a heliostat out of service.
-STILL = frozenset({"LOCK", "LOCK_AIM", "ROUGH", "ZERO", "PARAMETERS"})
+#: Commands that move nothing, now or later: they may be given to a heliostat out of service. ZERO
+#: and PARAMETERS are not among them: the next STOW would go where stow is by then.
+STILL = frozenset({"LOCK", "LOCK_AIM", "ROUGH"})
 
 
 @dataclass(frozen=True)
