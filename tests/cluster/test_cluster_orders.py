@@ -96,6 +96,18 @@ def test_a_command_that_cannot_be_is_refused(command: Command, text: str) -> Non
     run(main)
 
 
+def test_a_command_with_an_unknown_name_reaches_those_that_are_there() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        await field.order("mixed", "TRACK", heliostats=("B7", "A2"))
+        await field.until(lambda: field.states() == ["IDLE", "TRACKING"], 3.0)
+        assert field.plant.stages("mixed", "B7") == [Stage.REFUSED]
+        assert "cluster C1 has no heliostat 'B7'" in field.plant.text("mixed", "B7")
+        await field.until(lambda: Stage.DONE in field.plant.stages("mixed", "A2"), 3.0)
+
+    run(main, "IDLE")
+
+
 def test_without_a_lease_nobody_may_command() -> None:
     async def main(field: Field) -> None:
         field.plant.token = 0

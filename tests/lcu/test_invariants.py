@@ -233,7 +233,7 @@ class Fuzz:
         locked, at_fault = bench.state == "LOCKED", bench.controller.fault
         bench.start(bench.flash)
         assert max(map(abs, bench.slip)) <= bench.journal.stride * 8
-        assert bench.state in ("STOWED", "DEFOCUSED", "LOCKED", "FAULT")
+        assert bench.state in ("STOWED", "STOWING", "DEFOCUSED", "LOCKED", "FAULT")
         assert not locked or bench.state == "LOCKED"
         if at_fault and not locked:
             assert bench.state == "FAULT"

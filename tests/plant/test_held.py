@@ -12,7 +12,7 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.assigned import HELD, AssignedFile, Points
 from heliotrope.plant.authority import Person, Role
-from heliotrope.plant.lockouts import Lockout
+from heliotrope.plant.lockouts import Kind, Lockout
 from heliotrope.plant.locks import CERTAIN
 from support.plant_bench import OPERATOR, Bench, running
 
@@ -202,7 +202,7 @@ def test_one_that_is_out_of_service_is_opened_at_stow(store: AssignedFile, flags
         kept.append(await locked_by_a_visit(bench))
 
     async def after(bench: Bench) -> None:
-        bench.plant.out_of_service[NAME] = Lockout(NAME, "Vera", "a new motor", 0.0)
+        bench.plant.lockouts.put([Lockout(Kind.HELIOSTAT, NAME, "Vera", "a new motor", 0.0)])
         token = await bench.commanded()
         for _ in range(20):
             await bench.wait(1.0)

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from zlib import crc32
 
+import numpy as np
 import pytest
 
 from heliotrope.field.example import example_plant
@@ -100,6 +101,41 @@ def test_exchanged_addresses_are_named_and_neither_is_moved_or_written(
     run_virtual(main)
 
 
+def test_a_heliostat_that_its_cluster_does_not_list_is_named_and_not_moved(tmp_path: Path) -> None:
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path)
+        correct(bench)
+        plant, cluster = bench.plant, bench.cluster_of("P5A")
+        place = cluster.names.index("P5B")
+        whole = cluster.names, cluster.rows, cluster.age_ms
+        async with running(bench):
+            token = await bench.commanded(ENGINEER)
+            await bench.wait(3.0)
+            kind = alarms.UNLISTED.name
+            assert not [a for a in plant.alarms if a.condition == kind]
+            # The cluster is restarted with an older file.
+            cluster.deaf.add("P5B")
+            cluster.names = tuple(name for name in cluster.names if name != "P5B")
+            cluster.rows = np.delete(cluster.rows, place)
+            cluster.age_ms = np.delete(cluster.age_ms, place)
+            cluster.first = True
+            await bench.wait(2.0)
+            (alarm,) = [a for a in plant.alarms if a.condition == kind]
+            assert (alarm.subject, alarm.active) == ("P5B", True)
+            assert f"cluster {cluster.name} does not list it" in alarm.text
+            with pytest.raises(RefusedError, match=r"APPROACH P5B.*does not list it"):
+                plant.command(ENGINEER, token, "APPROACH", ("P5B",))
+            cluster.names, cluster.rows, cluster.age_ms = whole
+            cluster.deaf.clear()
+            cluster.first = True
+            await bench.wait(2.0)
+            last = [a for a in plant.alarms if a.condition == kind][-1]
+            assert (last.subject, last.active) == ("P5B", False)
+            assert plant.command(ENGINEER, token, "APPROACH", ("P5B",))
+
+    run_virtual(main)
+
+
 def test_both_of_an_exchanged_pair_are_stowed_until_that_is_seen(tmp_path: Path) -> None:
     async def main(clock: VirtualClock) -> None:
         bench = Bench(clock, tmp_path)
@@ -129,6 +165,7 @@ def test_both_of_an_exchanged_pair_are_stowed_until_that_is_seen(tmp_path: Path)
             assert "P5B" not in {n for m in cluster.commands("REFOCUS") for n in m.heliostats}
             assert waits.finished
             cluster.deaf.clear()
+            cluster.first = True
             assert state[row] == states.TRACKING
             await bench.until(lambda: bool(state[row] == states.STOWED), 70.0)
             await bench.wait(15.0)

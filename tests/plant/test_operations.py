@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import math
+import struct
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
@@ -423,6 +424,11 @@ def test_a_heliostat_out_of_service_is_moved_by_nobody() -> None:
                 shown.command(ENGINEER, token, command, (name,), values)
         with pytest.raises(RefusedError, match="out of service: washing"):
             shown.aim_at(ENGINEER, token, (name,), "left")
+        # Nor is anything written by which the next STOW would go elsewhere.
+        with pytest.raises(RefusedError, match=f"ZERO {name}: out of service: washing"):
+            plant.plant.zero(ENGINEER, token, name, (0, 0))
+        with pytest.raises(RefusedError, match=f"PARAMETERS {name}: out of service: washing"):
+            plant.plant.parameters(ENGINEER, token, name, {"stow": struct.pack("<ii", 9, 9)})
         assert _states(plant) == ["STOWED", "IDLE", "IDLE", "IDLE"]
         # What is safe passes.
         for safe in (shown.defocus, shown.stow):

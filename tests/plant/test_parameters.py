@@ -1,5 +1,6 @@
 """Parameters pass the same proofs as motions: where, how far, and never beside what is wanted."""
 
+import struct
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,8 @@ from heliotrope.mechanism.tracking import track
 from heliotrope.plant.audit import read
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.beam_watch import BeamError
-from support.plant_bench import ENGINEER, Bench, running
+from heliotrope.plant.lockouts import Kind, Lockout
+from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 NAME, OTHER = "P1A", "P2A"
 Scene = Callable[[Bench, int], Awaitable[None]]
@@ -120,6 +122,29 @@ def test_nothing_moves_beside_what_is_wanted(tmp_path: Path) -> None:
             plant.command(ENGINEER, token, "TRACK", (NAME,))
 
     play(tmp_path, scene, wanted=wanted)
+
+
+def test_nothing_is_written_to_a_heliostat_out_of_service(tmp_path: Path) -> None:
+    """A corrected stow position would move the mirror at the next STOW, with somebody at it."""
+
+    async def scene(bench: Bench, token: int) -> None:
+        plant, cluster = bench.plant, bench.cluster_of(NAME)
+        cluster.stored[NAME] = dict(plant.wanted.items[NAME]) | {"stow": bytes(8)}
+        cluster.set(states.LOCKED, NAME)
+        plant.lockouts.put([Lockout(Kind.HELIOSTAT, NAME, OPERATOR.name, "washing", 0.0)])
+        cluster.taken.clear()
+        plant.wanted.set(NAME, {"stow": struct.pack("<ii", 5, 6)})
+        plant.want(NAME, bench.design[NAME].calibrated)
+        for _ in range(80):
+            plant.authority.keep(ENGINEER, token)
+            await bench.wait(1.0)
+        assert plant.wanted.missing[NAME]
+        assert not cluster.of(Parameters)
+        plant.lockouts.remove(Kind.HELIOSTAT, NAME, OPERATOR.name)
+        await bench.wait(35.0)
+        assert {message.heliostat for message in cluster.of(Parameters)} == {NAME}
+
+    play(tmp_path, scene, wanted=Wanted({NAME: items(NAME)}))
 
 
 def test_one_that_does_not_answer_is_asked_again_now_and_then(tmp_path: Path) -> None:

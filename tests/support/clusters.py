@@ -200,6 +200,7 @@ class Field:
         kept: Kept | None = None,
         line: Callable[[], bool] | None = None,
         bus_keys: KeyRing | None = None,
+        begun: bool = False,
         **changes: Any,
     ) -> None:
         self.clock = clock
@@ -230,6 +231,11 @@ class Field:
             line=line,
             bus_keys=bus_keys,
         )
+        if begun:
+            # The cluster goes on: the DEFOCUS of its start is over.
+            first = self.cluster._work._emergencies
+            first._orders.clear()
+            first.pressing = False
 
     async def _tick(self) -> None:
         while True:
@@ -330,7 +336,7 @@ def run(
     boards, start = boards_in(state) if state else (settings.pop("boards", None), LATER)
 
     async def live(clock: VirtualClock) -> Field:
-        field = Field(clock, boards=boards, seed=seed, **settings)
+        field = Field(clock, boards=boards, seed=seed, begun=bool(state), **settings)
         async with field.alive():
             await main(field)
         return field

@@ -266,12 +266,13 @@ class Bench:
         self.journal.zero = self.declare  # type: ignore[method-assign]
         self.check()
 
-    def declare(self, *counts: int) -> None:
+    def declare(self, primary: int, secondary: int, doubts: int = 0) -> None:
         """ZERO: the motors stand where they stood, under other counts."""
+        counts = primary, secondary
         slip = zip(self.slip, self.made, counts, strict=True)
         self.slip = [s + m - c for s, m, c in slip]
         self.made = list(counts)
-        Journal.zero(self.journal, *counts)
+        Journal.zero(self.journal, primary, secondary, doubts)
 
     def read_tilt(self) -> tuple[float, float] | None:
         """The accelerometer."""

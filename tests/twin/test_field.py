@@ -305,6 +305,52 @@ def test_gears_faults_locks_and_supplies_are_those_of_the_boards() -> None:
     assert both.compared > 0.5 * COUNT * both.ticks
 
 
+def standing_at_the_receiver() -> Both:
+    both = Both()
+    both.run(2)
+    both.order("AIM", *RECEIVER)
+    both.order("APPROACH")
+    both.run(70)
+    both.order("TRACK")
+    both.run(12)
+    assert both.states() == {"TRACKING"}
+    return both
+
+
+def test_a_lock_does_not_end_what_takes_beams_off_as_on_the_boards() -> None:
+    both = standing_at_the_receiver()
+    both.order("DEFOCUS", rows=(0,))
+    both.order("STOW", rows=(1, 2))
+    both.run(0.5)
+    both.order("LOCK")
+    both.order("UNLOCK")  # busy
+    both.run(3)
+    assert both.states() == {"LOCKED"}
+    both.order("DEFOCUS", rows=(2,))  # from its way back
+    both.run(1)
+    both.run(100)
+    assert both.field.at_stow().all()
+    both.order("UNLOCK")
+    both.run(1)
+    assert both.states() == {"STOWED"}
+
+
+def test_supplies_that_fail_again_and_again_turn_a_beam_away_once_as_on_the_boards() -> None:
+    both = standing_at_the_receiver()
+    both.order("DEFOCUS", rows=(0, 1))
+    both.order("LOCK", rows=(2,))
+    both.run(15, sun=False)  # the locked one turns away in silence
+    stands = both.field.axes["count"].copy()
+    for warned in (False, True, True, False, True):
+        both.cut(0, 1, 2, warned=warned)
+        both.run(0.5, sun=False)
+        both.restore(0, 1, 2)
+        both.run(9, sun=False)
+        assert (both.field.axes["count"] == stands).all()
+    both.run(90, sun=False)
+    assert both.field.at_stow().all()
+
+
 def test_flux_follows_the_beams() -> None:
     rng = np.random.default_rng(2)
     place = np.c_[rng.uniform(-60, 60, 200), rng.uniform(60, 200, 200), np.zeros(200)]

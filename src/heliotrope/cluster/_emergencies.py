@@ -1,7 +1,8 @@
 """DEFOCUS and STOW: broadcast three times, then confirmed by each heliostat.
 
 They come from anyone or from the safety table. Nothing else goes on the bus before them. A
-heliostat that has not acknowledged is named, and asked again each second until it has.
+heliostat that has not acknowledged is named, and asked again each second until it has. The first
+is the cluster's own: a DEFOCUS of whatever is on the bus, which nobody needs to acknowledge.
 """
 
 from collections import deque
@@ -65,10 +66,11 @@ class Emergencies:
     ) -> None:
         self._nodes, self._exchange = nodes, exchange
         self._goals, self._reports, self._clock = goals, reports, clock
-        self._orders: list[_Order] = []
+        # Mirrors may be up, and one that is missing in the cluster's file hears nothing else.
+        self._orders = [_Order("", "DEFOCUS", [], True, clock())]
         self._serving = 0.0
         self._asked: set[tuple[str, int]] = set()
-        self.pressing = False
+        self.pressing = True
 
     def begin(self, identity: str, name: str, nodes: list[ClusterNode]) -> None:
         """Take an emergency for some heliostats or all; a repeated one counts once."""

@@ -257,21 +257,29 @@ class Nodes:
     def __getitem__(self, index: int) -> ClusterNode:
         return self._nodes[index]
 
-    def chosen(self, wanted: Iterable[str]) -> list[ClusterNode]:
-        """Return heliostats by name, all if none is named.
+    def named(self, name: str) -> ClusterNode:
+        """Return a heliostat by name.
 
         Raises
         ------
         OrderRefusedError
             A name that does not belong to this cluster.
         """
-        found = []
-        for name in dict.fromkeys(wanted):
-            node = self._by_name.get(name)
-            if node is None:
-                raise OrderRefusedError(f"cluster {self._cluster} has no heliostat {name!r}")
-            found.append(node)
-        return found or list(self._nodes)
+        node = self._by_name.get(name)
+        if node is None:
+            raise OrderRefusedError(f"cluster {self._cluster} has no heliostat {name!r}")
+        return node
+
+    def chosen(self, wanted: Iterable[str]) -> tuple[list[ClusterNode], dict[str, str]]:
+        """Return heliostats by name, all if none is named, and the refusals of unknown names."""
+        names = dict.fromkeys(wanted)
+        found, refused = list[ClusterNode](), dict[str, str]()
+        for name in names:
+            try:
+                found.append(self.named(name))
+            except OrderRefusedError as refusal:
+                refused[name] = str(refusal)
+        return (found if names else list(self._nodes)), refused
 
     def rows(self, now: float) -> bytes:
         """Return a row of `messages.NODE` for each, at a monotonic time."""

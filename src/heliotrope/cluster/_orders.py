@@ -151,14 +151,13 @@ class Orders:
 
     # -- accepting -------------------------------------------------------------------------
 
-    def accept(self, command: Command) -> None:
-        """Take a command, or refuse it."""
+    def accept(self, command: Command, nodes: list[ClusterNode]) -> None:
+        """Take a command for some of its heliostats, or refuse it."""
         try:
-            nodes = self._nodes.chosen(command.heliostats)
             steps = self._steps_of(command, nodes)
             self._may(command.token, command.lifetime, len(nodes))
         except OrderRefusedError as refusal:
-            for name in command.heliostats or ("",):
+            for name in [node.name for node in nodes] if command.heliostats else ("",):
                 self._reports.add(command.identity, Stage.REFUSED, name, str(refusal))
             return
         now = self._clock()
@@ -218,7 +217,7 @@ class Orders:
     def accept_parameters(self, message: Parameters) -> None:
         """Take items for the journal of a heliostat, or refuse them."""
         try:
-            (node,) = self._nodes.chosen((message.heliostat,))
+            node = self._nodes.named(message.heliostat)
             steps = _steps_of_items(node, message)
             self._may(message.token, message.lifetime, 1)
         except OrderRefusedError as refusal:

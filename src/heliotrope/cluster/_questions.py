@@ -122,7 +122,7 @@ class Questions:
 
     def _take_stored(self, ask: Ask) -> None:
         try:
-            (node,) = self._nodes.chosen((ask.heliostat,))
+            node = self._nodes.named(ask.heliostat)
         except OrderRefusedError as refusal:
             self._error(ask, str(refusal))
         else:

@@ -1,11 +1,9 @@
 """Work for the bus: emergencies first, then commands and parameters, then questions."""
 
-from collections.abc import Sequence
-
 from heliotrope.cluster._emergencies import NAMES, Emergencies
 from heliotrope.cluster._epoch import Epoch
 from heliotrope.cluster._exchange import Exchange
-from heliotrope.cluster._nodes import Nodes, OrderRefusedError
+from heliotrope.cluster._nodes import ClusterNode, Nodes
 from heliotrope.cluster._orders import Orders
 from heliotrope.cluster._questions import Questions
 from heliotrope.cluster._reports import Reports
@@ -32,24 +30,30 @@ class Work:
     def take(self, message: Emergency | Command | Parameters | Ask) -> None:
         """Take an order or a question of the plant."""
         if isinstance(message, Emergency):
-            self._take_emergency(message.identity, message.name, message.heliostats)
+            self._take_named(message)
         elif isinstance(message, Parameters):
             self._orders.accept_parameters(message)
         elif isinstance(message, Ask):
             self._questions.take(message)
-        elif message.name in NAMES:
-            self._take_emergency(message.identity, message.name, message.heliostats)
         else:
-            self._orders.accept(message)
+            self._take_named(message)
 
-    def _take_emergency(self, identity: str, name: str, heliostats: Sequence[str]) -> None:
-        try:
-            if name not in NAMES:
-                raise OrderRefusedError(f"{name!r} is not an emergency; give DEFOCUS or STOW")
-            nodes = self._nodes.chosen(heliostats)
-        except OrderRefusedError as refusal:
-            self._reports.add(identity, Stage.REFUSED, text=str(refusal))
+    def _take_named(self, message: Emergency | Command) -> None:
+        """Take an order for the heliostats that are here; the others are named in a refusal."""
+        nodes, unknown = self._nodes.chosen(message.heliostats)
+        for name, refusal in unknown.items():
+            self._reports.add(message.identity, Stage.REFUSED, name, refusal)
+        if not nodes:
             return
+        if message.name in NAMES:
+            self._take_emergency(message.identity, message.name, nodes)
+        elif isinstance(message, Command):
+            self._orders.accept(message, nodes)
+        else:
+            refusal = f"{message.name!r} is not an emergency; give DEFOCUS or STOW"
+            self._reports.add(message.identity, Stage.REFUSED, text=refusal)
+
+    def _take_emergency(self, identity: str, name: str, nodes: list[ClusterNode]) -> None:
         self._orders.cancel(nodes, name, f"{name} came before it")
         self._emergencies.begin(identity, name, nodes)
         self._exchange.interrupt()

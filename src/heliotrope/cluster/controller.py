@@ -8,8 +8,8 @@ plant; a third talks to it and may wait for it.
 
 The field is safe when left alone: the sun is sent only while the plant's lease (and the autonomy
 it grants) lasts, the time is sound, and no row of the safety table demands otherwise (`_watch`).
-Without the sun every local controller defocuses by itself. At a start nothing moves: the cluster
-waits for a lease, and then for a command.
+Without the sun every local controller defocuses by itself. At a start the cluster broadcasts
+DEFOCUS, since it does not know what is up; then it waits for a lease, and for a command.
 
 ::
 

@@ -11,8 +11,8 @@ STORE         items by name: for ``Journal.store``
 RECALL        item number: answer STORED from the journal
 BEFORE_STEPS  counts now (2) and after (2): ``Journal.before_steps``, before the segments are played
 AT_REST       counts (2): ``Journal.at_rest``
-NOTE          state, aim as bytes or None: ``Journal.note``
-ZEROED        counts (2): ``Journal.zero``
+NOTE          state with marks, aim as bytes or None, goals or (): ``Journal.note``
+ZEROED        counts (2), doubts: ``Journal.zero``
 FEED          the watchdog may be fed
 DRIVERS       on: switch the motors' drivers on, before segments, or off
 """
@@ -21,10 +21,11 @@ import struct
 
 from . import messages, states, ticks
 from .config import Config, is_place
-from .journal import ITEMS, items_of
+from .journal import ITEMS, MOST, STATE, TURNING, items_of
 from .lease import Clock, SunLease
 from .motion import (
     APPROACH,
+    DEFOCUS,
     DIAGNOSE,
     HOLD,
     MOVE,
@@ -75,12 +76,9 @@ HARMLESS = (
 )
 POSE = (states.UNCONFIGURED, states.STOWED, states.LOCKED, states.FAULT)
 MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT)
-STATES_OF = {
-    "SET_ARMATURE": POSE, "SET_BIAS": POSE, "SET_POSITION": HARMLESS,
-    "SET_DEFOCUS": HARMLESS, "SET_DRIVES": MACHINE, "SET_LIMITS": MACHINE,
-    "SET_STOW": MACHINE, "SET_WAY": MACHINE, "SET_STEPPING": MACHINE, "ZERO": MACHINE,
-    "SET_ADDRESS": HARMLESS,
-}  # fmt: skip
+#: Messages of class KEY that set neither the pose nor the machine, and those that set the pose.
+HARMLESS_SETS = ("SET_POSITION", "SET_DEFOCUS", "SET_ADDRESS")
+POSE_SETS = ("SET_ARMATURE", "SET_BIAS")
 
 #: States that hold a position for as long as the cluster is heard.
 HELD = (states.LOCKED, states.UNCONFIGURED)
@@ -88,6 +86,8 @@ HELD = (states.LOCKED, states.UNCONFIGURED)
 #: Motions that need the sun. The watchdog resets a board that is in one of them, or in a state that
 #: needs it, for longer than this (ms) beyond the lease: its program no longer does what it should.
 FOLLOWS, LATE_MS = (STANDBY, TRACK, SEARCH, APPROACH, RETURN), 1000
+#: Marks of the journal beside the state: locked at stow; turned away; on the way to stow.
+PARKED, TURNED, STOWS = 0x10, 0x20, 0x80
 #: A clock that changes by more than this (ms) has jumped.
 CLOCK_JUMP_MS = 2000
 MOST_STEPS = 1 << 29
@@ -140,6 +140,7 @@ class Controller:
         self._clock_jumped = self._ticks_jumped = False
         self._moving = False
         self._powered = True
+        self._marked = -1  # state and marks in the journal
 
     # Start.
 
@@ -152,13 +153,18 @@ class Controller:
         aim: "bytes | None",
         boots: int,
         looping: bool,
+        goals: "tuple[int, ...]" = (),
     ) -> "list[tuple[Any, ...]]":
-        """Start from the journal: ``primary, secondary, doubt, state, aim, boots, looping`` of
-        ``Journal``, whose items are in the configuration already.
+        """Start from the journal: ``primary, secondary, doubt, state, aim, boots, looping, goals``
+        of ``Journal``, whose items are in the configuration already.
         """  # noqa: D205 - the names are the summary
         self.out.clear()
         motion = self.motion
         motion.declare(primary, secondary, doubt >= 0)
+        motion.parked = state & PARKED != 0
+        if goals or state & TURNED:
+            motion.aside = goals
+        stows, state = state & STOWS, state & STATE
         self._doubtful = doubt != 0
         self.boots = boots
         if aim is not None:
@@ -173,7 +179,8 @@ class Controller:
             self.fault = BOOTS if looping else COUNTS
         elif state == states.FAULT:
             self.fault = LATCHED
-        if looping or state in (states.STOWED, states.FAULT):
+        rested = state in (states.STOWED, states.FAULT)
+        if looping or rested:
             motion.blind = 0  # it was not on the receiver, or has turned away before
         if state == states.LOCKED:
             self._event("BOOT_LOCKED")
@@ -181,7 +188,9 @@ class Controller:
             self._event("BOOT_FAULT")
         else:
             self._event("BOOT_STOWED" if motion.at_stow() else "BOOT_AWAY")
-        if state in (states.STOWED, states.FAULT) and not looping:
+        if stows and motion.known and self.state != states.LOCKED:
+            self._event("SILENT")
+        if rested and not looping:
             motion.blind = 1
         return self.out
 
@@ -217,7 +226,7 @@ class Controller:
         """Pass expired time limits to the state table."""
         state, kind = self.state, self.motion.kind
         idle = state == states.IDLE
-        follows = (idle and kind == STANDBY) or (state == states.STOWING and kind == RETURN)
+        follows = kind == RETURN or (idle and kind == STANDBY)
         if (idle and silent) or (not fresh and (follows or state in states.NEED_SUN)):
             self._event("LAPSED")
         elif state == states.DEFOCUSED:
@@ -233,7 +242,7 @@ class Controller:
         supply may be falling.
         """
         motion = self.motion
-        if motion.at_stow() or motion.kind == STOW:
+        if motion.parked or motion.at_stow() or motion.leaving():
             return
         if dark and motion.known and self.config.fits():
             self._event("SILENT")
@@ -273,6 +282,7 @@ class Controller:
             if motion.may_rest(elapsed) == self._powered:
                 self._powered = not self._powered
                 self.out.insert(place, (DRIVERS, self._powered))
+        self._mark()
         self._sunless_ms = min(self._sunless_ms + elapsed, 1_000_000)
         needs_sun = self.state in states.NEED_SUN or motion.kind in FOLLOWS
         if not needs_sun or self._sunless_ms <= self.config.lease_ms + LATE_MS:
@@ -291,14 +301,30 @@ class Controller:
             getattr(self.motion, found[1])()
         if self.state in (states.DEFOCUSED, states.FAULT) and before != self.state:
             self._dark.start(self._seen, self.config.stow_wait_ms)
-        if self.state != before:
-            self._note()
+        self._mark()
         return True
+
+    def _mark(self) -> None:
+        """Note in the journal what must outlast a reset, if it has changed."""
+        motion = self.motion
+        if motion.kind not in (HOLD, DEFOCUS):
+            motion.aside = None
+        motion.parked = self.state == states.LOCKED and (motion.parked or motion.at_stow())
+        marks = self.state
+        if motion.parked:
+            marks |= PARKED
+        elif motion.kind == STOW:
+            marks |= STOWS
+        elif motion.aside is not None:
+            marks |= TURNING if motion.aside else TURNED
+        if marks != self._marked:
+            self._marked = marks
+            self._note()
 
     def _note(self) -> None:
         aim = self.motion.aim
         data = None if aim is None else struct.pack("<fff", aim[0], aim[1], aim[2])
-        self.out.append((NOTE, self.state, data))
+        self.out.append((NOTE, self._marked, data, self.motion.aside or ()))
 
     def on_fault(self, number: int, now_ms: int, halt: bool) -> "list[tuple[Any, ...]]":
         """Latch a fault that the caller has found; ``halt`` stops the motors at once.
@@ -414,6 +440,8 @@ class Controller:
             if who != messages.ASK or self.gate is None or not self.gate.keyed():
                 # Anybody can ask a question: where frames are signed, it holds no mirror in place.
                 self._heard.start(now_ms, self.config.silence_ms)
+                if self.motion.kind == HOLD and self.state != states.FAULT:
+                    self.motion.aside = None  # it may be held for long, and the sun goes on
             if who == messages.ASK:
                 if reply or name == "DISCOVER":  # if all answered at once, none was understood
                     self._answer(name, values)
@@ -511,7 +539,7 @@ class Controller:
             return messages.REFUSED_SWITCH
         motion = self.motion
         if name in ("UNLOCK", "CLEAR_FAULT"):
-            return self._release(name)
+            return messages.BUSY if motion.leaving() else self._release(name)
         if states.transition(self.state, name) is None:
             return messages.REFUSED_STATE
         if motion.kind == DIAGNOSE and name not in ("LOCK", "IDLE"):
@@ -609,11 +637,16 @@ class Controller:
 
     def _set(self, name: str, values: "tuple[Any, ...]", payload: bytes) -> int:
         """Take a setting, in a safe state and at rest; return the result for ACK."""
-        allowed = STATES_OF.get(name)
-        if allowed is None or self.state not in allowed:
+        allowed: tuple[int, ...] = MACHINE
+        if name in HARMLESS_SETS:
+            allowed = HARMLESS
+        elif name in POSE_SETS:
+            allowed = POSE
+        if self.state not in allowed:
             return messages.REFUSED_STATE
         motion, config = self.motion, self.config
-        if allowed is not HARMLESS and (motion.following() or not motion.still()):
+        moves = motion.following() or motion.leaving() or not motion.still()
+        if allowed is not HARMLESS and moves:
             return messages.REFUSED_STATE
         if name == "ZERO":
             if max(abs(values[0]), abs(values[1])) > MOST_STEPS:
@@ -621,7 +654,7 @@ class Controller:
             motion.hold()
             motion.declare(values[0], values[1], True)
             self._doubtful, motion.ready = False, False
-            self.out.append((ZEROED, values[0], values[1]))
+            self.out.append((ZEROED, values[0], values[1], 0))
             self.out.append((STORE, items_of(name, payload)))
             return messages.DONE
         if name == "SET_ADDRESS" and values[0] != config.serial:
@@ -630,6 +663,7 @@ class Controller:
             items = items_of(name, payload)
         except ValueError:
             return messages.BAD_VALUE
+        known = motion.known
         for item in items:
             if item != "edition" and not config.take(item, items[item]):
                 return messages.BAD_VALUE
@@ -637,6 +671,10 @@ class Controller:
             motion.hold()  # a defocused mirror does not go on with the sun from another pose
         if name != "SET_ADDRESS":
             motion.rebuild()
+        if known and not motion.known:
+            self._doubtful = True
+            self.out.append((ZEROED, motion.place(0), motion.place(1), MOST))
+            self._latch(COUNTS)
         self.out.append((STORE, items))
         if self.state == states.UNCONFIGURED and config.complete():
             self._event("CONFIGURED")

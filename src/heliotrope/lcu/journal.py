@@ -21,6 +21,9 @@ farther than ``STRIDE`` from the counts in flash, a record "moving" is written; 
 ``doubt`` says so until ``zero``, and adds up over further cuts. A brown-out detector that calls
 ``brown_out`` prevents that.
 
+**Marks.** The byte of the state holds marks of the controller beside the state. While one of them,
+``TURNING``, is there, a record of ``GOALS`` holds the goals of the motion in place of the counts.
+
 The storage is injected::
 
     block_size, blocks      bytes of a block, number of blocks: two, and two or more for the ring
@@ -102,6 +105,8 @@ RING_RECORD = "<Iii12sBBH"
 RING_SIZE = 32
 FIRST_RING_BLOCK = 2
 BLANK = b"\xff" * RING_SIZE
+#: Of the byte of the state: the state itself; a motion is under way to the goals; a record of them.
+STATE, TURNING, GOALS = 0x0F, 0x40, 0x0F
 REST, AIM = 0x80, 0x40  # flags; the lower bits: three of doubts, three of boots
 
 #: Greatest distance of the true step counts from those in flash, steps.
@@ -177,7 +182,9 @@ class Journal:
         How often the counts may have gone wrong by up to ``stride``; 7 for 7 times or more, and
         where there was no record of counts at all.
     state
-        State of the newest record.
+        State of the newest record, with the controller's marks.
+    goals
+        Goals of the motion that it was in, as step counts, or ().
     aim
         Aim of the newest record as bytes (three ``f``), or None.
     boots
@@ -204,6 +211,7 @@ class Journal:
         self.rest = True
         self.doubts = MOST
         self.state = 0
+        self.goals: tuple[int, ...] = ()
         self.aim: bytes | None = None
         self.boots = 0
         self.unhealthy = 0
@@ -363,17 +371,17 @@ class Journal:
         self._advance()
         return self._write(primary, secondary, True)
 
-    def zero(self, primary: int, secondary: int) -> None:
-        """Declare the present counts: no doubt is left."""
-        self.doubts = 0
+    def zero(self, primary: int, secondary: int, doubts: int = 0) -> None:
+        """Declare the present counts: no doubt is left; with ``MOST``, nothing is known of them."""
+        self.doubts = doubts
         self._append(primary, secondary, True)
 
-    def note(self, state: int, aim: "bytes | None") -> None:
-        """Record state and aim: a new state at once, a new aim with the next record."""
+    def note(self, state: int, aim: "bytes | None", goals: "tuple[int, ...]" = ()) -> None:
+        """Record state, aim and goals: a new state at once, a new aim with the next record."""
         if aim is not None and len(aim) != 12:
             raise ValueError(f"journal: {len(aim)} bytes for an aim, 12 needed")
         changed = state != self.state
-        self.state, self.aim = state, aim
+        self.state, self.aim, self.goals = state, aim, goals
         if changed:
             self._append(self.primary, self.secondary, self.rest)
 
@@ -386,21 +394,27 @@ class Journal:
         return block + 1 if block + 1 < self._storage.blocks else FIRST_RING_BLOCK
 
     def _load_ring(self) -> None:
-        newest = None
+        held: list[bytes | None] = [None, None]  # the newest records, of counts and of goals
+        counters = [0, 0]
         for block in range(FIRST_RING_BLOCK, self._storage.blocks):
             for place in range(self._places):
                 data = self._storage.read(self._offset(block, place), RING_SIZE)
                 if data == BLANK or struct.unpack("<I", data[28:])[0] != crc32(data[:28]):
                     continue
                 counter = struct.unpack("<I", data[:4])[0]
-                if newest is None or _newer(counter, self._counter):
-                    newest = data
-                    self._counter, self._block = counter, block
+                kind = int(data[24] == GOALS)
+                if held[kind] is None or _newer(counter, counters[kind]):
+                    held[kind], counters[kind] = data, counter
+                    if held[1 - kind] is None or _newer(counter, counters[1 - kind]):
+                        self._counter, self._block = counter, block
+        newest, goals = held
         if newest is None:
             return
         _, self.primary, self.secondary, aim, self.state, flags, self.boots = struct.unpack(
             RING_RECORD, newest[:28]
         )
+        if goals is not None and self.state & TURNING:
+            self.goals = struct.unpack("<ii", goals[4:12])
         self._newest = self._block
         self.aim = aim if flags & AIM else None
         self.doubts, self.unhealthy = flags >> 3 & MOST, flags & MOST
@@ -426,6 +440,11 @@ class Journal:
             self._next_ready = False
 
     def _append(self, primary: int, secondary: int, rest: bool) -> None:
+        if self.goals:
+            # Near every record, so that no erasure leaves one without the other.
+            goals, state, self.goals, self.state = self.goals, self.state, (), GOALS
+            self._append(goals[0], goals[1], rest)
+            self.goals, self.state = goals, state
         for _ in range(self._places):
             if self._place >= self._places and not self._next_ready:
                 self._erase_next()

@@ -34,6 +34,8 @@ PIECE = 0.1
 #: A way back on which an axis would have to turn by more than this (rad) to the next point is left:
 #: such a turn, in the keyhole or the long way about a stop, carries the beam far off the line.
 FAR = 1.6
+#: An armature that stands farther than this (m) from the one before belongs to another mirror.
+ELSEWHERE = 0.5
 #: Time that the spiral rests on a point, ms.
 DWELL_MS = 2000
 #: Rough stepping waits for this many steps, where a full step is not known.
@@ -66,6 +68,12 @@ class Motion:
         Whether the standby point was reached by the safe way since stow was left.
     known
         Whether the step counts are known.
+    parked
+        Whether the mirror was locked at stow: neither DEFOCUS nor STOW moves it, wherever the stow
+        position is by now.
+    aside
+        Goals of the defocus that has begun, as step counts; () once it has ended, and the mirror
+        stands beside its aim or moves with the sun; None: another motion has begun since.
     blind
         Way (1, -1) in which a mirror with unknown counts may turn away; 0: it has done so.
     cut, unreachable
@@ -85,7 +93,8 @@ class Motion:
         self.stepper: Stepper | None = None
         self.kind = HOLD
         self.aim: tuple[float, float, float] | None = None
-        self.ready = self.known = self.cut = self.unreachable = False
+        self.ready = self.known = self.cut = self.unreachable = self.parked = False
+        self.aside: tuple[int, ...] | None = None
         self.rough = 0
         self.blind, self._turns = 1, 0
         self.diagnosis: tuple[Any, ...] = (0, 0, 0, 0.0, 0.0)
@@ -103,13 +112,21 @@ class Motion:
         self._diagnosis: Diagnosis | None = None
         self._home = [0, 0]
         self._rests, self._resting_ms = False, 0
+        self._origin: tuple[float, float, float] | None = None
         self.rebuild()
 
     # The axes.
 
     def rebuild(self) -> None:
-        """Apply the settings; new limits only at rest."""
+        """Apply the settings; new limits only at rest.
+
+        The counts of one mirror say nothing about another one, where its board is now.
+        """
         config = self.config
+        if config.pointing is not None:
+            origin, self._origin = self._origin, config.pointing.origin
+            if origin is None or norm(minus(origin, self._origin)) > ELSEWHERE:
+                self.known = self.ready = False
         if config.rests != self._rests:
             self._rests = config.rests
             self.set_rough(ROUGH_STEPS if config.rests else 0)
@@ -132,7 +149,7 @@ class Motion:
     def declare(self, primary: int, secondary: int, known: bool) -> None:
         """Declare the present step counts; only at rest."""
         self.counts[0], self.counts[1] = primary, secondary
-        self.known, self.blind = known, 1
+        self.known, self.blind, self.aside = known, 1, None
         if self.stepper is not None:
             for axis, count in zip(self.stepper.axes, self.counts):  # noqa: B905
                 axis.count = axis.goal = axis.leg = count
@@ -164,6 +181,10 @@ class Motion:
             and self.place(0) == stow[0]
             and self.place(1) == stow[1]
         )
+
+    def leaving(self) -> bool:
+        """Whether a motion is under way that takes the beam off: a defocus, or one to stow."""
+        return self.kind in (STOW, RETURN) or (self.kind == DEFOCUS and bool(self.aside))
 
     def may_rest(self, elapsed_ms: int) -> bool:
         """Whether the drivers may be off: full steps hold without current.
@@ -313,13 +334,33 @@ class Motion:
         if self.stepper is not None:
             self.stepper.stop()
 
+    def lock(self) -> None:
+        """Stand still, a motion that takes the beam off excepted: it goes on to its end."""
+        if self.leaving():
+            self._base = HOLD
+        else:
+            self.hold()
+
     def defocus(self) -> None:
-        """Turn away from the present position; where the counts are unknown, once, by as much."""
+        """Turn away from the present position; where the counts are unknown, once, by as much.
+
+        A turn that an emergency stop or a reset has interrupted goes on to the same goals.
+        """
         if self.kind in (DEFOCUS, STOW):
             return
+        if self.kind == RETURN:  # locked on its way to stow
+            self.kind = HOLD
+            self.stow_directly()
+            return
         # At stow an approach may have begun that has not made its first step.
-        if self.at_stow() or self.stepper is None or None in self.config.drives:
+        still = self.parked or self.at_stow()
+        if still or self.stepper is None or None in self.config.drives:
             self.hold()
+            return
+        if self.known and self.aside is not None:
+            self._base, self.kind = HOLD, DEFOCUS
+            if self.aside:
+                self.stepper.go(self.aside[0], self.aside[1], BOTH)
             return
         sense = 1
         if not self.known:
@@ -345,6 +386,7 @@ class Motion:
             # The other way is twice as far: past the place where the first turn began.
             angles[i] = away if sense > 0 else 3.0 * here - 2.0 * away
         self._go_angles(angles if found is None else found.angles, BOTH)
+        self.aside = (self.goal(0), self.goal(1)) if self.known else None
 
     def stow(self) -> None:
         """Return by the way of the approach, as far as the sun allows, and go to stow."""
@@ -375,6 +417,8 @@ class Motion:
     def stow_directly(self) -> None:
         """Go to stow at once, azimuth last."""
         self.ready = False
+        if self.parked:
+            return
         stow = self.config.stow
         if not self.known or self.stepper is None or stow is None or not self.config.fits():
             self.defocus()  # stow cannot be found, but the beam can go
@@ -541,6 +585,8 @@ class Motion:
             return "ARRIVED"
         if kind in (APPROACH, RETURN):
             return self._on_path()
+        if kind == DEFOCUS and self.aside and self.still():
+            self.aside = ()
         if kind == DIAGNOSE:
             self._diagnose(elapsed_ms)
         if kind == SEARCH:

@@ -9,7 +9,7 @@ SAFE, COMMAND, INTERNAL = range(3)
 EVENTS = {
     "DEFOCUS": (SAFE, "beams off the receiver, now"),
     "STOW": (SAFE, "go to stow; where it or the counts are unknown, turn away"),
-    "LOCK": (COMMAND, "stop and hold position"),
+    "LOCK": (COMMAND, "stop and hold position; what takes the beam off is finished first"),
     "APPROACH": (COMMAND, "leave stow for standby"),
     "IDLE": (COMMAND, "go to standby; where none was reached yet, hold (refused: DEFOCUSED)"),
     "TRACK": (COMMAND, "track the sun onto the aim"),
@@ -39,6 +39,7 @@ EVENTS = {
 #: Motion: meaning.
 MOTIONS = {
     "hold": "slow down and stop",
+    "lock": "finish a turn away or the motion to stow; otherwise slow down and stop",
     "defocus": "turn away by the defocus angles, without needing the sun",
     "stow": "back by the way of the approach, then to stow, azimuth last",
     "stow_directly": "to stow at once: elevation first, azimuth last",

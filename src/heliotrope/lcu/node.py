@@ -158,6 +158,7 @@ class Node:
             journal.aim,
             journal.boots,
             journal.looping,
+            journal.goals,
         )
         self._obey(actions, now_ms)
         if self.trouble or not good:
@@ -300,11 +301,11 @@ class Node:
             elif kind == controller.AT_REST:
                 journal.at_rest(action[1], action[2])
             elif kind == controller.NOTE:
-                journal.note(action[1], action[2])
+                journal.note(action[1], action[2], action[3])
             elif kind == controller.STORE:
                 journal.store(action[1])
             elif kind == controller.ZEROED:
-                journal.zero(action[1], action[2])
+                journal.zero(action[1], action[2], action[3])
             elif kind == HEALTHY:
                 journal.healthy()
         except OSError as error:

@@ -180,13 +180,16 @@ class Commands:
         numbers = whole(counts, wire.ROW_OF[wire.NUMBER_OF["ZERO"]][3], "ZERO")
         if wrong := self._permission.strange((heliostat,)):
             raise BeamError("ZERO", wrong)
+        self._permission.locked_out("ZERO", (heliostat,))
         ticket = self._permission.accept(person, token, "ZERO", numbers, (heliostat,))
-        self._orders.when_recorded(
-            ticket,
-            lambda _: self._orders.command(
-                ticket, "ZERO", numbers, ticket.waiting((heliostat,)), token
-            ),
-        )
+
+        def send(again: bool) -> None:
+            if again:
+                self._permission.locked_out("ZERO", (heliostat,))
+            left = ticket.waiting((heliostat,))
+            self._orders.command(ticket, "ZERO", numbers, left, token)
+
+        self._orders.when_recorded(ticket, send)
         return ticket
 
     def point(

@@ -199,7 +199,7 @@ class PlantController:
             self._clusters,
             self._tell,
             self._rewriting,
-            self._identities.barred,
+            self._unwritable,
         )
         self._sentinel = self._guarded(table)
         self._given = Given(self.field, points)
@@ -791,7 +791,7 @@ class PlantController:
         """
         row = self.field.place(heliostat)
         self.wanted.check(heliostat, items)
-        if wrong := self._identities.barred((heliostat,)):
+        if wrong := self._unwritable((heliostat,)):
             raise BeamError("PARAMETERS", wrong)
         before, after = self._tables(heliostat, items)
         if POSE_ITEMS.intersection(items):
@@ -851,6 +851,11 @@ class PlantController:
 
     def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
         return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
+
+    def _unwritable(self, heliostats: Sequence[str]) -> dict[str, str]:
+        """Return the heliostats to which nothing may be written, and the reasons."""
+        out = self.lockouts.blocked("PARAMETERS", heliostats)
+        return self._identities.barred(heliostats) | out
 
     def _differing(self, heliostats: Sequence[str]) -> Mapping[str, str]:
         return self._sync.differing(heliostats)

@@ -102,6 +102,8 @@ class FieldState:
     posed, posed_state, posed_at
         Step counts when they were last known, (N, 2), the state then, and that time, (N,): a local
         controller that has lost its counts goes on reporting numbers, which mean nothing.
+    unlisted
+        Heliostats for which their clusters report no row.
     turned
         Whether one that is locked or in FAULT has moved since: it has turned away, and turns no
         further, (N,). One that was locked anew would, which no status shows.
@@ -136,6 +138,7 @@ class FieldState:
         self.failed_at = np.full(len(pairs), -np.inf)
         self.turned = np.zeros(len(pairs), dtype=bool)
         self.status_at = dict.fromkeys(self.clusters, -math.inf)
+        self.unlisted: set[str] = set()
         self._places: dict[str, tuple[tuple[str, ...], npt.NDArray[np.intp]]] = {}
 
     def __len__(self) -> int:
@@ -199,6 +202,9 @@ class FieldState:
     def learn_order(self, cluster: str, names: tuple[str, ...]) -> None:
         """Take the names of a cluster's rows, in order."""
         self._places[cluster] = (names, self._rows_of(cluster, names))
+        members = self.members[cluster]
+        self.unlisted.difference_update(members)
+        self.unlisted.update(set(members).difference(names))
 
     def knows_order(self, cluster: str) -> bool:
         """Whether the names of a cluster's rows are known."""

@@ -62,6 +62,8 @@ class Identities:
         #: Checksums last reported, 0 before; whether they are the heliostat's own.
         self._stored = np.zeros(len(field), dtype=np.uint32)
         self._own = np.zeros(len(field), dtype=np.bool_)
+        #: Heliostats whose alarm says that they have no row.
+        self._unlisted: set[str] = set()
         #: Rows whose checksum is another's.
         self._foreign: set[int] = set()
         self._rows = {
@@ -87,11 +89,22 @@ class Identities:
     def look(self, cluster: str) -> dict[str, str]:
         """Judge the heliostats of a cluster by its status; return those newly found strange."""
         self._judged[cluster] = self._connections(cluster)
+        self._compare_rows(cluster)
         rows = self._rows[cluster]
         stored = self._field.rows["armature_crc"][rows]
         changed = stored != self._stored[rows]
         self._stored[rows] = stored
         return self._judge(rows[changed].tolist())
+
+    def _compare_rows(self, cluster: str) -> None:
+        """Raise the alarm about heliostats for which their cluster reports no row, and end it."""
+        unlisted = self._field.unlisted.intersection(self._field.members[cluster])
+        known = self._unlisted.intersection(self._field.members[cluster])
+        for name in sorted(unlisted - known):
+            self._tell(alarms.UNLISTED.raised(name, cluster=cluster))
+        for name in sorted(known - unlisted):
+            self._tell(alarms.UNLISTED.ended(name, cluster=cluster))
+        self._unlisted = (self._unlisted - known) | unlisted
 
     def _judge(self, changed: list[int]) -> dict[str, str]:
         """Judge rows whose checksum, or its owners, have changed, and with them their pairs."""
@@ -130,6 +143,9 @@ class Identities:
             cluster = field.clusters[field.cluster[row]]
             if name in self.strange:
                 found[name] = self.strange[name]
+                continue
+            if name in field.unlisted:
+                found[name] = refusals.UNLISTED.text.format(cluster=cluster)
                 continue
             judged = self._judged.get(cluster, -1) == self._connections(cluster)
             if not (judged and np.isfinite(field.heard[row])):

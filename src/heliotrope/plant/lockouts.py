@@ -18,8 +18,9 @@ import numpy.typing as npt
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
 
-#: Commands that move nothing: they may be given to a heliostat out of service.
-STILL = frozenset({"LOCK", "LOCK_AIM", "ROUGH", "ZERO", "PARAMETERS"})
+#: Commands that move nothing, now or later: they may be given to a heliostat out of service. ZERO
+#: and PARAMETERS are not among them: the next STOW would go where stow is by then.
+STILL = frozenset({"LOCK", "LOCK_AIM", "ROUGH"})
 #: Name of the tower among what is locked.
 TOWER = "tower"
 #: A beam whose aim is this close to the edge of a locked surface counts as on it, m.

@@ -116,7 +116,7 @@ class ParameterSync:
     proof
         Returns why items may not be written where a heliostat stands, "" if they may.
     barred
-        Returns which heliostats may not be written at all, and why.
+        Returns the heliostats to which nothing may be written, and the reasons.
     """
 
     def __init__(
@@ -199,6 +199,8 @@ class ParameterSync:
 
         def send(again: bool) -> None:
             if again:
+                if reason := self._barred((heliostat,)).get(heliostat):
+                    raise refusals.NOT_NOW.error(what=f"PARAMETERS {heliostat}", reason=reason)
                 self.check(heliostat, items)
             before()
             self._orders.parameters(ticket, heliostat, items, token)

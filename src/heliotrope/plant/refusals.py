@@ -194,6 +194,12 @@ OTHER_PARAMETERS = Refusal(
     "its address answers with the parameters of {other}",
     "Correct the addresses of both. LOCK, DEFOCUS and STOW are still sent.",
 )
+UNLISTED = Refusal(
+    "unlisted",
+    "A heliostat is moved, unlocked or written, and its cluster does not list it.",
+    "its cluster {cluster} does not list it",
+    "Add it to the cluster's file and restart the cluster. EMERGENCY reaches it until then.",
+)
 NOT_HEARD = Refusal(
     "not heard",
     "A heliostat is moved, unlocked or written before its board is known.",

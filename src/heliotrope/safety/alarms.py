@@ -130,6 +130,18 @@ IDENTITY = AlarmKind(
     "mirror that is there.",
     over="{subject}: its own parameters answer again",
 )
+UNLISTED = AlarmKind(
+    "heliostat_unlisted",
+    _PLANT,
+    Severity.ALARM,
+    "A cluster's status has no row for a heliostat of the plant: its file does not list it.",
+    "{subject}: cluster {cluster} does not list it, so nothing shows its state",
+    "Its mirror stays as it is while the cluster sends the sun, and no command by name reaches it. "
+    "DEFOCUS and STOW of the whole cluster do, and so does EMERGENCY, which cannot prove it off.",
+    "Send EMERGENCY if its beam may be out; then add it to the cluster's file and restart the "
+    "cluster.",
+    over="{subject}: cluster {cluster} lists it again",
+)
 SECOND_PLANT = AlarmKind(
     "second_plant",
     _PLANT,

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, bisector, normalize
 from heliotrope.lcu import states
-from heliotrope.lcu.controller import LATCHED, NO_FAULT
+from heliotrope.lcu.controller import LATCHED, NO_FAULT, SUPPLY
 from heliotrope.lcu.lease import RATE_FACTOR, RECENT_MS, UNIT
 from heliotrope.lcu.motion import (
     APPROACH,
@@ -68,6 +68,8 @@ AXIS = np.dtype(
 )
 #: As `lcu.config.Config`.
 LEASE_MS, STOW_WAIT_MS, SLOT_MS, AHEAD_MS = 6000, 30_000, 50, 100
+#: A defocus: none since another motion; under way to its goals; ended (`lcu.motion.Motion.aside`).
+NO_TURN, TURNING, TURNED = range(3)
 #: Time step of a field, ms: at least as often as a board's main loop turns.
 TICK_MS = 50
 
@@ -153,7 +155,10 @@ class Field:
         self._present = np.zeros(count, dtype=np.bool_)
         self._kept = self.state.copy()
         self.kind = np.full(count, HOLD, dtype=np.int8)
+        self._kept_kind = self.kind.copy()
         self._base = np.full(count, HOLD, dtype=np.int8)
+        self._aside = np.full(count, NO_TURN, dtype=np.int8)
+        self._turn_goals = np.zeros((count, 2), dtype=np.int64)
         self.aim = np.full((count, 3), np.nan)
         self._target = np.full((count, 3), np.nan)
         self._ready = np.zeros(count, dtype=np.bool_)
@@ -264,9 +269,15 @@ class Field:
         if not len(rows):
             return
         rows = rows[~among(self.kind[rows], DEFOCUS, STOW)]
+        comes = self.kind[rows] == RETURN  # locked on its way to stow
+        self._stow_directly(rows[comes])
+        rows = rows[~comes]
         home = self.at_stow(rows)
         self._hold(rows[home])
         rows = rows[~home]
+        begun = self._aside[rows] != NO_TURN
+        self._go_on_turning(rows[begun])
+        rows = rows[~begun]
         points, down = self._down(rows)
         lower = np.isfinite(down[:, 0])
         self._sense(rows[~lower])
@@ -278,6 +289,29 @@ class Field:
         angles = self._away(rows, self._angles_at(self.axes["count"][rows], rows))
         angles[lower] = down[lower]
         self._go(rows, angles, np.full(len(rows), kernels.BOTH))
+        self._aside[rows], self._turn_goals[rows] = TURNING, self.axes["goal"][rows]
+
+    def _go_on_turning(self, rows: Rows) -> None:
+        """Go on with turns that a reset or an emergency stop has interrupted."""
+        self.kind[rows], self._base[rows] = DEFOCUS, HOLD
+        rows = rows[self._aside[rows] == TURNING]
+        both = np.full(len(rows), kernels.BOTH)
+        kernels.go_rows(self.axes, self._order, rows, self._turn_goals[rows], both)
+
+    def _leaving(self, rows: Rows) -> Bools:
+        """Return which heliostats make a motion that takes the beam off: `Motion.leaving`."""
+        turns = (self.kind[rows] == DEFOCUS) & (self._aside[rows] == TURNING)
+        return np.asarray(among(self.kind[rows], STOW, RETURN) | turns)
+
+    def _note_motions(self) -> None:
+        """Forget the turns that other motions have replaced: `Controller._mark`."""
+        self._aside[~among(self.kind, HOLD, DEFOCUS)] = NO_TURN
+
+    def _lock_now(self, rows: Rows) -> None:
+        """Stand still, but end first what takes the beam off: `Motion.lock`."""
+        leaving = self._leaving(rows)
+        self._base[rows[leaving]] = HOLD
+        self._hold(rows[~leaving])
 
     def _down(self, rows: Rows) -> tuple[FloatArray, FloatArray]:
         """Return points (M, 3) and angles (M, 2) down the safe way, or NaN: `Motion._turn`."""
@@ -401,6 +435,8 @@ class Field:
     def hear(self, rows: Rows) -> None:
         """Note that heliostats hear their cluster; a position is held only while they do."""
         self._heard[rows] = LEASE_MS
+        held = (self.kind[rows] == HOLD) & (self.state[rows] != states.FAULT)
+        self._aside[rows[held & (self.state[rows] >= 0)]] = NO_TURN
 
     def order(self, name: str, rows: Rows | None = None, aim: npt.ArrayLike | None = None) -> Bools:
         """Give a command; return which heliostats take it, (N,).
@@ -448,6 +484,7 @@ class Field:
             self._target[tracks] = self.aim[tracks]
         else:
             raise InputError(f"field: {name!r} with aim {aim!r}; see Field.order for the commands")
+        self._note_motions()
         taken[chosen] = True
         return taken
 
@@ -465,17 +502,20 @@ class Field:
     def _lock(self, rows: Rows, name: str) -> Rows:
         """LOCK, UNLOCK and CLEAR_FAULT; return which heliostats take it."""
         state = self.state[rows]
+        if name == "LOCK":
+            self._enter(rows, states.LOCKED)
+            self._lock_now(rows)
+            return rows
+        free = ~self._leaving(rows)
         if name == "UNLOCK":
-            rows = rows[state == states.LOCKED]
-        elif name == "CLEAR_FAULT":
-            rows = rows[(state == states.FAULT) & ~self._present[rows]]
+            rows = rows[free & (state == states.LOCKED)]
+        else:
+            rows = rows[free & (state == states.FAULT) & ~self._present[rows]]
             self.fault[rows] = NO_FAULT
         home = np.where(self.at_stow(rows), states.STOWED, states.IDLE)
         after = np.where(self.fault[rows] == NO_FAULT, home, states.FAULT)
-        for to in (
-            (states.LOCKED,) if name == "LOCK" else (states.STOWED, states.IDLE, states.FAULT)
-        ):
-            self._enter(rows if name == "LOCK" else rows[after == to], to)
+        for to in (states.STOWED, states.IDLE, states.FAULT):
+            self._enter(rows[after == to], to)
         self._hold(rows)
         return rows
 
@@ -537,11 +577,13 @@ class Field:
         self._present[rows] = True
         self.fault[rows] = np.where(self.fault[rows] == NO_FAULT, number, self.fault[rows])
         state = self.state[rows]
-        self._hold(rows[among(state, states.STOWED, states.LOCKED)])
+        self._hold(rows[state == states.STOWED])
+        self._lock_now(rows[state == states.LOCKED])
         self._stow_directly(rows[state == states.STOWING])
         away = (states.APPROACHING, states.IDLE, states.TRACKING, states.DEFOCUSED)
         self._turn_away(rows[among(state, *away)])
         self._enter(rows[state != states.LOCKED], states.FAULT)
+        self._note_motions()
 
     def mend(self, rows: Rows) -> None:
         """Remove the causes of faults; the faults themselves stay until CLEAR_FAULT."""
@@ -555,7 +597,8 @@ class Field:
         rows = rows[self.state[rows] >= 0]
         self.edition += 1
         if warned:
-            self._enter(rows[self.state[rows] != states.LOCKED], states.FAULT)
+            self.fail(rows, SUPPLY)
+        self._kept_kind[rows] = self.kind[rows]
         self._kept[rows], self.state[rows] = self.state[rows], -1
         self.kind[rows] = self._base[rows] = HOLD
         self._lease[rows] = self._queued[rows] = self._order[rows] = 0
@@ -568,7 +611,10 @@ class Field:
             self.axes[name][rows] = self.axes["count"][rows]
 
     def restore(self, rows: Rows) -> None:
-        """Restore the power: locked and faulty controllers stay so, the others turn away."""
+        """Restore the power: locked and faulty controllers stay so, the others turn away.
+
+        A turn that had begun goes on, and so does the straight way to stow.
+        """
         rows = rows[self.state[rows] < 0]
         self.edition += 1
         before = self._kept[rows]
@@ -578,9 +624,13 @@ class Field:
         home = self.at_stow(rows) & ~locked & ~faulty
         self._enter(rows[locked], states.LOCKED)
         self._enter(rows[home], states.STOWED)
-        self._turn_away(rows[~home & ~locked])
+        comes = (self._kept_kind[rows] == STOW) & ~home & ~locked
+        self._turn_away(rows[~home & ~locked & ~comes])
         self._enter(rows[faulty], states.FAULT)
         self._enter(rows[~home & ~locked & ~faulty], states.DEFOCUSED)
+        self._stow_directly(rows[comes])
+        self.state[rows[comes & ~faulty]] = states.STOWING
+        self._note_motions()
 
     # -- time ------------------------------------------------------------------------------
 
@@ -613,6 +663,7 @@ class Field:
         self._dark = np.where(renewed, STOW_WAIT_MS, np.maximum(self._dark - TICK_MS, 0))
         self._lapses(fresh, silent, needs)
         self._move()
+        self._note_motions()
         kernels.advance_rows(
             self.axes, self._order, self._queued, self.drives.next(), TICK_MS, SLOT_MS, AHEAD_MS
         )
@@ -621,7 +672,7 @@ class Field:
         """`Controller._lapses`; ``needs``: in a state that needs the sun."""
         dark, latched = self._dark == 0, among(self.state, states.LOCKED, states.FAULT)
         idle = self.state == states.IDLE
-        comes = (self.state == states.STOWING) & (self.kind == RETURN)
+        comes = self.kind == RETURN
         held = latched & (self.kind == HOLD) & ~self._present & ~dark
         lapsed = ~fresh & (needs | comes | (idle & (self.kind == STANDBY)))
         if silent.any():
@@ -634,7 +685,7 @@ class Field:
             self.state[alone] = states.STOWING
         left = np.flatnonzero(latched & dark & (self.kind != STOW))
         if len(left):
-            self._stow_directly(left[~self.at_stow(left)])
+            self._stow_directly(left[~self._leaving(left) & ~self.at_stow(left)])
 
     def _move(self) -> None:
         """`Motion.tick`."""
@@ -645,7 +696,9 @@ class Field:
         arrived = np.flatnonzero((kind == STOW) & self.at_stow())
         self.kind[arrived] = HOLD
         self.state[arrived[self.state[arrived] == states.STOWING]] = states.STOWED
-        on_path = np.flatnonzero(among(kind, APPROACH, RETURN) & self.still())
+        still = self.still()
+        self._aside[(kind == DEFOCUS) & (self._aside == TURNING) & still] = TURNED
+        on_path = np.flatnonzero(among(kind, APPROACH, RETURN) & still)
         if len(on_path):
             self._on_path(on_path)
         due = ~among(kind, STOW, APPROACH, RETURN) & (self._renew <= 0)

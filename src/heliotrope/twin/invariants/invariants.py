@@ -157,7 +157,10 @@ NEAR_FOOT = 6.0
 #: A time that has jumped is no longer used after this, s.
 JUMP_SEEN = 3.0
 #: States that a boot may end in.
-AFTER_BOOT = (states.UNCONFIGURED, states.STOWED, states.DEFOCUSED, states.LOCKED, states.FAULT)
+AFTER_BOOT = (
+    states.UNCONFIGURED, states.STOWED, states.STOWING, states.DEFOCUSED, states.LOCKED,
+    states.FAULT,
+)  # fmt: skip
 #: States that DEFOCUS and STOW always end: the beam is out by command, and no return path may lead
 #: through a keep-out volume.
 ON_THE_WAY = (states.TRACKING, states.SEARCHING, states.APPROACHING, states.IDLE)
