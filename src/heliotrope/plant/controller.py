@@ -53,7 +53,13 @@ from heliotrope.plant.cluster_settings import ClusterSettings
 from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
 from heliotrope.plant.commands import Commands
 from heliotrope.plant.doubts import Doubts
-from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
+from heliotrope.plant.emergency import (
+    EmergencyOrder,
+    EmergencyRecord,
+    PlantReadings,
+    Sentinel,
+    TableWatch,
+)
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.given import Given
 from heliotrope.plant.giving_back import GivingBack
@@ -112,6 +118,8 @@ class PlantController:
         Called with each alarm.
     disk
         Does what waits for a disk; None: it is done in the loop, as virtual time needs it.
+    record
+        Store of the emergency that stands; None: it ends with the program.
 
     Attributes
     ----------
@@ -156,6 +164,7 @@ class PlantController:
         entropy: Callable[[int], bytes] = secrets.token_bytes,
         on_alarm: Callable[[Alarm], None] | None = None,
         disk: Disk | None = None,
+        record: EmergencyRecord | None = None,
     ) -> None:
         members = _checked(design, links, clusters)
         self.design, self.settings = design, settings or PlantSettings()
@@ -199,7 +208,7 @@ class PlantController:
             self._rewriting,
             self._identities.barred,
         )
-        self._sentinel = self._guarded(table)
+        self._sentinel = self._guarded(table, record)
         self._given = Given(self.field, points)
         self._permission = self._permitting()
         self._commands = self._directed()
@@ -224,7 +233,9 @@ class PlantController:
             self._sent,
         )
 
-    def _guarded(self, table: Iterable[Condition] | None) -> Sentinel:
+    def _guarded(
+        self, table: Iterable[Condition] | None, record: EmergencyRecord | None
+    ) -> Sentinel:
         """Return the sentinel, with the plant's own readings of the safety table."""
         if table is None:
             table = limited(conditions(self.settings.autonomy), self.design.safety)
@@ -252,6 +263,7 @@ class PlantController:
             self.beams.drives,
             self.settings.repeat,
             self._identities,
+            record,
         )
 
     def _permitting(self) -> Permission:
