@@ -11,7 +11,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
@@ -22,12 +21,11 @@ from heliotrope.plant.emergency.order import (
     COUNTS_UNKNOWN,
     ON_BEAM,
     EmergencyOrder,
-    at_stow,
     switched_off,
 )
 from heliotrope.plant.emergency.standing import EmergencyRecord, Standing, read_standing
 from heliotrope.plant.emergency.table import TableWatch
-from heliotrope.plant.field_state import FieldState, Mask
+from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.joining import JoinQueue
 from heliotrope.plant.orders import PlantOrders
@@ -285,7 +283,7 @@ class Sentinel:
     ) -> None:
         """Take a cluster's report on a ticket, if it is the order's ticket.
 
-        Where a plant has receivers, a cluster's word that a DEFOCUS is done only acknowledges it:
+        Where a plant has receivers, a cluster's word that the order is done only acknowledges it:
         the beam is off by the step counts of the next status, which show where it went.
         """
         order = self.order
@@ -298,7 +296,7 @@ class Sentinel:
             heliostats = tuple(
                 n for n in heliostats if good[self._field.index[n]] and n not in strange
             )
-            if order.act is Act.DEFOCUS and self._ways.unsent.watches:
+            if self._ways.unsent.watches:
                 stage = Stage.ACKNOWLEDGED
         order.take_stage(heliostats, stage, self._clock.monotonic())
 
@@ -312,6 +310,7 @@ class Sentinel:
         rows = [self._field.index[n] for n in names if not order.is_done(n)]
         if rows:
             index = np.array(rows, dtype=np.intp)
+            lit = self._ways.unsent.lit(index)
             order.take_rows(
                 tuple(self._field.names[r] for r in rows),
                 self._field.rows[index],
@@ -320,9 +319,9 @@ class Sentinel:
                 Drive(self._drives.table[index]),
                 now,
                 np.array([self._field.names[r] in self._identities.strange for r in rows]),
-                self._lit(index),
+                lit,
             )
-        for row in rows:
+        for row, shines in zip(rows, lit if rows else (), strict=True):
             name = self._field.names[row]
             if int(self._field.rows["flags"][row]) & COUNTS_UNKNOWN:
                 order.unknown[name] = self._last_of(row, now)
@@ -333,6 +332,11 @@ class Sentinel:
                 )
             elif not order.is_done(name) and (text := self._identities.strange.get(name)):
                 order.unknown[name] = f"{name}: {text}, so only stow proves that it is off"
+            elif shines:
+                order.unknown[name] = (
+                    f"{name}: it reports {states.STATES[self._field.rows['state'][row]]}, but by "
+                    "its step counts its beam is on a receiver"
+                )
             else:
                 order.unknown.pop(name, None)
 
@@ -342,13 +346,6 @@ class Sentinel:
         back = order.take_back(names, self._field.rows[index], self._field.heard[index])
         if back:
             self.send_safe(_TABLE, order.act, back, "it has come back while an emergency holds")
-
-    def _lit(self, rows: npt.NDArray[np.intp]) -> Mask:
-        """Return which heliostats (K,) are not proven to be off: their beams are on a receiver.
-
-        At stow nothing can take a beam elsewhere, so it counts as off, locked there or not.
-        """
-        return np.asarray(self._ways.unsent.lit(rows) & ~at_stow(self._field.rows[rows]))
 
     def barred(self, heliostats: Iterable[str], condition: str = "") -> dict[str, str]:
         """Return which heliostats one row, or any, keeps from their aims, and why."""
