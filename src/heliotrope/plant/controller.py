@@ -13,6 +13,7 @@ emergency.
 import asyncio
 import math
 import secrets
+import struct
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,6 +28,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.volumes import Volume
 from heliotrope.files.disk import AtOnce, Disk
 from heliotrope.geometry import FloatArray
+from heliotrope.lcu.journal import CODES_OF
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.common_settings import settings_checksum
 from heliotrope.links.link import Link
@@ -206,6 +208,7 @@ class PlantController:
             self._clusters,
             self._tell,
             self._rewriting,
+            self._resting,
             self._identities.barred,
         )
         self._sentinel = self._guarded(table, record)
@@ -788,9 +791,9 @@ class PlantController:
         if wrong := self._identities.barred((heliostat,)):
             raise BeamError("PARAMETERS", wrong)
         before, after = self._tables(heliostat, items)
+        self.authority.check(person, token, "PARAMETERS")
+        self._sync.check(heliostat, items)
         if POSE_ITEMS.intersection(items):
-            self.authority.check(person, token, "PARAMETERS")
-            self._sync.check(heliostat, items)
             change, limit = change_of_beam(before, after, self._aimed(row)), self.settings
             if not confirmed.strip() and change > limit.largest_change:
                 raise refusals.CHANGE_TOO_LARGE.error(
@@ -841,6 +844,16 @@ class PlantController:
 
     def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
         return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
+
+    def _resting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
+        """Return why a heliostat may not rest at the stow position in items, "" if it may."""
+        if "stow" not in items:
+            return ""
+        counts = np.array([struct.unpack(CODES_OF["stow"], items["stow"])], dtype=np.float64)
+        armature, drives = self._tables(heliostat, items)[1]
+        rows = np.array([self.field.place(heliostat)])
+        found = self.beams.standing(rows, counts, (armature[None], drives[None]))
+        return found.get(heliostat, "")
 
     def _differing(self, heliostats: Sequence[str]) -> Mapping[str, str]:
         return self._sync.differing(heliostats)
