@@ -13,6 +13,7 @@ emergency.
 import asyncio
 import math
 import secrets
+import struct
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,6 +28,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.volumes import Volume
 from heliotrope.files.disk import AtOnce, Disk
 from heliotrope.geometry import FloatArray
+from heliotrope.lcu.journal import CODES_OF
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.common_settings import settings_checksum
 from heliotrope.links.link import Link
@@ -53,7 +55,13 @@ from heliotrope.plant.cluster_settings import ClusterSettings
 from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
 from heliotrope.plant.commands import Commands
 from heliotrope.plant.doubts import Doubts
-from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
+from heliotrope.plant.emergency import (
+    EmergencyOrder,
+    EmergencyRecord,
+    PlantReadings,
+    Sentinel,
+    TableWatch,
+)
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.given import Given
 from heliotrope.plant.giving_back import GivingBack
@@ -112,6 +120,8 @@ class PlantController:
         Called with each alarm.
     disk
         Does what waits for a disk; None: it is done in the loop, as virtual time needs it.
+    record
+        Store of the emergency that stands; None: it ends with the program.
 
     Attributes
     ----------
@@ -156,6 +166,7 @@ class PlantController:
         entropy: Callable[[int], bytes] = secrets.token_bytes,
         on_alarm: Callable[[Alarm], None] | None = None,
         disk: Disk | None = None,
+        record: EmergencyRecord | None = None,
     ) -> None:
         members = _checked(design, links, clusters)
         self.design, self.settings = design, settings or PlantSettings()
@@ -197,9 +208,10 @@ class PlantController:
             self._clusters,
             self._tell,
             self._rewriting,
+            self._resting,
             self._identities.barred,
         )
-        self._sentinel = self._guarded(table)
+        self._sentinel = self._guarded(table, record)
         self._given = Given(self.field, points)
         self._permission = self._permitting()
         self._commands = self._directed()
@@ -224,7 +236,9 @@ class PlantController:
             self._sent,
         )
 
-    def _guarded(self, table: Iterable[Condition] | None) -> Sentinel:
+    def _guarded(
+        self, table: Iterable[Condition] | None, record: EmergencyRecord | None
+    ) -> Sentinel:
         """Return the sentinel, with the plant's own readings of the safety table."""
         if table is None:
             table = limited(conditions(self.settings.autonomy), self.design.safety)
@@ -252,6 +266,7 @@ class PlantController:
             self.beams.drives,
             self.settings.repeat,
             self._identities,
+            record,
         )
 
     def _permitting(self) -> Permission:
@@ -776,9 +791,9 @@ class PlantController:
         if wrong := self._identities.barred((heliostat,)):
             raise BeamError("PARAMETERS", wrong)
         before, after = self._tables(heliostat, items)
+        self.authority.check(person, token, "PARAMETERS")
+        self._sync.check(heliostat, items)
         if POSE_ITEMS.intersection(items):
-            self.authority.check(person, token, "PARAMETERS")
-            self._sync.check(heliostat, items)
             change, limit = change_of_beam(before, after, self._aimed(row)), self.settings
             if not confirmed.strip() and change > limit.largest_change:
                 raise refusals.CHANGE_TOO_LARGE.error(
@@ -829,6 +844,16 @@ class PlantController:
 
     def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
         return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
+
+    def _resting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
+        """Return why a heliostat may not rest at the stow position in items, "" if it may."""
+        if "stow" not in items:
+            return ""
+        counts = np.array([struct.unpack(CODES_OF["stow"], items["stow"])], dtype=np.float64)
+        armature, drives = self._tables(heliostat, items)[1]
+        rows = np.array([self.field.place(heliostat)])
+        found = self.beams.standing(rows, counts, (armature[None], drives[None]))
+        return found.get(heliostat, "")
 
     def _differing(self, heliostats: Sequence[str]) -> Mapping[str, str]:
         return self._sync.differing(heliostats)

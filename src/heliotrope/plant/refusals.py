@@ -248,6 +248,13 @@ PARAMETERS_NOT_HERE = Refusal(
     "PARAMETERS {heliostat}: {reason}; stow it first",
     "Stow the heliostat, or lock it at standby, then give the parameters again.",
 )
+STOW_UNPROVEN = Refusal(
+    "stow unproven",
+    "A stow position is given from which the beam would light something at some time of the year.",
+    "PARAMETERS {heliostat}: {reason}",
+    "Choose a stow position that `heliotrope field check` accepts; a mirror that looks to the "
+    "horizon, away from the tower, is one.",
+)
 CHANGE_TOO_LARGE = Refusal(
     "change too large",
     "Parameters would move the beam by more than the limit, and the change is not confirmed.",

@@ -5,11 +5,12 @@ a person orders it. It ends when nothing demands it any more: the causes have go
 acknowledged, and a person's order is withdrawn.
 """
 
+import contextlib
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
@@ -20,21 +21,24 @@ from heliotrope.plant.emergency.order import (
     COUNTS_UNKNOWN,
     ON_BEAM,
     EmergencyOrder,
-    at_stow,
     switched_off,
 )
+from heliotrope.plant.emergency.standing import EmergencyRecord, Standing, read_standing
 from heliotrope.plant.emergency.table import TableWatch
-from heliotrope.plant.field_state import FieldState, Mask
+from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.joining import JoinQueue
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import FLUX_READING, Act, Alarm
+from heliotrope.store.records import StoreError
 
 #: A heliostat that was sent off the receiver shows it within this time, s.
 OFF_SHOWS = 10.0
 #: Longest pause between two orders to one heliostat that does not show them, s.
 LONGEST_PAUSE = 60.0
+#: Pause between two records of a proof that goes on, s.
+_KEEP_PERIOD = 1.0
 #: Name and role of the safety table in a record.
 _TABLE = ("safety table", "plant")
 
@@ -56,6 +60,9 @@ class Sentinel:
         Pause between two repetitions of an order, s.
     identities
         Heliostats that are not what their address says: they must leave, and are done at stow only.
+    record
+        Store of the emergency that stands: the plant begins in one that held when its last program
+        ended. None: it ends with the program.
 
     Attributes
     ----------
@@ -78,10 +85,15 @@ class Sentinel:
         drives: Drive,
         repeat: float,
         identities: Identities,
+        record: EmergencyRecord | None = None,
     ) -> None:
         self.order: EmergencyOrder | None = None
         self.on = False
-        self._called = False
+        self._record, self._kept_at = record, -math.inf
+        self._kept = self._recalled = Standing() if record is None else _recall(record)
+        self._called = self._recalled.called
+        known = {"", *field.names, *field.clusters}
+        table.recall(row for row in self._recalled.rows if row[1] in known)
         self._clock, self.table, self._field = clock, table, field
         self._orders, self._joining, self._ways = orders, joining, ways
         self._drives, self._repeat, self._identities = drives, repeat, identities
@@ -101,6 +113,7 @@ class Sentinel:
         self._obey_field(now)
         self._obey_clusters()
         self._obey_heliostats(now)
+        self._keep(now)
         return news
 
     def _obey_field(self, now: float) -> None:
@@ -109,7 +122,7 @@ class Sentinel:
         # A consequence of an emergency may make it worse, but begins none: it would never end.
         if wanted is not None and wanted >= Act.DEFOCUS and (caused or self.on):
             if not self.on or order is None or wanted > order.act:
-                self._begin(wanted, _TABLE, self.table.reasons(Act.DEFOCUS))
+                self._begin_again(wanted)
             elif now - self._repeated_at >= self._repeat:
                 self._repeat_order(self._field.clusters)
         if not caused:
@@ -161,6 +174,14 @@ class Sentinel:
 
     # -- orders ----------------------------------------------------------------------------
 
+    def _begin_again(self, act: Act) -> None:
+        """Order what the table demands, or go on with the emergency of the program before."""
+        before, self._recalled = self._recalled, Standing()
+        if before.act:
+            self._begin(max(act, Act[before.act]), (before.who, "anybody"), before.continued)
+        else:
+            self._begin(act, _TABLE, self.table.reasons(Act.DEFOCUS))
+
     def _begin(self, act: Act, giver: tuple[str, str], reason: str) -> EmergencyOrder:
         """Order DEFOCUS or STOW of the whole field."""
         now, names = self._clock.monotonic(), self._field.names
@@ -176,13 +197,37 @@ class Sentinel:
         """Order an emergency for a person; it holds until it is withdrawn."""
         self._called = True
         if not self.on or self.order is None or act > self.order.act:
-            return self._begin(act, (who, "anybody"), reason)
-        self._orders.note(who, "anybody", act.name, f"{reason}; it holds already")
-        return self.order
+            order = self._begin(act, (who, "anybody"), reason)
+        else:
+            order = self.order
+            self._orders.note(who, "anybody", act.name, f"{reason}; it holds already")
+        self._keep(order.at)
+        return order
 
     def withdraw(self) -> None:
         """Withdraw a person's order; rows that it tripped still wait to be acknowledged."""
         self._called = False
+        self._keep(self._clock.monotonic())
+
+    def _keep(self, now: float) -> None:
+        """Keep what stands, for the next program; a proof that goes on, once in a while."""
+        if self._record is None or (self._recalled.act and not self.on):
+            return
+        standing = self._standing()
+        changed = replace(standing, unproven=()) != replace(self._kept, unproven=())
+        if standing == self._kept or not (changed or now - self._kept_at >= _KEEP_PERIOD):
+            return
+        with contextlib.suppress(StoreError):  # it is tried again, and the store's alarm says why
+            self._record.keep_emergency(standing.document)
+            self._kept, self._kept_at = standing, now
+
+    def _standing(self) -> Standing:
+        order = self.order if self.on else None
+        rows = self.table.standing()
+        if order is None:
+            return Standing(called=self._called, rows=rows)
+        unproven = tuple(sorted(order.proof.nodes - order.proof.done.keys()))
+        return Standing(order.act.name, order.who, order.reason, self._called, rows, unproven)
 
     def send_safe(
         self,
@@ -238,7 +283,7 @@ class Sentinel:
     ) -> None:
         """Take a cluster's report on a ticket, if it is the order's ticket.
 
-        Where a plant has receivers, a cluster's word that a DEFOCUS is done only acknowledges it:
+        Where a plant has receivers, a cluster's word that the order is done only acknowledges it:
         the beam is off by the step counts of the next status, which show where it went.
         """
         order = self.order
@@ -251,7 +296,7 @@ class Sentinel:
             heliostats = tuple(
                 n for n in heliostats if good[self._field.index[n]] and n not in strange
             )
-            if order.act is Act.DEFOCUS and self._ways.unsent.watches:
+            if self._ways.unsent.watches:
                 stage = Stage.ACKNOWLEDGED
         order.take_stage(heliostats, stage, self._clock.monotonic())
 
@@ -265,6 +310,7 @@ class Sentinel:
         rows = [self._field.index[n] for n in names if not order.is_done(n)]
         if rows:
             index = np.array(rows, dtype=np.intp)
+            lit = self._ways.unsent.lit(index)
             order.take_rows(
                 tuple(self._field.names[r] for r in rows),
                 self._field.rows[index],
@@ -273,9 +319,9 @@ class Sentinel:
                 Drive(self._drives.table[index]),
                 now,
                 np.array([self._field.names[r] in self._identities.strange for r in rows]),
-                self._lit(index),
+                lit,
             )
-        for row in rows:
+        for row, shines in zip(rows, lit if rows else (), strict=True):
             name = self._field.names[row]
             if int(self._field.rows["flags"][row]) & COUNTS_UNKNOWN:
                 order.unknown[name] = self._last_of(row, now)
@@ -286,6 +332,11 @@ class Sentinel:
                 )
             elif not order.is_done(name) and (text := self._identities.strange.get(name)):
                 order.unknown[name] = f"{name}: {text}, so only stow proves that it is off"
+            elif shines:
+                order.unknown[name] = (
+                    f"{name}: it reports {states.STATES[self._field.rows['state'][row]]}, but by "
+                    "its step counts its beam is on a receiver"
+                )
             else:
                 order.unknown.pop(name, None)
 
@@ -295,13 +346,6 @@ class Sentinel:
         back = order.take_back(names, self._field.rows[index], self._field.heard[index])
         if back:
             self.send_safe(_TABLE, order.act, back, "it has come back while an emergency holds")
-
-    def _lit(self, rows: npt.NDArray[np.intp]) -> Mask:
-        """Return which heliostats (K,) are not proven to be off: their beams are on a receiver.
-
-        At stow nothing can take a beam elsewhere, so it counts as off, locked there or not.
-        """
-        return np.asarray(self._ways.unsent.lit(rows) & ~at_stow(self._field.rows[rows]))
 
     def barred(self, heliostats: Iterable[str], condition: str = "") -> dict[str, str]:
         """Return which heliostats one row, or any, keeps from their aims, and why."""
@@ -327,3 +371,12 @@ class Sentinel:
             return f"an emergency holds ({self.order.act.name}: {self.order.reason})"
         texts = (self.table.reasons(Act.REFUSE_NEW, name) for name in sorted(set(clusters)))
         return next((text for text in texts if text), "")
+
+
+def _recall(record: EmergencyRecord) -> Standing:
+    """Return the emergency that stood when the last program ended."""
+    try:
+        document = record.emergency()
+    except StoreError as error:
+        document = str(error)  # no document: it reads as an emergency, which is the safe side
+    return read_standing(document)

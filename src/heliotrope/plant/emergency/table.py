@@ -27,6 +27,7 @@ from heliotrope.safety import (
     evaluate,
     narrowed,
     proof_readings,
+    recalled,
     start,
     watched_by,
 )
@@ -222,6 +223,23 @@ class TableWatch:
                 news.append(Alarm(*key, old.severity, f"{' '.join(key).strip()}: over", False))
         self._told = found
         return news
+
+    def recall(self, rows: Iterable[tuple[str, str]]) -> None:
+        """Take rows, each with its subject, as tripped: they were before a restart."""
+        self._state = recalled(self._state, rows)
+
+    def standing(self) -> tuple[tuple[str, str], ...]:
+        """Return the rows that outlive a restart, each with its subject.
+
+        They hold the beams of the whole field off, or wait to be acknowledged.
+        """
+        latched = {row.name for row in self._state.table if row.latched}
+        off = {
+            (a.condition, a.subject)
+            for a in self.actions
+            if a.scope is Scope.FIELD and a.act >= Act.DEFOCUS
+        }
+        return tuple(key for key in self._state.tripped() if key[0] in latched or key in off)
 
     def acknowledge(self, condition: str, who: str, role: AcknowledgeRole, subject: str) -> str:
         """Acknowledge a row; return why it is refused, "" if it is not."""
