@@ -177,8 +177,12 @@ def test_it_holds_until_withdrawn_and_acknowledged_and_then_nothing_moves(tmp_pa
         assert plant.command(OPERATOR, token, "LOCK", ("P2A",))
         with pytest.raises(RefusedError, match="the cause has not gone"):
             plant.acknowledge(OPERATOR, "operator_emergency")
-        with pytest.raises(RefusedError, match="Vera is viewer"):
+        with pytest.raises(
+            RefusedError, match="Vera has ordered no emergency; it was ordered by O"
+        ):
             plant.withdraw_emergency(VIEWER)
+        with pytest.raises(RefusedError, match="Vera is viewer"):
+            plant.withdraw_emergency(VIEWER, "Olga")
         plant.withdraw_emergency(OPERATOR)
         with pytest.raises(RefusedError, match="Vera is viewer"):
             plant.acknowledge(VIEWER, "operator_emergency")

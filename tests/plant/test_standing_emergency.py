@@ -10,7 +10,7 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency
 from heliotrope.plant.authority import RefusedError
-from heliotrope.plant.emergency import Standing, read_standing
+from heliotrope.plant.emergency import Call, Standing, read_standing
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Act
 from heliotrope.store.keeper import Keeper
@@ -156,7 +156,10 @@ def test_the_store_is_written_when_something_changes_and_again_after_it_failed(
         record.fails = False
         await bench.wait(2.0)
         standing = read_standing(record.document)
-        assert (standing.act, standing.who, standing.called) == ("DEFOCUS", "Olga", True)
+        assert (standing.act, standing.who) == ("DEFOCUS", "Olga")
+        assert [(call.who, call.reason) for call in standing.calls] == [
+            ("Olga", "emergency order of Olga")
+        ]
         assert standing.unproven == ()
         kept = record.kept
         await bench.wait(5.0)
@@ -194,8 +197,11 @@ def test_rows_of_heliostats_that_the_plant_no_longer_has_are_forgotten(tmp_path:
     programs(tmp_path, scene, record=record)
 
 
+CALLS = (Call("Olga", "smoke", "STOW", 12.0), Call("Vera", "a person on the tower", "DEFOCUS", 9.5))
+
+
 def test_a_standing_emergency_reads_as_it_was_kept() -> None:
-    standing = Standing("STOW", "Olga", "smoke", True, (("a", ""), ("b", "P1A")), ("P1A", "P2A"))
+    standing = Standing("STOW", "Olga", "smoke", CALLS, (("a", ""), ("b", "P1A")), ("P1A", "P2A"))
     assert read_standing(standing.document) == standing
     assert read_standing("") == Standing()
     many = Standing("STOW", "Olga", "smoke", unproven=tuple(f"H{i}" for i in range(10)))

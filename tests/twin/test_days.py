@@ -192,7 +192,7 @@ def test_a_persons_emergency_and_what_is_out_of_service_outlive_a_restart() -> N
     waits = SimpleNamespace(waits="an emergency held")
     restarted(plant(), called=False, out=False)
     restarted(plant(automatic=waits), called=True, out=False)
-    restarted(plant(holds=lambda: (SimpleNamespace(heliostat="H1"),)), called=False, out=True)
+    restarted(plant(holds=lambda: (SimpleNamespace(name="H1"),)), called=False, out=True)
     with pytest.raises(InvariantError, match=r"invariant L4 .* the new one goes on"):
         restarted(plant(), called=True, out=False)
     with pytest.raises(InvariantError, match=r"invariant L4 .* back in service: H1"):

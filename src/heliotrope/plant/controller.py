@@ -56,6 +56,7 @@ from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
 from heliotrope.plant.commands import Commands
 from heliotrope.plant.doubts import Doubts
 from heliotrope.plant.emergency import (
+    Call,
     EmergencyOrder,
     EmergencyRecord,
     PlantReadings,
@@ -475,6 +476,11 @@ class PlantController:
         return self._sentinel.order
 
     @property
+    def calls(self) -> tuple[Call, ...]:
+        """The emergency orders of persons that have not been withdrawn, one for each person."""
+        return self._sentinel.calls
+
+    @property
     def emergency_on(self) -> bool:
         """Whether an emergency of the whole field holds."""
         return self._sentinel.on
@@ -545,7 +551,8 @@ class PlantController:
     def raise_emergency(self, who: str, act: Act = Act.DEFOCUS, reason: str = "") -> EmergencyOrder:
         """Order DEFOCUS or STOW of the whole field, with proof; anybody may.
 
-        It holds until it is withdrawn and the rows that it trips are acknowledged.
+        Each person's order holds until it is withdrawn, and the rows that it trips until they are
+        acknowledged.
 
         Raises
         ------
@@ -554,7 +561,8 @@ class PlantController:
         """
         if act not in (Act.DEFOCUS, Act.STOW):
             raise InputError(f"emergency: {act.name} cannot be ordered; give DEFOCUS or STOW")
-        return self._sentinel.call(who, act, reason or f"emergency order of {who}")
+        at = self.clock.utc().timestamp()
+        return self._sentinel.call(who, act, reason or f"emergency order of {who}", at)
 
     # -- the command authority -------------------------------------------------------------
 
@@ -597,17 +605,25 @@ class PlantController:
         self.authority.release(person, token)
         self.note(person, "AUTHORITY", "released")
 
-    def withdraw_emergency(self, person: Person) -> None:
-        """Withdraw an emergency order; the rows that it tripped wait for `acknowledge`.
+    def withdraw_emergency(self, person: Person, owner: str = "") -> None:
+        """Withdraw a person's own emergency order, or, as an engineer, that of an ``owner``.
+
+        The emergency goes on while another person's order stands; the rows that it tripped wait for
+        `acknowledge`.
 
         Raises
         ------
         RefusedError
-            For a viewer.
+            If the person has ordered none while others have, or is no engineer.
         """
-        person.must_be(Role.OPERATOR, "emergency")
-        self._sentinel.withdraw()
-        self.note(person, "WITHDRAW", "emergency order")
+        who, calls = owner or person.name, self.calls
+        if who != person.name:
+            person.must_be(Role.ENGINEER, f"withdraw the emergency of {who}")
+        if calls and who not in {call.who for call in calls}:
+            texts = "; ".join(call.text for call in calls)
+            raise refusals.NOT_CALLER.error(who=who, calls=texts)
+        self._sentinel.withdraw(who)
+        self.note(person, "WITHDRAW", f"emergency order of {who}")
 
     def acknowledge(self, person: Person, condition: str, subject: str = "") -> None:
         """Acknowledge a row of the safety table that waits for it.

@@ -140,6 +140,12 @@ NOT_OWNER = Refusal(
     "{what}: {who} has no lock on {name}, which is locked: {text}",
     "Each person returns their own lock; an engineer may remove another's by the owner's name.",
 )
+NOT_CALLER = Refusal(
+    "not the caller",
+    "A person withdraws an emergency that only others have ordered.",
+    "withdraw: {who} has ordered no emergency; it was ordered by {calls}",
+    "Each person withdraws their own order; an engineer withdraws another's by the owner's name.",
+)
 NOT_ACKNOWLEDGED = Refusal(
     "not acknowledged",
     "The row is not tripped, its cause has not gone, or it needs another role.",

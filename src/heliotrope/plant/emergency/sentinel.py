@@ -23,7 +23,7 @@ from heliotrope.plant.emergency.order import (
     EmergencyOrder,
     switched_off,
 )
-from heliotrope.plant.emergency.standing import EmergencyRecord, Standing, read_standing
+from heliotrope.plant.emergency.standing import Call, EmergencyRecord, Standing, read_standing
 from heliotrope.plant.emergency.table import TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.identity import Identities
@@ -91,7 +91,7 @@ class Sentinel:
         self.on = False
         self._record, self._kept_at = record, -math.inf
         self._kept = self._recalled = Standing() if record is None else _recall(record)
-        self._called = self._recalled.called
+        self._calls = {call.who: call for call in self._recalled.calls}
         known = {"", *field.names, *field.clusters}
         table.recall(row for row in self._recalled.rows if row[1] in known)
         self._clock, self.table, self._field = clock, table, field
@@ -109,7 +109,7 @@ class Sentinel:
     def beat(self, now: float) -> list[Alarm]:
         """Evaluate the table and do what it demands; return the alarms raised and ended."""
         proof = self.order.proof if self.on and self.order is not None else None
-        news = self.table.evaluate(proof, called=self._called, now=now)
+        news = self.table.evaluate(proof, called=bool(self._calls), now=now)
         self._obey_field(now)
         self._obey_clusters()
         self._obey_heliostats(now)
@@ -193,9 +193,24 @@ class Sentinel:
         self._joining.drop(f"{act.name} of the field: {reason}")
         return self.order
 
-    def call(self, who: str, act: Act, reason: str) -> EmergencyOrder:
-        """Order an emergency for a person; it holds until it is withdrawn."""
-        self._called = True
+    @property
+    def calls(self) -> tuple[Call, ...]:
+        """The orders of persons that have not been withdrawn, one for each person."""
+        return tuple(self._calls.values())
+
+    def call(self, who: str, act: Act, reason: str, at: float) -> EmergencyOrder:
+        """Order an emergency for a person; it holds until it is withdrawn.
+
+        A person has one order: another one keeps the stronger act, and adds a new reason.
+        """
+        before = self._calls.get(who)
+        if before is None:
+            self._calls[who] = Call(who, reason, act.name, at)
+        else:
+            known = before.reason.split("; ")
+            reasons = before.reason if reason in known else f"{before.reason}; {reason}"
+            stronger = max(act, Act[before.act])
+            self._calls[who] = Call(who, reasons, stronger.name, before.at)
         if not self.on or self.order is None or act > self.order.act:
             order = self._begin(act, (who, "anybody"), reason)
         else:
@@ -204,9 +219,9 @@ class Sentinel:
         self._keep(order.at)
         return order
 
-    def withdraw(self) -> None:
-        """Withdraw a person's order; rows that it tripped still wait to be acknowledged."""
-        self._called = False
+    def withdraw(self, who: str) -> None:
+        """Withdraw one person's order; rows that it tripped still wait to be acknowledged."""
+        self._calls.pop(who, None)
         self._keep(self._clock.monotonic())
 
     def _keep(self, now: float) -> None:
@@ -225,9 +240,9 @@ class Sentinel:
         order = self.order if self.on else None
         rows = self.table.standing()
         if order is None:
-            return Standing(called=self._called, rows=rows)
+            return Standing(calls=self.calls, rows=rows)
         unproven = tuple(sorted(order.proof.nodes - order.proof.done.keys()))
-        return Standing(order.act.name, order.who, order.reason, self._called, rows, unproven)
+        return Standing(order.act.name, order.who, order.reason, self.calls, rows, unproven)
 
     def send_safe(
         self,

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from typing import Protocol
 
 from heliotrope.safety import Act
@@ -30,6 +31,32 @@ class EmergencyRecord(Protocol):
 
 
 @dataclass(frozen=True)
+class Call:
+    """One person's emergency order, which stands until that person withdraws it.
+
+    Attributes
+    ----------
+    who, reason
+        The person or program that gave it, and why.
+    act
+        "DEFOCUS" or "STOW".
+    at
+        POSIX s.
+    """
+
+    who: str
+    reason: str
+    act: str
+    at: float
+
+    @property
+    def text(self) -> str:
+        """One line: person, act, time, reason."""
+        since = f"{datetime.fromtimestamp(self.at, UTC):%H:%M} UTC"
+        return f"{self.who} ({self.act}, {since}: {self.reason})"
+
+
+@dataclass(frozen=True)
 class Standing:
     """What a plant's program must know of an emergency that began before it.
 
@@ -39,8 +66,8 @@ class Standing:
         Name of the order to the whole field, "DEFOCUS" or "STOW"; "" where no emergency holds.
     who, reason
         The person or part of the plant that gave it, and why.
-    called
-        Whether a person has ordered an emergency and not withdrawn it.
+    calls
+        The orders of persons that have not been withdrawn, one for each person.
     rows
         Rows of the safety table that hold beams off or wait to be acknowledged, each with its
         cluster or heliostat, "" for the field.
@@ -51,7 +78,7 @@ class Standing:
     act: str = ""
     who: str = ""
     reason: str = ""
-    called: bool = False
+    calls: tuple[Call, ...] = ()
     rows: tuple[tuple[str, str], ...] = ()
     unproven: tuple[str, ...] = ()
 
@@ -81,9 +108,14 @@ def read_standing(document: str) -> Standing:
         act, who, reason = (str(found[key]) for key in ("act", "who", "reason"))
         if act and Act[act] not in (Act.DEFOCUS, Act.STOW):
             raise ValueError(act)
-        return Standing(act, who, reason, bool(found["called"]), rows, unproven)
+        calls = tuple(
+            Call(str(c["who"]), str(c["reason"]), str(c["act"]), float(c["at"]))
+            for c in found["calls"]
+        )
+        return Standing(act, who, reason, calls, rows, unproven)
     except (ValueError, KeyError, TypeError):
-        return Standing("DEFOCUS", "plant", _UNREADABLE, called=True)
+        call = Call("plant", _UNREADABLE, "DEFOCUS", 0.0)
+        return Standing(call.act, call.who, call.reason, (call,))
 
 
 def _names(found: Sequence[object]) -> tuple[str, ...]:
