@@ -131,7 +131,8 @@ def test_where_nobody_measures_the_flux_the_proof_rests_on_the_mirrors(tmp_path:
         report = order.report(plant.now())
         assert report.complete
         assert report.text == (
-            "every heliostat has acknowledged and is done; flux on the receiver not measured"
+            "every heliostat has acknowledged and is done, as it reports; flux on the receiver not "
+            "measured, so this is believed: a stalled drive reports the same"
         )
         assert plant.emergency is order
         told = {alarm.condition for alarm in plant.alarms}
@@ -621,3 +622,42 @@ def test_only_a_row_and_counts_from_after_the_order_prove_it(act: Act, state: in
     assert proven(101.0, 101.0) is (can and state != states.STOWING)
     assert not proven(106.0, 106.0, lit=True)
     assert proven(106.0, 106.0, strange=True) is (state == states.STOWED)
+
+
+def test_no_motion_begins_in_the_cold(tmp_path: Path) -> None:
+    """Where ice may hold drives; what runs goes on, and DEFOCUS and STOW pass."""
+
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        token = await bench.commanded()
+
+        async def air(celsius: float, seconds: int) -> None:
+            for _ in range(seconds):
+                plant.put("temperature", celsius)
+                plant.authority.keep(OPERATOR, token)
+                await bench.wait(1.0)
+
+        await air(12.0, 3)
+        assert plant.command(OPERATOR, token, "APPROACH", ("P2A",))
+        await air(0.5, 3)
+        said = r"the air is at 0.5 °C: ice may hold drives, .* \(limit 1 °C\)"
+        with pytest.raises(RefusedError, match=said):
+            plant.command(OPERATOR, token, "APPROACH", ("P2B",))
+        assert bench.count(states.TRACKING) == 17
+        assert plant.stow("anybody", ("P2B",))
+        # Between its limits it holds, and it ends half an hour after the air is warm.
+        await air(3.0, 3)
+        with pytest.raises(RefusedError, match="not yet back at 4 °C"):
+            plant.command(OPERATOR, token, "APPROACH", ("P2B",))
+        await air(5.0, 62)
+        assert plant.command(OPERATOR, token, "APPROACH", ("P2B",))
+        # A silent thermometer counts as frost.
+        for _ in range(63):
+            plant.authority.keep(OPERATOR, token)
+            await bench.wait(1.0)
+        with pytest.raises(RefusedError, match="no reading of temperature of the air"):
+            plant.command(OPERATOR, token, "APPROACH", ("P2C",))
+
+    settings = PlantSettings(sensors=frozenset({"temperature"}))
+    table = limited(conditions(), {"cold": {"clear_for_s": 60.0}})
+    play(tmp_path, scene, settings=settings, table=table)
