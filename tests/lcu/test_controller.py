@@ -361,7 +361,7 @@ def test_a_defocus_turns_by_angles_of_its_own_and_not_by_those_of_the_last(befor
         assert np.abs(turned) == pytest.approx([0.1, 0.05], abs=4e-3)
 
 
-def test_a_defocus_that_cannot_choose_its_sense_turns_by_its_angles_after_one_from_standby() -> None:
+def test_a_defocus_without_a_standby_point_turns_by_its_angles_after_one_from_standby() -> None:
     """The one before turned by none, down the way; this one has no standby point to turn from."""
     bench = standing_by()
     assert bench.order("DEFOCUS") == DONE
