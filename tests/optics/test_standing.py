@@ -66,6 +66,35 @@ def test_a_beam_that_enters_at_any_sun_of_the_year_is_found(seed: int) -> None:
     assert not entered.all()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_narrow_beam_between_the_suns_is_found(seed: int) -> None:
+    """A pebble in the beam of a small and perfect mirror, at any sun of the year."""
+    random = np.random.default_rng(seed)
+    mirror = MirrorOptics.of(0.1, 0.1, error=0.0)
+    latitude = random.uniform(-1.0, 1.0)
+    tried = 0
+    while tried < 40:
+        declination, hour = random.uniform(-0.409, 0.409), random.uniform(-np.pi, np.pi)
+        level = np.cos(declination) * np.cos(hour)
+        sine, cosine = np.sin(latitude), np.cos(latitude)
+        sun = np.array(
+            [
+                -np.cos(declination) * np.sin(hour),
+                cosine * np.sin(declination) - sine * level,
+                sine * np.sin(declination) + cosine * level,
+            ]
+        )
+        normal = normalize(random.normal(size=3), "normal")
+        if sun[2] < 0.02 or sun @ normal < 0.05:
+            continue
+        tried += 1
+        pebble = Sphere("pebble", tuple(100.0 * reflect(sun, normal)), 0.01)
+        found = entered_over_the_year(
+            np.zeros((1, 3)), normal[None], mirror, [pebble], latitude, 200.0
+        )
+        assert found.all()
+
+
 def test_a_mirror_to_the_ground_lights_nothing_above_it() -> None:
     vertex, down = np.array([[0.0, -50.0, 1.0]]), np.array([[0.0, 0.0, -1.0]])
     receiver = [Sphere("receiver", (0.0, 0.0, 40.0), 3.0)]

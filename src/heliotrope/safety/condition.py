@@ -107,7 +107,7 @@ class Condition:
     watcher
         Tier that evaluates it.
     reading, unit
-        Key of the reading, and its unit: "s", "m/s", "rad", "share" (1 is 100 %), "count" or
+        Key of the reading, and its unit: "s", "m/s", "rad", "°C", "share" (1 is 100 %), "count" or
         "yes/no" (1 is yes).
     what, wrong
         The reading as a noun; what is wrong when the row trips, with ``{value}`` for the reading.

@@ -162,6 +162,14 @@ def _weather() -> tuple[Condition, ...]:
             site=(3.0, 20.0),
         ),
         Condition(
+            "cold", _PLANT, "temperature", "°C", "temperature of the air",
+            "the air is at {value}: ice may hold drives, and a stalled drive reports steps that the"
+            " mirror has not made", 1.0, 4.0, _REFUSE, _FIELD, _WARNING, 65.0, clear_for=1800.0,
+            stale_after=60.0, release="the air is warm again",
+            remedy="Wait until it is warmer; look whether mirrors carry ice before the field goes"
+            " up.", site=(-20.0, 20.0),
+        ),
+        Condition(
             "sun_below_horizon", _PLANT, "sun_elevation", "rad", "elevation of the sun",
             "the sun is down: its elevation is {value}", 0.0, 0.035, _STOW, _FIELD, _INFO, 300.0,
             clear_for=60.0, stale_after=10.0, release="the sun is up",
