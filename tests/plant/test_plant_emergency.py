@@ -17,7 +17,7 @@ from heliotrope.links.messages import NODE, Acknowledge, Emergency
 from heliotrope.mechanism.drives import Drive, rotary
 from heliotrope.plant.audit import read
 from heliotrope.plant.authority import RefusedError
-from heliotrope.plant.emergency import EmergencyOrder, carried_out
+from heliotrope.plant.emergency import UNPROVEN, EmergencyOrder, carried_out
 from heliotrope.plant.operations.given_readings import GivenReadings
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.settings import PlantSettings
@@ -164,6 +164,61 @@ def test_a_sensor_of_the_flux_counts_also_when_it_is_silent(
         assert not [a for a in plant.alarms if a.condition == "unknown_reading"]
 
     play(tmp_path, scene, settings=MEASURED)
+
+
+def test_a_heliostat_that_an_emergency_left_unproven_tracks_after_an_engineers_word(
+    tmp_path: Path,
+) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        bench.cluster_of("P1C").deaf.add("P1C")
+        token = await bench.commanded()
+        plant.raise_emergency("Olga")
+        for _ in range(9):
+            await bench.wait(5.0)
+            plant.authority.keep(OPERATOR, token)
+        plant.withdraw_emergency(OPERATOR)
+        await bench.wait(3.0)
+        plant.authority.keep(OPERATOR, token)
+        plant.acknowledge(OPERATOR, "operator_emergency")
+        await bench.wait(4.0)
+        assert not plant.emergency_on
+        plant.acknowledge(OPERATOR, "nodes_unacknowledged")
+        await bench.wait(2.0)
+        left = [a.subject for a in plant.alarms if a.condition == UNPROVEN]
+        assert left == ["P1C"]
+        for command in ("TRACK", "IDLE"):
+            with pytest.raises(RefusedError, match="nothing shows that it has carried out the or"):
+                plant.command(OPERATOR, token, command, ("P1C",))
+        with pytest.raises(RefusedError, match="engineer must acknowledge, not operator"):
+            plant.acknowledge(OPERATOR, UNPROVEN, "P1C")
+        plant.acknowledge(ENGINEER, UNPROVEN, "P1C")
+        await bench.wait(2.0)
+        assert [a.active for a in plant.alarms if a.condition == UNPROVEN] == [True, False]
+
+    play(tmp_path, scene)
+
+
+def test_what_is_proven_after_its_emergency_needs_nobodys_word(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        bench.cluster_of("P1C").deaf.add("P1C")
+        await bench.commanded()
+        plant.raise_emergency("Olga", Act.STOW)
+        await bench.wait(5.0)
+        plant.withdraw_emergency(OPERATOR)
+        await bench.wait(3.0)
+        plant.acknowledge(OPERATOR, "operator_emergency")
+        await bench.wait(2.0)
+        assert not plant.emergency_on
+        left = [(a.subject, a.active) for a in plant.alarms if a.condition == UNPROVEN]
+        assert left == [("P1C", True)]
+        bench.cluster_of("P1C").deaf.clear()
+        await bench.wait(60.0)
+        left = [(a.subject, a.active) for a in plant.alarms if a.condition == UNPROVEN]
+        assert left == [("P1C", True), ("P1C", False)]
+
+    play(tmp_path, scene)
 
 
 def test_it_holds_until_withdrawn_and_acknowledged_and_then_nothing_moves(tmp_path: Path) -> None:
@@ -569,7 +624,7 @@ def test_an_order_that_is_given_again_is_not_acknowledged_away(tmp_path: Path) -
             assert plant.emergency_on
             with pytest.raises(RefusedError, match="the cause has not gone"):
                 plant.acknowledge(OPERATOR, "operator_emergency")
-            plant.withdraw_emergency(OPERATOR)
+            plant.withdraw_emergency(VIEWER)
             await bench.wait(3.0)
             plant.acknowledge(OPERATOR, "operator_emergency")
             await bench.wait(2.0)

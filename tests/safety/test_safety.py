@@ -37,6 +37,7 @@ TRIPS = {
     "emergency_line": (0.0, 1.0, Act.DEFOCUS, Scope.FIELD, "emergency line carries no current"),
     "nodes_unacknowledged": (1.0, 0.0, Act.DEFOCUS, Scope.FIELD, "emergency order: 1"),
     "flux_after_emergency": (0.11, 0.02, Act.STOW, Scope.FIELD, "is 11 % of nominal after an em"),
+    "unproven_after_emergency": (1.0, 0.0, Act.DEFOCUS, Scope.HELIOSTAT, "nothing shows that it"),
     "authority_lost": (10.5, 0.0, Act.REFUSE_NEW, Scope.FIELD, "authority for 1[01].* s .*10 s"),
     "receiver_flux_high": (1.02, 0.5, Act.DEFOCUS, Scope.FIELD, "is 102 % of its limit"),
     "receiver_temperature_high": (1.01, 0.9, Act.DEFOCUS, Scope.FIELD, "temperature .* is 101 %"),

@@ -647,7 +647,7 @@ class PlantController:
         if condition == alarms.COUNTS_DOUBTFUL.name:
             self.doubts.confirm(subject)
         elif condition in self._sentinel.table.rows or subject not in self._clusters.ends:
-            refusal = self._sentinel.table.acknowledge(condition, person.name, role, subject)
+            refusal = self._sentinel.acknowledge(condition, person.name, role, subject)
             if refusal:
                 raise refusals.NOT_ACKNOWLEDGED.error(reason=refusal)
         else:

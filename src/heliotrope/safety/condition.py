@@ -132,6 +132,8 @@ class Condition:
         Whether the reading is an age or a silence, which grows until the next reading.
     role
         Role that must acknowledge; None if the row does not latch.
+    waiver
+        Role that may end a row that does not latch although its cause has not gone; None: nobody.
     release
         Condition of its end, in words.
     remedy
@@ -160,6 +162,7 @@ class Condition:
     stale_after: float = 5.0
     ages: bool = False
     role: AcknowledgeRole | None = None
+    waiver: AcknowledgeRole | None = None
     release: str = ""
     remedy: str = ""
     site: tuple[float, float] | None = None

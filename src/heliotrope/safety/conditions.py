@@ -88,6 +88,15 @@ def _orders() -> tuple[Condition, ...]:
             " still on it.", site=(0.01, 0.10),
         ),
         Condition(
+            "unproven_after_emergency", _PLANT, "unproven", "yes/no",
+            "missing proof that it has carried out an emergency order",
+            "an emergency has ended, and nothing shows that it has carried out the order", 0.5, 0.4,
+            _DEFOCUS, _HELIOSTAT, _SERIOUS, 30.0, waiver=_SUPERVISOR,
+            release="its reports show that it has carried out the order",
+            remedy="Assume that its beam has not moved: inspect it from a safe place. An engineer"
+            " who has seen that it is off acknowledges it by name.",
+        ),
+        Condition(
             "authority_lost", _PLANT, "authority_silence", "s",
             "time since the command authority was renewed",
             "nobody has renewed the command authority for {value}",

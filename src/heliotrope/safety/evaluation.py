@@ -382,13 +382,14 @@ def acknowledge(
         return state, f"{label}: there is no such condition here"
     if track.tripped_at is None:
         return state, f"{label}: it is not tripped; there is nothing to acknowledge"
-    if row.role is None:
+    needed = row.waiver if row.role is None else row.role
+    if needed is None:
         return state, f"{label}: it releases by itself and needs no acknowledgement"
     if not who.strip():
         return state, f"{label}: an acknowledgement needs a person's name"
-    if role < row.role:
-        return state, f"{label}: {row.role.title} must acknowledge, not {role.title}"
-    if not track.cleared:
+    if role < needed:
+        return state, f"{label}: {needed.title} must acknowledge, not {role.title}"
+    if not track.cleared and row.waiver is None:
         return state, f"{label}: {_remains(row, track, state.now)}"
     released = replace(
         track, tripped_at=None, cleared=False, beyond_since=None, acknowledged_by=who.strip()

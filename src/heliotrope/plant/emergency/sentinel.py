@@ -30,13 +30,17 @@ from heliotrope.plant.identity import Identities
 from heliotrope.plant.joining import JoinQueue
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety import FLUX_READING, Act, Alarm
+from heliotrope.safety import FLUX_READING, AcknowledgeRole, Act, Alarm
 from heliotrope.store.records import StoreError
 
 #: A heliostat that was sent off the receiver shows it within this time, s.
 OFF_SHOWS = 10.0
 #: Longest pause between two orders to one heliostat that does not show them, s.
 LONGEST_PAUSE = 60.0
+#: Row of heliostats that an emergency left unproven.
+UNPROVEN = "unproven_after_emergency"
+#: A heliostat that was proven after its emergency is shown to the table for this long, s.
+_PROVEN_SHOWS = 5.0
 #: Pause between two records of a proof that goes on, s.
 _KEEP_PERIOD = 1.0
 #: Name and role of the safety table in a record.
@@ -92,6 +96,11 @@ class Sentinel:
         self._record, self._kept_at = record, -math.inf
         self._kept = self._recalled = Standing() if record is None else _recall(record)
         self._calls = {call.who: call for call in self._recalled.calls}
+        #: Heliostats that an emergency left unproven, and when each was proven, monotonic s.
+        self._unproven: dict[str, float] = {}
+        if not self._recalled.act:
+            left = set(self._recalled.unproven) & set(field.names)
+            self._unproven = dict.fromkeys(sorted(left), math.inf)
         known = {"", *field.names, *field.clusters}
         table.recall(row for row in self._recalled.rows if row[1] in known)
         self._clock, self.table, self._field = clock, table, field
@@ -109,7 +118,8 @@ class Sentinel:
     def beat(self, now: float) -> list[Alarm]:
         """Evaluate the table and do what it demands; return the alarms raised and ended."""
         proof = self.order.proof if self.on and self.order is not None else None
-        news = self.table.evaluate(proof, called=bool(self._calls), now=now)
+        self._unproven = {n: at for n, at in self._unproven.items() if now - at < _PROVEN_SHOWS}
+        news = self.table.evaluate(proof, self._unproven, called=bool(self._calls), now=now)
         self._obey_field(now)
         self._obey_clusters()
         self._obey_heliostats(now)
@@ -125,8 +135,9 @@ class Sentinel:
                 self._begin_again(wanted)
             elif now - self._repeated_at >= self._repeat:
                 self._repeat_order(self._field.clusters)
-        if not caused:
+        if not caused and self.on:
             self.on = False
+            self._unproven = dict.fromkeys(self._not_done(), math.inf)
         if wanted is not None and wanted >= Act.HOLD:
             self._joining.drop(self.table.reasons(Act.HOLD))
 
@@ -164,8 +175,8 @@ class Sentinel:
                 continue
             self._tries[name] = tries + 1, now + min(OFF_SHOWS * 2**tries, LONGEST_PAUSE)
             best = self._ways.way_out(name, again=tries > 0)
-            if order is not None:
-                best = max(best, order.act)
+            if self.order is not None and (self.on or name in self._unproven):
+                best = max(best, self.order.act)
             sent.setdefault(max(act, best), {})[name] = text
         for act, texts in sent.items():
             why = "; ".join([*texts.values()][:3])
@@ -189,6 +200,7 @@ class Sentinel:
         measured = self.table.flux_measured
         self.order = EmergencyOrder(act, giver[0], reason, now, ticket, flux_measured=measured)
         self.on, self._repeated_at = True, now
+        self._unproven = {}
         self._orders.emergency(ticket, act, names)
         self._joining.drop(f"{act.name} of the field: {reason}")
         return self.order
@@ -236,12 +248,25 @@ class Sentinel:
             self._record.keep_emergency(standing.document)
             self._kept, self._kept_at = standing, now
 
+    def _not_done(self) -> tuple[str, ...]:
+        """Return the heliostats that are not proven to have carried out the last order."""
+        order = self.order
+        return () if order is None else tuple(sorted(order.proof.nodes - order.proof.done.keys()))
+
+    def acknowledge(self, condition: str, who: str, role: AcknowledgeRole, subject: str) -> str:
+        """Acknowledge a row of the table; return why it is refused, "" if it is not."""
+        refusal = self.table.acknowledge(condition, who, role, subject)
+        if not refusal and condition == UNPROVEN:
+            self._unproven.pop(subject, None)
+        return refusal
+
     def _standing(self) -> Standing:
         order = self.order if self.on else None
         rows = self.table.standing()
         if order is None:
-            return Standing(calls=self.calls, rows=rows)
-        unproven = tuple(sorted(order.proof.nodes - order.proof.done.keys()))
+            left = tuple(sorted(name for name, at in self._unproven.items() if math.isinf(at)))
+            return Standing(calls=self.calls, rows=rows, unproven=left)
+        unproven = self._not_done()
         return Standing(order.act.name, order.who, order.reason, self.calls, rows, unproven)
 
     def send_safe(
@@ -317,11 +342,13 @@ class Sentinel:
 
     def take_rows(self, cluster: str, now: float) -> None:
         """Update the proof of the order from a cluster's new status."""
-        order = self.order
-        if order is None or not self.on:
+        order, names = self.order, self._field.members[cluster]
+        if not self.on:
+            names = tuple(name for name in names if name in self._unproven)
+        if order is None or not names:
             return
-        names = self._field.members[cluster]
-        self._order_again(order, names)
+        if self.on:
+            self._order_again(order, names)
         rows = [self._field.index[n] for n in names if not order.is_done(n)]
         if rows:
             index = np.array(rows, dtype=np.intp)
@@ -354,6 +381,10 @@ class Sentinel:
                 )
             else:
                 order.unknown.pop(name, None)
+
+        for name in () if self.on else names:
+            if order.is_done(name):
+                self._unproven[name] = min(self._unproven[name], now)
 
     def _order_again(self, order: EmergencyOrder, names: tuple[str, ...]) -> None:
         """Send heliostats off again that have come back while the emergency holds."""

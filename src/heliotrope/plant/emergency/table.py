@@ -1,7 +1,8 @@
 """The plant's part of the safety table: readings in, demands and alarms out."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -37,6 +38,7 @@ OWN_READINGS = frozenset(
     {
         "emergency_order",
         "nodes_unacknowledged",
+        "unproven",
         "flux_after_emergency",
         "authority_silence",
         "cluster_silence",
@@ -89,7 +91,7 @@ class PlantReadings:
         self.names = OWN_READINGS | beams.watched
 
     def take(
-        self, proof: Proof | None, *, called: bool, now: float
+        self, proof: Proof | None, unproven: Mapping[str, float], *, called: bool, now: float
     ) -> dict[tuple[str, str], Reading]:
         """Return the readings now.
 
@@ -97,6 +99,9 @@ class PlantReadings:
         ----------
         proof
             Proof of the emergency order in force; None if there is none.
+        unproven
+            Time since which each heliostat that an emergency left unproven is proven, monotonic s;
+            infinite if it is not.
         called
             Whether a person has ordered an emergency and not withdrawn it.
         now
@@ -112,6 +117,8 @@ class PlantReadings:
             ("audit_silence", ""): Reading(now - self._orders.confirmed_at, now),
             ("sun_elevation", ""): Reading(self._elevation, now),
             ("node_fault_share", ""): Reading(self._field.failed_share(now), now),
+            ("unproven", ""): Reading(0.0, now),
+            **{("unproven", n): Reading(float(at > now), now) for n, at in unproven.items()},
             **self._beams.readings(now),
             **self._agreement.readings(now),
         }
@@ -199,12 +206,19 @@ class TableWatch:
         if name not in DERIVED.values():
             self._put[name, subject] = Reading(value, at)
 
-    def evaluate(self, proof: Proof | None, *, called: bool, now: float) -> list[Alarm]:
+    def evaluate(
+        self,
+        proof: Proof | None,
+        unproven: Mapping[str, float] = MappingProxyType({}),
+        *,
+        called: bool,
+        now: float,
+    ) -> list[Alarm]:
         """Evaluate all rows; return the alarms raised and ended since the last time.
 
-        For ``proof`` and ``called`` see `PlantReadings.take`.
+        For ``proof``, ``unproven`` and ``called`` see `PlantReadings.take`.
         """
-        own = self._own.take(proof, called=called, now=now)
+        own = self._own.take(proof, unproven, called=called, now=now)
         readings = self._put | {key: each for key, each in own.items() if key[0] in self._fed}
         for row in self._single:
             subjects = [name for reading, name in readings if reading == row.reading and name]
