@@ -90,7 +90,8 @@ class Gauges:
         who, operations, over = Person("gauges", Role.ENGINEER), self.operations, Future[bool]()
 
         def work() -> None:
-            operations.withdraw(who)
+            for call in operations.plant.calls:
+                operations.withdraw(who, call.who)
             for alarm in operations.alarms():
                 if not alarm.acknowledged_by:
                     with contextlib.suppress(HeliotropeError):

@@ -283,6 +283,7 @@ MACHINE = """
 [groups.azel.machine]
 stow_deg = [90, 88]
 defocus_mrad = [100, 50]
+defocus_spread = 0
 standby_m = [12, 0, 40]
 leaves_stow_first = "elevation"
 way_m = [[20, -25, 0], [12, 0, 5]]
@@ -346,6 +347,22 @@ def test_machine_of_a_group(tmp_path: Path) -> None:
     assert plant.machine("A2") == machine
     plant_file.write_plant(plant, tmp_path / "again.toml")
     assert plant_file.read_plant(tmp_path / "again.toml").machine("A1") == machine
+
+
+@pytest.mark.parametrize(("key", "most"), [("", 2.0), ("defocus_spread = 2.5", 3.5)])
+def test_mirrors_turn_away_by_angles_of_their_own(key: str, most: float, tmp_path: Path) -> None:
+    text = MACHINE.replace("defocus_spread = 0", f"{key}\nstow_lights = true")
+    plant = plant_file.read_plant(with_machine(tmp_path, text))
+    one, two = (plant.machine(name) for name in ("A1", "A2"))
+    assert one.defocus != two.defocus
+    assert one.stow_lights
+    for machine in (one, two):
+        assert 0.1 <= machine.defocus[0] <= most * 0.1
+        assert 0.05 <= machine.defocus[1] <= most * 0.05
+    # What is written holds each mirror's angles, and reads as it was.
+    plant_file.write_plant(plant, tmp_path / "again.toml")
+    again = plant_file.read_plant(tmp_path / "again.toml")
+    assert (again.machine("A1"), again.machine("A2")) == (one, two)
 
 
 def test_machine_of_each_heliostat(tmp_path: Path) -> None:

@@ -340,6 +340,43 @@ def test_an_approach_that_is_called_off_before_its_first_step_does_not_begin(nam
     assert bench.order("TRACK") == REFUSED_STATE
 
 
+@pytest.mark.parametrize("before", ["IDLE", "TRACKING"])
+def test_a_defocus_turns_by_angles_of_its_own_and_not_by_those_of_the_last(before: str) -> None:
+    """From standby it goes down the way, and from the aim after that by the angles again."""
+    bench = tracking() if before == "TRACKING" else standing_by()
+    assert bench.state == before
+    assert bench.order("DEFOCUS") == DONE
+    bench.run(10)
+    for _ in range(2):
+        assert bench.order("REFOCUS") == DONE
+        bench.run(30)
+        assert bench.order("TRACK") == DONE
+        bench.run(20)
+        assert bench.miss(AIM) < 0.01
+        begin = bench.machine.drives.angles(np.array(bench.made))
+        assert bench.order("DEFOCUS") == DONE
+        bench.run(20)
+        assert bench.miss(AIM) > OFF
+        turned = bench.machine.drives.angles(np.array(bench.made)) - begin
+        assert np.abs(turned) == pytest.approx([0.1, 0.05], abs=4e-3)
+
+
+def test_a_defocus_without_a_standby_point_turns_by_its_angles_after_one_from_standby() -> None:
+    """The one before turned by none, down the way; this one has no standby point to turn from."""
+    bench = standing_by()
+    assert bench.order("DEFOCUS") == DONE
+    bench.run(10)
+    assert bench.order("REFOCUS") == DONE
+    bench.run(30)
+    begin = bench.machine.drives.angles(np.array(bench.made))
+    bench.controller.motion.config.standby = None
+    assert bench.order("DEFOCUS") == DONE
+    bench.run(20)
+    turned = bench.machine.drives.angles(np.array(bench.made)) - begin
+    assert turned == pytest.approx([0.1, 0.05], abs=4e-3)
+    assert bench.miss(AIM) > OFF
+
+
 def usual_turn(bench: Bench) -> tuple[np.ndarray, tuple[float, float, float]]:
     """Angles to which the usual turn, by 0.1 and 0.05 rad, leads, and a point of the beam there."""
     turned = bench.machine.drives.angles(np.array(bench.made)) + [0.1, 0.05]

@@ -494,10 +494,11 @@ def _done(operations: dict[str, Any], name: str, given: dict[str, Any], blob: by
 
 
 def test_an_emergency_is_withdrawn_in_the_name_of_who_asks() -> None:
-    by = list[Person]()
-    here = {"withdraw": by.append, "emergency_view": lambda: not by}
+    by = list[tuple[Person, str]]()
+    here = {"withdraw": lambda *given: by.append(given), "emergency_view": lambda: not by}
     assert _done(here, "withdraw_emergency", {}) is False
-    assert by == [OLGA]
+    assert _done(here, "withdraw_emergency", {"owner": "Otto"}) is False
+    assert by == [(OLGA, ""), (OLGA, "Otto")]
 
 
 def test_a_photograph_that_is_known_is_not_sent_again() -> None:

@@ -198,7 +198,8 @@ def test_an_emergency_leaves_nothing_locked_and_the_field_goes_up_again(stage: s
         assert not report.unknown
         assert set(here.states().values()) <= {"STOWED", "LOCKED"}
         assert here.live.assembly.left() == "", "all stand at stow, locked there or not"
-        operations.withdraw(ENGINEER)
+        (call,) = operations.plant.calls
+        operations.withdraw(ENGINEER, call.who)
         await asyncio.sleep(6.0)
         for alarm in operations.alarms():
             with contextlib.suppress(RefusedError):

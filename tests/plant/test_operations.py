@@ -385,7 +385,19 @@ def test_persons_come_before_the_automat() -> None:
         view = shown.emergency_view()
         assert (view.on, view.act, view.done) == (True, "STOW", 4)
         assert shown.summary().emergency
-        shown.withdraw(OPERATOR)
+        # Two persons have their reasons; each withdraws their own, an engineer another's by name.
+        shown.emergency(OPERATOR, reason="somebody on the tower")
+        calls = [(call.who, call.act, call.reason) for call in shown.emergency_view().calls]
+        assert calls == [("Vera", "STOW", "a fire"), ("Olga", "DEFOCUS", "somebody on the tower")]
+        shown.withdraw(VIEWER)
+        await asyncio.sleep(40.0)
+        assert shown.summary().emergency
+        with pytest.raises(RefusedError, match=r"Otto has ordered no emergency.*Olga \(DEFOCUS"):
+            shown.withdraw(Person("Otto", Role.OPERATOR))
+        with pytest.raises(RefusedError, match="withdraw the emergency of Olga: Otto is operator"):
+            shown.withdraw(Person("Otto", Role.OPERATOR), "Olga")
+        shown.withdraw(ENGINEER, "Olga")
+        assert shown.emergency_view().calls == ()
         await asyncio.sleep(20.0)
         assert shown.summary().states == {"STOWED": 4}
         with pytest.raises(UnknownNameError, match="act of an emergency"):
@@ -669,11 +681,20 @@ def test_after_a_restart_in_an_emergency_a_person_resumes(tmp_path: Path) -> Non
 
     async def stay(plant: LivePlant) -> None:
         assert _waits(plant)
-        text = plant.operations.summary().resume
+        shown = plant.operations
+        text = shown.summary().resume
         assert text.startswith("operator_emergency held when the last program ended; raised at ")
         await asyncio.sleep(100.0)
         assert _states(plant) == ["STOWED"] * 4
-        plant.operations.resume(OPERATOR)
+        # The order stands until it is withdrawn and acknowledged, whatever program runs.
+        (call,) = shown.emergency_view().calls
+        assert (call.who, call.act, call.reason) == ("Vera", "STOW", "a fire")
+        shown.withdraw(VIEWER)
+        await asyncio.sleep(5.0)
+        shown.acknowledge(OPERATOR, "operator_emergency")
+        await asyncio.sleep(5.0)
+        shown.resume(OPERATOR)
+        shown.give_back(OPERATOR)
         await asyncio.sleep(200.0)
         assert _states(plant) == ["TRACKING"] * 4
 

@@ -15,6 +15,7 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Ask, Parameters
 from heliotrope.mechanism.board_items import Wanted, items_of, packed, tables_with
+from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant.audit import read
 from heliotrope.plant.authority import RefusedError
@@ -256,3 +257,77 @@ def test_nothing_moves_before_its_parameters_have_been_compared(tmp_path: Path) 
 
     run_virtual(main)
     assert made[0].cluster_of(OTHER).commands("APPROACH")
+
+
+def stows(bench: Bench) -> tuple[tuple[int, int], tuple[int, int]]:
+    """A stow position from which the beam of `NAME` lights the receiver now, and a good one."""
+    rows, beams = np.array([bench.plant.field.place(NAME)]), bench.plant.beams
+    aim = bench.design.receivers[0].center[None]
+    found = beams.poses(rows, aim, bench.plant.sun_vector()).best_counts[0].round()
+    for elevation in np.radians((90.0, 0.0, -30.0)):
+        good = np.round(Drive(beams.drives.table[rows[0]]).counts(np.array([0.0, elevation])))
+        if not beams.standing(rows, good[None]):
+            return (int(found[0]), int(found[1])), (int(good[0]), int(good[1]))
+    raise AssertionError("no stow position of the example plant is clear")
+
+
+def test_no_stow_position_is_given_from_which_the_beam_lights_something(tmp_path: Path) -> None:
+    async def scene(bench: Bench, token: int) -> None:
+        bad, good = stows(bench)
+        bench.cluster_of(NAME).set(states.LOCKED, NAME)
+        await bench.wait(2.0)
+        said = "P1A: at stow its beam would come within reach of the receiver at some time of"
+        with pytest.raises(RefusedError, match=said):
+            bench.plant.parameters(ENGINEER, token, NAME, {"stow": packed("stow", bad)})
+        assert NAME not in bench.plant.wanted.items
+        assert not bench.cluster_of(NAME).of(Parameters)
+        items = {"stow": packed("stow", good)}
+        assert await bench.plant.parameters(ENGINEER, token, NAME, items).end(5.0)
+
+    play(tmp_path, scene)
+
+
+def test_the_plant_writes_no_stow_position_that_is_not_proven(tmp_path: Path) -> None:
+    wanted = Wanted()
+
+    async def scene(bench: Bench, token: int) -> None:
+        bad, good = stows(bench)
+        cluster = bench.cluster_of(NAME)
+        cluster.set(states.LOCKED, NAME)
+        for stow in (bad, good):
+            told = len(bench.plant.alarms)
+            wanted.set(NAME, {"stow": packed("stow", stow), "defocus": packed("defocus", (0.1, 0))})
+            bench.plant._sync.compare(NAME)
+            for _ in range(40):
+                await bench.wait(1.0)
+                bench.plant.authority.keep(ENGINEER, token)
+            texts = [alarm.text for alarm in list(bench.plant.alarms)[told:]]
+            held_back = any("stow, which is not written: at stow its beam" in t for t in texts)
+            assert held_back is (stow is bad)
+            assert ("stow" in cluster.stored[NAME]) is (stow is good)
+            assert cluster.stored[NAME]["defocus"] == packed("defocus", (0.1, 0))
+
+    play(tmp_path, scene, wanted=wanted)
+
+
+def test_items_are_compared_byte_by_byte(tmp_path: Path) -> None:
+    """Stored bytes of the right names and lengths are not the wanted ones for that."""
+    good = items(NAME)
+    wanted = Wanted({NAME: dict(good)})
+
+    async def scene(bench: Bench, token: int) -> None:
+        plant, cluster = bench.plant, bench.cluster_of(NAME)
+        for item, data in good.items():
+            for place in (0, len(data) // 2, len(data) - 1):
+                changed = bytearray(data)
+                changed[place] ^= 1
+                cluster.stored[NAME] = {**good, item: bytes(changed)}
+                await plant.stored(NAME)
+                assert plant.wanted.missing.get(NAME) == (item,)
+        with pytest.raises(BeamError, match="it stores parameters that differ"):
+            plant.command(ENGINEER, token, "TRACK", (NAME,))
+        cluster.stored[NAME] = dict(good)
+        await plant.stored(NAME)
+        assert NAME not in plant.wanted.missing
+
+    play(tmp_path, scene, wanted=wanted)

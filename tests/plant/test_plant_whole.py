@@ -99,7 +99,8 @@ def test_real_boards_that_a_visit_has_locked_prove_their_stow_and_are_unlocked_t
             await whole.until(lambda: order.report(plant.now()).complete, 300.0)
             assert whole.all_are("LOCKED"), "nothing is unlocked in an emergency"
             assert order.ticket.good, order.ticket.text
-            plant.withdraw_emergency(ENGINEER)
+            (call,) = plant.calls
+            plant.withdraw_emergency(ENGINEER, call.who)
             await whole.wait(5.0)
             plant.acknowledge(ENGINEER, "operator_emergency")
             await whole.until(lambda: whole.all_are("STOWED"), 30.0)

@@ -277,7 +277,8 @@ def test_an_emergency_another_person_or_a_cloud_ends_it_with_the_aims_as_they_we
         await asyncio.sleep(10.0)
         assert set(here.states().values()) == {"DEFOCUSED"}
         assert plant.movements.names, "no order follows an emergency"
-        plant.withdraw_emergency(ENGINEER)
+        (call,) = plant.calls
+        plant.withdraw_emergency(ENGINEER, call.who)
         await asyncio.sleep(4.0)
         plant.acknowledge(ENGINEER, "operator_emergency")
         await here.until(lambda: not plant.movements.names, 60.0)
@@ -331,7 +332,8 @@ def test_an_emergency_while_parameters_are_written_leaves_none_locked() -> None:
         report = plant.emergency.report(plant.now()) if plant.emergency else None
         assert report is not None
         assert report.complete, report.text
-        plant.withdraw_emergency(ENGINEER)
+        (call,) = plant.calls
+        plant.withdraw_emergency(ENGINEER, call.who)
         await asyncio.sleep(4.0)
         plant.acknowledge(ENGINEER, "operator_emergency")
         await here.until(lambda: set(here.states().values()) == {"STOWED"}, 120.0)

@@ -222,7 +222,7 @@ def test_drivers_rest_again_however_a_visit_ends(out: str) -> None:
             plant.raise_emergency("Egon")
             await asyncio.sleep(20.0)
             assert not any(rough(live)), "rough steps move a mirror: not in an emergency"
-            plant.withdraw_emergency(ENGINEER)
+            plant.withdraw_emergency(ENGINEER, "Egon")
             await asyncio.sleep(4.0)
             plant.acknowledge(ENGINEER, "operator_emergency")
         token = plant.seize_authority(ENGINEER, "a test").token

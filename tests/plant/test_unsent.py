@@ -31,6 +31,7 @@ LIT = [
     for state in range(len(states.STATES))
     if states.STATES[state] not in ("TRACKING", "SEARCHING")
 ]
+AT_STOW = 1 << names.FLAGS.index("AT_STOW")
 SUN = np.array([0.3, 0.4, 0.866]) / np.linalg.norm([0.3, 0.4, 0.866])
 Point = tuple[float, float, float]
 
@@ -91,16 +92,12 @@ def test_a_beam_left_on_the_receiver_is_sent_off_in_every_state(state: int, tmp_
 
 
 @pytest.mark.parametrize("way", [-1.0, 1.0], ids=["west", "east"])
-def test_a_beam_that_was_sent_there_or_comes_off_or_is_at_stow_is_left_in_peace(
+def test_a_beam_that_was_sent_there_or_comes_off_is_left_in_peace(
     way: float, tmp_path: Path
 ) -> None:
     async def scene(bench: Bench) -> None:
-        cluster = bench.cluster_of("P5C")
         put(bench, "P5A", states.TRACKING, ON)
         put(bench, "P5B", states.SEARCHING, ON)
-        put(bench, "P5C", states.STOWED, ON)
-        row = cluster.names.index("P5C")
-        cluster.rows["flags"][row] = 1 << names.FLAGS.index("AT_STOW")
         # P4A crosses the receiver slowly, on its way to a place beside it.
         for tick in range(20):
             at, end = way * (0.04 * tick - 0.4), (way * 8.0, 0.0, 8.0)
@@ -110,6 +107,54 @@ def test_a_beam_that_was_sent_there_or_comes_off_or_is_at_stow_is_left_in_peace(
         # It stops there.
         await bench.wait(12.0)
         assert alarmed(bench.plant) == {"P4A"}
+
+    play(tmp_path, scene)
+
+
+@pytest.mark.parametrize("state", [states.STOWED, states.LOCKED, states.FAULT])
+@pytest.mark.parametrize("act", [Act.DEFOCUS, Act.STOW])
+def test_a_wrong_stow_position_proves_nothing(act: Act, state: int, tmp_path: Path) -> None:
+    """A board that is at the stow position which it stores says so, wherever its beam is."""
+
+    async def scene(bench: Bench) -> None:
+        plant, cluster = bench.plant, bench.cluster_of("P5A")
+        for name in plant.field.names:
+            put(bench, name, states.STOWED, BESIDE)
+        put(bench, "P5A", state, ON)
+        cluster.rows["flags"][cluster.names.index("P5A")] = AT_STOW
+        await bench.wait(2.0)
+        order = plant.raise_emergency("Vera", act)
+        for _ in range(20):
+            cluster.set(state, "P5A")
+            await bench.wait(0.5)
+        report = order.report(plant.now())
+        assert report.not_done == ("P5A",)
+        assert not report.complete
+        assert f"P5A: it reports {states.STATES[state]}, but by its step counts" in report.text
+        # It is an alarm without an emergency as well.
+        assert alarmed(plant) == {"P5A"}
+        put(bench, "P5A", states.STOWED, BESIDE)
+        await bench.wait(8.0)
+        assert order.report(plant.now()).complete
+        assert alarmed(plant) == set()
+
+    play(tmp_path, scene)
+
+
+def test_step_counts_from_before_an_order_prove_no_stow(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, name = bench.plant, "P5A"
+        put(bench, name, states.STOWED, BESIDE)
+        cluster = bench.cluster_of(name)
+        await bench.wait(3.0)
+        cluster.untold.add(name)
+        await bench.wait(2.5)
+        order = plant.raise_emergency("Vera", Act.STOW)
+        await bench.wait(10.0)
+        assert name in order.report(plant.now()).not_done
+        cluster.untold.clear()
+        await bench.wait(3.0)
+        assert order.is_done(name)
 
     play(tmp_path, scene)
 

@@ -37,6 +37,7 @@ TRIPS = {
     "emergency_line": (0.0, 1.0, Act.DEFOCUS, Scope.FIELD, "emergency line carries no current"),
     "nodes_unacknowledged": (1.0, 0.0, Act.DEFOCUS, Scope.FIELD, "emergency order: 1"),
     "flux_after_emergency": (0.11, 0.02, Act.STOW, Scope.FIELD, "is 11 % of nominal after an em"),
+    "unproven_after_emergency": (1.0, 0.0, Act.DEFOCUS, Scope.HELIOSTAT, "nothing shows that it"),
     "authority_lost": (10.5, 0.0, Act.REFUSE_NEW, Scope.FIELD, "authority for 1[01].* s .*10 s"),
     "receiver_flux_high": (1.02, 0.5, Act.DEFOCUS, Scope.FIELD, "is 102 % of its limit"),
     "receiver_temperature_high": (1.01, 0.9, Act.DEFOCUS, Scope.FIELD, "temperature .* is 101 %"),
@@ -46,6 +47,7 @@ TRIPS = {
     "wind_gust_defocus": (16.0, 5.0, Act.DEFOCUS, Scope.FIELD, r"of 16 m/s \(limit 15 m/s\)"),
     "wind_mean_stow": (14.5, 5.0, Act.STOW, Scope.FIELD, r"mean wind of 14.5 m/s"),
     "wind_mean_defocus": (11.5, 5.0, Act.DEFOCUS, Scope.FIELD, "mean wind of 11.5 m/s"),
+    "cold": (-3.0, 9.0, Act.REFUSE_NEW, Scope.FIELD, r"the air is at -3 °C: ice .*limit 1 °C\)"),
     "sun_below_horizon": (-0.01, 0.5, Act.STOW, Scope.FIELD, r"is -0.573° \(limit 0°\)"),
     "plant_link_lost": (3.1, 0.0, Act.DEFOCUS, Scope.CLUSTER, r"plant for .* s \(limit 3 s\)"),
     "cluster_silent": (3.1, 0.0, Act.DEFOCUS, Scope.CLUSTER, r"cluster for .* s \(limit 3 s\)"),
@@ -624,7 +626,7 @@ def test_a_proof_rests_on_the_mirrors_where_nobody_measures_the_flux() -> None:
     report = proof.with_done("A2", 41.0).report(50.0)
     assert report.complete
     assert report.flux is FluxProof.NOT_MEASURED
-    assert report.text.endswith("is done; flux on the receiver not measured")
+    assert report.text.endswith("a stalled drive reports the same")
 
 
 @pytest.mark.parametrize(("share", "trips"), [(0.05, False), (0.12, True), (None, True)])

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -240,7 +241,8 @@ class LiveConsole:
             self._why = here.plant._sentinel.refusal(here.plant.field.clusters)
             return not self._why
 
-        self.call(lambda: here.withdraw(who))
+        for call in self.call(lambda: here.plant.calls):
+            self.call(partial(here.withdraw, who, call.who))
         try:
             self.until(quiet)
         except AssertionError:

@@ -1,11 +1,13 @@
 """The vectorised field beside firmware-true boards: the same steps, from stow to stow."""
 
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
 import pytest
 
 from heliotrope.errors import InputError
+from heliotrope.geometry import reflect
 from heliotrope.lcu import states, wire
 from heliotrope.lcu.controller import STUCK_PRIMARY
 from heliotrope.lcu.sender import Sender
@@ -37,8 +39,8 @@ def field_of(mechanism: Mechanism, **options: Any) -> Field:
 class Both:
     """Boards and a field that are told the same at the same time."""
 
-    def __init__(self, play: float = 0.0, wind: Wind | None = None) -> None:
-        made = outfits(COUNT, seed=4)
+    def __init__(self, play: float = 0.0, wind: Wind | None = None, count: int = COUNT) -> None:
+        made = outfits(count, seed=4)
         self.boards = [Board(outfit, seed=i, play=play, wind=wind) for i, outfit in enumerate(made)]
         gear = {"steps_per_turn": 200, "gear_ratio": STEPS_PER_TURN / 800, "microsteps": 4}
         perfect = kinds.azimuth_elevation(
@@ -141,6 +143,14 @@ class Both:
         """Largest angle between the true normals of boards and field, rad."""
         normals = [board.mirror()[1] for board in self.boards]
         return float(np.linalg.norm(self.field.normals() - normals, axis=1).max())
+
+    def lit(self) -> list[int]:
+        """The heliostats whose true beams pass within 4 m of the receiver's middle."""
+        normal, vertex = self.field.stand()
+        sun = vector(START + timedelta(seconds=self.now), SITE)
+        beams = reflect(np.broadcast_to(sun, normal.shape), normal)
+        off = np.linalg.norm(np.cross(beams, np.array(RECEIVER) - vertex), axis=1)
+        return np.flatnonzero(off < 4.0).tolist()
 
     def states(self) -> set[str]:
         return {states.STATES[state] for state in self.field.state}
@@ -480,3 +490,51 @@ def test_what_a_field_refuses() -> None:
         field_of(field.mechanism, play=-1.0)
     with pytest.raises(InputError, match=r"probability 1.5 of losing one; give 0 or more"):
         field_of(field.mechanism, miss=1.5)
+
+
+ORDERS = (
+    "APPROACH",
+    "IDLE",
+    "TRACK",
+    "REFOCUS",
+    "DEFOCUS",
+    "STOW",
+    "LOCK",
+    "UNLOCK",
+    "CLEAR_FAULT",
+)
+
+
+@pytest.mark.parametrize("first", ORDERS)
+def test_after_any_two_orders_a_defocus_takes_the_beam_off(first: str) -> None:
+    """From standby and from the aim: every order after every other, then TRACK and DEFOCUS.
+
+    The angles of an earlier defocus must not count: from standby it goes down the way, and turns
+    nothing beside. Boards and field do the same at every tick.
+    """
+    both = Both(count=2 * len(ORDERS))
+    every = tuple(range(2 * len(ORDERS)))
+    both.run(2)
+    both.order("AIM", *RECEIVER, rows=every)
+    both.order("APPROACH", rows=every)
+    both.run(45)
+    assert both.states() == {"IDLE"}
+    both.order("TRACK", rows=every[len(ORDERS) :])
+    both.run(6)
+    both.order(first, rows=every)
+    both.run(1.5)
+    for i, second in enumerate(ORDERS):
+        both.order(second, rows=(i, i + len(ORDERS)))
+    both.run(3)
+    both.order("TRACK", rows=every)
+    both.run(6)
+    # Where it was not ordered to stow, it is off only by the last order.
+    assert "TRACKING" in both.states() or first in ("STOW", "LOCK")
+    both.order("DEFOCUS", rows=every)
+    both.run(6)
+    assert "TRACKING" not in both.states()
+    assert both.lit() == []
+    # A second one turns nothing back.
+    both.order("DEFOCUS", rows=every)
+    both.run(3)
+    assert both.lit() == []

@@ -328,16 +328,21 @@ def emergency(
     act: Annotated[str, typer.Option(help="DEFOCUS or STOW.")] = "DEFOCUS",
     reason: Annotated[str, typer.Option(help="Reason, for the audit.")] = "",
     withdraw: Annotated[
-        bool, typer.Option("--withdraw", help="Withdraw the emergency instead.")
+        bool, typer.Option("--withdraw", help="Withdraw your order instead.")
     ] = False,
+    owner: Annotated[
+        str, typer.Option(help="With --withdraw, as an engineer: whose order to withdraw.")
+    ] = "",
 ) -> None:
     """Take all beams off the receiver now."""
     with _client(context) as client:
         if withdraw:
-            found = client.ask("DELETE", "emergency")
+            found = client.ask("DELETE", "emergency", {"owner": owner})
         else:
             found = client.ask("POST", "emergency", {"act": act.upper(), "reason": reason})
     print(f"emergency {'in force' if found['on'] else 'not in force'}: {found['text']}")
+    for call in found["calls"]:
+        print(f"ordered by {call['who']} ({call['act']}, {_utc(call['at'])}): {call['reason']}")
 
 
 @app.command()

@@ -3,9 +3,15 @@
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from heliotrope.cli._common import print_json, print_table
+
+#: Suns of `defocus`: azimuth from the middle of the day, and elevation, degrees.
+_SUNS = ((0.0, 65.0), (0.0, 40.0), (90.0, 30.0), (-70.0, 20.0))
+#: How far from the receiver beams are followed there, m.
+_AROUND = 100.0
 
 app = typer.Typer(help="Make and check plant files.", no_args_is_help=True)
 
@@ -22,9 +28,17 @@ def check(
 ) -> None:
     """Print everything that is wrong or strange in a plant file; exit code 2 if it cannot run."""
     from heliotrope.field.formats import plant_file
+    from heliotrope.plant.aims import BeamCheck
 
     findings = plant_file.check_plant(file)
     wrong = any(finding.severity == "error" for finding in findings)
+    if not wrong:
+        design = plant_file.read_plant(file)
+        unsafe = BeamCheck(design, design.names).at_stow()
+        if unsafe:
+            name, text = next(iter(unsafe.items()))
+            text = f"{len(unsafe)} heliostats cannot be stowed where the file says: {name}: {text}"
+            findings.append(plant_file.Finding("warning", text))
     if as_json:
         print_json({"file": str(file), "ok": not wrong, "findings": [vars(f) for f in findings]})
     else:
@@ -80,6 +94,57 @@ def safety(
         for one in found
     ]
     print_table(("number", "in force", "default", "range"), rows)
+
+
+@app.command()
+def defocus(
+    file: Annotated[Path, typer.Argument(help="Plant file (TOML).")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Print how hot the air beside the receiver is after a DEFOCUS of the whole field.
+
+    In suns, at the hottest place: with all mirrors turned by the same angles, and as the file
+    spreads them; then how far from the receiver's centre more than 10 suns reach.
+    """
+    from heliotrope.errors import InputError
+    from heliotrope.field.formats import plant_file
+    from heliotrope.geometry import direction
+    from heliotrope.optics.standing import hottest
+    from heliotrope.plant.aims import BeamCheck, default_aims
+    from heliotrope.plant.leaving import defocused_field
+
+    design = plant_file.read_plant(file)
+    if not design.receivers or not len(design):
+        raise InputError(f"{file}: no receiver or no heliostats; nothing to defocus from")
+    check = BeamCheck(design, design.names)
+    given = default_aims(design, design.names, check.armature.origin_1, None)
+    aims, center = np.stack(list(given.values())), design.receivers[0].center
+    found = []
+    for bearing, elevation in _SUNS:
+        # The highest suns stand on the side of the equator.
+        azimuth = bearing + (0.0 if design.site.latitude_deg < 0.0 else 180.0)
+        sun = direction(np.radians(azimuth), np.radians(elevation))
+        row: dict[str, float] = {"azimuth_deg": azimuth % 360.0, "elevation_deg": elevation}
+        for name, alike in (("same", True), ("spread", False)):
+            angles = defocused_field(check, aims, sun, alike=alike)
+            hot = hottest(check.together(angles, sun), center, _AROUND)
+            away = float(np.linalg.norm(hot.point - center))
+            row |= {f"{name}_suns": hot.suns, f"{name}_m": away, f"{name}_reach_m": hot.reach}
+        found.append(row)
+    if as_json:
+        print_json(found)
+        return
+    heads = ("sun", "same angles", "as in the file", "above 10 suns")
+    rows = [
+        (
+            f"{row['azimuth_deg']:.0f}°, {row['elevation_deg']:.0f}° high",
+            f"{row['same_suns']:.0f} suns, {row['same_m']:.0f} m away",
+            f"{row['spread_suns']:.0f} suns, {row['spread_m']:.0f} m away",
+            f"within {row['spread_reach_m']:.0f} m",
+        )
+        for row in found
+    ]
+    print_table(heads, rows)
 
 
 Plant = Annotated[Path, typer.Argument(help="Plant file (TOML).")]

@@ -29,9 +29,15 @@ async def call_emergency(
 
 
 @router.delete("/emergency", response_model=models.EmergencyView, tags=["safety"])
-async def withdraw_emergency(console: Here, who: Operator) -> JSONResponse:
-    """Withdraw the emergency order; nothing moves because of it."""
-    return answer(await console.plant.ask("withdraw_emergency", who.person))
+async def withdraw_emergency(
+    console: Here, who: Anyone, given: orders.Withdrawal | None = None
+) -> JSONResponse:
+    """Withdraw your emergency order, or an owner's as an engineer; nothing moves because of it.
+
+    The emergency goes on while another person's order stands.
+    """
+    owner = "" if given is None else given.owner
+    return answer(await console.plant.ask("withdraw_emergency", who.person, owner=owner))
 
 
 @router.post("/alarms/acknowledge", status_code=204, tags=["alarms"])

@@ -25,7 +25,7 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive, rotary
 from heliotrope.mechanism.kernels import slots as slot
-from heliotrope.mechanism.machine import AxisLimits, Machine
+from heliotrope.mechanism.machine import AxisLimits, Machine, spread_machines
 from heliotrope.sun import Site
 
 #: Heliostats of one cluster controller, at most.
@@ -370,7 +370,8 @@ def stepped_machine(mechanism: Mechanism, receiver: Receiver) -> Machine:
 
     Limits are the stops of the drives, the rate is that of the drives, and the acceleration
     reaches it in half a second. At stow the azimuth is in the middle of its stops and the mirror
-    looks up. The standby point is beside the receiver, at the height of its centre.
+    looks up, from where its beam passes the receiver or a target now and then. The standby point is
+    beside the receiver, at the height of its centre.
 
     Parameters
     ----------
@@ -391,7 +392,8 @@ def stepped_machine(mechanism: Mechanism, receiver: Receiver) -> Machine:
     aside = max(_ASIDE * receiver.width, _LEAST_ASIDE) * level
     east, north, height = (receiver.center + aside).tolist()
     stow = (int(ranges[0].mean()), up)
-    return Machine((axes[0], axes[1]), stow, _DEFOCUS, (east, north, height))
+    standby = (east, north, height)
+    return Machine((axes[0], axes[1]), stow, _DEFOCUS, standby, stow_lights=True)
 
 
 def malan_plant(heliostats: int = 10_000) -> Plant:
@@ -467,6 +469,7 @@ def lay_out(
         )
     count = len(places)
     mechanism = stepped(places.position, size)
+    machine = stepped_machine(mechanism, receiver)
     return Plant(
         name or kind,
         site,
@@ -477,7 +480,7 @@ def lay_out(
                 np.full(count, size.width),
                 np.full(count, size.height),
                 cluster=clusters(count),
-                machines=(stepped_machine(mechanism, receiver),) * count,
+                machines=spread_machines(machine, places.names),
             )
         },
         targets,

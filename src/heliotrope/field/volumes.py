@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, once
-from heliotrope.field.target import Receiver
+from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray, as_float, as_vectors
 
 
@@ -129,6 +129,13 @@ def around(receiver: Receiver, room: float) -> Volume:
         ends = receiver.center - half, receiver.center + half
         return Cylinder(name, *ends, 0.5 * receiver.width + room)
     return Sphere(name, receiver.center, 0.5 * np.hypot(receiver.width, receiver.height) + room)
+
+
+def around_target(target: Target, room: float) -> Volume:
+    """Return a ball that holds a target and ``room`` (m) on every side of it."""
+    name = once(f"target {target.name}")
+    half = float(np.linalg.norm(target.corners - target.center, axis=1).max())
+    return Sphere("the target" if name == "target" else name, target.center, half + room)
 
 
 #: Number of points that draw a circle on a map.

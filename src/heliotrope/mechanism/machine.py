@@ -5,9 +5,15 @@ that a local controller stores.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from zlib import crc32
+
+import numpy as np
+import numpy.typing as npt
 
 from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float
 from heliotrope.lcu.config import (
     LEAST_DEFOCUS,
     MOST_DEFOCUS,
@@ -21,6 +27,8 @@ WAY_POINTS = MOST_POINTS
 #: Highest rate that a local controller emits, steps/s.
 MOST_RATE = 1000 * Config().stride // Config().ahead_ms
 _NAMES = ("primary", "secondary")
+#: Steps in which `spread_defocus` spreads each axis: their product is the number of machines.
+_SPREADS = 8
 
 
 @dataclass(frozen=True)
@@ -117,6 +125,9 @@ class Machine:
         `WAY_POINTS`; (): the local controller finds its own.
     stepping
         How the drivers step; None: the local controller keeps what it has, at first no rest.
+    stow_lights
+        Whether the beam may pass a receiver or a target at some hours of the year while the mirror
+        is at stow: it is one sun. Keep-out volumes are never passed.
 
     Raises
     ------
@@ -132,6 +143,7 @@ class Machine:
     azimuth_axis: int = 0
     way: tuple[tuple[float, float, float], ...] = ()
     stepping: Stepping | None = None
+    stow_lights: bool = False
 
     @property
     def rests(self) -> bool:
@@ -163,3 +175,44 @@ class Machine:
             raise InputError(
                 f"way: {len(self.way)} points; a local controller stores {WAY_POINTS} at most"
             )
+
+
+def spread_defocus(defocus: npt.ArrayLike, names: Sequence[str], spread: float) -> FloatArray:
+    """Return angles of the defocus that differ from mirror to mirror, rad, (N, 2).
+
+    If all mirrors turned by the same angles, their beams would stay together beside the receiver.
+    Each axis turns by its angle, and by up to ``spread`` times more. How much depends on the name
+    alone, so that a mirror keeps its angles when others are added. `optics.standing.hottest` shows
+    what that is worth.
+
+    Parameters
+    ----------
+    defocus
+        Smallest angles of both axes, rad, (N, 2) or (2,).
+    names
+        The N heliostats.
+    spread
+        0 for none.
+    """
+    if spread == 0.0:
+        return as_float(np.broadcast_to(as_float(defocus), (len(names), 2)))
+    drawn = np.array([crc32(name.encode()) for name in names], dtype=np.int64)
+    shares = np.stack([drawn // 256 % _SPREADS, drawn // 65536 % _SPREADS], axis=-1)
+    # To 0.1 mrad, which keeps tables of heliostats short.
+    return as_float(np.round(as_float(defocus) * (1.0 + spread * shares / (_SPREADS - 1)), 4))
+
+
+def spread_machines(
+    machine: Machine, names: Sequence[str], spread: float = 1.0
+) -> tuple[Machine, ...]:
+    """Return the machine of each of N heliostats, alike but for the defocus; see `spread_defocus`.
+
+    Heliostats with the same angles share one object.
+    """
+    made: dict[tuple[float, float], Machine] = {}
+    found = []
+    for one, two in spread_defocus(machine.defocus, names, spread).tolist():
+        if (one, two) not in made:
+            made[one, two] = replace(machine, defocus=(one, two))
+        found.append(made[one, two])
+    return tuple(found)

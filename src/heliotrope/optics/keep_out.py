@@ -50,6 +50,12 @@ def clearance(points: npt.ArrayLike, volumes: Sequence[Volume]) -> FloatArray:
     return out.reshape(*p.shape[:-1], len(volumes))
 
 
+def bounds(volumes: Sequence[Volume]) -> tuple[FloatArray, FloatArray]:
+    """Return balls about volumes: centres, ENU, m, (V, 3), and radii, m, (V,)."""
+    table, _ = _packed(volumes)
+    return table[:, 1:4].copy(), table[:, 4].copy()
+
+
 @dataclass(frozen=True)
 class Entries:
     """Where N beams enter V volumes; NaN where they are clear.

@@ -1,19 +1,22 @@
 """Aim points for heliostats, and the proof that a beam may go to its point."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
-from heliotrope.field.volumes import Volume, around
+from heliotrope.field.volumes import Volume, around, around_target
 from heliotrope.geometry import FloatArray, as_float, as_vectors
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import SLOTS, Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.mechanism.tracking import Tracking, TrackingStatus, track
 from heliotrope.optics import MirrorOptics, beams, crossing, find_entries, sweep
+from heliotrope.optics.beam import Beams
+from heliotrope.optics.standing import entered_over_the_year, standing_beams
 
 #: Length over which an unobstructed beam is followed, m.
 FAR = 3000.0
@@ -131,6 +134,9 @@ class BeamCheck:
         self.names = tuple(names)
         self.volumes = tuple(design.keep_outs if volumes is None else volumes)
         self.solids = tuple(around(receiver, ROOM) for receiver in design.receivers)
+        self._targets = tuple(around_target(target, ROOM) for target in design.targets)
+        self._centers = [receiver.center for receiver in design.receivers]
+        self._latitude = float(np.radians(design.site.latitude_deg))
         places = [*design.eyes.values()] if eyes is None else eyes
         self.eyes = as_vectors(np.reshape(as_float(places), (-1, 3)), "eyes")
         self.position = design.position[rows]
@@ -402,6 +408,61 @@ class BeamCheck:
             return np.zeros((len(rows), len(self.solids)), dtype=np.bool_)
         armature = Armature(self.armature.table[rows])
         return sweep(armature, path, sun, _MIDDLE, self.solids, reach=FAR).entered
+
+    def standing(
+        self,
+        rows: npt.NDArray[np.intp],
+        counts: FloatArray,
+        tables: tuple[FloatArray, FloatArray] | None = None,
+    ) -> dict[str, str]:
+        """Return the heliostats whose beams come too near to something in a year, and why.
+
+        That is a receiver, a target or a keep-out volume, with the mirrors standing still at counts
+        (K, 2) and the sun wherever it is in a year. See also `Machine.stow_lights`.
+
+        Parameters
+        ----------
+        rows, counts
+            Rows of the heliostats, (K,), and steps, (K, 2).
+        tables
+            Armatures and drives, (K, 18) and (K, 2, 19); None: those of the check.
+        """
+        armature, drives = tables or (self.armature.table[rows], self.drives.table[rows])
+        normal, vertex = Armature(armature).pose(Drive(drives).angles(counts))
+        volumes = (*self.solids, *self._targets, *self.volumes)
+        mirrors = _rows_of(self.mirrors, rows)
+        entered = entered_over_the_year(vertex, normal, mirrors, volumes, self._latitude, FAR)
+        machines = [self.machines.get(self.names[row]) for row in rows]
+        allowed = np.array([each is not None and each.stow_lights for each in machines], dtype=bool)
+        entered[:, : len(volumes) - len(self.volumes)] &= ~allowed[:, None]
+        return {
+            self.names[rows[i]]: f"at stow its beam would come within reach of "
+            f"{volumes[int(entered[i].argmax())].name} at some time of the year; choose another "
+            "stow position"
+            for i in np.flatnonzero(entered.any(axis=-1))
+        }
+
+    def at_stow(self) -> dict[str, str]:
+        """Return the heliostats that may not rest at their stow positions, and why.
+
+        Those whose machine is not known are left out; see `standing`.
+        """
+        known = [row for row, name in enumerate(self.names) if name in self.machines]
+        stow = [self.machines[self.names[row]].stow for row in known]
+        return self.standing(np.array(known, np.intp), np.reshape(as_float(stow), (-1, 2)))
+
+    def together(self, angles: FloatArray, sun: FloatArray) -> Beams:
+        """Return the beams of the whole field with the axes at angles (N, 2).
+
+        Each mirror is taken to be focused on the first receiver, which is where its beam is
+        strongest.
+        """
+        normal, vertex = self.armature.pose(angles)
+        mirrors = self.mirrors
+        if len(self._centers):
+            focus = np.linalg.norm(self._centers[0] - vertex, axis=-1)
+            mirrors = replace(mirrors, focus=focus)
+        return standing_beams(vertex, normal, sun, mirrors, FAR)
 
     def inside(self, row: int, poses: FloatArray, sun: FloatArray) -> npt.NDArray[np.bool_]:
         """Return in which poses, angles of the axes (K, 2), the beam of a heliostat is in a volume.

@@ -137,6 +137,7 @@ class PlantAssembly:
             assigned=ports.assigned,
             on_alarm=self.logbook.take_alarm,
             disk=ports.disk,
+            record=ports.records,
         )
         cameras = ports.cameras if design.targets else None
         cycle = joint = receiver = None

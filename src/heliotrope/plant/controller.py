@@ -13,6 +13,7 @@ emergency.
 import asyncio
 import math
 import secrets
+import struct
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,6 +28,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.volumes import Volume
 from heliotrope.files.disk import AtOnce, Disk
 from heliotrope.geometry import FloatArray
+from heliotrope.lcu.journal import CODES_OF
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.common_settings import settings_checksum
 from heliotrope.links.link import Link
@@ -53,7 +55,14 @@ from heliotrope.plant.cluster_settings import ClusterSettings
 from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
 from heliotrope.plant.commands import Commands
 from heliotrope.plant.doubts import Doubts
-from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
+from heliotrope.plant.emergency import (
+    Call,
+    EmergencyOrder,
+    EmergencyRecord,
+    PlantReadings,
+    Sentinel,
+    TableWatch,
+)
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.given import Given
 from heliotrope.plant.giving_back import GivingBack
@@ -112,6 +121,8 @@ class PlantController:
         Called with each alarm.
     disk
         Does what waits for a disk; None: it is done in the loop, as virtual time needs it.
+    record
+        Store of the emergency that stands; None: it ends with the program.
 
     Attributes
     ----------
@@ -156,6 +167,7 @@ class PlantController:
         entropy: Callable[[int], bytes] = secrets.token_bytes,
         on_alarm: Callable[[Alarm], None] | None = None,
         disk: Disk | None = None,
+        record: EmergencyRecord | None = None,
     ) -> None:
         members = _checked(design, links, clusters)
         self.design, self.settings = design, settings or PlantSettings()
@@ -199,9 +211,10 @@ class PlantController:
             self._clusters,
             self._tell,
             self._rewriting,
+            self._resting,
             self._unwritable,
         )
-        self._sentinel = self._guarded(table)
+        self._sentinel = self._guarded(table, record)
         self._given = Given(self.field, points)
         self._permission = self._permitting()
         self._commands = self._directed()
@@ -226,7 +239,9 @@ class PlantController:
             self._sent,
         )
 
-    def _guarded(self, table: Iterable[Condition] | None) -> Sentinel:
+    def _guarded(
+        self, table: Iterable[Condition] | None, record: EmergencyRecord | None
+    ) -> Sentinel:
         """Return the sentinel, with the plant's own readings of the safety table."""
         if table is None:
             table = limited(conditions(self.settings.autonomy), self.design.safety)
@@ -254,6 +269,7 @@ class PlantController:
             self.beams.drives,
             self.settings.repeat,
             self._identities,
+            record,
         )
 
     def _permitting(self) -> Permission:
@@ -472,6 +488,11 @@ class PlantController:
         return self._sentinel.order
 
     @property
+    def calls(self) -> tuple[Call, ...]:
+        """The emergency orders of persons that have not been withdrawn, one for each person."""
+        return self._sentinel.calls
+
+    @property
     def emergency_on(self) -> bool:
         """Whether an emergency of the whole field holds."""
         return self._sentinel.on
@@ -548,7 +569,8 @@ class PlantController:
     def raise_emergency(self, who: str, act: Act = Act.DEFOCUS, reason: str = "") -> EmergencyOrder:
         """Order DEFOCUS or STOW of the whole field, with proof; anybody may.
 
-        It holds until it is withdrawn and the rows that it trips are acknowledged.
+        Each person's order holds until it is withdrawn, and the rows that it trips until they are
+        acknowledged.
 
         Raises
         ------
@@ -557,7 +579,8 @@ class PlantController:
         """
         if act not in (Act.DEFOCUS, Act.STOW):
             raise InputError(f"emergency: {act.name} cannot be ordered; give DEFOCUS or STOW")
-        return self._sentinel.call(who, act, reason or f"emergency order of {who}")
+        at = self.clock.utc().timestamp()
+        return self._sentinel.call(who, act, reason or f"emergency order of {who}", at)
 
     # -- the command authority -------------------------------------------------------------
 
@@ -600,17 +623,25 @@ class PlantController:
         self.authority.release(person, token)
         self.note(person, "AUTHORITY", "released")
 
-    def withdraw_emergency(self, person: Person) -> None:
-        """Withdraw an emergency order; the rows that it tripped wait for `acknowledge`.
+    def withdraw_emergency(self, person: Person, owner: str = "") -> None:
+        """Withdraw a person's own emergency order, or, as an engineer, that of an ``owner``.
+
+        The emergency goes on while another person's order stands; the rows that it tripped wait for
+        `acknowledge`.
 
         Raises
         ------
         RefusedError
-            For a viewer.
+            If the person has ordered none while others have, or is no engineer.
         """
-        person.must_be(Role.OPERATOR, "emergency")
-        self._sentinel.withdraw()
-        self.note(person, "WITHDRAW", "emergency order")
+        who, calls = owner or person.name, self.calls
+        if who != person.name:
+            person.must_be(Role.ENGINEER, f"withdraw the emergency of {who}")
+        if calls and who not in {call.who for call in calls}:
+            texts = "; ".join(call.text for call in calls)
+            raise refusals.NOT_CALLER.error(who=who, calls=texts)
+        self._sentinel.withdraw(who)
+        self.note(person, "WITHDRAW", f"emergency order of {who}")
 
     def acknowledge(self, person: Person, condition: str, subject: str = "") -> None:
         """Acknowledge a row of the safety table that waits for it.
@@ -634,7 +665,7 @@ class PlantController:
         if condition == alarms.COUNTS_DOUBTFUL.name:
             self.doubts.confirm(subject)
         elif condition in self._sentinel.table.rows or subject not in self._clusters.ends:
-            refusal = self._sentinel.table.acknowledge(condition, person.name, role, subject)
+            refusal = self._sentinel.acknowledge(condition, person.name, role, subject)
             if refusal:
                 raise refusals.NOT_ACKNOWLEDGED.error(reason=refusal)
         else:
@@ -794,9 +825,9 @@ class PlantController:
         if wrong := self._unwritable((heliostat,)):
             raise BeamError("PARAMETERS", wrong)
         before, after = self._tables(heliostat, items)
+        self.authority.check(person, token, "PARAMETERS")
+        self._sync.check(heliostat, items)
         if POSE_ITEMS.intersection(items):
-            self.authority.check(person, token, "PARAMETERS")
-            self._sync.check(heliostat, items)
             change, limit = change_of_beam(before, after, self._aimed(row)), self.settings
             if not confirmed.strip() and change > limit.largest_change:
                 raise refusals.CHANGE_TOO_LARGE.error(
@@ -856,6 +887,16 @@ class PlantController:
         """Return the heliostats to which nothing may be written, and the reasons."""
         out = self.lockouts.blocked("PARAMETERS", heliostats)
         return self._identities.barred(heliostats) | out
+
+    def _resting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
+        """Return why a heliostat may not rest at the stow position in items, "" if it may."""
+        if "stow" not in items:
+            return ""
+        counts = np.array([struct.unpack(CODES_OF["stow"], items["stow"])], dtype=np.float64)
+        armature, drives = self._tables(heliostat, items)[1]
+        rows = np.array([self.field.place(heliostat)])
+        found = self.beams.standing(rows, counts, (armature[None], drives[None]))
+        return found.get(heliostat, "")
 
     def _differing(self, heliostats: Sequence[str]) -> Mapping[str, str]:
         return self._sync.differing(heliostats)

@@ -5,6 +5,8 @@ needed. The ways are those of a mirror that has no sun: by the angles of the def
 stow, azimuth last.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from heliotrope.geometry import FloatArray, as_float
@@ -93,6 +95,40 @@ def defocused(
         if end is not None:
             return end
     return turned_away(begin, machine, drives, _angles(check, row, aim, counts, sun))
+
+
+def defocused_field(
+    check: BeamCheck, aims: FloatArray, sun: FloatArray, *, alike: bool = False
+) -> FloatArray:
+    """Return the angles (N, 2) where DEFOCUS ends for a field that tracks its aims (N, 3).
+
+    Parameters
+    ----------
+    check
+        The field.
+    aims, sun
+        ENU, m, (N, 3), and the unit vector to the sun, (3,).
+    alike
+        Whether all turn by the smallest angles of the field, as if they were not spread.
+    """
+    rows = np.arange(len(check.names))
+    tracking = check.poses(rows, aims, sun)
+    machines = [check.machines.get(name) for name in check.names]
+    known = [machine for machine in machines if machine is not None]
+    if alike and known:
+        one, two = np.min([machine.defocus for machine in known], axis=0).tolist()
+        machines = [None if m is None else replace(m, defocus=(one, two)) for m in machines]
+    points = [None if m is None or m.standby is None else m.standby for m in machines]
+    standbys = as_float([(np.nan,) * 3 if point is None else point for point in points])
+    stood = check.poses(rows, standbys, sun, tracking.best_counts).best_angles
+    begin = as_float(tracking.best_angles)
+    drives = check.drives.table
+    return np.stack(
+        [
+            turned_away(begin[row], machines[row], Drive(drives[row]), None, stood[row])
+            for row in rows
+        ]
+    )
 
 
 def _down(

@@ -115,6 +115,8 @@ class ParameterSync:
         Called with each alarm.
     proof
         Returns why items may not be written where a heliostat stands, "" if they may.
+    stow_proof
+        Returns why a heliostat may not rest at the stow position in items, "" if it may.
     barred
         Returns the heliostats to which nothing may be written, and the reasons.
     """
@@ -127,11 +129,12 @@ class ParameterSync:
         clusters: Clusters,
         tell: Callable[[Alarm], None],
         proof: Callable[[str, Mapping[str, bytes]], str],
+        stow_proof: Callable[[str, Mapping[str, bytes]], str],
         barred: Callable[[Sequence[str]], Mapping[str, str]],
     ) -> None:
         self._field, self._wanted, self._orders = field, wanted, orders
         self._clusters, self._tell, self._proof = clusters, tell, proof
-        self._barred = barred
+        self._stow_proof, self._barred = stow_proof, barred
         #: Heliostats to be compared, each with its time, monotonic s.
         self._due = dict.fromkeys(wanted.items, -math.inf)
         #: Those not compared since their cluster connected: any board may answer there.
@@ -172,8 +175,11 @@ class ParameterSync:
         Raises
         ------
         RefusedError
-            If they change its pose where it does not stand still, or where its beam is not free.
+            If they change its pose where it does not stand still, or where its beam is not free; or
+            a stow position from which its beam would light a receiver, a target or a volume.
         """
+        if reason := self._stow_proof(heliostat, items):
+            raise refusals.STOW_UNPROVEN.error(heliostat=heliostat, reason=reason)
         state = int(self._field.rows["state"][self._field.place(heliostat)])
         moving = ", ".join(sorted(POSE_ITEMS.intersection(items)))
         reason = ""
@@ -268,13 +274,19 @@ class ParameterSync:
             return
         self._tried[name] = now
         items = {item: self._wanted.items[name][item] for item in able}
+        if reason := self._stow_proof(name, items):
+            del items["stow"]
+            listed = f"stow, which is not written: {reason}"
+            self._tell(alarms.PARAMETERS_DIFFER.raised(name, items=listed))
+        if not items:
+            return
         try:
             self.check(name, items)
         except refusals.RefusedError:
             return  # it is written at stow
         try:
             ticket = self._orders.accept(
-                ("plant", "plant", "PARAMETERS"), (), (name,), ", ".join(able)
+                ("plant", "plant", "PARAMETERS"), (), (name,), ", ".join(items)
             )
         except AuditError:
             return  # nothing is sent without its record; the safety table reports the disk

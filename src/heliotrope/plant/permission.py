@@ -11,7 +11,7 @@ from heliotrope.plant.audit import AuditError
 from heliotrope.plant.authority import Authority, Person
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.doubts import Doubts
-from heliotrope.plant.emergency import Sentinel
+from heliotrope.plant.emergency import UNPROVEN, Sentinel
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.given import Given
 from heliotrope.plant.identity import Identities
@@ -100,6 +100,7 @@ class Permission:
             wrong |= self._untaken(names)
         elif name in _TO_STANDBY:
             wrong |= self._sentinel.barred(self._off(names), ASTRAY)
+            wrong |= self._sentinel.barred(names, UNPROVEN)
         elif name in _STILL:
             for row in _SENT_OFF:
                 wrong |= self._sentinel.barred(names, row)

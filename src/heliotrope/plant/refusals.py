@@ -140,6 +140,12 @@ NOT_OWNER = Refusal(
     "{what}: {who} has no lock on {name}, which is locked: {text}",
     "Each person returns their own lock; an engineer may remove another's by the owner's name.",
 )
+NOT_CALLER = Refusal(
+    "not the caller",
+    "A person withdraws an emergency that only others have ordered.",
+    "withdraw: {who} has ordered no emergency; it was ordered by {calls}",
+    "Each person withdraws their own order; an engineer withdraws another's by the owner's name.",
+)
 NOT_ACKNOWLEDGED = Refusal(
     "not acknowledged",
     "The row is not tripped, its cause has not gone, or it needs another role.",
@@ -253,6 +259,13 @@ PARAMETERS_NOT_HERE = Refusal(
     "Parameters that change a pose are given where the beam would move or is not proven free.",
     "PARAMETERS {heliostat}: {reason}; stow it first",
     "Stow the heliostat, or lock it at standby, then give the parameters again.",
+)
+STOW_UNPROVEN = Refusal(
+    "stow unproven",
+    "A stow position is given from which the beam would light something at some time of the year.",
+    "PARAMETERS {heliostat}: {reason}",
+    "Choose a stow position that `heliotrope field check` accepts; a mirror that looks to the "
+    "horizon, away from the tower, is one.",
 )
 CHANGE_TOO_LARGE = Refusal(
     "change too large",

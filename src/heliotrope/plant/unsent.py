@@ -2,7 +2,8 @@
 
 Every heliostat is looked at that is not tracking or searching, by its step counts and the mechanism
 that the plant believes: a beam is on the receiver by where it is, whatever the state is called. A
-mirror that comes nearer to its goal is on its way, and one at stow has nowhere better to go.
+mirror that comes nearer to its goal is on its way. One at stow is checked as all others are: the
+stow position may be the wrong one.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.geometry import FloatArray
-from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
@@ -30,7 +30,6 @@ _MOVES, _GAINS = 200, 20
 _SENT = (states.TRACKING, states.SEARCHING)
 #: States in which DEFOCUS turns nothing any more.
 _TURNED = (states.DEFOCUSED, states.STOWING)
-_AT_STOW = 1 << meanings.FLAGS.index("AT_STOW")
 
 
 class UnsentBeams:
@@ -84,8 +83,7 @@ class UnsentBeams:
         field = self._field
         self._turn = (self._turn + 1) % TURNS
         every = np.arange(len(field))
-        at_stow = field.rows["flags"] & _AT_STOW != 0
-        watched = field.sure(now) & ~np.isin(field.rows["state"], _SENT) & ~at_stow
+        watched = field.sure(now) & ~np.isin(field.rows["state"], _SENT)
         left = np.abs(field.goals(every) - field.counts(every)).max(axis=-1)
         moves = left > _MOVES
         chosen = watched & (moves | (every % TURNS == self._turn))

@@ -27,6 +27,7 @@ from heliotrope.safety.evaluation import (
     decision,
     evaluate,
     narrowed,
+    recalled,
     start,
     watched_by,
 )
@@ -74,6 +75,7 @@ __all__ = [
     "narrowed",
     "numbers",
     "proof_readings",
+    "recalled",
     "settings_of",
     "start",
     "watched_by",

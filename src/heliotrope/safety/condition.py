@@ -107,7 +107,7 @@ class Condition:
     watcher
         Tier that evaluates it.
     reading, unit
-        Key of the reading, and its unit: "s", "m/s", "rad", "share" (1 is 100 %), "count" or
+        Key of the reading, and its unit: "s", "m/s", "rad", "°C", "share" (1 is 100 %), "count" or
         "yes/no" (1 is yes).
     what, wrong
         The reading as a noun; what is wrong when the row trips, with ``{value}`` for the reading.
@@ -132,6 +132,8 @@ class Condition:
         Whether the reading is an age or a silence, which grows until the next reading.
     role
         Role that must acknowledge; None if the row does not latch.
+    waiver
+        Role that may end a row that does not latch although its cause has not gone; None: nobody.
     release
         Condition of its end, in words.
     remedy
@@ -160,6 +162,7 @@ class Condition:
     stale_after: float = 5.0
     ages: bool = False
     role: AcknowledgeRole | None = None
+    waiver: AcknowledgeRole | None = None
     release: str = ""
     remedy: str = ""
     site: tuple[float, float] | None = None

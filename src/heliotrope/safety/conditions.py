@@ -88,6 +88,15 @@ def _orders() -> tuple[Condition, ...]:
             " still on it.", site=(0.01, 0.10),
         ),
         Condition(
+            "unproven_after_emergency", _PLANT, "unproven", "yes/no",
+            "missing proof that it has carried out an emergency order",
+            "an emergency has ended, and nothing shows that it has carried out the order", 0.5, 0.4,
+            _DEFOCUS, _HELIOSTAT, _SERIOUS, 30.0, waiver=_SUPERVISOR,
+            release="its reports show that it has carried out the order",
+            remedy="Assume that its beam has not moved: inspect it from a safe place. An engineer"
+            " who has seen that it is off acknowledges it by name.",
+        ),
+        Condition(
             "authority_lost", _PLANT, "authority_silence", "s",
             "time since the command authority was renewed",
             "nobody has renewed the command authority for {value}",
@@ -160,6 +169,14 @@ def _weather() -> tuple[Condition, ...]:
             "mean wind of {value}", 11.0, 9.0, _DEFOCUS, _FIELD, _WARNING, 30.0,
             clear_for=600.0, release="the wind has dropped", remedy="Wait for the wind to drop.",
             site=(3.0, 20.0),
+        ),
+        Condition(
+            "cold", _PLANT, "temperature", "°C", "temperature of the air",
+            "the air is at {value}: ice may hold drives, and a stalled drive reports steps that the"
+            " mirror has not made", 1.0, 4.0, _REFUSE, _FIELD, _WARNING, 65.0, clear_for=1800.0,
+            stale_after=60.0, release="the air is warm again",
+            remedy="Wait until it is warmer; look whether mirrors carry ice before the field goes"
+            " up.", site=(-20.0, 20.0),
         ),
         Condition(
             "sun_below_horizon", _PLANT, "sun_elevation", "rad", "elevation of the sun",

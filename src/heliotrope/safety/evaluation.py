@@ -180,6 +180,21 @@ def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetySt
     return replace(state, tracks=tracks)
 
 
+def recalled(state: SafetyState, keys: Iterable[Key]) -> SafetyState:
+    """Return the state with rows tripped as before a restart, each with its subject.
+
+    They release as all rows do: by fresh readings, and an acknowledgement where they wait for one.
+    A row that is no longer in the table is left out.
+    """
+    known = {row.name: row for row in state.table}
+    tripped = {
+        key: Track(seen=state.now, tripped_at=state.now)
+        for key in keys
+        if key[0] in known and (key in state.tracks or known[key[0]].scope is Scope.HELIOSTAT)
+    }
+    return replace(state, tracks={**state.tracks, **tripped})
+
+
 def evaluate(
     readings: Mapping[Key, Reading], state: SafetyState, now: float
 ) -> tuple[SafetyState, list[Action]]:
@@ -313,6 +328,8 @@ def _act(row: Condition, tripped_for: float) -> Act:
 def _said(row: Condition, track: Track, now: float) -> str:
     """Return, in words, the value that the row is judged by."""
     counts = _counting(row, track.value, track.seen, now)
+    if track.value is None and not row.ages and now - track.seen <= row.stale_after:
+        return f"tripped when the plant's program ended, and {row.what} has not been read since"
     if math.isinf(counts):
         return f"no reading of {row.what} for {now - track.seen:.1f} s, so the worst case counts"
     if row.beyond(counts):
@@ -365,13 +382,14 @@ def acknowledge(
         return state, f"{label}: there is no such condition here"
     if track.tripped_at is None:
         return state, f"{label}: it is not tripped; there is nothing to acknowledge"
-    if row.role is None:
+    needed = row.waiver if row.role is None else row.role
+    if needed is None:
         return state, f"{label}: it releases by itself and needs no acknowledgement"
     if not who.strip():
         return state, f"{label}: an acknowledgement needs a person's name"
-    if role < row.role:
-        return state, f"{label}: {row.role.title} must acknowledge, not {role.title}"
-    if not track.cleared:
+    if role < needed:
+        return state, f"{label}: {needed.title} must acknowledge, not {role.title}"
+    if not track.cleared and row.waiver is None:
         return state, f"{label}: {_remains(row, track, state.now)}"
     released = replace(
         track, tripped_at=None, cleared=False, beyond_since=None, acknowledged_by=who.strip()

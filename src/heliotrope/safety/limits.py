@@ -25,10 +25,11 @@ _UNITS: dict[str, dict[str, float]] = {
     "rad": {"_deg": math.pi / 180.0, "_mrad": 1e-3},
     "share": {"_percent": 0.01},
     "count": {"": 1.0},
+    "°C": {"_c": 1.0},
     "yes/no": {},
 }
 #: Safest value of a reading that is bad when it is small.
-_SAFEST = {"share": 1.0, "rad": math.pi / 4.0}
+_SAFEST = {"share": 1.0, "rad": math.pi / 4.0, "°C": 40.0}
 #: Angles below this are shown in mrad, rad.
 _SMALL = 0.05
 #: Shortest and longest time of a key, s. A longer ``then_stow`` than the row's own is refused too.

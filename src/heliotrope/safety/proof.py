@@ -1,4 +1,8 @@
-"""The proof that an emergency order was carried out."""
+"""The proof that an emergency order was carried out.
+
+It is a proof of reports: of states and step counts. Only the flux on the receiver is measured,
+where a sensor feeds it.
+"""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -22,12 +26,14 @@ FLUX_READING = "receiver_flux_nominal"
 class FluxProof(Enum):
     """What a proof says about the flux on the receiver; the value is its text."""
 
-    #: No sensor feeds it: the proof rests on what is known of each heliostat.
-    NOT_MEASURED = "flux on the receiver not measured"
+    #: No sensor feeds it: the proof rests on what each heliostat reports.
+    NOT_MEASURED = (
+        "flux on the receiver not measured, so this is believed: a stalled drive reports the same"
+    )
     #: There is still time for a reading.
     AWAITED = "flux not proven yet"
     #: A fresh reading, taken after the order, shows it below its limit.
-    BELOW = "the flux is below its limit"
+    BELOW = "measured: the flux is below its limit"
     #: No such reading came in time.
     NOT_BELOW = f"flux not proven to be below {FLUX_LIMIT:.0%}"
 
@@ -62,7 +68,7 @@ class ProofReport:
     def text(self) -> str:
         """One line for the operator."""
         if self.complete:
-            return f"every heliostat has acknowledged and is done; {self.flux.value}"
+            return f"every heliostat has acknowledged and is done, as it reports; {self.flux.value}"
         parts = []
         for names, what in ((self.unacknowledged, "not acknowledged"), (self.not_done, "not done")):
             if names:

@@ -45,6 +45,8 @@ _NUMBERED = (tables.sighting, tables.visit, tables.hold, tables.event, tables.al
 _MANY = 500
 #: Row of the table ``about`` with the numbers of the safety table in force.
 _LIMITS = "safety limits"
+#: Name of the document about the emergency that stands.
+_EMERGENCY = "emergency"
 
 
 class Keeper:
@@ -468,6 +470,17 @@ class Keeper:
 
         before = self.do(work)
         return {} if before is None else dict(json.loads(before))
+
+    def emergency(self) -> str:
+        """Return the document about the emergency that stands, "" if none does."""
+        about = tables.about
+        query = select(about.c.value).where(about.c.name == _EMERGENCY)
+        return str(self.do(lambda connection: connection.scalar(query)) or "")
+
+    def keep_emergency(self, document: str) -> None:
+        """Replace the document about the emergency that stands; "" if none does any more."""
+        row = {"name": _EMERGENCY, "value": document}
+        self.writer.put(lambda connection: rows.replace(connection, tables.about, [row]))
 
     def do(self, work: Work[Any], timeout: float = 5.0) -> Any:
         """Do work in the writer and return its result; see `Writer.do`."""

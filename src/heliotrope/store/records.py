@@ -434,6 +434,14 @@ class Records(Protocol):
         """Keep the numbers of the safety table in force; return those of the run before, or {}."""
         ...
 
+    def emergency(self) -> str:
+        """Return the document about the emergency that stands, "" if none does."""
+        ...
+
+    def keep_emergency(self, document: str) -> None:
+        """Replace the document about the emergency that stands; "" if none does any more."""
+        ...
+
     async def confirm(self) -> None:
         """Wait until all earlier records are safe.
 

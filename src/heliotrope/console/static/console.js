@@ -56,8 +56,16 @@ function badge(box) {
 function alert(box) {
   const text = h("span"), viewer = me.role === "viewer";
   const back = h("button", { className: "hx-button", onclick: async () => {
-    if (!await ask("Withdraw the emergency order? Nothing moves because of it; alarms that remain must be acknowledged.", [], "Withdraw")) return;
-    try { await api("DELETE", "emergency"); say("emergency withdrawn; acknowledge the alarms that remain"); } catch (error) { say(error.message, true); }
+    // Each person withdraws their own order; an engineer withdraws another's by the owner's name.
+    const { calls } = store.head.order, owners = calls.map((call) => call.who), own = !calls.length || owners.includes(me.name);
+    const by = (call) => `${call.who}: ${call.reason}`;
+    const whose = own ? "your emergency order" : `another person's emergency order (${calls.map(by).join("; ")})`;
+    const given = await ask(`Withdraw ${whose}? Nothing moves because of it; alarms that remain must be acknowledged.`, own ? [] : [{ name: "owner", label: "Whose", options: owners }], "Withdraw");
+    if (!given) return;
+    try {
+      const left = (await api("DELETE", "emergency", own ? undefined : { owner: given.owner })).calls;
+      say(left.length ? `withdrawn; still ordered by ${left.map(by).join("; ")}` : "emergency withdrawn; acknowledge the alarms that remain");
+    } catch (error) { say(error.message, true); }
   } }, "Withdraw");
   const resume = h("button", { className: "hx-button", onclick: async () => {
     if (await ask("Resume automatic control? It raises the heliostats that it has lost.", [], "Resume")) await act(() => api("POST", "automatic/resume"), "Resume");
@@ -67,8 +75,8 @@ function alert(box) {
   return store.on("frame", (now) => {
     box.classList.toggle("on", now.emergency || Boolean(now.resume));
     box.classList.toggle("waits", !now.emergency);
-    back.hidden = !now.emergency; resume.hidden = !now.resume;
-    text.textContent = now.emergency ? `EMERGENCY ${now.order.act} by ${now.order.who || "the safety table"} · acknowledged ${count(now.order.acknowledged)} of ${count(now.order.heliostats)} · done ${count(now.order.done)}` : now.resume;
+    back.hidden = !now.emergency || !now.order.calls.length; resume.hidden = !now.resume;
+    text.textContent = now.emergency ? `EMERGENCY ${now.order.act} by ${now.order.calls.length ? now.order.calls.map((call) => `${call.who} (${call.reason})`).join(", ") : now.order.who || "the safety table"} · acknowledged ${count(now.order.acknowledged)} of ${count(now.order.heliostats)} · done ${count(now.order.done)}` : now.resume;
   });
 }
 

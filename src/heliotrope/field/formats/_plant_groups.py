@@ -24,7 +24,7 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS, Drive
 from heliotrope.mechanism.kernels import slots as slot
-from heliotrope.mechanism.machine import AxisLimits, Machine, Stepping
+from heliotrope.mechanism.machine import AxisLimits, Machine, Stepping, spread_defocus
 from heliotrope.sun import Site
 
 # Numbers of a drive as the writer names them; names such as "rate" have no unit because it
@@ -312,7 +312,9 @@ class _Reader:
             )
             if numbers not in made:
                 limits = (AxisLimits(*numbers[0]), AxisLimits(*numbers[1]))
-                made[numbers] = Machine(limits, *numbers[2:], joints.index(first), way, stepping)
+                made[numbers] = Machine(
+                    limits, *numbers[2:], joints.index(first), way, stepping, table.stow_lights
+                )
             found.append(made[numbers])
         return tuple(found)
 
@@ -369,7 +371,8 @@ class _Reader:
             raise self.fail("give one of defocus_deg, defocus_mrad, defocus_rad", "machine")
         key = f"defocus_{units[0]}"
         given = self.array(f"machine.{key}", getattr(table, key))
-        return np.asarray(given * ANGLE_UNITS[units[0]])
+        names = [self.table.name[row] for row in self.rows]
+        return spread_defocus(given * ANGLE_UNITS[units[0]], names, table.defocus_spread)
 
 
 def _joint_names(kind: str) -> tuple[str, str]:
@@ -467,6 +470,7 @@ def _machine_document(
     document: dict[str, Any] = {
         "stow_steps": first("machine.stow_steps", np.array([one.stow for one in machines])),
         "defocus_rad": first("machine.defocus_rad", np.array([one.defocus for one in machines])),
+        "defocus_spread": 0.0,  # the angles of each mirror are written
         "leaves_stow_first": joints[machines[0].azimuth_axis],
     }
     if machines[0].standby is not None:
@@ -479,4 +483,6 @@ def _machine_document(
             "microsteps": list(stepping.microsteps),
             "rests": stepping.rests,
         }
+    if machines[0].stow_lights:
+        document["stow_lights"] = True
     return {**document, "axes": axes}

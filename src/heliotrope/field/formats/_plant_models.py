@@ -275,6 +275,16 @@ class MachineTable(StrictTable):
     )
     defocus_mrad: Pair | None = None
     defocus_rad: Pair | None = None
+    defocus_spread: Annotated[float, Field(ge=0.0, le=4.0)] = Field(
+        1.0,
+        description="Each mirror turns by up to this many times more, so that their beams part; "
+        "0: all by the same angles.",
+    )
+    stow_lights: bool = Field(
+        False,
+        description="Whether beams may pass a receiver or a target at some hours of the year while "
+        "the mirrors are at stow.",
+    )
     standby_m: Vector | None = Field(
         None, description="ENU; without: the local controller keeps the point it has."
     )

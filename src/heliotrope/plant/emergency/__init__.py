@@ -6,15 +6,21 @@ field with its proof.
 """
 
 from heliotrope.plant.emergency.order import EmergencyOrder, at_stow, carried_out
-from heliotrope.plant.emergency.sentinel import Sentinel
+from heliotrope.plant.emergency.sentinel import UNPROVEN, Sentinel
+from heliotrope.plant.emergency.standing import Call, EmergencyRecord, Standing, read_standing
 from heliotrope.plant.emergency.table import OWN_READINGS, PlantReadings, TableWatch
 
 __all__ = [
     "OWN_READINGS",
+    "UNPROVEN",
+    "Call",
     "EmergencyOrder",
+    "EmergencyRecord",
     "PlantReadings",
     "Sentinel",
+    "Standing",
     "TableWatch",
     "at_stow",
     "carried_out",
+    "read_standing",
 ]

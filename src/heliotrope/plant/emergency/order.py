@@ -138,7 +138,7 @@ class EmergencyOrder:
     ) -> None:
         """Take the state of heliostats (K,): rows of `NODE`, when they were true, and drives.
 
-        Step counts (``counted``) from before the order prove no DEFOCUS.
+        Step counts (``counted``) from before the order prove nothing: they do not show the beam.
 
         ``strange`` ones are not what their address says. They are done at stow only: the goals of
         their defocus may belong to another mirror. Where a beam is still on a receiver (``lit``),
@@ -146,9 +146,9 @@ class EmergencyOrder:
         """
         settled = heard >= self.at + LEAVING
         stowed = carried_out(Act.STOW, rows, drives, settled)
-        off = carried_out(self.act, rows, drives, settled) & (counted >= self.at)
+        off = carried_out(self.act, rows, drives, settled)
         fulfilled = stowed | (off & ~strange)
-        fulfilled &= (heard >= self.at) & ~lit
+        fulfilled &= (heard >= self.at) & (counted >= self.at) & ~lit
         ready = tuple(names[i] for i in np.flatnonzero(fulfilled))
         if ready:
             self.take_stage(ready, Stage.DONE, now)

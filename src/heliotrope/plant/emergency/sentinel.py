@@ -5,11 +5,12 @@ a person orders it. It ends when nothing demands it any more: the causes have go
 acknowledged, and a person's order is withdrawn.
 """
 
+import contextlib
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
@@ -20,21 +21,28 @@ from heliotrope.plant.emergency.order import (
     COUNTS_UNKNOWN,
     ON_BEAM,
     EmergencyOrder,
-    at_stow,
     switched_off,
 )
+from heliotrope.plant.emergency.standing import Call, EmergencyRecord, Standing, read_standing
 from heliotrope.plant.emergency.table import TableWatch
-from heliotrope.plant.field_state import FieldState, Mask
+from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.joining import JoinQueue
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety import FLUX_READING, Act, Alarm
+from heliotrope.safety import FLUX_READING, AcknowledgeRole, Act, Alarm
+from heliotrope.store.records import StoreError
 
 #: A heliostat that was sent off the receiver shows it within this time, s.
 OFF_SHOWS = 10.0
 #: Longest pause between two orders to one heliostat that does not show them, s.
 LONGEST_PAUSE = 60.0
+#: Row of heliostats that an emergency left unproven.
+UNPROVEN = "unproven_after_emergency"
+#: A heliostat that was proven after its emergency is shown to the table for this long, s.
+_PROVEN_SHOWS = 5.0
+#: Pause between two records of a proof that goes on, s.
+_KEEP_PERIOD = 1.0
 #: Name and role of the safety table in a record.
 _TABLE = ("safety table", "plant")
 
@@ -56,6 +64,9 @@ class Sentinel:
         Pause between two repetitions of an order, s.
     identities
         Heliostats that are not what their address says: they must leave, and are done at stow only.
+    record
+        Store of the emergency that stands: the plant begins in one that held when its last program
+        ended. None: it ends with the program.
 
     Attributes
     ----------
@@ -78,10 +89,20 @@ class Sentinel:
         drives: Drive,
         repeat: float,
         identities: Identities,
+        record: EmergencyRecord | None = None,
     ) -> None:
         self.order: EmergencyOrder | None = None
         self.on = False
-        self._called = False
+        self._record, self._kept_at = record, -math.inf
+        self._kept = self._recalled = Standing() if record is None else _recall(record)
+        self._calls = {call.who: call for call in self._recalled.calls}
+        #: Heliostats that an emergency left unproven, and when each was proven, monotonic s.
+        self._unproven: dict[str, float] = {}
+        if not self._recalled.act:
+            left = set(self._recalled.unproven) & set(field.names)
+            self._unproven = dict.fromkeys(sorted(left), math.inf)
+        known = {"", *field.names, *field.clusters}
+        table.recall(row for row in self._recalled.rows if row[1] in known)
         self._clock, self.table, self._field = clock, table, field
         self._orders, self._joining, self._ways = orders, joining, ways
         self._drives, self._repeat, self._identities = drives, repeat, identities
@@ -97,10 +118,12 @@ class Sentinel:
     def beat(self, now: float) -> list[Alarm]:
         """Evaluate the table and do what it demands; return the alarms raised and ended."""
         proof = self.order.proof if self.on and self.order is not None else None
-        news = self.table.evaluate(proof, called=self._called, now=now)
+        self._unproven = {n: at for n, at in self._unproven.items() if now - at < _PROVEN_SHOWS}
+        news = self.table.evaluate(proof, self._unproven, called=bool(self._calls), now=now)
         self._obey_field(now)
         self._obey_clusters()
         self._obey_heliostats(now)
+        self._keep(now)
         return news
 
     def _obey_field(self, now: float) -> None:
@@ -109,11 +132,12 @@ class Sentinel:
         # A consequence of an emergency may make it worse, but begins none: it would never end.
         if wanted is not None and wanted >= Act.DEFOCUS and (caused or self.on):
             if not self.on or order is None or wanted > order.act:
-                self._begin(wanted, _TABLE, self.table.reasons(Act.DEFOCUS))
+                self._begin_again(wanted)
             elif now - self._repeated_at >= self._repeat:
                 self._repeat_order(self._field.clusters)
-        if not caused:
+        if not caused and self.on:
             self.on = False
+            self._unproven = dict.fromkeys(self._not_done(), math.inf)
         if wanted is not None and wanted >= Act.HOLD:
             self._joining.drop(self.table.reasons(Act.HOLD))
 
@@ -151,8 +175,8 @@ class Sentinel:
                 continue
             self._tries[name] = tries + 1, now + min(OFF_SHOWS * 2**tries, LONGEST_PAUSE)
             best = self._ways.way_out(name, again=tries > 0)
-            if order is not None:
-                best = max(best, order.act)
+            if self.order is not None and (self.on or name in self._unproven):
+                best = max(best, self.order.act)
             sent.setdefault(max(act, best), {})[name] = text
         for act, texts in sent.items():
             why = "; ".join([*texts.values()][:3])
@@ -161,6 +185,14 @@ class Sentinel:
 
     # -- orders ----------------------------------------------------------------------------
 
+    def _begin_again(self, act: Act) -> None:
+        """Order what the table demands, or go on with the emergency of the program before."""
+        before, self._recalled = self._recalled, Standing()
+        if before.act:
+            self._begin(max(act, Act[before.act]), (before.who, "anybody"), before.continued)
+        else:
+            self._begin(act, _TABLE, self.table.reasons(Act.DEFOCUS))
+
     def _begin(self, act: Act, giver: tuple[str, str], reason: str) -> EmergencyOrder:
         """Order DEFOCUS or STOW of the whole field."""
         now, names = self._clock.monotonic(), self._field.names
@@ -168,21 +200,74 @@ class Sentinel:
         measured = self.table.flux_measured
         self.order = EmergencyOrder(act, giver[0], reason, now, ticket, flux_measured=measured)
         self.on, self._repeated_at = True, now
+        self._unproven = {}
         self._orders.emergency(ticket, act, names)
         self._joining.drop(f"{act.name} of the field: {reason}")
         return self.order
 
-    def call(self, who: str, act: Act, reason: str) -> EmergencyOrder:
-        """Order an emergency for a person; it holds until it is withdrawn."""
-        self._called = True
-        if not self.on or self.order is None or act > self.order.act:
-            return self._begin(act, (who, "anybody"), reason)
-        self._orders.note(who, "anybody", act.name, f"{reason}; it holds already")
-        return self.order
+    @property
+    def calls(self) -> tuple[Call, ...]:
+        """The orders of persons that have not been withdrawn, one for each person."""
+        return tuple(self._calls.values())
 
-    def withdraw(self) -> None:
-        """Withdraw a person's order; rows that it tripped still wait to be acknowledged."""
-        self._called = False
+    def call(self, who: str, act: Act, reason: str, at: float) -> EmergencyOrder:
+        """Order an emergency for a person; it holds until it is withdrawn.
+
+        A person has one order: another one keeps the stronger act, and adds a new reason.
+        """
+        before = self._calls.get(who)
+        if before is None:
+            self._calls[who] = Call(who, reason, act.name, at)
+        else:
+            known = before.reason.split("; ")
+            reasons = before.reason if reason in known else f"{before.reason}; {reason}"
+            stronger = max(act, Act[before.act])
+            self._calls[who] = Call(who, reasons, stronger.name, before.at)
+        if not self.on or self.order is None or act > self.order.act:
+            order = self._begin(act, (who, "anybody"), reason)
+        else:
+            order = self.order
+            self._orders.note(who, "anybody", act.name, f"{reason}; it holds already")
+        self._keep(order.at)
+        return order
+
+    def withdraw(self, who: str) -> None:
+        """Withdraw one person's order; rows that it tripped still wait to be acknowledged."""
+        self._calls.pop(who, None)
+        self._keep(self._clock.monotonic())
+
+    def _keep(self, now: float) -> None:
+        """Keep what stands, for the next program; a proof that goes on, once in a while."""
+        if self._record is None or (self._recalled.act and not self.on):
+            return
+        standing = self._standing()
+        changed = replace(standing, unproven=()) != replace(self._kept, unproven=())
+        if standing == self._kept or not (changed or now - self._kept_at >= _KEEP_PERIOD):
+            return
+        with contextlib.suppress(StoreError):  # it is tried again, and the store's alarm says why
+            self._record.keep_emergency(standing.document)
+            self._kept, self._kept_at = standing, now
+
+    def _not_done(self) -> tuple[str, ...]:
+        """Return the heliostats that are not proven to have carried out the last order."""
+        order = self.order
+        return () if order is None else tuple(sorted(order.proof.nodes - order.proof.done.keys()))
+
+    def acknowledge(self, condition: str, who: str, role: AcknowledgeRole, subject: str) -> str:
+        """Acknowledge a row of the table; return why it is refused, "" if it is not."""
+        refusal = self.table.acknowledge(condition, who, role, subject)
+        if not refusal and condition == UNPROVEN:
+            self._unproven.pop(subject, None)
+        return refusal
+
+    def _standing(self) -> Standing:
+        order = self.order if self.on else None
+        rows = self.table.standing()
+        if order is None:
+            left = tuple(sorted(name for name, at in self._unproven.items() if math.isinf(at)))
+            return Standing(calls=self.calls, rows=rows, unproven=left)
+        unproven = self._not_done()
+        return Standing(order.act.name, order.who, order.reason, self.calls, rows, unproven)
 
     def send_safe(
         self,
@@ -238,7 +323,7 @@ class Sentinel:
     ) -> None:
         """Take a cluster's report on a ticket, if it is the order's ticket.
 
-        Where a plant has receivers, a cluster's word that a DEFOCUS is done only acknowledges it:
+        Where a plant has receivers, a cluster's word that the order is done only acknowledges it:
         the beam is off by the step counts of the next status, which show where it went.
         """
         order = self.order
@@ -251,20 +336,23 @@ class Sentinel:
             heliostats = tuple(
                 n for n in heliostats if good[self._field.index[n]] and n not in strange
             )
-            if order.act is Act.DEFOCUS and self._ways.unsent.watches:
+            if self._ways.unsent.watches:
                 stage = Stage.ACKNOWLEDGED
         order.take_stage(heliostats, stage, self._clock.monotonic())
 
     def take_rows(self, cluster: str, now: float) -> None:
         """Update the proof of the order from a cluster's new status."""
-        order = self.order
-        if order is None or not self.on:
+        order, names = self.order, self._field.members[cluster]
+        if not self.on:
+            names = tuple(name for name in names if name in self._unproven)
+        if order is None or not names:
             return
-        names = self._field.members[cluster]
-        self._order_again(order, names)
+        if self.on:
+            self._order_again(order, names)
         rows = [self._field.index[n] for n in names if not order.is_done(n)]
         if rows:
             index = np.array(rows, dtype=np.intp)
+            lit = self._ways.unsent.lit(index)
             order.take_rows(
                 tuple(self._field.names[r] for r in rows),
                 self._field.rows[index],
@@ -273,9 +361,9 @@ class Sentinel:
                 Drive(self._drives.table[index]),
                 now,
                 np.array([self._field.names[r] in self._identities.strange for r in rows]),
-                self._lit(index),
+                lit,
             )
-        for row in rows:
+        for row, shines in zip(rows, lit if rows else (), strict=True):
             name = self._field.names[row]
             if int(self._field.rows["flags"][row]) & COUNTS_UNKNOWN:
                 order.unknown[name] = self._last_of(row, now)
@@ -286,8 +374,17 @@ class Sentinel:
                 )
             elif not order.is_done(name) and (text := self._identities.strange.get(name)):
                 order.unknown[name] = f"{name}: {text}, so only stow proves that it is off"
+            elif shines:
+                order.unknown[name] = (
+                    f"{name}: it reports {states.STATES[self._field.rows['state'][row]]}, but by "
+                    "its step counts its beam is on a receiver"
+                )
             else:
                 order.unknown.pop(name, None)
+
+        for name in () if self.on else names:
+            if order.is_done(name):
+                self._unproven[name] = min(self._unproven[name], now)
 
     def _order_again(self, order: EmergencyOrder, names: tuple[str, ...]) -> None:
         """Send heliostats off again that have come back while the emergency holds."""
@@ -295,13 +392,6 @@ class Sentinel:
         back = order.take_back(names, self._field.rows[index], self._field.heard[index])
         if back:
             self.send_safe(_TABLE, order.act, back, "it has come back while an emergency holds")
-
-    def _lit(self, rows: npt.NDArray[np.intp]) -> Mask:
-        """Return which heliostats (K,) are not proven to be off: their beams are on a receiver.
-
-        At stow nothing can take a beam elsewhere, so it counts as off, locked there or not.
-        """
-        return np.asarray(self._ways.unsent.lit(rows) & ~at_stow(self._field.rows[rows]))
 
     def barred(self, heliostats: Iterable[str], condition: str = "") -> dict[str, str]:
         """Return which heliostats one row, or any, keeps from their aims, and why."""
@@ -327,3 +417,12 @@ class Sentinel:
             return f"an emergency holds ({self.order.act.name}: {self.order.reason})"
         texts = (self.table.reasons(Act.REFUSE_NEW, name) for name in sorted(set(clusters)))
         return next((text for text in texts if text), "")
+
+
+def _recall(record: EmergencyRecord) -> Standing:
+    """Return the emergency that stood when the last program ended."""
+    try:
+        document = record.emergency()
+    except StoreError as error:
+        document = str(error)  # no document: it reads as an emergency, which is the safe side
+    return read_standing(document)

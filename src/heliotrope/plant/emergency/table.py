@@ -1,7 +1,8 @@
 """The plant's part of the safety table: readings in, demands and alarms out."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from heliotrope.safety import (
     evaluate,
     narrowed,
     proof_readings,
+    recalled,
     start,
     watched_by,
 )
@@ -36,6 +38,7 @@ OWN_READINGS = frozenset(
     {
         "emergency_order",
         "nodes_unacknowledged",
+        "unproven",
         "flux_after_emergency",
         "authority_silence",
         "cluster_silence",
@@ -88,7 +91,7 @@ class PlantReadings:
         self.names = OWN_READINGS | beams.watched
 
     def take(
-        self, proof: Proof | None, *, called: bool, now: float
+        self, proof: Proof | None, unproven: Mapping[str, float], *, called: bool, now: float
     ) -> dict[tuple[str, str], Reading]:
         """Return the readings now.
 
@@ -96,6 +99,9 @@ class PlantReadings:
         ----------
         proof
             Proof of the emergency order in force; None if there is none.
+        unproven
+            Time since which each heliostat that an emergency left unproven is proven, monotonic s;
+            infinite if it is not.
         called
             Whether a person has ordered an emergency and not withdrawn it.
         now
@@ -111,6 +117,8 @@ class PlantReadings:
             ("audit_silence", ""): Reading(now - self._orders.confirmed_at, now),
             ("sun_elevation", ""): Reading(self._elevation, now),
             ("node_fault_share", ""): Reading(self._field.failed_share(now), now),
+            ("unproven", ""): Reading(0.0, now),
+            **{("unproven", n): Reading(float(at > now), now) for n, at in unproven.items()},
             **self._beams.readings(now),
             **self._agreement.readings(now),
         }
@@ -198,12 +206,19 @@ class TableWatch:
         if name not in DERIVED.values():
             self._put[name, subject] = Reading(value, at)
 
-    def evaluate(self, proof: Proof | None, *, called: bool, now: float) -> list[Alarm]:
+    def evaluate(
+        self,
+        proof: Proof | None,
+        unproven: Mapping[str, float] = MappingProxyType({}),
+        *,
+        called: bool,
+        now: float,
+    ) -> list[Alarm]:
         """Evaluate all rows; return the alarms raised and ended since the last time.
 
-        For ``proof`` and ``called`` see `PlantReadings.take`.
+        For ``proof``, ``unproven`` and ``called`` see `PlantReadings.take`.
         """
-        own = self._own.take(proof, called=called, now=now)
+        own = self._own.take(proof, unproven, called=called, now=now)
         readings = self._put | {key: each for key, each in own.items() if key[0] in self._fed}
         for row in self._single:
             subjects = [name for reading, name in readings if reading == row.reading and name]
@@ -222,6 +237,23 @@ class TableWatch:
                 news.append(Alarm(*key, old.severity, f"{' '.join(key).strip()}: over", False))
         self._told = found
         return news
+
+    def recall(self, rows: Iterable[tuple[str, str]]) -> None:
+        """Take rows, each with its subject, as tripped: they were before a restart."""
+        self._state = recalled(self._state, rows)
+
+    def standing(self) -> tuple[tuple[str, str], ...]:
+        """Return the rows that outlive a restart, each with its subject.
+
+        They hold the beams of the whole field off, or wait to be acknowledged.
+        """
+        latched = {row.name for row in self._state.table if row.latched}
+        off = {
+            (a.condition, a.subject)
+            for a in self.actions
+            if a.scope is Scope.FIELD and a.act >= Act.DEFOCUS
+        }
+        return tuple(key for key in self._state.tripped() if key[0] in latched or key in off)
 
     def acknowledge(self, condition: str, who: str, role: AcknowledgeRole, subject: str) -> str:
         """Acknowledge a row; return why it is refused, "" if it is not."""

@@ -84,8 +84,8 @@ async def _to_mark(desk: Desk, _: Person, identity: int) -> WithBlob:
     return WithBlob({"number": identity}, await desk.marking.picture(identity))
 
 
-def _withdraw(desk: Desk, who: Person, *_: Any) -> Any:
-    desk.operations.withdraw(who)
+def _withdraw(desk: Desk, who: Person, given: orders.Withdrawal, _: bytes) -> Any:
+    desk.operations.withdraw(who, given.owner)
     return desk.operations.emergency_view()
 
 
@@ -210,7 +210,7 @@ _URGENT = {
     ),
 }
 _ORDERS = {
-    "withdraw_emergency": Call(Role.OPERATOR, orders.Nothing, _withdraw),
+    "withdraw_emergency": Call(Role.VIEWER, orders.Withdrawal, _withdraw),
     "acknowledge": Call(
         Role.OPERATOR,
         orders.Acknowledged,

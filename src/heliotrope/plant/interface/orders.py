@@ -224,6 +224,12 @@ class EmergencyCall(Strict):
     ] = ""
 
 
+class Withdrawal(Strict):
+    """Whose emergency order to withdraw, as an engineer; "": one's own."""
+
+    owner: Words = ""
+
+
 class Acknowledged(Strict):
     """The alarm."""
 

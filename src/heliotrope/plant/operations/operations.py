@@ -699,16 +699,19 @@ class Operations:
         """Return the last emergency order with its proof."""
         return self._viewer.emergency()
 
-    def withdraw(self, person: Person) -> None:
-        """Withdraw an emergency order.
+    def withdraw(self, person: Person, owner: str = "") -> None:
+        """Withdraw a person's own emergency order, or an ``owner``'s as an engineer.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer.
+            See `PlantController.withdraw_emergency`.
         """
-        self.plant.withdraw_emergency(person)
-        self._tell(person, "emergency withdrawn", "command")
+        self.plant.withdraw_emergency(person, owner)
+        left = "; ".join(call.text for call in self.plant.calls)
+        whose = f"{owner}'s emergency" if owner not in ("", person.name) else "emergency"
+        still = f"; still ordered by {left}" if left else ""
+        self._tell(person, f"{whose} withdrawn{still}", "command")
 
     def acknowledge(self, person: Person, condition: str, subject: str = "") -> None:
         """Acknowledge an alarm, and its row of the safety table.

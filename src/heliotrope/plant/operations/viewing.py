@@ -214,6 +214,7 @@ class Viewer:
             count - len(report.not_done),
             report.not_done[:_SOME],
             report.text,
+            plant.calls,
         )
 
 

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.geometry import FloatArray
+from heliotrope.plant.emergency import Call
 from heliotrope.plant.operations.outlook import FieldPoint, Outlook
 from heliotrope.safety import Severity
 
@@ -613,6 +614,8 @@ class EmergencyView:
         Names of the first heliostats not proven to have carried it out.
     text
         The same for people.
+    calls
+        The orders of persons that have not been withdrawn, one for each person.
     """
 
     on: bool
@@ -625,6 +628,7 @@ class EmergencyView:
     done: int
     not_done: tuple[str, ...]
     text: str
+    calls: tuple[Call, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -438,8 +438,11 @@ class Operator:
 
     def _end_emergency(self, plant: PlantController) -> None:
         if self._called:
-            plant.withdraw_emergency(self._duty)
-            self._observer.obeyed(self._duty.name, "WITHDRAW", self._clock.monotonic())
+            for call in plant.calls:
+                # Others' orders are withdrawn by an engineer, by the owner's name.
+                who = self._duty if call.who == self._duty.name else ENGINEER
+                plant.withdraw_emergency(who, call.who)
+                self._observer.obeyed(who.name, "WITHDRAW", self._clock.monotonic())
             self._called = False
 
     def _acknowledge(self, plant: PlantController) -> set[str]:

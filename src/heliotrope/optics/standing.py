@@ -1,0 +1,190 @@
+"""Beams of mirrors that stand still: over all suns of the year, and all together in the air."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.field.volumes import Volume
+from heliotrope.geometry import FloatArray, as_float, normalize, reflect
+from heliotrope.optics.beam import SUN_RADIUS, Beams, MirrorOptics, crossing
+from heliotrope.optics.keep_out import bounds, find_entries
+
+#: Largest declination of the sun, rad, and room for refraction, which lifts a sun at the horizon.
+_TROPIC, _REFRACTION = float(np.radians(23.45)), float(np.radians(0.6))
+#: Angle between neighbouring suns of the year, rad; no sun is further than 0.71 of it from one.
+_STEP = float(np.radians(1.0))
+#: Points at which `hottest` asks for the light of all beams, at first.
+_POINTS = 1000
+#: Points of each beam on both sides of the place, and steps of the search about the hottest, m.
+_ALONG, _COARSE, _FINE = 25, 4.0, 0.2
+#: Pairs of a point and a beam that are computed at once.
+_PAIRS = 200_000
+
+
+def suns_of_the_year(latitude: float) -> FloatArray:
+    """Return unit vectors (S, 3), ENU, to all suns above the horizon, about 1° apart.
+
+    Parameters
+    ----------
+    latitude
+        rad, north positive.
+    """
+    declination = np.arange(-_TROPIC, _TROPIC + _STEP, _STEP)
+    hour = np.arange(-np.pi, np.pi, _STEP)
+    d, h = (angle.ravel() for angle in np.meshgrid(declination, hour))
+    polar, equal = np.sin(d), np.cos(d) * np.cos(h)
+    sine, cosine = np.sin(latitude), np.cos(latitude)
+    north, up = cosine * polar - sine * equal, sine * polar + cosine * equal
+    suns = np.stack([-np.cos(d) * np.sin(h), north, up], axis=-1)
+    return as_float(suns[up > -_REFRACTION])
+
+
+def entered_over_the_year(
+    vertex: FloatArray,
+    normal: FloatArray,
+    mirrors: MirrorOptics,
+    volumes: Sequence[Volume],
+    latitude: float,
+    reach: float,
+) -> npt.NDArray[np.bool_]:
+    """Return whether the beam of each standing mirror enters each volume in a year, (N, V).
+
+    "Clear" is proven as in `keep_out`: each beam is widened by what lies between neighbouring suns.
+
+    Parameters
+    ----------
+    vertex, normal
+        ENU, m, and unit vectors, (N, 3).
+    mirrors
+        N mirrors.
+    volumes
+        V volumes.
+    latitude
+        rad, north positive.
+    reach
+        Length over which a beam is followed, m.
+    """
+    entered = np.zeros((len(vertex), len(volumes)), dtype=np.bool_)
+    suns = suns_of_the_year(latitude)
+    wide = MirrorOptics(**{**vars(mirrors), "error": mirrors.error + 0.71 * _STEP})
+    for v, (volume, center, radius) in enumerate(zip(volumes, *bounds(volumes), strict=True)):
+        way = center - vertex
+        distance = np.linalg.norm(way, axis=-1)
+        share = (radius + mirrors.half_diagonal) / np.maximum(distance, 1e-9)
+        # All suns whose beams may touch the ball about the volume are in this cone.
+        room = np.arcsin(np.minimum(share, 1.0)) + wide.spread
+        room = np.where(share >= 1.0, np.pi, room)
+        toward = reflect(normalize(way, "way"), normal)
+        for i in range(len(vertex)):
+            near = suns[suns @ toward[i] >= np.cos(min(room[i], np.pi))]
+            near = near[near @ normal[i] > -SUN_RADIUS]
+            if len(near):
+                entered[i, v] = _enters(vertex[i], normal[i], wide, i, near, volume, reach)
+    return entered
+
+
+def _enters(
+    vertex: FloatArray,
+    normal: FloatArray,
+    mirrors: MirrorOptics,
+    row: int,
+    suns: FloatArray,
+    volume: Volume,
+    reach: float,
+) -> bool:
+    """Return whether the beam of one mirror enters a volume with one of the suns (S, 3)."""
+    count = len(suns)
+    one = MirrorOptics(**{k: np.repeat(v[row : row + 1], count) for k, v in vars(mirrors).items()})
+    given = Beams(
+        np.repeat(vertex[None], count, axis=0),
+        np.ascontiguousarray(reflect(suns, normal)),
+        one,
+        np.full(count, reach),
+    )
+    return bool(find_entries(given, [volume]).entered.any())
+
+
+def standing_beams(
+    vertex: FloatArray, normal: FloatArray, sun: FloatArray, mirrors: MirrorOptics, reach: float
+) -> Beams:
+    """Return the beams of mirrors that stand still.
+
+    Parameters
+    ----------
+    vertex, normal
+        ENU, m, and unit vectors, (N, 3).
+    sun
+        Unit vector, (3,).
+    mirrors
+        N mirrors.
+    reach
+        Length over which they are followed, m.
+    """
+    way = np.ascontiguousarray(reflect(np.broadcast_to(sun, normal.shape), normal))
+    return Beams(np.ascontiguousarray(vertex), way, mirrors, np.full(len(vertex), reach))
+
+
+@dataclass(frozen=True)
+class Hottest:
+    """The place where the beams of a field together are strongest.
+
+    Attributes
+    ----------
+    suns
+        Irradiance on a surface that faces each beam, over that of the sun.
+    point
+        ENU, m, (3,).
+    reach
+        Largest distance from the centre at which more than the limit was found, m; 0: nowhere.
+    """
+
+    suns: float
+    point: FloatArray
+    reach: float
+
+
+def hottest(given: Beams, center: FloatArray, around: float, limit: float = 10.0) -> Hottest:
+    """Return where beams are strongest together, near a place in the air.
+
+    Points on the beams' axes are asked first, evenly chosen, then the neighbourhood of the best of
+    them: a narrow peak between them may be missed.
+
+    Parameters
+    ----------
+    given
+        N beams.
+    center
+        The middle of the search, such as a receiver's, ENU, m, (3,).
+    around
+        How far from it each beam is followed, m.
+    limit
+        Suns of `Hottest.reach`.
+    """
+    near = np.einsum("nk,nk->n", center - given.origin, given.direction)
+    points = given.point(near[:, None] + np.linspace(-around, around, _ALONG)).reshape(-1, 3)
+    chosen = np.unique(np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(np.intp))
+    points = points[chosen]
+    suns = _suns(given, points)
+    away = np.linalg.norm(points - center, axis=-1)
+    reach = float(np.max(away, where=suns > limit, initial=0.0))
+    best, most, step = points[suns.argmax()], float(suns.max()), _COARSE
+    while step > _FINE:
+        grid = np.stack(np.meshgrid(*[np.arange(-2, 3) * step] * 3), axis=-1).reshape(-1, 3) + best
+        suns = _suns(given, grid)
+        if suns.max() > most * (1.0 + 1e-6):
+            best, most = grid[suns.argmax()], float(suns.max())
+        else:
+            step *= 0.5
+    return Hottest(
+        most,
+        as_float(best),
+        max(reach, float(np.linalg.norm(best - center)) if most > limit else 0.0),
+    )
+
+
+def _suns(given: Beams, points: FloatArray) -> FloatArray:
+    """Return the light of all beams at points (P, 3), in suns, (P,)."""
+    parts = np.array_split(points, 1 + len(points) * len(given) // _PAIRS)
+    return np.concatenate([crossing(given, part, dni=1.0).irradiance for part in parts])

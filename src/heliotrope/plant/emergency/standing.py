@@ -1,0 +1,122 @@
+"""The emergency that stands, as the store keeps it across a restart of the plant's program."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from typing import Protocol
+
+from heliotrope.safety import Act
+
+#: Reason of the emergency in which a plant begins that cannot read its record.
+_UNREADABLE = "the record of the last emergency cannot be read"
+
+
+class EmergencyRecord(Protocol):
+    """A store of one document about the emergency that stands."""
+
+    def emergency(self) -> str:
+        """Return the document, "" if none is kept."""
+        ...
+
+    def keep_emergency(self, document: str) -> None:
+        """Replace the document; "" if no emergency stands any more.
+
+        Raises
+        ------
+        StoreError
+            If it cannot be kept.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Call:
+    """One person's emergency order, which stands until that person withdraws it.
+
+    Attributes
+    ----------
+    who, reason
+        The person or program that gave it, and why.
+    act
+        "DEFOCUS" or "STOW".
+    at
+        POSIX s.
+    """
+
+    who: str
+    reason: str
+    act: str
+    at: float
+
+    @property
+    def text(self) -> str:
+        """One line: person, act, time, reason."""
+        since = f"{datetime.fromtimestamp(self.at, UTC):%H:%M} UTC"
+        return f"{self.who} ({self.act}, {since}: {self.reason})"
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What a plant's program must know of an emergency that began before it.
+
+    Attributes
+    ----------
+    act
+        Name of the order to the whole field, "DEFOCUS" or "STOW"; "" where no emergency holds.
+    who, reason
+        The person or part of the plant that gave it, and why.
+    calls
+        The orders of persons that have not been withdrawn, one for each person.
+    rows
+        Rows of the safety table that hold beams off or wait to be acknowledged, each with its
+        cluster or heliostat, "" for the field.
+    unproven
+        Heliostats that the proof did not show to be done.
+    """
+
+    act: str = ""
+    who: str = ""
+    reason: str = ""
+    calls: tuple[Call, ...] = ()
+    rows: tuple[tuple[str, str], ...] = ()
+    unproven: tuple[str, ...] = ()
+
+    @property
+    def document(self) -> str:
+        """The document that the store keeps, "" if nothing stands."""
+        return "" if self == Standing() else json.dumps(asdict(self))
+
+    @property
+    def continued(self) -> str:
+        """The reason, in words, of the order that continues this emergency."""
+        text = f"{self.reason}; it held when the plant's program ended"
+        if not self.unproven:
+            return text
+        more = f" and {len(self.unproven) - 8} more" if len(self.unproven) > 8 else ""
+        return f"{text}, not proven for {', '.join(self.unproven[:8])}{more}"
+
+
+def read_standing(document: str) -> Standing:
+    """Return what a document says; a person's DEFOCUS if it cannot be read: the safe side."""
+    if not document:
+        return Standing()
+    try:
+        found = json.loads(document)
+        rows = tuple((str(row), str(subject)) for row, subject in found["rows"])
+        unproven = _names(found["unproven"])
+        act, who, reason = (str(found[key]) for key in ("act", "who", "reason"))
+        if act and Act[act] not in (Act.DEFOCUS, Act.STOW):
+            raise ValueError(act)
+        calls = tuple(
+            Call(str(c["who"]), str(c["reason"]), str(c["act"]), float(c["at"]))
+            for c in found["calls"]
+        )
+        return Standing(act, who, reason, calls, rows, unproven)
+    except (ValueError, KeyError, TypeError):
+        call = Call("plant", _UNREADABLE, "DEFOCUS", 0.0)
+        return Standing(call.act, call.who, call.reason, (call,))
+
+
+def _names(found: Sequence[object]) -> tuple[str, ...]:
+    return tuple(str(name) for name in found)

@@ -1,0 +1,164 @@
+"""Beams of mirrors that stand still: through the year, and together beside a receiver."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from heliotrope.field.layouts import malan_plant
+from heliotrope.field.volumes import Sphere, Volume
+from heliotrope.geometry import direction, normalize, reflect
+from heliotrope.optics import MirrorOptics
+from heliotrope.optics.beam import Beams, crossing
+from heliotrope.optics.standing import (
+    entered_over_the_year,
+    hottest,
+    standing_beams,
+    suns_of_the_year,
+)
+from heliotrope.plant.aims import BeamCheck, default_aims
+from heliotrope.plant.leaving import defocused_field
+from heliotrope.sun import Site, fast_vector
+
+LATITUDE = np.radians(-28.5)
+MIRROR = MirrorOptics.of(2.5, 2.0)
+
+
+def test_every_sun_of_a_year_is_close_to_one_of_its_suns() -> None:
+    site = Site(-28.5, 21.2, 830.0)
+    suns = suns_of_the_year(LATITUDE)
+    times = np.random.default_rng(1).uniform(0.0, 366.0 * 86_400.0, 400) + 1.79e9
+    real = np.stack([fast_vector(time, site) for time in times])
+    real = real[real[:, 2] > 0.0]
+    nearest = np.arccos(np.clip((real @ suns.T).max(axis=1), -1.0, 1.0))
+    assert len(real) > 150
+    # A step is 1°; refraction lifts the lowest suns.
+    assert np.degrees(nearest).max() < 0.75
+    assert len(suns_of_the_year(np.radians(90.0))) > 1000
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_beam_that_enters_at_any_sun_of_the_year_is_found(seed: int) -> None:
+    """Brute force over random suns never finds an entry that the proof calls clear."""
+    random = np.random.default_rng(seed)
+    count = 40
+    vertex = random.uniform(-80.0, 80.0, (count, 3)) * (1.0, 1.0, 0.02)
+    normal = normalize(random.normal(size=(count, 3)) + (0.0, 0.0, 2.0), "normal")
+    volumes: list[Volume] = [
+        Sphere("receiver", (0.0, 0.0, 40.0), 3.0),
+        Sphere("low", (30.0, -20.0, 3.0), 4.0),
+    ]
+    mirrors = MIRROR.broadcast(count)
+    entered = entered_over_the_year(vertex, normal, mirrors, volumes, float(LATITUDE), 1000.0)
+    suns = suns_of_the_year(float(LATITUDE))
+    suns = suns[(suns[:, 2] > 0.0)]
+    suns = suns[random.integers(0, len(suns), 3000)]
+    for v, volume in enumerate(volumes):
+        assert isinstance(volume, Sphere)
+        for i in range(count):
+            light = suns[suns @ normal[i] > 0.0]
+            way, to = reflect(light, normal[i]), np.array(volume.center) - vertex[i]
+            along = way @ to
+            off = np.sqrt(np.maximum(to @ to - along**2, 0.0))
+            hit = bool(((along > 0.0) & (off < volume.radius)).any())
+            assert entered[i, v] or not hit
+    assert entered.any()
+    assert not entered.all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_narrow_beam_between_the_suns_is_found(seed: int) -> None:
+    """A pebble in the beam of a small and perfect mirror, at any sun of the year."""
+    random = np.random.default_rng(seed)
+    mirror = MirrorOptics.of(0.1, 0.1, error=0.0)
+    latitude = random.uniform(-1.0, 1.0)
+    tried = 0
+    while tried < 40:
+        declination, hour = random.uniform(-0.409, 0.409), random.uniform(-np.pi, np.pi)
+        level = np.cos(declination) * np.cos(hour)
+        sine, cosine = np.sin(latitude), np.cos(latitude)
+        sun = np.array(
+            [
+                -np.cos(declination) * np.sin(hour),
+                cosine * np.sin(declination) - sine * level,
+                sine * np.sin(declination) + cosine * level,
+            ]
+        )
+        normal = normalize(random.normal(size=3), "normal")
+        if sun[2] < 0.02 or sun @ normal < 0.05:
+            continue
+        tried += 1
+        pebble = Sphere("pebble", tuple(100.0 * reflect(sun, normal)), 0.01)
+        found = entered_over_the_year(
+            np.zeros((1, 3)), normal[None], mirror, [pebble], latitude, 200.0
+        )
+        assert found.all()
+
+
+def test_a_mirror_to_the_ground_lights_nothing_above_it() -> None:
+    vertex, down = np.array([[0.0, -50.0, 1.0]]), np.array([[0.0, 0.0, -1.0]])
+    receiver = [Sphere("receiver", (0.0, 0.0, 40.0), 3.0)]
+    mirrors = MIRROR.broadcast(1)
+    assert not entered_over_the_year(vertex, down, mirrors, receiver, -0.5, 1000.0).any()
+    # Facing up, it needs a sun in the south, 38° high: there is none far in the south.
+    far_south, far_north = (
+        entered_over_the_year(vertex, -down, mirrors, receiver, latitude, 1000.0).any()
+        for latitude in (-0.9, 0.9)
+    )
+    assert not far_south
+    assert far_north
+
+
+def test_the_hottest_place_of_two_beams_is_where_they_cross() -> None:
+    origin = np.array([[-50.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, -80.0, 0.0]])
+    cross = np.array([0.0, 3.0, 40.0])
+    way = normalize(np.array([cross, cross, (0.0, 0.0, 80.0)]) - origin, "way")
+    mirrors = MirrorOptics.of(6.0, 6.0, focus=64.0).broadcast(3)
+    given = Beams(origin, way, mirrors, np.full(3, 1000.0))
+    found = hottest(given, np.array([0.0, 0.0, 40.0]), 60.0, limit=50.0)
+    at = crossing(given, cross, dni=1.0).irradiance[0]
+    assert found.suns >= at
+    assert np.linalg.norm(found.point - cross) < 2.0
+    assert found.reach <= 60.0
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(0.0, 65.0), (90.0, 30.0)])
+def test_spread_angles_of_the_defocus_part_the_beams(azimuth: float, elevation: float) -> None:
+    design = malan_plant(600)
+    check = BeamCheck(design, design.names)
+    given = default_aims(design, design.names, check.armature.origin_1, None)
+    aims, center = np.stack(list(given.values())), design.receivers[0].center
+    sun = direction(np.radians(azimuth), np.radians(elevation))
+    suns = {}
+    for alike in (True, False):
+        angles = defocused_field(check, aims, sun, alike=alike)
+        found = hottest(check.together(angles, sun), center, 100.0)
+        suns[alike] = found.suns
+        # The place that was found has this light, by the beams of the whole field.
+        beams = check.together(angles, sun)
+        again = crossing(beams, found.point[None], dni=1.0).irradiance[0]
+        assert again == pytest.approx(found.suns)
+    assert suns[False] < 0.45 * suns[True]
+
+
+def test_standing_beams_leave_as_the_mirror_reflects() -> None:
+    sun = direction(0.3, 0.8)
+    normal = normalize(sun + direction(2.0, 0.3), "normal")[None]
+    found = standing_beams(np.zeros((1, 3)), normal, sun, MIRROR.broadcast(1), 100.0)
+    np.testing.assert_allclose(found.direction[0], direction(2.0, 0.3), atol=1e-12)
+
+
+def test_a_stow_position_that_lights_something_is_known() -> None:
+    design = malan_plant(300)
+    group = design.groups["azel"]
+    names = design.names
+    assert BeamCheck(design, names).at_stow() == {}
+    strict = replace(
+        group, machines=tuple(replace(one, stow_lights=False) for one in group.machines)
+    )
+    found = BeamCheck(replace(design, groups={"azel": strict}), names).at_stow()
+    assert 0 < len(found) < 300
+    assert "at some time of the year; choose another stow position" in next(iter(found.values()))
+    # A keep-out volume counts wherever it is.
+    over = replace(design, keep_outs=(Sphere("corridor", (0.0, -60.0, 60.0), 40.0),))
+    assert "corridor" in next(iter(BeamCheck(over, names).at_stow().values()))
