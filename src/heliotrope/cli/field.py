@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from heliotrope.cli._common import print_json, print_table
@@ -106,6 +105,8 @@ def defocus(
     In suns, at the hottest place: with all mirrors turned by the same angles, and as the file
     spreads them; then how far from the receiver's centre more than 10 suns reach.
     """
+    import numpy as np
+
     from heliotrope.errors import InputError
     from heliotrope.field.formats import plant_file
     from heliotrope.geometry import direction

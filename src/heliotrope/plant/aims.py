@@ -433,7 +433,7 @@ class BeamCheck:
         mirrors = _rows_of(self.mirrors, rows)
         entered = entered_over_the_year(vertex, normal, mirrors, volumes, self._latitude, FAR)
         machines = [self.machines.get(self.names[row]) for row in rows]
-        allowed = np.array([each is not None and each.stow_lights for each in machines], dtype=bool)
+        allowed = np.array([m is not None and m.stow_lights for m in machines], dtype=np.bool_)
         entered[:, : len(volumes) - len(self.volumes)] &= ~allowed[:, None]
         return {
             self.names[rows[i]]: f"at stow its beam would come within reach of "

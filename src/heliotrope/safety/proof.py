@@ -27,9 +27,7 @@ class FluxProof(Enum):
     """What a proof says about the flux on the receiver; the value is its text."""
 
     #: No sensor feeds it: the proof rests on what each heliostat reports.
-    NOT_MEASURED = (
-        "flux on the receiver not measured, so this is believed: a stalled drive reports the same"
-    )
+    NOT_MEASURED = "flux on the receiver not measured"
     #: There is still time for a reading.
     AWAITED = "flux not proven yet"
     #: A fresh reading, taken after the order, shows it below its limit.
@@ -68,7 +66,12 @@ class ProofReport:
     def text(self) -> str:
         """One line for the operator."""
         if self.complete:
-            return f"every heliostat has acknowledged and is done, as it reports; {self.flux.value}"
+            measured = self.flux is FluxProof.BELOW
+            believed = "" if measured else ", so this is believed: a stalled drive reports the same"
+            return (
+                "every heliostat has acknowledged and is done, as it reports; "
+                f"{self.flux.value}{believed}"
+            )
         parts = []
         for names, what in ((self.unacknowledged, "not acknowledged"), (self.not_done, "not done")):
             if names:
