@@ -287,10 +287,19 @@ def test_a_ticket_ends_and_is_done_only_where_the_mirror_is() -> None:
         ticked(ticket(Stage.DONE, finished=True, name="DEFOCUS"), 5.0, was=False, stowed=True)
 
 
-def alarmed(kind: str, *, rest: float, began: float = 0.0, calls: int = 0, over: int = 0) -> None:
+def alarmed(
+    kind: str,
+    *,
+    rest: float,
+    began: float = 0.0,
+    calls: int = 0,
+    over: int = 0,
+    ends: bool = False,
+) -> None:
     """Observe an alarm at 200 s, after a fault that ended at some time.
 
-    Before that persons have called some emergencies, of which some are over.
+    Before that persons have called some emergencies, of which some are over. It stays, or ends at
+    once.
     """
     observer = AlarmObserver(0.0, {"C1": [board(states.STOWED)]}, (DAYS,))
     if began:
@@ -305,6 +314,8 @@ def alarmed(kind: str, *, rest: float, began: float = 0.0, calls: int = 0, over:
         observer.heard("C1", float(now))
         observer.look({"H1": rest}, {"C1"}, float(now), runs=True, writes=True)
     observer.alarmed(Alarm(kind, "", Severity.ALARM, "three heliostats left the receiver"), 200.0)
+    if ends:
+        observer.alarmed(Alarm(kind, "", Severity.ALARM, "it is over", active=False), 200.0)
     observer.heard("C1", 200.0)
     observer.look({"H1": rest}, {"C1"}, 200.0, runs=True, writes=True)
 
@@ -320,6 +331,7 @@ def test_the_plants_own_act_is_no_cause_of_an_alarm() -> None:
 
 def test_an_emergency_has_a_person_who_has_called_it() -> None:
     alarmed("operator_emergency", rest=-inf, calls=1)
+    alarmed("operator_emergency", rest=-inf, calls=1, ends=True)  # simulated day 7
     alarmed("operator_emergency", rest=-inf, began=198.0)  # a new program goes on with it
     for calls, over in ((0, 0), (1, 1)):
         with pytest.raises(InvariantError, match=r"invariant L2 .* nobody has called one"):

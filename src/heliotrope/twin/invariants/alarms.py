@@ -101,7 +101,7 @@ class AlarmObserver:
         self._boards = {each.outfit.name: each for some in boards.values() for each in some}
         self._clusters = {name: [b.outfit.name for b in some] for name, some in boards.items()}
         self._active: dict[tuple[str, str], float] = {}
-        self._new: list[Alarm] = []
+        self._new: list[tuple[Alarm, bool]] = []  # and whether an emergency was called by then
         self._last: dict[tuple[str, str], Alarm] = {}
         self._heard = dict.fromkeys(boards, start)
         self._runs_since = inf
@@ -128,7 +128,7 @@ class AlarmObserver:
         self._last[key] = alarm
         if alarm.active:
             self._active.setdefault(key, now)
-            self._new.append(alarm)
+            self._new.append((alarm, self._called))
         else:
             self._active.pop(key, None)
             self._called &= alarm.condition != CALLED
@@ -180,8 +180,8 @@ class AlarmObserver:
         new, self._new = self._new, []
         if runs:
             self._began_at = min(self._began_at, now)
-        for alarm in new:
-            self._caused(alarm, rests, now)
+        for alarm, called in new:
+            self._caused(alarm, rests, now, called=called)
         self._runs_since = min(self._runs_since, now) if runs else inf
         if not (runs and self._alone):
             self._heard = dict.fromkeys(self._heard, now)
@@ -199,7 +199,9 @@ class AlarmObserver:
             for name in some:
                 self._named(name, max(self._well[cluster], self._runs_since), now)
 
-    def _caused(self, alarm: Alarm, rests: Mapping[str, float], now: float) -> None:
+    def _caused(
+        self, alarm: Alarm, rests: Mapping[str, float], now: float, *, called: bool
+    ) -> None:
         """Check that an alarm can have a cause, names something, and is readable."""
         kind, subject = alarm.condition, alarm.subject
         saw = f"{kind} is raised: {alarm.text}"
@@ -211,7 +213,7 @@ class AlarmObserver:
         recalled = now - self._began_at <= RECALLED_WITHIN
         if kind == CALLED and self._alone:
             nobody = f"{saw}: nobody has called one since the last was over"
-            self._check(self._called or recalled, now, subject, nobody, L2)
+            self._check(called or recalled, now, subject, nobody, L2)
         if kind in UNORDERED and self._works:
             calm = now - rests[""]
             good = calm <= UNORDERED[kind] or recalled
