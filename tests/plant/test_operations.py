@@ -703,6 +703,43 @@ def test_after_a_restart_in_an_emergency_a_person_resumes(tmp_path: Path) -> Non
     keeper.close()
 
 
+def test_the_night_is_no_emergency_and_people_work_at_the_mirrors() -> None:
+    evening = START
+    site = lay_out("radial", 4).site
+    while fast_vector(evening.timestamp(), site)[2] > math.sin(math.radians(0.3)):
+        evening += timedelta(minutes=1)
+
+    async def work(plant: LivePlant) -> None:
+        shown, name = plant.operations, plant.names[0]
+        await asyncio.sleep(400.0)
+        assert shown.sun().elevation < 0.0
+        assert not shown.summary().emergency
+        assert shown.emergency_view().text == "no emergency so far"
+        alarms_ = {(a.condition, a.severity) for a in shown.alarms()}
+        assert ("sun_below_horizon", Severity.INFO) in alarms_
+        assert Severity.EMERGENCY not in {severity for _, severity in alarms_}
+        token = shown.take_authority(ENGINEER).token
+        await asyncio.sleep(3.0)
+        for command in ("LOCK", "UNLOCK"):
+            ticket = shown.command(ENGINEER, token, command, (name,))
+            for _ in range(3):
+                shown.keep_authority(ENGINEER, token)
+                await asyncio.sleep(3.0)
+            assert ticket.good, ticket.text
+        for command in ("APPROACH", "IDLE", "TRACK"):
+            with pytest.raises(RefusedError, match=f"{command}: not accepted now: sun_below_hor"):
+                shown.command(ENGINEER, token, command, (name,))
+        # The plant passes what serves work at a mirror; this board is at stow, and says so.
+        for command, values in (("ROUGH", (1,)), ("GOTO", (0, 0)), ("DIAGNOSE", ())):
+            shown.keep_authority(ENGINEER, token)
+            moved = shown.command(ENGINEER, token, command, (name,), values)
+            await asyncio.sleep(6.0)
+            assert "not in this state (STOWED)" in moved.text
+
+    settings_ = AutomaticSettings(wanted=True, calibrate=False, margin=0.0)
+    live(work, settings_, 4, start=evening)
+
+
 def test_the_stow_of_the_evening_is_no_loss_although_it_goes_in_turn() -> None:
     evening = START
     site = lay_out("radial", 4).site

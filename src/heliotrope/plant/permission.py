@@ -241,4 +241,7 @@ class Permission:
     def _refusal(self, name: str, cluster: str) -> str:
         """Return why no new motion may begin in a cluster, "" if it may; all take LOCK."""
         reason = "" if name == "LOCK" else self._sentinel.refusal((cluster,))
+        # The sun is needed to follow it, and to stand at standby; work at the mirrors is not.
+        if name in JOINING or name in _TO_STANDBY:
+            reason = reason or self._sentinel.night
         return reason or self._rivals.refusal((cluster,))

@@ -204,6 +204,21 @@ class SimulatedAudit:
         """Close the audit; everything is on the disk already."""
 
 
+class EmergencyDisk:
+    """The record of an emergency that survives the plant's program; an `EmergencyRecord`."""
+
+    def __init__(self) -> None:
+        self._document = ""
+
+    def emergency(self) -> str:
+        """Return the document, "" if none is kept."""
+        return self._document
+
+    def keep_emergency(self, document: str) -> None:
+        """Replace the document."""
+        self._document = document
+
+
 class AssignedDisk:
     """Assigned points on a disk that survives the plant's program; an `assigned.Assigned`."""
 

@@ -140,15 +140,15 @@ class EmergencyOrder:
 
         Step counts (``counted``) from before the order prove nothing: they do not show the beam.
 
-        ``strange`` ones are not what their address says. They are done at stow only: the goals of
-        their defocus may belong to another mirror. Where a beam is still on a receiver (``lit``),
+        ``strange`` ones are not what their address says: their counts may be another mirror's, so
+        nothing that they report proves anything. Where a beam is still on a receiver (``lit``),
         nothing is done.
         """
         settled = heard >= self.at + LEAVING
         stowed = carried_out(Act.STOW, rows, drives, settled)
         off = carried_out(self.act, rows, drives, settled)
-        fulfilled = stowed | (off & ~strange)
-        fulfilled &= (heard >= self.at) & (counted >= self.at) & ~lit
+        fulfilled = (stowed | off) & ~strange & ~lit
+        fulfilled &= (heard >= self.at) & (counted >= self.at)
         ready = tuple(names[i] for i in np.flatnonzero(fulfilled))
         if ready:
             self.take_stage(ready, Stage.DONE, now)

@@ -45,6 +45,8 @@ _PROVEN_SHOWS = 5.0
 _KEEP_PERIOD = 1.0
 #: Name and role of the safety table in a record.
 _TABLE = ("safety table", "plant")
+#: Name and role of the night in a record.
+_NIGHT = ("the sun is down", "plant")
 
 
 class Sentinel:
@@ -63,7 +65,7 @@ class Sentinel:
     repeat
         Pause between two repetitions of an order, s.
     identities
-        Heliostats that are not what their address says: they must leave, and are done at stow only.
+        Heliostats that are not what their address says: they must leave, and are never proven.
     record
         Store of the emergency that stands: the plant begins in one that held when its last program
         ended. None: it ends with the program.
@@ -76,6 +78,8 @@ class Sentinel:
         The last order to the whole field, None before the first.
     on
         Whether an emergency of the whole field holds.
+    night
+        Why the field rests at stow although nothing is wrong, "" by day.
     """
 
     def __init__(
@@ -93,6 +97,7 @@ class Sentinel:
     ) -> None:
         self.order: EmergencyOrder | None = None
         self.on = False
+        self.night = ""
         self._record, self._kept_at = record, -math.inf
         self._kept = self._recalled = Standing() if record is None else _recall(record)
         self._calls = {call.who: call for call in self._recalled.calls}
@@ -121,6 +126,7 @@ class Sentinel:
         self._unproven = {n: at for n, at in self._unproven.items() if now - at < _PROVEN_SHOWS}
         news = self.table.evaluate(proof, self._unproven, called=bool(self._calls), now=now)
         self._obey_field(now)
+        self._obey_night()
         self._obey_clusters()
         self._obey_heliostats(now)
         self._keep(now)
@@ -140,6 +146,13 @@ class Sentinel:
             self._unproven = dict.fromkeys(self._not_done(), math.inf)
         if wanted is not None and wanted >= Act.HOLD:
             self._joining.drop(self.table.reasons(Act.HOLD))
+
+    def _obey_night(self) -> None:
+        """Send the field to stow when the sun goes down, in turn, as an ordinary STOW."""
+        before, self.night = self.night, self.table.night()
+        if self.night and not before:
+            self._joining.drop(self.night)
+            self.send_safe(_NIGHT, Act.STOW, self._field.names, self.night, in_turn=True)
 
     def _obey_clusters(self) -> None:
         for name, members in self._field.members.items():
@@ -373,7 +386,9 @@ class Sentinel:
                     "off; it was not at stow"
                 )
             elif not order.is_done(name) and (text := self._identities.strange.get(name)):
-                order.unknown[name] = f"{name}: {text}, so only stow proves that it is off"
+                order.unknown[name] = (
+                    f"{name}: {text}, so nothing that it reports proves that it is off"
+                )
             elif shines:
                 order.unknown[name] = (
                     f"{name}: it reports {states.STATES[self._field.rows['state'][row]]}, but by "

@@ -1,7 +1,8 @@
 """The plant's part of the safety table: readings in, demands and alarms out."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from types import MappingProxyType
 
 import numpy as np
@@ -51,6 +52,8 @@ OWN_READINGS = frozenset(
         "pointing_errors",
     }
 )
+#: Row of the night: the field rests at stow, and that is no emergency.
+NIGHT = "sun_below_horizon"
 #: Rows that follow from an emergency; by themselves they keep none going.
 CONSEQUENCES = frozenset({"nodes_unacknowledged", "flux_after_emergency"})
 #: Readings that the plant makes of a sensor's, and the sensor.
@@ -265,9 +268,20 @@ class TableWatch:
 
     def demanded(self, cluster: str = "") -> Act | None:
         """Return the strongest act demanded of the field, or of one cluster alone."""
+        return max((a.act for a in self._demands(cluster)), default=None)
+
+    def _demands(self, cluster: str = "") -> Iterator[Action]:
+        """Yield the actions about the field, or about one cluster alone, but those of the night."""
         scope = Scope.CLUSTER if cluster else Scope.FIELD
-        acts = (a.act for a in self.actions if a.scope is scope and a.subject == cluster)
-        return max(acts, default=None)
+        return (
+            a
+            for a in self.actions
+            if a.scope is scope and a.subject == cluster and a.condition != NIGHT
+        )
+
+    def night(self) -> str:
+        """Return why the field rests at stow although nothing is wrong, "" if it need not."""
+        return next((a.text for a in self.actions if a.condition == NIGHT), "")
 
     def off(self) -> dict[str, tuple[Act, str]]:
         """Return the heliostats that must leave, by name: by which act, and why."""
@@ -289,16 +303,10 @@ class TableWatch:
     def caused(self) -> bool:
         """Whether a row other than the consequences of an emergency demands one for the field."""
         return any(
-            a.scope is Scope.FIELD and a.act >= Act.DEFOCUS and a.condition not in CONSEQUENCES
-            for a in self.actions
+            a.act >= Act.DEFOCUS and a.condition not in CONSEQUENCES for a in self._demands()
         )
 
     def reasons(self, least: Act, cluster: str = "") -> str:
         """Return, in words, which rows demand at least an act of the field or a cluster."""
-        texts = [
-            a.text
-            for a in self.actions
-            if a.act >= least
-            and (a.scope is Scope.FIELD or (a.scope is Scope.CLUSTER and a.subject == cluster))
-        ]
-        return "; ".join(texts[:3])
+        demands = chain(self._demands(), self._demands(cluster) if cluster else ())
+        return "; ".join([a.text for a in demands if a.act >= least][:3])

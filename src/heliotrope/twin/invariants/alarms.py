@@ -41,7 +41,8 @@ BY_OTHERS = frozenset({
     "flux_after_emergency",
     "identity", "keep_out_predicted", "nodes_unacknowledged", "operator_emergency",
     "parameters_differ", "pointing_disagrees", "receiver_flux_high", "resume_needed",
-    "sun_below_horizon", "unknown_reading", "wind_gust_defocus", "wind_gust_stow",
+    "sun_below_horizon", "unknown_reading", "unproven_after_emergency", "wind_gust_defocus",
+    "wind_gust_stow",
     "wind_mean_defocus", "wind_mean_stow",
 })  # fmt: skip
 #: Alarms of mirrors that point elsewhere, and the worlds in which they come without a fault.

@@ -52,7 +52,7 @@ from heliotrope.twin.invariants.shown import ShownObserver
 from heliotrope.twin.invariants.tickets import TicketObserver
 from heliotrope.twin.invariants.visits import VisitObserver
 from heliotrope.twin.invariants.watch import Watch
-from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
+from heliotrope.twin.records import AssignedDisk, EmergencyDisk, RecordsDisk, SimulatedAudit
 from heliotrope.twin.true_mirrors import TrueMirror, mirrors_of
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.acts import Acts
@@ -313,6 +313,7 @@ class Simulation:
         # The boards' wanted items and assigned points survive the plant's program.
         self._fits = known
         self._wanted = wanted_of(known) if knows_boards(plan.worlds) else Wanted()
+        self._emergency = EmergencyDisk()
         self._assigned = AssignedDisk()
         self._assigned.keep({"STANDBY": {each.name: STANDBY for each in fits}})
         self.disk = RecordsDisk()
@@ -500,6 +501,7 @@ class Simulation:
             entropy=self._chance.randbytes,
             on_alarm=self._alarmed,
             disk=self.disk.queue(self._clock, context) if "disk" in self.plan.worlds else None,
+            record=self._emergency,
         )
         self.operator.begins(plant)
         self.instruments.plant = plant
