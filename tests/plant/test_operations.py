@@ -569,6 +569,24 @@ def test_after_a_loss_of_many_only_a_person_resumes(away: float) -> None:
     live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0), count=8)
 
 
+def test_a_field_of_two_that_is_lost_waits_for_a_person() -> None:
+    """Three may be lost of a large field; of a field of two, both are all of it."""
+
+    async def work(plant: LivePlant) -> None:
+        await asyncio.sleep(200.0)
+        assert _states(plant) == ["TRACKING"] * 2
+        for link in plant.links.values():
+            link.plugged = False
+        await asyncio.sleep(20.0)
+        for link in plant.links.values():
+            link.plugged = True
+        await asyncio.sleep(180.0)
+        assert _waits(plant)
+        assert not {"TRACKING", "APPROACHING", "IDLE"} & set(_states(plant)), _states(plant)
+
+    live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0), count=2)
+
+
 def test_what_a_few_heliostats_lost_they_regain() -> None:
     async def work(plant: LivePlant) -> None:
         await asyncio.sleep(200.0)
@@ -835,3 +853,5 @@ def test_work_settings_that_are_none() -> None:
         AutomaticSettings(rate=0.0)
     with pytest.raises(InputError, match="-1 losses"):
         AutomaticSettings(losses=-1)
+    with pytest.raises(InputError, match=r"losses of 1\.5 of the field"):
+        AutomaticSettings(losses_share=1.5)

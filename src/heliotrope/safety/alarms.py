@@ -280,8 +280,8 @@ RESUME_NEEDED = AlarmKind(
     "resume_needed",
     _PLANT,
     Severity.ALARM,
-    "More heliostats than the setting `losses` left the receiver within 30 s without an order, or "
-    "an emergency held when the last program ended.",
+    "More heliostats than `losses` or `losses_share` allow left the receiver within 30 s without an "
+    "order, or an emergency held when the last program ended.",
     "{what} at {since} UTC",
     "Automatic control waits and raises nothing.",
     "Find the cause, make sure that nobody is in the field, then press Resume.",
