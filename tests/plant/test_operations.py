@@ -31,6 +31,7 @@ from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.photographs import Shot, seen, spiral
 from heliotrope.plant.visits.settings import Centring
 from heliotrope.safety import Alarm, Severity, alarms
+from heliotrope.store.backup import OWNER, backup, restore
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import StoreError
 from heliotrope.sun import fast_vector
@@ -528,6 +529,47 @@ def test_out_of_service_outlasts_a_restart_and_its_time(tmp_path: Path) -> None:
     for work in (take_out, stay):
         live(work, settings_, records=keeper)
     keeper.close()
+
+
+def test_a_restored_store_leaves_the_field_in_stow_until_an_engineer_confirms(
+    tmp_path: Path,
+) -> None:
+    """Its locks are old: a mirror was raised with somebody at it, who had locked it since."""
+    keeper = Keeper(tmp_path / "data", inline=True)
+    settings_ = AutomaticSettings(wanted=True, calibrate=False, margin=0.0)
+
+    async def take_out(plant: LivePlant) -> None:
+        backup(keeper.database, tmp_path / "backup", plant.clock.utc())
+        plant.operations.hold(OPERATOR, plant.names[:1], "washing")
+
+    async def stay(plant: LivePlant) -> None:
+        shown = plant.operations
+        await asyncio.sleep(200.0)
+        assert _states(plant) == ["STOWED"] * 4
+        (lock,) = shown.holds()
+        assert (lock.kind, lock.who) == ("tower", OWNER)
+        assert "a backup of" in lock.reason
+        with pytest.raises(RefusedError, match=f"has no lock on tower.*{OWNER}"):
+            shown.unhold(ENGINEER, tower=True)
+        with pytest.raises(RefusedError, match="Olga is operator"):
+            shown.unhold(OPERATOR, tower=True, owner=OWNER, reason="all seen")
+
+    async def confirm(plant: LivePlant) -> None:
+        shown = plant.operations
+        await asyncio.sleep(100.0)
+        assert _states(plant) == ["STOWED"] * 4
+        shown.hold(OPERATOR, plant.names[:1], "washing")
+        shown.unhold(ENGINEER, tower=True, owner=OWNER, reason="all seen, Olga is at the first")
+        await asyncio.sleep(200.0)
+        assert _states(plant) == ["STOWED", "TRACKING", "TRACKING", "TRACKING"]
+
+    live(take_out, settings_, records=keeper)
+    keeper.close()
+    restore(tmp_path / "backup", tmp_path / "restored")
+    again = Keeper(tmp_path / "restored", inline=True)
+    for work in (stay, confirm):
+        live(work, settings_, records=again)
+    again.close()
 
 
 async def _cut(plant: LivePlant, cluster: str, seconds: float) -> None:

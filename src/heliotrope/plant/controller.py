@@ -465,6 +465,11 @@ class PlantController:
         return self._sentinel.on
 
     @property
+    def standby_unknown(self) -> npt.NDArray[np.bool_]:
+        """Which heliostats may have any standby point, (N,); see `Points.unknown`."""
+        return self._ways.points.unknown("STANDBY")
+
+    @property
     def unwatched(self) -> tuple[str, ...]:
         """Rows of the safety table that have no reading."""
         return self._sentinel.table.unwatched

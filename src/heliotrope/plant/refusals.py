@@ -218,6 +218,13 @@ AIM_NOT_TAKEN = Refusal(
     "its last aim was not taken ({reason}), so its beam would go to an earlier one",
     "Give the aim again.",
 )
+STANDBY_NOT_TAKEN = Refusal(
+    "standby point not taken",
+    "A heliostat is sent to standby, and no standby point is known that its local controller has: "
+    "the plant's store was restored from a backup, or the first one was not taken.",
+    "its standby point was not taken ({reason}), so its beam would go to an unknown one",
+    "Give the standby point again; automatic control does so.",
+)
 PLACE_UNKNOWN = Refusal(
     "place unknown",
     "Where there are keep-out volumes: a heliostat is ordered to standby, moved by counts (JOG, "

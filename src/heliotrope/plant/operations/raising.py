@@ -204,6 +204,10 @@ class Raising:
         busy = (self._busy_until >= now) & (self._told_in == plant.field.rows["state"])
         free = self.wanted & ~busy & ~resting
         free[[plant.field.place(name) for name in visiting()]] = False
+        unknown = plant.standby_unknown & plant.field.among((states.STOWED,), now)
+        if rows := np.flatnonzero(free & unknown)[: self._most].tolist():
+            await self._rest_again(np.array(rows), token)
+        free &= ~unknown
         strayed = (states.TRACKING, "IDLE", self._on_targets(plant.aims))
         here = np.ones(len(free), dtype=np.bool_)
         for state, name, where in (
@@ -218,6 +222,21 @@ class Raising:
         rows = np.flatnonzero(able)[: self._most]
         if len(rows) and self._aims and plant.waiting < self._most:
             await self._join(rows, token, visiting)
+
+    async def _rest_again(self, rows: Rows, token: int) -> None:
+        """Give heliostats at stow their standby points, since they may have any."""
+        plant = self._plant
+        points = {plant.field.names[row]: plant.standbys[row].copy() for row in rows}
+        given = self._give(
+            rows,
+            states.STOWED,
+            lambda names: plant.standby(self._person, token, {n: points[n] for n in names}),
+        )
+        if given is not None:
+            names, ticket = given
+            await ticket.end(10.0)
+            for name in names:
+                self.release(name)
 
     async def _join(self, rows: Rows, token: int, visiting: Callable[[], frozenset[str]]) -> None:
         """Give heliostats their aims on the receiver, and send them there."""
