@@ -70,6 +70,7 @@ from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.plant.stepping import Stepping
 from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.told_alarms import ToldAlarms
+from heliotrope.plant.witnesses import Witnesses
 from heliotrope.safety import Act, Alarm, Condition, alarms, conditions, limited
 from heliotrope.sun import fast_vector
 
@@ -115,7 +116,7 @@ class PlantController:
 
     Attributes
     ----------
-    design, settings, field, authority, wanted, counters, beliefs, doubts
+    design, settings, field, authority, wanted, counters, beliefs, doubts, witnesses
         See their classes.
     beams
         Mirrors and keep-out volumes; see `BeamCheck`.
@@ -184,7 +185,12 @@ class PlantController:
             self._clusters.connection,
             self._tell,
         )
-        self.doubts = Doubts(self.field, design, self.aims, self._tell)
+        self.witnesses = Witnesses(
+            self.settings.witnesses, design.site, lambda: clock.utc().timestamp(), self._tell
+        )
+        self.doubts = Doubts(
+            self.field, design, self.aims, self._tell, lambda: self.witnesses.refusal
+        )
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
         self._rivals, self._told_alarms = Rivals(self.name, self._tell), ToldAlarms()
         self._cluster_settings = ClusterSettings(self._tell, _expected(self.settings))
@@ -435,6 +441,7 @@ class PlantController:
             self._orders.pay()
         if slow:
             self._slow_at = now
+            self.witnesses.beat()
             if work := self._ways.points.settling():
                 self._orders.owe(work)
             self._sync.beat(now, token, not self._sentinel.refusal(self.field.clusters))

@@ -249,6 +249,13 @@ SEEN_ASTRAY = Refusal(
     "a flight sees it far from where its parameters say, and no photograph has settled that yet",
     "Let automatic control calibrate it: it goes to a target before all others.",
 )
+UNWITNESSED = Refusal(
+    "sun not witnessed",
+    "A heliostat is sent to the receiver, and an independent witness contradicts the sun of plant "
+    "and clusters, or none of those required has agreed today.",
+    "no independent witness confirms the sun of this plant: {problem}",
+    "Follow the alarm `sun_contradicted` or `unwitnessed`. Targets and standby stay open.",
+)
 PARAMETERS_NOT_HERE = Refusal(
     "parameters not here",
     "Parameters that change a pose are given where the beam would move or is not proven free.",

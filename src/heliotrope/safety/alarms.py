@@ -153,6 +153,31 @@ SETTINGS_DIFFER = AlarmKind(
     "wrong one and restart its program.",
     over="cluster {subject}: its settings are no longer known to differ",
 )
+SUN_CONTRADICTED = AlarmKind(
+    "sun_contradicted",
+    _PLANT,
+    Severity.ALARM,
+    "An independent witness sees the sun elsewhere than the plant computes it: the time or site "
+    "that plant and clusters share is wrong.",
+    "{problem}, at {at} UTC by the plant's clock",
+    "No heliostat joins a receiver; those that track go on, beside their aims.",
+    "Defocus the field. Compare the plant's clock with another one, and its site with a map; then "
+    "correct them.",
+    over="{subject} sees the sun where the plant computes it",
+)
+UNWITNESSED = AlarmKind(
+    "unwitnessed",
+    _PLANT,
+    Severity.WARNING,
+    "No independent witness has agreed with the plant's sun today; worse where one is required.",
+    "nothing independent has seen today's sun where the plant computes it: {problem}",
+    "Where a witness is required, no heliostat joins a receiver; else a time or site that is wrong "
+    "in plant and clusters stays unseen.",
+    "Let a heliostat that was calibrated before today visit a target, or see to the witness; name "
+    "witnesses in the table witness of the links file, or accept there that there is none.",
+    over="a witness sees the sun where the plant computes it",
+    worse=Severity.ALARM,
+)
 CONSOLE = AlarmKind(
     "console",
     _PLANT,
@@ -280,8 +305,8 @@ RESUME_NEEDED = AlarmKind(
     "resume_needed",
     _PLANT,
     Severity.ALARM,
-    "More heliostats than `losses` or `losses_share` allow left the receiver within 30 s without an "
-    "order, or an emergency held when the last program ended.",
+    "More heliostats than `losses` or `losses_share` allow left the receiver within 30 s without "
+    "an order, or an emergency held when the last program ended.",
     "{what} at {since} UTC",
     "Automatic control waits and raises nothing.",
     "Find the cause, make sure that nobody is in the field, then press Resume.",
