@@ -55,6 +55,7 @@ from heliotrope.plant.commands import Commands
 from heliotrope.plant.doubts import Doubts
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.firmware import Firmware
 from heliotrope.plant.given import Given
 from heliotrope.plant.giving_back import GivingBack
 from heliotrope.plant.identity import Identities
@@ -194,6 +195,7 @@ class PlantController:
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
         self._rivals, self._told_alarms = Rivals(self.name, self._tell), ToldAlarms()
         self._cluster_settings = ClusterSettings(self._tell, _expected(self.settings))
+        self._firmware = Firmware(self.settings.firmware, self._clusters, self._tell)
         self._orders = self._ordering(clock, audit, disk or AtOnce())
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
         self._sync = ParameterSync(
@@ -363,6 +365,7 @@ class PlantController:
         """Repeat orders to a cluster that has connected, and compare its parameters."""
         self._sentinel.greet(end.name)
         self._sync.greet(end.members)
+        self._firmware.greet(end.name, self.now())
 
     def _take(self, end: ClusterEnd, message: object, now: float) -> None:
         match message:
@@ -442,6 +445,7 @@ class PlantController:
         if slow:
             self._slow_at = now
             self.witnesses.beat()
+            self._firmware.beat(now)
             if work := self._ways.points.settling():
                 self._orders.owe(work)
             self._sync.beat(now, token, not self._sentinel.refusal(self.field.clusters))

@@ -114,6 +114,12 @@ class LinksDocument(Table):
         default_factory=ExpectedPolling,  # type: ignore[arg-type]
         description="What every cluster file of this plant has in its table of that name.",
     )
+    firmware: int | None = Field(
+        None,
+        ge=0,
+        le=0xFFFF,
+        description="Version of the firmware that every board should have; default: not compared.",
+    )
     witness: WitnessTable = Field(
         default_factory=WitnessTable,  # type: ignore[arg-type]
         description="What sees the sun independently of the clocks and sites of the plant.",
@@ -220,6 +226,7 @@ class LinksFile:
             made.light = read_reference(folder / self.document.receiver_light)
         made.given = frozenset(n for n, f in sensors.items() if f == GIVEN)
         self._call(made, clock)
+        made.firmware = self.document.firmware
         polling = self.document.polling
         made.common = CommonSettings(polling.steps_every_s, polling.silence_s)
         served = {n: self.keys[n] for n, how in self.document.clusters.items() if how == "tcp"}
@@ -314,6 +321,8 @@ class PlantLinks:
         Settings that every cluster should have, as far as this file holds them.
     witnesses, witnessed
         Independent witnesses of the sun; names of all that count, as in `PlantSettings.witnesses`.
+    firmware
+        Version that every board should have; None: it is not compared.
     light
         Reference by which the receiver's camera gives its flux; None: it gives none.
     """
@@ -329,6 +338,7 @@ class PlantLinks:
     light: ReceiverReference | None = None
     witnesses: list[Witness] = field(default_factory=list)
     witnessed: frozenset[str] | None = frozenset()
+    firmware: int | None = None
 
     def facts(self) -> dict[str, str]:
         """Return, by name, why the last connection was refused and whose new key is not used."""

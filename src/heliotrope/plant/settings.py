@@ -51,6 +51,8 @@ class PlantSettings:
     witnesses
         Witnesses of the sun, one of which must agree before the first heliostat of a day joins a
         receiver; none: the plant says so once a day; None: that is accepted. See `witnesses`.
+    firmware
+        Version of the firmware that every board should have; None: they are not compared.
     common
         Settings that every cluster should have; None: the clusters are compared with each other.
     """
@@ -73,6 +75,7 @@ class PlantSettings:
     largest_change: float = 5e-3
     stow_rate: float = 200.0
     witnesses: frozenset[str] | None = None
+    firmware: int | None = None
     common: CommonSettings | None = None
 
     def __post_init__(self) -> None:

@@ -153,6 +153,18 @@ SETTINGS_DIFFER = AlarmKind(
     "wrong one and restart its program.",
     over="cluster {subject}: its settings are no longer known to differ",
 )
+FIRMWARE_DIFFERS = AlarmKind(
+    "firmware_differs",
+    _PLANT,
+    Severity.WARNING,
+    "Boards on the bus of a cluster have another firmware version than the plant expects.",
+    "cluster {subject}: {boards} have other firmware than version {expected}, which this plant "
+    "expects",
+    "They go on with their own.",
+    "Install the expected version on them, or correct firmware in the links file. The bus is "
+    "searched when the cluster connects.",
+    over="cluster {subject}: all boards that answer have the expected firmware",
+)
 SUN_CONTRADICTED = AlarmKind(
     "sun_contradicted",
     _PLANT,

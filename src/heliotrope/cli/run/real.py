@@ -107,6 +107,7 @@ def _settings(
             given=outside.links.given,
             common=common,
             witnesses=outside.links.witnessed,
+            firmware=outside.links.firmware,
         ),
         # A heliostat that a person gives to automatic control is calibrated too.
         work=AutomaticSettings(wanted=not choice.idle, foresee=FORESEE),

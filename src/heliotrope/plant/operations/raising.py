@@ -220,7 +220,8 @@ class Raising:
         calibrated = np.array([plant.beliefs.record(n) is not None for n in plant.field.names])
         able = free & (self._clear | calibrated) & plant.field.among((states.IDLE,), now)
         rows = np.flatnonzero(able)[: self._most]
-        if len(rows) and self._aims and plant.waiting < self._most:
+        witnessed = not plant.witnesses.refusal
+        if len(rows) and self._aims and witnessed and plant.waiting < self._most:
             await self._join(rows, token, visiting)
 
     async def _rest_again(self, rows: Rows, token: int) -> None:
