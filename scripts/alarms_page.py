@@ -25,8 +25,9 @@ Severities, from the least serious: **info**, **warning**, **alarm**, **emergenc
 _REFUSALS = """
 ## Refusals
 
-A refused command was not sent, and nothing moves. DEFOCUS, STOW and EMERGENCY are never refused
-by the plant. Over HTTP a refusal has the status 409.
+A refused command was not sent, and nothing moves. The plant refuses DEFOCUS, STOW and EMERGENCY to
+nobody; a cluster refuses names that its file lacks, and a heliostat without power, with stalled
+drives or switched off at the mirror cannot obey. Over HTTP a refusal has the status 409.
 
 | refusal | when | text | what to do |
 |---|---|---|---|

@@ -3,6 +3,8 @@
 import re
 from pathlib import Path
 
+from heliotrope.lcu import messages
+
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "explanation" / "hazards.md").read_text(encoding="utf-8")
 
@@ -25,6 +27,20 @@ def test_each_test_stands_in_a_file_that_its_chapter_names() -> None:
             count += 1
             assert where.get(name, set()) & files, f"{chapter.splitlines()[0]}: {name}"
     assert count > 80
+
+
+def test_every_order_that_moves_or_locks_has_a_row_of_unsafe_control_actions() -> None:
+    table = PAGE.partition("\n## Unsafe control actions")[2].partition("\n## ")[0]
+    rows = {
+        line.split("|")[1].strip(" `"): line.strip("|").split("|")
+        for line in table.splitlines()
+        if line.startswith("| `")
+    }
+    orders = {
+        row[1] for row in messages.MESSAGES if row[2] in (messages.ANYONE, messages.AUTHORITY)
+    }
+    assert rows.keys() == orders
+    assert all(len(cells) == 7 and all(cell.strip() for cell in cells) for cells in rows.values())
 
 
 def test_each_hazard_has_a_cause_a_safeguard_a_test_and_what_remains() -> None:

@@ -32,6 +32,7 @@ from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.photographs import Shot, seen, spiral
 from heliotrope.plant.visits.settings import Centring
 from heliotrope.safety import Alarm, Severity, alarms
+from heliotrope.store.backup import OWNER, backup, restore
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import StoreError
 from heliotrope.sun import fast_vector
@@ -548,6 +549,47 @@ def test_out_of_service_outlasts_a_restart_and_its_time(tmp_path: Path) -> None:
     keeper.close()
 
 
+def test_a_restored_store_leaves_the_field_in_stow_until_an_engineer_confirms(
+    tmp_path: Path,
+) -> None:
+    """Its locks are old: a mirror was raised with somebody at it, who had locked it since."""
+    keeper = Keeper(tmp_path / "data", inline=True)
+    settings_ = AutomaticSettings(wanted=True, calibrate=False, margin=0.0)
+
+    async def take_out(plant: LivePlant) -> None:
+        backup(keeper.database, tmp_path / "backup", plant.clock.utc())
+        plant.operations.hold(OPERATOR, plant.names[:1], "washing")
+
+    async def stay(plant: LivePlant) -> None:
+        shown = plant.operations
+        await asyncio.sleep(200.0)
+        assert _states(plant) == ["STOWED"] * 4
+        (lock,) = shown.holds()
+        assert (lock.kind, lock.who) == ("tower", OWNER)
+        assert "a backup of" in lock.reason
+        with pytest.raises(RefusedError, match=f"has no lock on tower.*{OWNER}"):
+            shown.unhold(ENGINEER, tower=True)
+        with pytest.raises(RefusedError, match="Olga is operator"):
+            shown.unhold(OPERATOR, tower=True, owner=OWNER, reason="all seen")
+
+    async def confirm(plant: LivePlant) -> None:
+        shown = plant.operations
+        await asyncio.sleep(100.0)
+        assert _states(plant) == ["STOWED"] * 4
+        shown.hold(OPERATOR, plant.names[:1], "washing")
+        shown.unhold(ENGINEER, tower=True, owner=OWNER, reason="all seen, Olga is at the first")
+        await asyncio.sleep(200.0)
+        assert _states(plant) == ["STOWED", "TRACKING", "TRACKING", "TRACKING"]
+
+    live(take_out, settings_, records=keeper)
+    keeper.close()
+    restore(tmp_path / "backup", tmp_path / "restored")
+    again = Keeper(tmp_path / "restored", inline=True)
+    for work in (stay, confirm):
+        live(work, settings_, records=again)
+    again.close()
+
+
 async def _cut(plant: LivePlant, cluster: str, seconds: float) -> None:
     """Take a cluster's link away for a time."""
     plant.links[cluster].plugged = False
@@ -585,6 +627,24 @@ def test_after_a_loss_of_many_only_a_person_resumes(away: float) -> None:
         assert not _waits(plant)
 
     live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0), count=8)
+
+
+def test_a_field_of_two_that_is_lost_waits_for_a_person() -> None:
+    """Three may be lost of a large field; of a field of two, both are all of it."""
+
+    async def work(plant: LivePlant) -> None:
+        await asyncio.sleep(200.0)
+        assert _states(plant) == ["TRACKING"] * 2
+        for link in plant.links.values():
+            link.plugged = False
+        await asyncio.sleep(20.0)
+        for link in plant.links.values():
+            link.plugged = True
+        await asyncio.sleep(180.0)
+        assert _waits(plant)
+        assert not {"TRACKING", "APPROACHING", "IDLE"} & set(_states(plant)), _states(plant)
+
+    live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0), count=2)
 
 
 def test_what_a_few_heliostats_lost_they_regain() -> None:
@@ -899,3 +959,5 @@ def test_work_settings_that_are_none() -> None:
         AutomaticSettings(rate=0.0)
     with pytest.raises(InputError, match="-1 losses"):
         AutomaticSettings(losses=-1)
+    with pytest.raises(InputError, match=r"losses of 1\.5 of the field"):
+        AutomaticSettings(losses_share=1.5)

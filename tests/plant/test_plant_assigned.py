@@ -21,7 +21,10 @@ from heliotrope.plant.assigned import (
 )
 from heliotrope.plant.audit import read
 from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.kept_audit import KeptPoints
 from heliotrope.plant.settings import PlantSettings
+from heliotrope.store.backup import backup, restore
+from heliotrope.store.keeper import Keeper
 from support.plant_bench import OPERATOR, Bench, SlowDisk, running
 
 AIM, OTHER, STANDBY = (0.1, 0.2, 16.5), (0.0, 0.0, 16.0), (4.0, 0.0, 14.0)
@@ -245,6 +248,48 @@ def test_after_a_restart_the_plant_knows_which_points_were_not_taken(tmp_path: P
 
     run_virtual(before)
     run_virtual(after)
+
+
+def test_after_a_restore_no_mirror_goes_to_a_standby_point_that_it_may_not_have(
+    tmp_path: Path,
+) -> None:
+    """A point of the backup led to proofs of paths that the mirrors did not take."""
+    old, names = (9.0, 0.0, 14.0), ("P1A", "P1B")
+    keeper = Keeper(tmp_path / "data")
+
+    async def before(clock: VirtualClock) -> None:
+        async with running(Bench(clock, tmp_path, assigned=KeptPoints(keeper))) as bench:
+            plant, token = bench.plant, await bench.commanded()
+            for give in (plant.aim, plant.standby):
+                assert await give(OPERATOR, token, dict.fromkeys(names, old)).end(5.0)
+            await bench.wait(3.0)
+            backup(keeper.database, tmp_path / "backup", clock.utc())
+            assert await plant.standby(OPERATOR, token, dict.fromkeys(names, AIM)).end(5.0)
+            await bench.wait(3.0)
+
+    async def after(clock: VirtualClock) -> None:
+        folder = tmp_path / "again"
+        folder.mkdir()
+        async with running(Bench(clock, folder, seed=2, assigned=KeptPoints(again))) as bench:
+            plant, token = bench.plant, await bench.commanded()
+            await bench.wait(2.0)
+            for name in ("APPROACH", "IDLE"):
+                with pytest.raises(RefusedError, match="its standby point was not taken"):
+                    plant.command(OPERATOR, token, name, names)
+            rows = [plant.field.place(name) for name in names]
+            assert plant.standby_unknown[rows].all()
+            assert await plant.standby(OPERATOR, token, {"P1A": old}).end(5.0)
+            ticket = plant.command(OPERATOR, token, "APPROACH", names)
+            await bench.wait(3.0)
+            assert ticket.refusals.keys() == {"P1B"}
+            assert plant.standby_unknown[rows].tolist() == [False, True]
+
+    run_virtual(before)
+    keeper.close()
+    restore(tmp_path / "backup", tmp_path / "restored")
+    again = Keeper(tmp_path / "restored")
+    run_virtual(after)
+    again.close()
 
 
 def test_the_store_knows_after_each_assignment_what_the_plant_knows(tmp_path: Path) -> None:

@@ -80,6 +80,8 @@ class ScriptedCluster:
         Items of each heliostat's journal.
     poses
         Completes the rows with the step counts of heliostats that track.
+    found
+        What a search of its bus finds; None: it refuses to search.
     late, site, settings
         Error of its time, s; the site and the checksum of settings that it reports.
     """
@@ -104,6 +106,7 @@ class ScriptedCluster:
         self.late = 0.0
         self.site: tuple[float, ...] = ()
         self.settings = ""
+        self.found: list[dict[str, Any]] | None = None
 
     def of(self, kind: type[Any]) -> list[Any]:
         """The messages of a kind."""
@@ -190,6 +193,8 @@ class ScriptedCluster:
     def _answer(self, ask: Ask) -> Answer:
         if ask.what == "statistics":
             return Answer(ask.identity, {name: {} for name in self.names})
+        if ask.what == "discover" and self.found is not None:
+            return Answer(ask.identity, {"found": self.found})
         if ask.what == "stored" and ask.heliostat not in self.deaf:
             items = self.stored[ask.heliostat] or {"address": struct.pack("<H", 1)}
             sizes = [len(data) for data in items.values()]

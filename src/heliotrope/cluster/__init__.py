@@ -13,10 +13,10 @@ Begin with ``config_file.read_cluster`` and ``controller``. The cluster knows no
 
 from heliotrope.cluster.config import MOST_MEMBERS, ClusterConfig, Member, spread_phase
 from heliotrope.cluster.controller import Cluster
-from heliotrope.cluster.gpsd import Gpsd, SatelliteReceiver
 from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.timekeeping import Quality, SystemTime, Time, TimeKeeper, kernel_bound
 from heliotrope.cluster.turns import Turns
+from heliotrope.links.gpsd import Gpsd, SatelliteReceiver
 
 __all__ = [
     "MOST_MEMBERS",

@@ -3,18 +3,17 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
-from urllib.parse import urlsplit
 
 from pydantic import Field
 
 from heliotrope.cluster.config import MOST_MEMBERS, ClusterConfig, Member
-from heliotrope.cluster.gpsd import PORT
 from heliotrope.cluster.serial_bus import BusSettings
 from heliotrope.errors import FormatError, InputError
 from heliotrope.files.documents import read_document, read_toml
 from heliotrope.links.addresses import Table, check_encryption, url_parts
 from heliotrope.links.bus_key_file import read_bus_keys
 from heliotrope.links.common_settings import CommonSettings
+from heliotrope.links.gpsd import gpsd_at
 from heliotrope.links.keys import HELIOSTATS, BrokerPassword, KeyRing, Keys
 from heliotrope.safety import Limits
 from heliotrope.sun import Site
@@ -335,7 +334,7 @@ def _install(
         plant_keys=KeyRing(*secrets.plant),
         password=BrokerPassword(secrets.password),
         error=document.time.error_s,
-        gpsd=_gpsd_at(path, document.time.gpsd),
+        gpsd=gpsd_at(path, document.time.gpsd, "time.gpsd") if document.time.gpsd else None,
         state=path.parent / (document.state or f"{document.name}.state.json"),
         emergency_line=path.parent / line if line else None,
     )
@@ -346,17 +345,3 @@ def _placed(path: Path, table: PlantLinkTable) -> PlantLinkTable:
     if table.authority is None:
         return table
     return table.model_copy(update={"authority": str(path.parent / table.authority)})
-
-
-def _gpsd_at(path: Path, text: str) -> tuple[str, int] | None:
-    """Return host and port of gpsd, None if there is none."""
-    if not text:
-        return None
-    try:
-        parts = urlsplit(f"//{text}")
-        host, port = parts.hostname, parts.port or PORT
-    except ValueError:
-        host = None
-    if not host or parts.path:
-        raise FormatError(path, f"{text!r}: give host or host:port of gpsd", "time.gpsd")
-    return host, port

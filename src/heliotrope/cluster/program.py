@@ -12,13 +12,13 @@ from typing import Any
 from heliotrope.cluster import timekeeping
 from heliotrope.cluster.config_file import Installation, read_cluster
 from heliotrope.cluster.controller import Cluster
-from heliotrope.cluster.gpsd import Gpsd
 from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.serial_bus import SerialBus
 from heliotrope.cluster.timekeeping import SystemTime, TimeKeeper
 from heliotrope.errors import FormatError
 from heliotrope.files.disk import DiskThread
 from heliotrope.links.clock import Clock
+from heliotrope.links.gpsd import Gpsd
 from heliotrope.links.in_process import memory_pair
 from heliotrope.links.link import Link
 

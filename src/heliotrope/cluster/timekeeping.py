@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal, Protocol
 
-from heliotrope.cluster.gpsd import Gpsd
 from heliotrope.errors import InputError, TimeError
 from heliotrope.links.clock import GPS_EPOCH, Clock, gps_seconds, sleep_until
+from heliotrope.links.gpsd import Gpsd
 
 Quality = Literal["gps", "system", "holdover", "none"]
 

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from heliotrope.errors import HeliotropeError
 from heliotrope.field.plant import Plant
 from heliotrope.lcu import states
+from heliotrope.links.clock import sleep_until
 from heliotrope.links.link import running
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.assigned import rest_on
@@ -55,6 +56,8 @@ SILENT = 10.0
 _STANDS = 15.0
 #: Period of reading the sensors, s.
 _SENSED = 0.5
+#: Period of asking the witnesses of the sun, s.
+_WITNESSED = 5.0
 #: The audit has changed limits in this name.
 _PLANT_FILE = Person("plant file", Role.ENGINEER)
 #: States that STOW does not change: only their motion shows whether such heliostats obey.
@@ -250,6 +253,8 @@ class PlantAssembly:
                     tasks.append(group.create_task(self._look(cameras)))
                 if sensors is not None:
                     tasks.append(group.create_task(self._sense(sensors)))
+                if self.ports.witnesses:
+                    tasks.append(group.create_task(self._witness()))
                 yield self
                 for task in tasks:
                     task.cancel()
@@ -273,6 +278,15 @@ class PlantAssembly:
                     alarms.SENSOR.raised(name, problem=text) if text else alarms.SENSOR.ended(name)
                 )
             await asyncio.sleep(_SENSED)
+
+    async def _witness(self) -> None:
+        """Compare the plant's sun with those of its witnesses as they come."""
+        while True:
+            for witness in self.ports.witnesses:
+                seen = await witness.sun(self.design.site)
+                if seen is not None:
+                    self.plant.witnesses.take(witness.name, *seen)
+            await sleep_until(self.clock, self.clock.monotonic() + _WITNESSED)
 
     async def _look(self, cameras: Cameras) -> None:
         """Photograph each target once, so that a camera that fails is known before a beam comes."""

@@ -203,6 +203,14 @@ class Points:
             name = self._names[row]
             self._taken[kind][name] = tuple(place), marks.get(name)
 
+    def unknown(self, kind: str) -> npt.NDArray[np.bool_]:
+        """Return which local controllers may have any point, (N,).
+
+        The assigned one was not taken, and none before it is known: it was the first, or the store
+        is a restored backup.
+        """
+        return np.asarray((self.earlier[kind][0] == self._arrays[kind]).all(axis=-1))
+
     def possible(self, kind: str, rows: npt.NDArray[np.intp]) -> list[tuple[Rows, FloatArray]]:
         """Return where local controllers (K,) may send their beams.
 

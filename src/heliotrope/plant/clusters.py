@@ -180,13 +180,21 @@ class Clusters:
         return f"{what}-{self._numbers}"
 
     def ask(
-        self, end: ClusterEnd, what: str, take: Callable[[Answer], None], heliostat: str = ""
+        self,
+        end: ClusterEnd,
+        what: str,
+        take: Callable[[Answer], None],
+        heliostat: str = "",
+        patience: float = ANSWER_PATIENCE,
     ) -> None:
-        """Send a question to a cluster; ``take`` is called with its answer, if one comes."""
+        """Send a question to a cluster.
+
+        ``take`` is called with its answer, if one comes within ``patience`` s.
+        """
         now = self._clock.monotonic()
-        self._awaited = {i: a for i, a in self._awaited.items() if now - a[0] < ANSWER_PATIENCE}
+        self._awaited = {i: a for i, a in self._awaited.items() if now < a[0]}
         identity = self.number(what)
-        self._awaited[identity] = now, take
+        self._awaited[identity] = now + patience, take
         end.post(Ask(identity, what, heliostat), QUESTION_LIFE)
 
     async def answer(

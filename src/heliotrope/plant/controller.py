@@ -64,6 +64,7 @@ from heliotrope.plant.emergency import (
     TableWatch,
 )
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.firmware import Firmware
 from heliotrope.plant.given import Given
 from heliotrope.plant.giving_back import GivingBack
 from heliotrope.plant.identity import Identities
@@ -79,6 +80,7 @@ from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.plant.stepping import Stepping
 from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.told_alarms import ToldAlarms
+from heliotrope.plant.witnesses import Witnesses
 from heliotrope.safety import Act, Alarm, Condition, alarms, conditions, limited
 from heliotrope.sun import fast_vector
 
@@ -126,7 +128,7 @@ class PlantController:
 
     Attributes
     ----------
-    design, settings, field, authority, wanted, counters, beliefs, doubts
+    design, settings, field, authority, wanted, counters, beliefs, doubts, witnesses
         See their classes.
     beams
         Mirrors and keep-out volumes; see `BeamCheck`.
@@ -198,10 +200,16 @@ class PlantController:
             self._clusters.connection,
             self._tell,
         )
-        self.doubts = Doubts(self.field, design, self.aims, self._tell)
+        self.witnesses = Witnesses(
+            self.settings.witnesses, design.site, lambda: clock.utc().timestamp(), self._tell
+        )
+        self.doubts = Doubts(
+            self.field, design, self.aims, self._tell, lambda: self.witnesses.refusal
+        )
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
         self._rivals, self._told_alarms = Rivals(self.name, self._tell), ToldAlarms()
         self._cluster_settings = ClusterSettings(self._tell, _expected(self.settings))
+        self._firmware = Firmware(self.settings.firmware, self._clusters, self._tell)
         self._orders = self._ordering(clock, audit, disk or AtOnce())
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
         self._sync = ParameterSync(
@@ -375,6 +383,7 @@ class PlantController:
         """Repeat orders to a cluster that has connected, and compare its parameters."""
         self._sentinel.greet(end.name)
         self._sync.greet(end.members)
+        self._firmware.greet(end.name, self.now())
 
     def _take(self, end: ClusterEnd, message: object, now: float) -> None:
         match message:
@@ -453,6 +462,8 @@ class PlantController:
             self._orders.pay()
         if slow:
             self._slow_at = now
+            self.witnesses.beat()
+            self._firmware.beat(now)
             points, held = self._ways.points, self._held()
             for work in (points.settling(), points.released(held, now)):
                 if work is not None:
@@ -496,6 +507,11 @@ class PlantController:
     def emergency_on(self) -> bool:
         """Whether an emergency of the whole field holds."""
         return self._sentinel.on
+
+    @property
+    def standby_unknown(self) -> npt.NDArray[np.bool_]:
+        """Which heliostats may have any standby point, (N,); see `Points.unknown`."""
+        return self._ways.points.unknown("STANDBY")
 
     @property
     def unwatched(self) -> tuple[str, ...]:

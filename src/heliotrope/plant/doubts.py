@@ -5,7 +5,7 @@ which it reports as COUNTS_DOUBTFUL until ZERO. Its beam may then stand beside i
 any other sign. Such a heliostat is named, and kept off the receiver until a photograph on a target
 or a person has confirmed its place. A confirmation holds for one boot: it says nothing of the next
 cut. One that stores new parameters which a calibration has yet to verify stays off in the same way,
-and one whose parameters a flight of a drone contradicts.
+one whose parameters a flight of a drone contradicts, and all while no witness confirms the sun.
 """
 
 import contextlib
@@ -38,6 +38,8 @@ class Doubts:
         Assigned aims, ENU, m, (N, 3).
     tell
         Called with each alarm.
+    unwitnessed
+        Returns why no heliostat may join a receiver, "" if heliostats may; see `witnesses`.
 
     Attributes
     ----------
@@ -46,8 +48,14 @@ class Doubts:
     """
 
     def __init__(
-        self, field: FieldState, design: Plant, aims: FloatArray, tell: Callable[[Alarm], None]
+        self,
+        field: FieldState,
+        design: Plant,
+        aims: FloatArray,
+        tell: Callable[[Alarm], None],
+        unwitnessed: Callable[[], str],
     ) -> None:
+        self._unwitnessed = unwitnessed
         self._field, self._aims, self._tell = field, aims, tell
         self._receivers = np.array([each.center for each in design.receivers]).reshape(-1, 3)
         self._targets = np.array([each.center for each in design.targets]).reshape(-1, 3)
@@ -115,13 +123,16 @@ class Doubts:
         names = tuple(heliostats)
         rows = [self._field.place(name) for name in names]
         unverified, astray = (np.isin(rows, list(s)) for s in (self._unverified, self._astray))
-        doubted = self.standing[rows] | unverified | astray
+        blocked = self._unwitnessed()
+        doubted = self.standing[rows] | unverified | astray | bool(blocked)
         if not doubted.any():
             return {}
         on_target = self._on_target(self._aims[rows] if points is None else points)
         found = {}
         for i in np.flatnonzero(doubted & ~on_target):
-            found[names[i]] = refusals.COUNTS_DOUBTFUL.text
+            found[names[i]] = blocked
+            if self.standing[rows[i]]:
+                found[names[i]] = refusals.COUNTS_DOUBTFUL.text
             if astray[i]:
                 found[names[i]] = refusals.SEEN_ASTRAY.text
             if unverified[i]:

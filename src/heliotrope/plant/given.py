@@ -14,7 +14,7 @@ from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.tickets import Ticket
 
 #: Why a point of an earlier program may not have been taken.
-_BEFORE_START = "the plant's program ended before it was acknowledged"
+_BEFORE_START = "the plant's program ended before it was acknowledged, or its store was restored"
 
 
 class Given:
@@ -67,3 +67,8 @@ class Given:
             elif ticket.stage(name) in (Stage.REFUSED, Stage.FAILED):
                 found[name] = ticket.refusals[name]
         return found
+
+    def unknown(self, kind: str, heliostats: Sequence[str]) -> dict[str, str]:
+        """Return the heliostats that may have any point, and the reasons; see `Points`."""
+        unknown, untaken = self._points.unknown(kind), self.untaken(kind, heliostats)
+        return {n: why for n, why in untaken.items() if unknown[self._field.place(n)]}

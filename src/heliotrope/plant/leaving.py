@@ -1,8 +1,8 @@
 """The shorter of the two ways on which a beam leaves a keep-out volume: DEFOCUS or STOW.
 
-Both orders are open to anybody and never refused by a local controller, so no command authority is
-needed. The ways are those of a mirror that has no sun: by the angles of the defocus, or straight to
-stow, azimuth last.
+Both orders are open to anybody, and a local controller accepts them in every state, so no command
+authority is needed. The ways are those of a mirror that has no sun: by the angles of the defocus,
+or straight to stow, azimuth last.
 """
 
 from dataclasses import replace

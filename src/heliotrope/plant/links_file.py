@@ -23,6 +23,7 @@ from heliotrope.links.addresses import Table, check_encryption, url_parts
 from heliotrope.links.clock import Clock
 from heliotrope.links.common_settings import CommonSettings
 from heliotrope.links.connection import CarriedLink
+from heliotrope.links.gpsd import Gpsd, gpsd_at
 from heliotrope.links.keys import CLUSTERS, BrokerPassword, KeyRing, Keys
 from heliotrope.links.link import Link
 from heliotrope.links.mqtt import Broker, mqtt_link
@@ -30,6 +31,7 @@ from heliotrope.links.papers import Papers, authority_of
 from heliotrope.links.tcp import TcpServer
 from heliotrope.links.tls import RenewedTls, TlsSource, server_tls
 from heliotrope.plant.sensors import FED, SensorFiles
+from heliotrope.plant.witnesses import PHOTOGRAPHS, SatelliteWitness, SunSensorFile, Witness
 from heliotrope.safety import FLUX_READING
 
 
@@ -64,6 +66,25 @@ class MqttTable(Table):
     unencrypted: bool = Field(False, description="Accept a broker elsewhere without TLS.")
 
 
+class WitnessTable(Table):
+    """``[witness]``: what sees the sun independently of the clocks and sites of the plant."""
+
+    gpsd: str = Field(
+        "", description="`host` or `host:port` of gpsd, whose satellite receiver is at the plant."
+    )
+    sun_sensor: str = Field(
+        "",
+        description="File beside this one with azimuth and elevation of the sun, degrees, replaced "
+        "with each reading.",
+    )
+    photographs: bool = Field(
+        False, description="Whether photographs of beams on targets count as a witness."
+    )
+    none: bool = Field(
+        False, description="Accept that there is no witness; else the plant says so once a day."
+    )
+
+
 class ExpectedPolling(Table):
     """``[polling]``: what every cluster file of this plant has in its table of that name."""
 
@@ -93,6 +114,16 @@ class LinksDocument(Table):
         default_factory=ExpectedPolling,  # type: ignore[arg-type]
         description="What every cluster file of this plant has in its table of that name.",
     )
+    firmware: int | None = Field(
+        None,
+        ge=0,
+        le=0xFFFF,
+        description="Version of the firmware that every board should have; default: not compared.",
+    )
+    witness: WitnessTable = Field(
+        default_factory=WitnessTable,  # type: ignore[arg-type]
+        description="What sees the sun independently of the clocks and sites of the plant.",
+    )
     sensors: dict[str, str] = Field(
         default_factory=dict,
         description='File with one number, or `"api"`, by reading of the safety table; '
@@ -111,7 +142,13 @@ GIVEN = "api"
 #: Says that the receiver's camera gives its flux.
 CAMERA = "camera"
 #: The tables, for the reference and for hints.
-TABLES: tuple[type[Table], ...] = (LinksDocument, TcpTable, MqttTable, ExpectedPolling)
+TABLES: tuple[type[Table], ...] = (
+    LinksDocument,
+    TcpTable,
+    MqttTable,
+    WitnessTable,
+    ExpectedPolling,
+)
 
 
 @dataclass(frozen=True)
@@ -188,6 +225,8 @@ class LinksFile:
         if self.document.receiver_light:
             made.light = read_reference(folder / self.document.receiver_light)
         made.given = frozenset(n for n, f in sensors.items() if f == GIVEN)
+        self._call(made, clock)
+        made.firmware = self.document.firmware
         polling = self.document.polling
         made.common = CommonSettings(polling.steps_every_s, polling.silence_s)
         served = {n: self.keys[n] for n, how in self.document.clusters.items() if how == "tcp"}
@@ -200,6 +239,20 @@ class LinksFile:
             elif how != "tcp":
                 made.local[name] = folder / how
         return made
+
+    def _call(self, made: "PlantLinks", clock: Clock) -> None:
+        """Call the witnesses of the sun."""
+        table, names = self.document.witness, set()
+        if table.gpsd:
+            gpsd = Gpsd(clock, *gpsd_at(self.path, table.gpsd, "witness.gpsd"))
+            made.parts.append(gpsd)
+            made.witnesses.append(SatelliteWitness(gpsd, clock))
+        if table.sun_sensor:
+            made.witnesses.append(SunSensorFile(self.path.parent / table.sun_sensor))
+        if table.photographs:
+            names.add(PHOTOGRAPHS)
+        names.update(witness.name for witness in made.witnesses)
+        made.witnessed = None if table.none else frozenset(names)
 
     def _take_keys(self) -> None:
         """Read the key file again, and give the links their keys."""
@@ -266,6 +319,10 @@ class PlantLinks:
         Readings of the safety table that programs give by the HTTP API.
     common
         Settings that every cluster should have, as far as this file holds them.
+    witnesses, witnessed
+        Independent witnesses of the sun; names of all that count, as in `PlantSettings.witnesses`.
+    firmware
+        Version that every board should have; None: it is not compared.
     light
         Reference by which the receiver's camera gives its flux; None: it gives none.
     """
@@ -279,6 +336,9 @@ class PlantLinks:
     given: frozenset[str] = frozenset()
     common: CommonSettings = field(default_factory=CommonSettings)
     light: ReceiverReference | None = None
+    witnesses: list[Witness] = field(default_factory=list)
+    witnessed: frozenset[str] | None = frozenset()
+    firmware: int | None = None
 
     def facts(self) -> dict[str, str]:
         """Return, by name, why the last connection was refused and whose new key is not used."""
@@ -341,6 +401,9 @@ def _check(found: LinksFile) -> None:
             "together; take one with heliotrope camera receiver",
             "receiver_light",
         )
+    seen_by = document.witness
+    if seen_by.none and (seen_by.gpsd or seen_by.sun_sensor or seen_by.photographs):
+        raise FormatError(path, "it names a witness, and accepts that there is none", "witness")
     ways = set(document.clusters.values())
     for way, table in (("tcp", document.tcp), ("mqtt", document.mqtt)):
         if way in ways and table is None:

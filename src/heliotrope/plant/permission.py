@@ -101,6 +101,10 @@ class Permission:
         elif name in _TO_STANDBY:
             wrong |= self._sentinel.barred(self._off(names), ASTRAY)
             wrong |= self._sentinel.barred(names, UNPROVEN)
+            wrong |= {
+                each: refusals.STANDBY_NOT_TAKEN.text.format(reason=why)
+                for each, why in self._given.unknown("STANDBY", names).items()
+            }
         elif name in _STILL:
             for row in _SENT_OFF:
                 wrong |= self._sentinel.barred(names, row)

@@ -5,7 +5,7 @@ only in the `Ports` that are passed in: links to clusters, cameras, sensors, a c
 records.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +27,7 @@ from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.sensors import Sensors
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.stacks import Exposed
+from heliotrope.plant.witnesses import Witness
 from heliotrope.plant.workers import Worker, at_once
 from heliotrope.safety import Alarm
 from heliotrope.store.records import Records
@@ -120,6 +121,8 @@ class Ports:
         None: nothing is calibrated.
     sensors
         None: no reading comes from outside.
+    witnesses
+        Independent witnesses of the sun, beside photographs.
     disk
         Does the work of audit and assigned points; it is closed with the plant. None: they are
         written in the loop, as virtual time needs it.
@@ -151,6 +154,7 @@ class Ports:
     audit: Audit
     cameras: Cameras | None = None
     sensors: Sensors | None = None
+    witnesses: Sequence[Witness] = field(default=(), kw_only=True)
     disk: Disk | None = field(default=None, kw_only=True)
     pictures: Pictures | None = field(default=None, kw_only=True)
     marks: Path | None = field(default=None, kw_only=True)

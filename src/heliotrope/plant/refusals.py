@@ -230,6 +230,13 @@ AIM_NOT_TAKEN = Refusal(
     "its last aim was not taken ({reason}), so its beam would go to an earlier one",
     "Give the aim again.",
 )
+STANDBY_NOT_TAKEN = Refusal(
+    "standby point not taken",
+    "A heliostat is sent to standby, and no standby point is known that its local controller has: "
+    "the plant's store was restored from a backup, or the first one was not taken.",
+    "its standby point was not taken ({reason}), so its beam would go to an unknown one",
+    "Give the standby point again; automatic control does so.",
+)
 PLACE_UNKNOWN = Refusal(
     "place unknown",
     "Where there are keep-out volumes: a heliostat is ordered to standby, moved by counts (JOG, "
@@ -253,6 +260,13 @@ SEEN_ASTRAY = Refusal(
     "parameters say.",
     "a flight sees it far from where its parameters say, and no photograph has settled that yet",
     "Let automatic control calibrate it: it goes to a target before all others.",
+)
+UNWITNESSED = Refusal(
+    "sun not witnessed",
+    "A heliostat is sent to the receiver, and an independent witness contradicts the sun of plant "
+    "and clusters, or none of those required has agreed today.",
+    "no independent witness confirms the sun of this plant: {problem}",
+    "Follow the alarm `sun_contradicted` or `unwitnessed`. Targets and standby stay open.",
 )
 PARAMETERS_NOT_HERE = Refusal(
     "parameters not here",

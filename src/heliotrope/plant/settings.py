@@ -48,6 +48,11 @@ class PlantSettings:
         their drives do not start together; 0: all at once. By the default 10,000 take 50 s, with
         2 % of the field starting in a second. A person's LOCK takes one that waits out of its
         order. Emergencies and the safety table never wait.
+    witnesses
+        Witnesses of the sun, one of which must agree before the first heliostat of a day joins a
+        receiver; none: the plant says so once a day; None: that is accepted. See `witnesses`.
+    firmware
+        Version of the firmware that every board should have; None: they are not compared.
     common
         Settings that every cluster should have; None: the clusters are compared with each other.
     """
@@ -69,6 +74,8 @@ class PlantSettings:
     repeat: float = 1.0
     largest_change: float = 5e-3
     stow_rate: float = 200.0
+    witnesses: frozenset[str] | None = None
+    firmware: int | None = None
     common: CommonSettings | None = None
 
     def __post_init__(self) -> None:

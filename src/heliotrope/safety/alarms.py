@@ -165,6 +165,43 @@ SETTINGS_DIFFER = AlarmKind(
     "wrong one and restart its program.",
     over="cluster {subject}: its settings are no longer known to differ",
 )
+FIRMWARE_DIFFERS = AlarmKind(
+    "firmware_differs",
+    _PLANT,
+    Severity.WARNING,
+    "Boards on the bus of a cluster have another firmware version than the plant expects.",
+    "cluster {subject}: {boards} have other firmware than version {expected}, which this plant "
+    "expects",
+    "They go on with their own.",
+    "Install the expected version on them, or correct firmware in the links file. The bus is "
+    "searched when the cluster connects.",
+    over="cluster {subject}: all boards that answer have the expected firmware",
+)
+SUN_CONTRADICTED = AlarmKind(
+    "sun_contradicted",
+    _PLANT,
+    Severity.ALARM,
+    "An independent witness sees the sun elsewhere than the plant computes it: the time or site "
+    "that plant and clusters share is wrong.",
+    "{problem}, at {at} UTC by the plant's clock",
+    "No heliostat joins a receiver; those that track go on, beside their aims.",
+    "Defocus the field. Compare the plant's clock with another one, and its site with a map; then "
+    "correct them.",
+    over="{subject} sees the sun where the plant computes it",
+)
+UNWITNESSED = AlarmKind(
+    "unwitnessed",
+    _PLANT,
+    Severity.WARNING,
+    "No independent witness has agreed with the plant's sun today; worse where one is required.",
+    "nothing independent has seen today's sun where the plant computes it: {problem}",
+    "Where a witness is required, no heliostat joins a receiver; else a time or site that is wrong "
+    "in plant and clusters stays unseen.",
+    "Let a heliostat that was calibrated before today visit a target, or see to the witness; name "
+    "witnesses in the table witness of the links file, or accept there that there is none.",
+    over="a witness sees the sun where the plant computes it",
+    worse=Severity.ALARM,
+)
 CONSOLE = AlarmKind(
     "console",
     _PLANT,
@@ -292,8 +329,8 @@ RESUME_NEEDED = AlarmKind(
     "resume_needed",
     _PLANT,
     Severity.ALARM,
-    "More heliostats than the setting `losses` left the receiver within 30 s without an order, or "
-    "an emergency held when the last program ended.",
+    "More heliostats than `losses` or `losses_share` allow left the receiver within 30 s without "
+    "an order, or an emergency held when the last program ended.",
     "{what} at {since} UTC",
     "Automatic control waits and raises nothing.",
     "Find the cause, make sure that nobody is in the field, then press Resume.",

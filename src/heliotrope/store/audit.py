@@ -96,6 +96,20 @@ def points(connection: Connection) -> dict[str, dict[str, tuple[float, ...]]]:
     return found
 
 
+def doubt_points(connection: Connection) -> None:
+    """Let no assigned point count as taken by its local controller.
+
+    A point before that is like the assigned one says so; see `plant.assigned`.
+    """
+    known = points(connection)
+    doubted = {
+        f"{kind}-1": {n: p for n, p in places.items() if n not in known.get(f"{kind}-1", {})}
+        for kind, places in known.items()
+        if "-" not in kind
+    }
+    change_points(connection, doubted, {})
+
+
 def change_points(
     connection: Connection, new: Mapping[str, Places], gone: Mapping[str, Iterable[str]]
 ) -> None:

@@ -4,6 +4,10 @@ A backup is a folder: ``store.sqlite`` (of a store in PostgreSQL too, so each ki
 into the other), the telemetry if wanted, and ``manifest.json`` with the checksum of every file;
 ``manifest.sig`` is the manifest's signature, if a key was given. It is there whole or not at all. A
 restore needs an empty place: nothing is ever overwritten.
+
+The store in a backup knows that it is one, however it comes to a plant: it holds a lock on the
+tower, and none of its assigned points counts as taken. What has been locked or assigned since it
+was made is not in it, so a person confirms both before a heliostat leaves stow.
 """
 
 import hashlib
@@ -19,18 +23,21 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, delete, func, select
 from sqlalchemy.exc import SQLAlchemyError
 
 from heliotrope import __version__
 from heliotrope.errors import FormatError
-from heliotrope.store import tables
+from heliotrope.store import _rows as rows
+from heliotrope.store import audit, tables
 from heliotrope.store.database import FILE, HEAD, PRIVATE, Database, cause, make_private
-from heliotrope.store.records import StoreError
+from heliotrope.store.records import Hold, StoreError
 from heliotrope.store.signing import PublicKey, SigningKey
 
 MANIFEST, SIGNATURE = "manifest.json", "manifest.sig"
 TELEMETRY = "telemetry"
+#: Owner of the lock on the tower that a backup holds; see `plant.lockouts`.
+OWNER = "restored backup"
 _ROWS = 5000
 
 
@@ -84,7 +91,9 @@ def backup(
             _copy_file(database.file, beside / FILE)
         else:
             _copy_tables(database, Database(beside / FILE))
-            _close_log(beside / FILE)
+        with Database(beside / FILE) as copy:
+            _lock(copy, now)
+        _close_log(beside / FILE)
         if telemetry is not None:
             _copy_telemetry(Path(telemetry), beside / TELEMETRY)
         files = {str(p.relative_to(beside)): checksum(p) for p in _files(beside)}
@@ -323,6 +332,28 @@ def _copy_file(source: Path, target: Path) -> None:
         (state,) = new.execute("PRAGMA quick_check(1)").fetchone()
     if state != "ok":
         raise StoreError(f"store {source}: it is damaged ({state}); restore a backup")
+
+
+def _lock(copy: Database, now: datetime) -> None:
+    """Lock the tower in a backup made at a time, and doubt its assigned points."""
+    hold = Hold(
+        "tower",
+        "tower",
+        f"this store is a backup of {now:%d %b %Y %H:%M} UTC: locks taken and points assigned "
+        "since then are not in it",
+        OWNER,
+        now.timestamp(),
+    )
+    own = (tables.hold.c.person == OWNER) & tables.hold.c.ended.is_(None)
+    try:
+        with copy.connect() as connection, connection.begin():
+            connection.execute(delete(tables.hold).where(own))
+            number = connection.scalar(select(func.max(tables.hold.c.number))) or 0
+            row = rows.row_of(tables.hold, hold, number=number + 1, ended=None, ended_by="")
+            rows.insert(connection, tables.hold, [row])
+            audit.doubt_points(connection)
+    except SQLAlchemyError as error:
+        raise StoreError(f"store {copy.name}: cannot be written ({cause(error)})") from None
 
 
 def _close_log(file: Path) -> None:

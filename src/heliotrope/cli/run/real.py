@@ -102,7 +102,13 @@ def _settings(
 ) -> AssemblySettings:
     common = replace(outside.links.common, delta_t=design.site.delta_t, limits=design.safety)
     return AssemblySettings(
-        plant=replace(shown.plant, given=outside.links.given, common=common),
+        plant=replace(
+            shown.plant,
+            given=outside.links.given,
+            common=common,
+            witnesses=outside.links.witnessed,
+            firmware=outside.links.firmware,
+        ),
         # A heliostat that a person gives to automatic control is calibrated too.
         work=AutomaticSettings(wanted=not choice.idle, foresee=FORESEE),
         machines=MachineTables.WRITTEN if choice.configure else MachineTables.UNKNOWN,
@@ -173,6 +179,7 @@ class _Outside:
             KeptAudit(keeper, clock, clock.utc()),
             cameras,
             self.sensors(cameras, clock),
+            witnesses=self.links.witnesses,
             disk=DiskThread(),
             records=keeper,
             assigned=KeptPoints(keeper),

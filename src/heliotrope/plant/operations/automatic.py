@@ -108,6 +108,9 @@ class AutomaticSettings:
         Standard deviations by which an uncalibrated beam must miss the targets.
     losses
         Heliostats that may be lost within 30 s; after more, it waits for a person's Resume.
+    losses_share
+        Share of the field that may be lost within 30 s, where that is fewer: 3 are all of a small
+        field.
     foresee
         Time between predictions of the field's errors for the rest of the day, s; 0: none is made.
     events
@@ -122,6 +125,7 @@ class AutomaticSettings:
     patience: float = 60.0
     margin: float = 3.0
     losses: int = 3
+    losses_share: float = 0.5
     foresee: float = 0.0
     events: float = 400.0
 
@@ -133,6 +137,10 @@ class AutomaticSettings:
             )
         if self.losses < 0:
             raise InputError(f"automatic control: {self.losses} losses; give 0 or more")
+        if not 0.0 <= self.losses_share <= 1.0:
+            raise InputError(
+                f"automatic control: losses of {self.losses_share:g} of the field; give 0 to 1"
+            )
         if not 0.0 <= self.foresee < math.inf:
             raise InputError(
                 f"automatic control: a prediction every {self.foresee} s; give 0 (none) or more"
@@ -197,7 +205,8 @@ class AutomaticControl:
             clearance=settings.margin * self.installed,
             wanted=settings.wanted,
         )
-        self._losses = Losses(plant, logbook, settings.losses, records, self._wait)
+        most = min(settings.losses, math.floor(settings.losses_share * len(plant.field)))
+        self._losses = Losses(plant, logbook, most, records, self._wait)
         visits = CycleSettings() if cycle is None else cycle.settings
         self.flights = FlightIntake(plant, logbook, self._keeping, visits)
         self.learning = Learning(

@@ -437,7 +437,18 @@ class Calibrating:
             chosen = self._scheduler.next(target, rows) if rows.any() else None
             if chosen is not None:
                 return chosen.heliostat, False
-        return "", False
+        return self._witness(fresh), False
+
+    def _witness(self, ready: npt.NDArray[np.bool_]) -> str:
+        """Return a heliostat (N,) whose photographs show where the sun stands, if any must."""
+        plant = self._plant
+        if not plant.witnesses.awaits_photographs:
+            return ""
+        for row in np.flatnonzero(ready)[np.argsort(self._visited[ready], kind="stable")]:
+            name: str = plant.field.names[row]
+            if plant.witnesses.testifies(plant.beliefs.record(name)):
+                return name
+        return ""
 
     def _now(self) -> float:
         return self._plant.clock.utc().timestamp()

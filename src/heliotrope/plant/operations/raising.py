@@ -206,6 +206,10 @@ class Raising:
         # A cluster that may begin no motion, as one with a wrong clock, keeps no other waiting.
         out = (*visiting(), *plant.held(plant.field.names))
         free[[plant.field.place(name) for name in out]] = False
+        unknown = plant.standby_unknown & plant.field.among((states.STOWED,), now)
+        if rows := np.flatnonzero(free & unknown)[: self._most].tolist():
+            await self._rest_again(np.array(rows), token)
+        free &= ~unknown
         strayed = (states.TRACKING, "IDLE", self._on_targets(plant.aims))
         here = np.ones(len(free), dtype=np.bool_)
         for state, name, where in (
@@ -218,8 +222,24 @@ class Raising:
         calibrated = np.array([plant.beliefs.record(n) is not None for n in plant.field.names])
         able = free & (self._clear | calibrated) & plant.field.among((states.IDLE,), now)
         rows = np.flatnonzero(able)[: self._most]
-        if len(rows) and self._aims and plant.waiting < self._most:
+        witnessed = not plant.witnesses.refusal
+        if len(rows) and self._aims and witnessed and plant.waiting < self._most:
             await self._join(rows, token, visiting)
+
+    async def _rest_again(self, rows: Rows, token: int) -> None:
+        """Give heliostats at stow their standby points, since they may have any."""
+        plant = self._plant
+        points = {plant.field.names[row]: plant.standbys[row].copy() for row in rows}
+        given = self._give(
+            rows,
+            states.STOWED,
+            lambda names: plant.standby(self._person, token, {n: points[n] for n in names}),
+        )
+        if given is not None:
+            names, ticket = given
+            await ticket.end(10.0)
+            for name in names:
+                self.release(name)
 
     async def _join(self, rows: Rows, token: int, visiting: Callable[[], frozenset[str]]) -> None:
         """Give heliostats their aims on the receiver, and send them there."""

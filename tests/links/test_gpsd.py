@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from heliotrope.cluster.gpsd import Gpsd, GpsdReader
 from heliotrope.cluster.timekeeping import SystemTime
 from heliotrope.links.clock import SystemClock, VirtualClock
+from heliotrope.links.gpsd import Gpsd, GpsdReader
 from heliotrope.links.link import running
 from support.gpsd_process import (
     CHRONYD,

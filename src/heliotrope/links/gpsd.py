@@ -1,8 +1,9 @@
 """A satellite receiver as reported by gpsd: position, fix, and a second opinion on the time.
 
 gpsd reads the receiver and feeds chrony, which disciplines the computer's clock
-(docs/how-to/time.md). The cluster takes its time from that clock. It listens to gpsd only to show
-the receiver's state and to notice when clock and receiver contradict each other.
+(docs/how-to/time.md). A cluster takes its time from that clock. It listens to gpsd only to show the
+receiver's state and to notice when clock and receiver contradict each other; a plant, as to an
+independent witness of its time and site.
 
 `GpsdReader` turns bytes of gpsd's JSON protocol into a `SatelliteReceiver` without any input or
 output; `Gpsd` keeps a connection open and feeds one.
@@ -15,8 +16,11 @@ import random
 from collections import deque
 from dataclasses import dataclass, replace
 from datetime import datetime
+from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
+from heliotrope.errors import FormatError
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.link import Backoff, until_closed
 
@@ -36,6 +40,24 @@ _PATIENCE = 10.0
 _SILENCE = 30.0
 _OPEN_LIMIT = 3.0
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 10.0
+
+
+def gpsd_at(path: Path, text: str, key: str) -> tuple[str, int]:
+    """Return host and port of gpsd, as a key of a file gives them.
+
+    Raises
+    ------
+    FormatError
+        Another text.
+    """
+    try:
+        parts = urlsplit(f"//{text}")
+        host, port = parts.hostname, parts.port or PORT
+    except ValueError:
+        host = None
+    if not host or parts.path:
+        raise FormatError(path, f"{text!r}: give host or host:port of gpsd", key)
+    return host, port
 
 
 @dataclass(frozen=True)

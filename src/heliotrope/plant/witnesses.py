@@ -1,0 +1,255 @@
+"""Independent witnesses of the sun: what sees a time or a site that is wrong in plant and clusters.
+
+Where plant and clusters share a wrong time or site, all of their suns agree, and every mirror
+follows them in good order, beside its aim. So before the first heliostat of a day joins a
+receiver, a witness must have seen the sun where the plant computes it: a satellite receiver (its
+time and its place), a sun sensor, or photographs of beams on targets. Beams may go to targets
+meanwhile.
+"""
+
+import asyncio
+import math
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from heliotrope.calibration.record import HeliostatCalibration
+from heliotrope.calibration.sightings import Sightings, ray_directions
+from heliotrope.geometry import FloatArray, angle_between, direction, reflect
+from heliotrope.links.clock import Clock
+from heliotrope.links.gpsd import Gpsd
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.plant import refusals
+from heliotrope.safety import Alarm, alarms
+from heliotrope.sun import Site, fast_vector
+
+#: A sun that a witness sees this far from the plant's own contradicts it, beside the witness's
+#: error, rad: 14 s of time, or the limit at which a cluster's site differs.
+AGREES = 1e-3
+#: Errors of the witnesses, rad: of a sun sensor, and of a beam whose mirror was calibrated (the
+#: limit of `pointing_disagrees`).
+SENSOR_ERROR, BEAM_ERROR = 5e-3, 3e-3
+#: Elevation of the sun from which a plant says that no witness has seen it today, rad.
+_UP = math.radians(5.0)
+#: Name of the witness that calibration visits are.
+PHOTOGRAPHS = "photographs"
+#: Longest text of a sun sensor, bytes.
+_LONGEST = 64
+
+
+class Witness(Protocol):
+    """What sees the sun, or computes it, independently of the plant's clock and file."""
+
+    @property
+    def name(self) -> str:
+        """Name for people."""
+        ...
+
+    async def sun(self, site: Site) -> tuple[FloatArray, float] | None:
+        """Return the unit vector to the sun now, ENU, (3,), and its error, rad; None: not known.
+
+        Parameters
+        ----------
+        site
+            Of the plant, for its air; a witness that knows its own place takes that.
+        """
+        ...
+
+
+class SatelliteWitness:
+    """A satellite receiver at the plant: its time and its place give a sun.
+
+    Parameters
+    ----------
+    gpsd
+        Run by others.
+    clock
+        Clock of the plant.
+    """
+
+    name = "satellite receiver"
+
+    def __init__(self, gpsd: Gpsd, clock: Clock) -> None:
+        self._gpsd, self._clock = gpsd, clock
+
+    async def sun(self, site: Site) -> tuple[FloatArray, float] | None:
+        """Return the sun of the receiver's time and place; None without a fresh fix."""
+        ahead, receiver = self._gpsd.ahead, self._gpsd.receiver
+        place = receiver.latitude_deg, receiver.longitude_deg
+        if ahead is None or not np.isfinite(place).all():
+            return None
+        there = Site(*place, site.height, site.pressure, site.temperature_c)
+        return fast_vector(self._clock.utc().timestamp() - ahead, there), 0.0
+
+
+class SunSensorFile:
+    """A sun sensor, read from a file that another program replaces with each reading.
+
+    It holds the azimuth from north through east and the elevation of the apparent sun, degrees.
+
+    Parameters
+    ----------
+    path
+        The file.
+    """
+
+    name = "sun sensor"
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._written = path, 0
+
+    async def sun(self, site: Site) -> tuple[FloatArray, float] | None:
+        """Return the sun of a file that was replaced since the last call; None if it was not."""
+        del site  # the sensor sees the sun
+        return await asyncio.to_thread(self._read)
+
+    def _read(self) -> tuple[FloatArray, float] | None:
+        try:
+            written = self._path.stat().st_mtime_ns
+            if self._written in (0, written):
+                self._written = written  # the file that is there at the start may be old
+                return None
+            self._written = written
+            with self._path.open("rb") as file:
+                azimuth, elevation = (math.radians(float(x)) for x in file.read(_LONGEST).split())
+        except (OSError, ValueError):
+            return None
+        if not (math.isfinite(azimuth) and 0.0 < elevation <= 0.5 * math.pi):
+            return None
+        return direction(azimuth, elevation), SENSOR_ERROR
+
+
+class Witnesses:
+    """What the witnesses of a plant have said today.
+
+    Parameters
+    ----------
+    names
+        Witnesses of which one must agree before the first heliostat of a day joins a receiver;
+        none: nothing is required, and the plant says so once a day; None: that is accepted.
+    site
+        Of the plant.
+    utc
+        Returns the plant's time, POSIX s.
+    tell
+        Called with each alarm.
+    """
+
+    def __init__(
+        self,
+        names: frozenset[str] | None,
+        site: Site,
+        utc: Callable[[], float],
+        tell: Callable[[Alarm], None],
+    ) -> None:
+        self._names, self._site, self._utc, self._tell = names, site, utc, tell
+        #: Day on which a witness agreed last, and on which the plant said that none has.
+        self._agreed_on = self._told_on = -1
+        #: Witnesses that contradict, and what they say.
+        self._contradicting: dict[str, str] = {}
+        #: Offsets of the sun by photographs of today that contradict, (3,), by heliostat.
+        self._offsets: dict[str, FloatArray] = {}
+
+    def _day(self, utc: float) -> int:
+        """Return the number of the day at the site, from midnight to midnight of mean time."""
+        return math.floor(utc / 86_400.0 + self._site.longitude_deg / 360.0)
+
+    @property
+    def refusal(self) -> str:
+        """Why no heliostat may join a receiver, "" if heliostats may."""
+        if self._contradicting:
+            problem = "; ".join(self._contradicting.values())
+        elif self._names and self._agreed_on != self._day(self._utc()):
+            problem = f"none of its witnesses ({', '.join(sorted(self._names))}) has agreed today"
+        else:
+            return ""
+        return refusals.UNWITNESSED.text.format(problem=problem)
+
+    def take(self, name: str, seen: FloatArray, error: float) -> None:
+        """Take the sun (3,) that a witness sees now, with its error, rad."""
+        off = float(angle_between(seen, fast_vector(self._utc(), self._site)))
+        if off <= AGREES + error:
+            self._agrees(name)
+        else:
+            self._contradicts(name, seen - fast_vector(self._utc(), self._site))
+
+    def photographed(
+        self, record: HeliostatCalibration | None, mechanism: Mechanism, seen: Sightings
+    ) -> None:
+        """Take photographs of a heliostat's beam on a target, before they are learnt from.
+
+        The beam shows where the sun stands, if the mirror was calibrated before today: what it
+        has learnt today may have come from the wrong sun. One mirror that misses by more may have
+        moved; two that put the sun at the same wrong place have not.
+
+        Parameters
+        ----------
+        record, mechanism
+            The calibration believed, None before the first; and its mechanism, batch shape (1,).
+        seen
+            Sightings of the photographs.
+        """
+        if self._names is None or record is None or not self.testifies(record):
+            return
+        pose = mechanism.pose(seen.counts)
+        source, path = ray_directions(seen, pose.vertex)
+        offset = np.mean(reflect(path, pose.normal) - source, axis=0)
+        if float(np.linalg.norm(offset)) <= BEAM_ERROR:
+            self._offsets.clear()
+            self._agrees(PHOTOGRAPHS)
+            return
+        others = [each for name, each in self._offsets.items() if name != record.heliostat]
+        self._offsets[record.heliostat] = offset
+        if any(np.linalg.norm(offset - each) <= BEAM_ERROR for each in others):
+            self._contradicts(PHOTOGRAPHS, offset)
+
+    def testifies(self, record: HeliostatCalibration | None) -> bool:
+        """Return whether photographs of a heliostat show where the sun stands."""
+        return record is not None and self._day(record.at) < self._day(self._utc())
+
+    @property
+    def awaits_photographs(self) -> bool:
+        """Whether photographs count and no witness has agreed today, or one contradicts."""
+        return PHOTOGRAPHS in (self._names or ()) and bool(self.refusal)
+
+    def beat(self) -> None:
+        """Say once a day that no witness has seen the sun, if that is so."""
+        now = self._utc()
+        day = self._day(now)
+        if self._names is None or day in (self._agreed_on, self._told_on):
+            return
+        if fast_vector(now, self._site)[2] < math.sin(_UP):
+            return
+        self._told_on = day
+        listed = ", ".join(sorted(self._names))
+        problem = f"none of {listed} has agreed" if listed else "this plant has none"
+        kind = alarms.UNWITNESSED
+        self._tell(kind.ended())
+        self._tell(kind.raised(problem=problem, worse=bool(listed)))
+
+    def _agrees(self, name: str) -> None:
+        if self._contradicting.pop(name, None) is not None:
+            self._tell(alarms.SUN_CONTRADICTED.ended(name))
+        if self._names is not None and name in self._names:
+            self._agreed_on = self._day(self._utc())
+            if self._told_on == self._agreed_on:
+                self._told_on = -1
+                self._tell(alarms.UNWITNESSED.ended())
+
+    def _contradicts(self, name: str, offset: FloatArray) -> None:
+        utc = self._utc()
+        rate = fast_vector(utc + 30.0, self._site) - fast_vector(utc - 30.0, self._site)
+        late = 60.0 * float(offset @ rate) / float(rate @ rate)
+        text = (
+            f"{name} sees the sun {1e3 * float(np.linalg.norm(offset)):.1f} mrad from where the "
+            f"plant computes it, as a clock that is {abs(late):.0f} s "
+            f"{'slow' if late > 0.0 else 'fast'} would show it"
+        )
+        known = name in self._contradicting
+        self._contradicting[name] = text
+        if not known:
+            at = f"{datetime.fromtimestamp(utc, UTC):%H:%M:%S}"
+            self._tell(alarms.SUN_CONTRADICTED.raised(name, problem=text, at=at))
