@@ -6,7 +6,7 @@ heliostat, column, value, remedy); a file that cannot be used raises an error.
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration.plausibility import UNKNOWABLE, YEAR
 from heliotrope.calibration.sightings import (
     LARGEST_SIGMA,
     Sightings,
@@ -58,7 +59,9 @@ _FARTHEST_OFFSET = 50.0
 
 
 def read_sightings(
-    path: str | Path, names: Sequence[str]
+    path: str | Path,
+    names: Sequence[str],
+    judge: Callable[[Sightings, Sequence[str]], Mapping[int, str]] | None = None,
 ) -> tuple[Sightings, tuple[str, ...], list[str]]:
     """Return the sightings of a table, their kinds, and a line for each row left out.
 
@@ -71,6 +74,9 @@ def read_sightings(
         is NaN. Other columns are ignored.
     names
         Names of the heliostats in the order of their rows, (N,).
+    judge
+        Gives the sightings that cannot have happened, by row, with the reason: it is called with
+        all sightings and their kinds. See `heliotrope.calibration.plausibility`.
 
     Returns
     -------
@@ -93,6 +99,9 @@ def read_sightings(
     heliostat = find_heliostats(rows, "heliostat", names)
     kinds = rows.texts("kind")
     time = rows.times("time", optional=True) if "time" in rows.columns else None
+    if time is not None:
+        for i in np.flatnonzero(time >= UNKNOWABLE):
+            rows.refuse(i, "time", YEAR)
     counts = np.stack([rows.numbers(name, "drive counts") for name in drives], axis=-1)
     far = {end: rows.flags(f"{end}_at_infinity") for end in _ENDS}
     ends = {end: _points(rows, end, far[end]) for end in _ENDS}
@@ -113,6 +122,10 @@ def read_sightings(
         destination_covariance=spread["destination"][good],
     )
     named = replace(seen, names=tuple(names))
+    if judge is not None:
+        reasons = judge(named, [kinds[i] for i in good])
+        rows.reasons |= {int(good[k]): reason for k, reason in reasons.items()}
+        named, good = named.take(np.flatnonzero(np.isin(good, rows.good))), rows.good
     return named, tuple(kinds[i] for i in good), rows.left_out
 
 

@@ -4,7 +4,7 @@
 `evaluate` only tests how well held-out sightings are predicted.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration import evaluation
+from heliotrope.calibration import evaluation, plausibility
 from heliotrope.calibration.evaluation import Split
 from heliotrope.calibration.learn import models
 from heliotrope.calibration.learn.assessment import Assessment, assess
@@ -25,6 +25,7 @@ from heliotrope.calibration.learn.periodic import (
     with_ratios,
 )
 from heliotrope.calibration.learn.sequential import predict_by_stream, predict_in_turn
+from heliotrope.calibration.plausibility import Judgement
 from heliotrope.calibration.report.content import CalibrationReport
 from heliotrope.calibration.sighting_table import read_sightings
 from heliotrope.calibration.sightings import Sightings, of_measurements
@@ -54,6 +55,8 @@ class FieldSightings:
         Name of each sighting.
     left_out
         One line for each measurement that could not be used.
+    notes
+        Lines on what contradicts most of the sightings.
     """
 
     plant: Plant
@@ -61,6 +64,7 @@ class FieldSightings:
     seen: Sightings
     ids: tuple[str, ...]
     left_out: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def heliostats(self) -> Heliostats:
@@ -74,8 +78,9 @@ def read_field_sightings(
     table: Path | None = None,
     *,
     centroid: Literal["utis", "helios"] = "utis",
+    now: float | None = None,
 ) -> FieldSightings:
-    """Return the sightings of a folder in PAINT's form, or of a table.
+    """Return the plausible sightings of a folder in PAINT's form, or of a table.
 
     Parameters
     ----------
@@ -87,6 +92,8 @@ def read_field_sightings(
         Table of sightings; without one ``place`` must be a folder with measurements.
     centroid
         Which published centroid to use.
+    now
+        The computer's clock, Unix seconds: sightings that are still to come are left out.
 
     Raises
     ------
@@ -96,9 +103,9 @@ def read_field_sightings(
         If no measurement can be used.
     """
     if table is not None:
-        found = _read_table(plant, place, table)
+        found = _read_table(plant, place, table, now)
     elif place.is_dir():
-        found = _read_folder(plant, place, centroid)
+        found = _read_folder(plant, place, centroid, now)
     else:
         raise InputError(
             f"{place}: a plant without measurements; give --sightings TABLE, or a folder with both"
@@ -109,26 +116,61 @@ def read_field_sightings(
     return found
 
 
-def _read_table(plant: Plant, place: Path, table: Path) -> FieldSightings:
+def _read_table(plant: Plant, place: Path, table: Path, now: float | None) -> FieldSightings:
     if len(plant.groups) != 1:
         raise InputError(
             f"{place}: {len(plant.groups)} groups of heliostats; calibrate them one by one: "
             "give a plant with one group"
         )
     ((group, heliostats),) = plant.groups.items()
-    seen, _, left = read_sightings(table, heliostats.names)
+    judged: list[Judgement] = []
+
+    def judge(seen: Sightings, kinds: Sequence[str]) -> Mapping[int, str]:
+        judged.append(_judge(plant, heliostats, seen, kinds, now))
+        return judged[0].reasons
+
+    seen, _, left = read_sightings(table, heliostats.names, judge)
     ids = tuple(f"{heliostats.names[h]} {k}" for k, h in enumerate(seen.heliostat))
-    return FieldSightings(plant, group, seen, ids, tuple(left))
+    return FieldSightings(plant, group, seen, ids, tuple(left), judged[0].notes)
 
 
-def _read_folder(plant: Plant, place: Path, centroid: Literal["utis", "helios"]) -> FieldSightings:
+def _read_folder(
+    plant: Plant, place: Path, centroid: Literal["utis", "helios"], now: float | None
+) -> FieldSightings:
     ((group, heliostats),) = plant.groups.items()
     found = measurements.read_measurements(place, centroid=centroid)
     seen, left = of_measurements(found, heliostats)
     known = set(heliostats.names)
     pairs = zip(found.heliostat, found.ids, strict=True)
-    ids = tuple(f"{name} {number}" for name, number in pairs if name in known)
-    return FieldSightings(plant, group, seen, ids, (*found.left_out, *left))
+    ids = [f"{name} {number}" for name, number in pairs if name in known]
+    judged = _judge(plant, heliostats, seen, ["camera_target"] * len(seen), now)
+    kept = [k for k in range(len(seen)) if k not in judged.reasons]
+    impossible = [f"{ids[k]}: {reason}" for k, reason in sorted(judged.reasons.items())]
+    return FieldSightings(
+        plant,
+        group,
+        seen.take(kept),
+        tuple(ids[k] for k in kept),
+        (*found.left_out, *left, *impossible),
+        judged.notes,
+    )
+
+
+def _judge(
+    plant: Plant,
+    heliostats: Heliostats,
+    seen: Sightings,
+    kinds: Sequence[str],
+    now: float | None,
+) -> Judgement:
+    return plausibility.judge(
+        seen,
+        mechanism=heliostats.mechanism,
+        site=plant.site,
+        surfaces=(*plant.targets, *plant.receivers),
+        kinds=kinds,
+        now=now,
+    )
 
 
 @dataclass(frozen=True)
