@@ -13,11 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration import evaluation, plausibility
+from heliotrope.calibration.clock import ClockCheck, check_clock
 from heliotrope.calibration.evaluation import Split
 from heliotrope.calibration.learn import models
 from heliotrope.calibration.learn.assessment import Assessment, assess
 from heliotrope.calibration.learn.learned import Learned
 from heliotrope.calibration.learn.learning import FEWEST, Runner, learn
+from heliotrope.calibration.learn.misfits import Misfit, find_misfits
 from heliotrope.calibration.learn.models import ScoredModel
 from heliotrope.calibration.learn.periodic import (
     PeriodicError,
@@ -284,6 +286,7 @@ def evaluate(
     runner: Runner | None = None,
     steps: Steps | None = None,
     learner: Learner = "stream",
+    misfits: tuple[Misfit, ...] | None = None,
 ) -> HeldOutEvaluation:
     """Learn from a part of each heliostat's sightings and assess the rest.
 
@@ -309,6 +312,8 @@ def evaluate(
     learner
         For the split "sequential": "stream" updates a belief by one sighting after another
         (`heliotrope.calibration.learn.stream`); "batch" learns every history afresh.
+    misfits
+        As for `learn`.
 
     Raises
     ------
@@ -317,8 +322,11 @@ def evaluate(
     """
     training, tested = evaluation.partition(sightings, split, fraction, seed)
     choice = None
+    if misfits is None:
+        misfits = find_misfits(mechanism, sightings, training)
     if model == "auto":
-        choice = find_model(mechanism, sightings, training, steps)
+        fits = ~np.isin(sightings.heliostat, [misfit.row for misfit in misfits])
+        choice = find_model(mechanism, sightings, training & fits, steps)
         model, mechanism = choice.parameters, choice.mechanism
     learned = learn(
         mechanism,
@@ -326,6 +334,7 @@ def evaluate(
         model,
         used=training,
         priors=priors,
+        misfits=misfits,
         runner=runner,
         progress=_step(steps, "learning from the training part"),
     )
@@ -364,11 +373,13 @@ def calibrate(
     if fraction != 1.0:
         evaluation.check_fraction(fraction)
     names, mechanism = field.heliostats.names, field.heliostats.mechanism
+    misfits = find_misfits(mechanism, field.seen)
+    fits = ~np.isin(field.seen.heliostat, [misfit.row for misfit in misfits])
     comparison: tuple[str, ...] = ()
     if model == "auto":
-        choice = find_model(mechanism, field.seen, None, steps)
+        choice = find_model(mechanism, field.seen, fits, steps)
         model, mechanism, comparison = choice.parameters, choice.mechanism, choice.describe()
-    options: dict[str, Any] = {"priors": priors, "runner": runner}
+    options: dict[str, Any] = {"priors": priors, "runner": runner, "misfits": misfits}
     tested = None
     if fraction != 1.0:
         tested = evaluate(
@@ -383,9 +394,10 @@ def calibrate(
             **options,
         ).assessment
     learned = learn(mechanism, field.seen, model, progress=_step(steps, "learning"), **options)
+    clock = clock_of(field, learned)
     return CalibrationReport(
         names,
-        learned,
+        learned if clock is None or not clock.found else learned.doubted(),
         _with_mechanism(field.plant, field.group, mechanism),
         field.group,
         tested,
@@ -393,7 +405,17 @@ def calibrate(
         field.left_out,
         f"{split} split, {100 * fraction:.0f} % to learn from, seed {seed}",
         comparison,
+        clock,
+        field.notes,
     )
+
+
+def clock_of(field: FieldSightings, learned: Learned) -> ClockCheck | None:
+    """Return the common error of the clock by the sightings of all mirrors that fit."""
+    rows = [misfit.row for misfit in learned.misfits]
+    seen = field.seen.take(~np.isin(field.seen.heliostat, rows))
+    latitude = np.radians(field.plant.site.latitude_deg)
+    return check_clock(learned.mechanism, seen, learned.model, float(latitude))
 
 
 def _with_mechanism(plant: Plant, group: str, mechanism: Mechanism) -> Plant:

@@ -10,6 +10,7 @@ from heliotrope import sun as solar
 from heliotrope.calibration.evaluation import BeamErrors, beam_errors
 from heliotrope.calibration.fit.estimator import (
     FieldFit,
+    FitOutcome,
     parameter_rows,
 )
 from heliotrope.calibration.fit.residuals import linearise
@@ -187,6 +188,14 @@ class Learned(Value, Framed):
             heliostats=self.heliostats[i : i + 1],
             misfits=tuple(replace(m, row=0) for m in self.misfits if m.row == i),
         )
+
+    def doubted(self) -> "Learned":
+        """Return the same, where the clock may be wrong: no heliostat counts as learnt."""
+        outcome = self.static.outcome.copy()
+        outcome[np.isin(outcome, (FitOutcome.CONVERGED, FitOutcome.NOT_CONVERGED))] = (
+            FitOutcome.CLOCK
+        )
+        return replace(self, static=replace(self.static, outcome=outcome))
 
     def _card(self) -> Card:
         model, all_names = len(self.model), len(self.names)

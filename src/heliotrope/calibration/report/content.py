@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from heliotrope.calibration.clock import ClockCheck
 from heliotrope.calibration.evaluation import BeamErrors, ErrorSummary, beam_errors, summarise
 from heliotrope.calibration.fit.estimator import FitOutcome
-from heliotrope.calibration.learn.assessment import Assessment
+from heliotrope.calibration.learn.assessment import Assessment, unexplained_mirrors
 from heliotrope.calibration.learn.learned import Learned, left_out_errors
 from heliotrope.calibration.report.results import FieldParameters, at_moment
 from heliotrope.calibration.uncertainty import BlindSpot, unobservable
@@ -54,6 +55,10 @@ class CalibrationReport:
         How the held-out part was chosen.
     comparison
         Lines on the comparison of models.
+    clock
+        The common error of the clock, if it could be tested.
+    notes
+        Lines on what contradicts most of the sightings.
     """
 
     names: tuple[str, ...]
@@ -65,6 +70,29 @@ class CalibrationReport:
     left_out: tuple[str, ...] = ()
     note: str = ""
     comparison: tuple[str, ...] = ()
+    clock: ClockCheck | None = None
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def _applied(self) -> tuple[Plant, tuple[str, ...]]:
+        return self.results.applied_to(self.plant)
+
+    @property
+    def calibrated(self) -> Plant:
+        """The plant with what was learnt; see `FieldParameters.applied_to`."""
+        return self._applied[0]
+
+    @cached_property
+    def remarks(self) -> tuple[str, ...]:
+        """Lines on clock, contradictions, mirrors that do not fit, and those that were not learnt.
+
+        What calls the result into question comes first.
+        """
+        clock = () if self.clock is None else (str(self.clock),)
+        wrong = self.clock is not None and self.clock.found
+        doubts = (*self.notes, *unexplained_mirrors(self.names, self.learned))
+        kept = self._applied[1]
+        return (*clock, *doubts, *kept) if wrong else (*doubts, *kept, *clock)
 
     @cached_property
     def results(self) -> FieldParameters:
@@ -174,7 +202,12 @@ class CalibrationReport:
             }
             for row in self.rows
         }
-        document: dict[str, Any] = {"model": list(self.learned.model), "heliostats": heliostats}
+        document: dict[str, Any] = {
+            "model": list(self.learned.model),
+            "heliostats": heliostats,
+            "clock": None if self.clock is None else self.clock.document(),
+            "remarks": list(self.remarks),
+        }
         if self.assessment is not None:
             document["held_out_median_of_medians_mrad"] = 1e3 * self.assessment.median_of_medians
             document["held_out_coverage_90"] = self.assessment.coverage
