@@ -3,21 +3,25 @@
 The sun's direction is computed from the time. A clock that is fast by a minute moves all suns by
 4 mrad, and each mirror's parameters take up most of that; what they cannot take up shows the error.
 Every trial moves the suns by the same time along their path and fits all mirrors again. The error
-is that of the lowest total cost, and its uncertainty comes from the curvature and from the scatter
-between mirrors. It is stated, never corrected: the times, or the suns, are the plant's to mend.
+is that of the lowest total cost, refined by Gauss-Newton; its uncertainty comes from the noise or
+from the scatter between mirrors, whichever is larger. It is stated, never corrected: the times, or the suns, are the plant's to mend.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize_scalar
 
-from heliotrope.calibration.fit.estimator import fit
+from heliotrope import sun as solar
+from heliotrope.calibration.fit._fit_kernels import CAUCHY_WIDTH
+from heliotrope.calibration.fit.estimator import FieldFit, fit
+from heliotrope.calibration.fit.residuals import linearise, whitening
 from heliotrope.calibration.learn.misfits import costs
-from heliotrope.calibration.sightings import Sightings
-from heliotrope.geometry import FloatArray, rotation
+from heliotrope.calibration.plausibility import MOVED
+from heliotrope.calibration.sightings import Sightings, ray_directions
+from heliotrope.geometry import FloatArray, angle_between, normalize, rotation
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.sun import Site
 from heliotrope.values import amount
 
 #: The sky turns by this, rad/s (a mean solar day: the sun).
@@ -30,6 +34,8 @@ CLEAR = 3.0
 MIRRORS, MOST, FIRST = 10, 60, 20
 #: Fewest sightings of a mirror that say something about the clock.
 FEWEST = 8
+#: Most steps from a start.
+ROUNDS = 8
 #: Weight of the stated sigma in the estimate of the noise, degrees of freedom.
 FREEDOM = 5.0
 
@@ -42,21 +48,18 @@ class ClockCheck:
     ----------
     error, sigma
         Recorded less true time, and its standard deviation, s.
-    gain
-        Cost without the error less the cost with it, in units of the noise.
     heliostats
         Number of mirrors that were tested.
     """
 
     error: float
     sigma: float
-    gain: float
     heliostats: int
 
     @property
     def found(self) -> bool:
         """Whether the error explains the sightings far better than the clock as it is."""
-        return self.gain > CLEAR**2 and abs(self.error) > CLEAR * self.sigma
+        return abs(self.error) > CLEAR * self.sigma
 
     def __str__(self) -> str:
         """One line."""
@@ -71,7 +74,7 @@ class ClockCheck:
         return (
             f"the clock may be wrong by {abs(self.error):.0f} s ± {self.sigma:.0f} s ({side}): by "
             f"that the sightings of {amount(self.heliostats, 'heliostat')} fit far better "
-            f"({np.sqrt(self.gain):.0f} standard deviations). Check clock and time zone, correct "
+            f"({abs(self.error) / self.sigma:.0f} standard deviations). Check clock and time zone, correct "
             "times and suns, and calibrate again; the plant file keeps its parameters"
         )
 
@@ -80,7 +83,6 @@ class ClockCheck:
         return {
             "error_s": self.error,
             "sigma_s": self.sigma,
-            "gain": self.gain,
             "found": self.found,
         }
 
@@ -89,7 +91,7 @@ def check_clock(
     mechanism: Mechanism,
     sightings: Sightings,
     model: tuple[str, ...],
-    latitude: float,
+    site: Site,
 ) -> ClockCheck | None:
     """Return the common error of the clock that explains the sightings best.
 
@@ -101,8 +103,8 @@ def check_clock(
         M of these heliostats; those with other light than the sun's say nothing.
     model
         The parameters to fit.
-    latitude
-        Of the plant, rad.
+    site
+        The plant's, for the path of the sun.
 
     Returns
     -------
@@ -114,42 +116,111 @@ def check_clock(
     chosen = chosen[counts[chosen] >= FEWEST]
     if not len(chosen):
         return None
-    pole = np.array([0.0, np.cos(latitude), np.sin(latitude)])
 
     def cost(seen: Sightings, shift: float) -> FloatArray:
-        moved = _moved(seen, pole, shift)
+        moved = later(seen, site, shift)
         return costs(fit(mechanism[chosen], moved, model, adapt_scale=False), mechanism[chosen])
 
     few, many = (_part(suns, chosen, most) for most in (FIRST, MOST))
     trials = np.arange(-REACH, REACH + 1.0, STEP)
     totals = [float(cost(few, shift).sum()) for shift in trials]
-    best = [
-        minimize_scalar(
-            lambda shift: float(cost(many, shift).sum()),
-            bounds=(middle - STEP, middle + STEP),
-            method="bounded",
-            options={"xatol": 2.0},
-        )
-        for middle in dict.fromkeys((0.0, float(trials[int(np.argmin(totals))])))
-    ]
-    shift = float(min(best, key=lambda found: found.fun).x)
-    least = cost(many, shift)
-    noise = (float(least.sum()) + FREEDOM) / (2.0 * len(many) + FREEDOM)
-    sigma = _sigma(cost(many, shift - 60.0), least, cost(many, shift + 60.0), noise)
-    gain = (float(cost(many, 0.0).sum()) - float(least.sum())) / noise
-    return ClockCheck(-shift, sigma, gain, len(chosen))
+    starts = dict.fromkeys((0.0, float(trials[int(np.argmin(totals))])))
+    steps = [_settled(mechanism[chosen], many, model, site, start) for start in starts]
+    best = min(steps, key=lambda step: float(cost(many, step.shift).sum()))
+    return ClockCheck(-best.shift, best.sigma, len(chosen))
 
 
-def _moved(seen: Sightings, pole: FloatArray, shift: float) -> Sightings:
-    """Return the sightings with the suns as they stood ``shift`` s later."""
-    turn = rotation(pole, -RATE * shift)
-    far = seen.destination_at_infinity[:, None]
-    return replace(
-        seen,
-        source=seen.source @ turn.T,
-        # A sun sensor looks at the sun too.
-        destination=np.where(far, seen.destination @ turn.T, seen.destination),
+@dataclass(frozen=True)
+class _Step:
+    """The shift of the suns that the sightings at another one ask for, and its sigma, s."""
+
+    shift: float
+    sigma: float
+
+
+def _settled(
+    mechanism: Mechanism, seen: Sightings, model: tuple[str, ...], site: Site, shift: float
+) -> _Step:
+    """Return the shift at which the sightings ask for no other, from a start."""
+    for _ in range(ROUNDS):
+        step = _step(mechanism, seen, model, site, shift)
+        done = abs(step.shift - shift) < 0.1 * step.sigma
+        shift = float(np.clip(step.shift, shift - STEP, shift + STEP))
+        if done:
+            break
+    return replace(step, shift=shift)
+
+
+def _step(
+    mechanism: Mechanism, seen: Sightings, model: tuple[str, ...], site: Site, shift: float
+) -> _Step:
+    """Gauss-Newton: with H, B, Z the normal matrices of a mirror's own parameters, their coupling
+    with the shift and the shift's, a mirror reveals Z - B^T H^-1 B of the shift (see `fit.common`).
+    """
+    moved = later(seen, site, shift)
+    fitted = fit(mechanism, moved, model, adapt_scale=False)
+    row, names = seen.heliostat, fitted.names
+    each = mechanism.with_parameters(fitted.parameters)[row]
+    line = linearise(each, moved, names)
+    vertex = each.pose(seen.counts).vertex
+    axes, whiten = whitening(moved, vertex)
+    before, after = (
+        np.sum(ray_directions(later(seen, site, shift + side), vertex), axis=0)
+        for side in (-1.0, 1.0)
     )
+    rate = -0.5 * (normalize(after) - normalize(before))
+    by_shift = np.einsum("mab,mbk,mk->ma", whiten, axes, rate)
+    weight = 1.0 / (1.0 + (fitted.lengths * fitted.scale[row] / CAUCHY_WIDTH) ** 2)
+    count = len(mechanism)
+    normal = fitted.prior[:, :, None] ** -2.0 * np.eye(len(names))
+    coupling, revealed, pulled = np.zeros((count, len(names))), np.zeros(count), np.zeros(count)
+    for total, term in (
+        (normal, np.einsum("m,map,maq->mpq", weight, line.jacobian, line.jacobian)),
+        (coupling, np.einsum("m,map,ma->mp", weight, line.jacobian, by_shift)),
+        (revealed, weight * (by_shift**2).sum(axis=1)),
+        (pulled, weight * (by_shift * line.residual).sum(axis=1)),
+    ):
+        np.add.at(total, row, term)
+    # The fit has ended: the parameters ask for no change of their own.
+    information = revealed - (coupling * np.linalg.solve(normal, coupling[..., None])[..., 0]).sum(1)
+    noise = _noise(fitted)
+    information, pulled = np.maximum(information, 1e-12) / noise, pulled / noise
+    total = float(information.sum())
+    change = -float(pulled.sum()) / total
+    variance = 1.0 / total
+    if count > 2:
+        # Where mirrors disagree by more than their noise, their scatter is the uncertainty.
+        away = -pulled / information - change
+        variance *= max(1.0, float((information * away**2).sum()) / (count - 1))
+    return _Step(shift + change, float(np.sqrt(variance)))
+
+
+def _noise(fitted: FieldFit) -> FloatArray:
+    """Return the variance of each mirror's sightings in units of their sigma, (N,)."""
+    square = (fitted.lengths * fitted.scale[fitted.rows]) ** 2
+    robust = CAUCHY_WIDTH**2 * np.log1p(square / CAUCHY_WIDTH**2)
+    count = len(fitted.scale)
+    data = np.bincount(fitted.rows, robust, count)
+    many = np.bincount(fitted.rows, minlength=count)
+    return np.asarray((data + FREEDOM) / (2.0 * many + FREEDOM))
+
+
+def later(seen: Sightings, site: Site, shift: float) -> Sightings:
+    """Return sightings of the sun with the suns as they stood ``shift`` s later.
+
+    Where a time is known and the given sun stood there, that is the sun of the other time; else the
+    given sun is turned about the pole.
+    """
+    latitude = np.radians(site.latitude_deg)
+    turn = rotation(np.array([0.0, np.cos(latitude), np.sin(latitude)]), -RATE * shift)
+    source = seen.source @ turn.T
+    rows = np.flatnonzero(np.isfinite(seen.time))
+    agree = angle_between(seen.source[rows], solar.vector(seen.time[rows], site)) < MOVED
+    rows = rows[agree]
+    source[rows] = solar.vector(seen.time[rows] + shift, site)
+    # A sun sensor looks at the sun too.
+    far = seen.destination_at_infinity[:, None]
+    return replace(seen, source=source, destination=np.where(far, source, seen.destination))
 
 
 def _part(suns: Sightings, chosen: npt.NDArray[np.intp], most: int) -> Sightings:
@@ -162,15 +233,3 @@ def _part(suns: Sightings, chosen: npt.NDArray[np.intp], most: int) -> Sightings
         place.append(np.full(len(kept), k))
     return suns.take(np.concatenate(rows)).renumbered(np.concatenate(place))
 
-
-def _sigma(before: FloatArray, least: FloatArray, after: FloatArray, noise: float) -> float:
-    """Return the standard deviation of the shift from the costs of mirrors 60 s beside it, s."""
-    curvature = np.maximum((before + after - 2.0 * least) / 60.0**2, 1e-12)
-    total = float(curvature.sum())
-    variance = noise * 2.0 / total
-    if len(least) > 2:
-        # Where mirrors disagree by more than their noise, their scatter is the uncertainty.
-        away = (before - after) / (2.0 * 60.0 * curvature)
-        scatter = float((curvature * away**2).sum()) / total / (len(least) - 1)
-        variance = max(variance, scatter)
-    return float(np.sqrt(variance))

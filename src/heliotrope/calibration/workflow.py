@@ -414,8 +414,7 @@ def clock_of(field: FieldSightings, learned: Learned) -> ClockCheck | None:
     """Return the common error of the clock by the sightings of all mirrors that fit."""
     rows = [misfit.row for misfit in learned.misfits]
     seen = field.seen.take(~np.isin(field.seen.heliostat, rows))
-    latitude = np.radians(field.plant.site.latitude_deg)
-    return check_clock(learned.mechanism, seen, learned.model, float(latitude))
+    return check_clock(learned.mechanism, seen, learned.model, field.plant.site)
 
 
 def _with_mechanism(plant: Plant, group: str, mechanism: Mechanism) -> Plant:

@@ -88,11 +88,12 @@ class CalibrationReport:
 
         What calls the result into question comes first.
         """
-        clock = () if self.clock is None else (str(self.clock),)
-        wrong = self.clock is not None and self.clock.found
-        doubts = (*self.notes, *unexplained_mirrors(self.names, self.learned))
         kept = self._applied[1]
-        return (*clock, *doubts, *kept) if wrong else (*doubts, *kept, *clock)
+        if self.clock is not None and self.clock.found:
+            # What a wrong clock leaves is no fault of single mirrors.
+            return (str(self.clock), *self.notes, *kept)
+        clock = () if self.clock is None else (str(self.clock),)
+        return (*self.notes, *unexplained_mirrors(self.names, self.learned), *kept, *clock)
 
     @cached_property
     def results(self) -> FieldParameters:
@@ -166,7 +167,7 @@ class CalibrationReport:
         (`canting_secondary`) is not among them.
         """
         r = self.results
-        if not set(r.model) <= set(MODELS["guo6"]):
+        if not set(r.model) <= set(MODELS["guo6"]) or not r.learnt.any():
             return None
         moved = self.learned.mechanism.with_parameters(
             {name: r.values[:, r.names.index(name)] for name in r.model}
@@ -178,6 +179,7 @@ class CalibrationReport:
         return {
             row.name: {f"{n}_deg": float(found[n][row.index]) for n in found if n != "H_z"}
             for row in self.rows
+            if r.learnt[row.index]
         }
 
     def document(self) -> dict[str, Any]:
