@@ -2,9 +2,9 @@
 
 The sun's direction is computed from the time. A clock that is fast by a minute moves all suns by
 4 mrad, and each mirror's parameters take up most of that; what they cannot take up shows the error.
-Every trial moves the suns by the same time along their path and fits all mirrors again. The error
-is that of the lowest total cost, refined by Gauss-Newton; its uncertainty comes from the noise or
-from the scatter between mirrors, whichever is larger. It is stated, never corrected: the times, or the suns, are the plant's to mend.
+Trials move the suns along their path by one time for all, and fit all mirrors again; the best is
+refined by Gauss-Newton. The uncertainty is that of the noise, or of the scatter between mirrors if
+that is larger. An error is stated, never corrected: the times and suns are the plant's to mend.
 """
 
 from dataclasses import dataclass, replace
@@ -74,7 +74,7 @@ class ClockCheck:
         return (
             f"the clock may be wrong by {abs(self.error):.0f} s ± {self.sigma:.0f} s ({side}): by "
             f"that the sightings of {amount(self.heliostats, 'heliostat')} fit far better "
-            f"({abs(self.error) / self.sigma:.0f} standard deviations). Check clock and time zone, correct "
+            f"({abs(self.error) / self.sigma:.0f} standard deviations). Check the clock and zone, correct "
             "times and suns, and calibrate again; the plant file keeps its parameters"
         )
 
@@ -154,8 +154,10 @@ def _settled(
 def _step(
     mechanism: Mechanism, seen: Sightings, model: tuple[str, ...], site: Site, shift: float
 ) -> _Step:
-    """Gauss-Newton: with H, B, Z the normal matrices of a mirror's own parameters, their coupling
-    with the shift and the shift's, a mirror reveals Z - B^T H^-1 B of the shift (see `fit.common`).
+    """Return one Gauss-Newton step.
+
+    With H, B and Z the normal matrices of a mirror's own parameters, of their coupling with the
+    shift and of the shift, the mirror reveals Z - B^T H^-1 B of the shift (as in `fit.common`).
     """
     moved = later(seen, site, shift)
     fitted = fit(mechanism, moved, model, adapt_scale=False)
@@ -182,12 +184,13 @@ def _step(
     ):
         np.add.at(total, row, term)
     # The fit has ended: the parameters ask for no change of their own.
-    information = revealed - (coupling * np.linalg.solve(normal, coupling[..., None])[..., 0]).sum(1)
+    information = revealed - (coupling * np.linalg.solve(normal, coupling[..., None])[..., 0]).sum(
+        1
+    )
     noise = _noise(fitted)
     information, pulled = np.maximum(information, 1e-12) / noise, pulled / noise
-    total = float(information.sum())
-    change = -float(pulled.sum()) / total
-    variance = 1.0 / total
+    known = float(information.sum())
+    change, variance = -float(pulled.sum()) / known, 1.0 / known
     if count > 2:
         # Where mirrors disagree by more than their noise, their scatter is the uncertainty.
         away = -pulled / information - change
@@ -232,4 +235,3 @@ def _part(suns: Sightings, chosen: npt.NDArray[np.intp], most: int) -> Sightings
         rows.append(kept)
         place.append(np.full(len(kept), k))
     return suns.take(np.concatenate(rows)).renumbered(np.concatenate(place))
-

@@ -129,8 +129,7 @@ def _impossible(seen: Sightings, now: float | None) -> Iterator[tuple[Rows, Text
         clock = format_time(float(np.floor(now)))
         yield (
             ahead,
-            f"the time lies more than a year ahead of this computer's clock, {clock}: correct one "
-            "of them",
+            f"the time is more than a year ahead of this computer's clock, {clock}: correct one",
         )
     low = seen.source_at_infinity & (seen.source[:, 2] < np.sin(LOWEST))
     angles = np.degrees(np.arcsin(np.clip(seen.source[low, 2], -1.0, 1.0)))
@@ -142,9 +141,9 @@ def copies(seen: Sightings) -> Rows:
     """Return which sightings repeat an earlier one: same mirror, time, counts and ray, (M,)."""
     known = np.nan_to_num(seen.time, nan=-np.inf)[:, None]
     table = np.hstack([seen.heliostat[:, None], known, seen.counts, seen.source, seen.destination])
-    first = np.unique(table, axis=0, return_index=True)[1] if len(seen) else []
     again = np.ones(len(seen), np.bool_)
-    again[first] = False
+    if len(seen):
+        again[np.unique(table, axis=0, return_index=True)[1]] = False
     return again
 
 
@@ -163,13 +162,12 @@ def _contradicted(
         return rows, "", ""
     if 2 * rows.sum() > able.sum():
         middle = float(np.degrees(np.median(away[rows])))
-        return (
-            np.zeros_like(rows),
-            "",
+        note = (
             f"the suns of {rows.sum()} of {able.sum()} sightings do not stand where the sun stood "
             f"at their times (median {middle:.1f}° off): check clock, time zone and the plant's "
-            "[site]",
+            "[site]"
         )
+        return np.zeros_like(rows), "", note
     where, there = azimuth_elevation(seen.source[rows]), azimuth_elevation(expected[rows[able]])
     texts = [
         f"the sun is given at azimuth {a % 360.0:.1f}°, elevation {e:.1f}°, and stood at "

@@ -68,7 +68,7 @@ _TEXTS = {
     FitOutcome.NOT_CONVERGED: "the iteration did not settle; the parameters may not be the best",
     FitOutcome.TOO_FEW: "no sightings: the parameters are the prior's",
     FitOutcome.FAILED: "the residuals are not finite from the start; check the nominal mechanism",
-    FitOutcome.MISFIT: "no plausible parameters explain the sightings; the parameters are the prior's",
+    FitOutcome.MISFIT: "no plausible parameters explain the sightings; they are the prior's",
     FitOutcome.UNMOVED: "the mirror did not move: the parameters are the prior's",
     FitOutcome.CLOCK: "the clock may be wrong: the parameters would take up its error",
 }

@@ -84,7 +84,6 @@ def find_misfits(
     names = parameter_table.model("full", mechanism.parameters)
     fitted = fit(mechanism, moved, names, adapt_scale=False)
     error = _median_errors(mechanism, moved, fitted)
-    cost = costs(fitted, mechanism)
     found = list(unmoved)
     for row in np.flatnonzero(fitted.count):
         outcome = FitOutcome(int(fitted.outcome[row]))
@@ -96,7 +95,7 @@ def find_misfits(
         ):
             continue
         one = moved.take(moved.heliostat == row)
-        reason = _mistake(mechanism, one, int(row), names, float(cost[row]))
+        reason = _mistake(mechanism, one, int(row), names)
         if reason is None:
             reason = _hopeless(mechanism, one, outcome, strain, float(error[row]))
         if reason is not None:
@@ -168,9 +167,7 @@ def _hopeless(
     return None
 
 
-def _mistake(
-    mechanism: Mechanism, one: Sightings, row: int, names: tuple[str, ...], cost: float
-) -> str | None:
+def _mistake(mechanism: Mechanism, one: Sightings, row: int, names: tuple[str, ...]) -> str | None:
     """Return the mistake that explains the sightings of a mirror, None if there is none."""
     part = one.take(np.linspace(0, len(one) - 1, min(MOST, len(one))).round().astype(np.intp))
     trials = list(_hypotheses(mechanism, part, row))
@@ -210,8 +207,7 @@ def _hypotheses(
         )
     if len(joints) == 2:
         yield (
-            f"the motors of {' and '.join(joints)} both seem reversed: their counts run the other "
-            "way",
+            f"the motors of {' and '.join(joints)} both seem reversed",
             row,
             replace(part, counts=np.stack(back, axis=-1)),
         )
@@ -235,9 +231,9 @@ def _hypotheses(
     ):
         far = part.source_at_infinity[:, None]
         yield text, row, replace(part, source=np.where(far, part.source * sign, part.source))
-    for other in _likely(mechanism, part, row):
-        name = part.names[other] if part.names else f"row {other}"
-        yield f"its rows seem to be those of {name}", other, part
+    for neighbour in _likely(mechanism, part, row):
+        name = part.names[neighbour] if part.names else f"row {neighbour}"
+        yield f"its rows seem to be those of {name}", neighbour, part
 
 
 def _reversed(mechanism: Mechanism, part: Sightings, row: int, drive: int) -> FloatArray:

@@ -105,9 +105,7 @@ class FieldParameters:
                 f"{', '.join(scaled)}"
             )
         if rest.any():
-            lines.append(
-                f"{amount(int(rest.sum()), 'heliostat')} not learnt: parameters unchanged"
-            )
+            lines.append(f"{amount(int(rest.sum()), 'heliostat')} not learnt: parameters unchanged")
         kept = self.learnt | filled
         return plant.with_calibration(self.only(kept)) if kept.any() else plant, tuple(lines)
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from heliotrope import sun
 from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.plausibility import judge
 from heliotrope.calibration.record import (
     CalibrationOutcome,
     HeliostatCalibration,
@@ -334,7 +335,10 @@ class CalibrationCycle:
         name, beliefs = visit.heliostat, self._plant.beliefs
         surface = visit.target.name if production is None else production.surface
         new = [self._sighting(shot, counts) for shot, counts in taken.used]
-        known, rejected = beliefs.seen(name), tuple(taken.rejected)
+        reasons = judge(join(new), mechanism=beliefs.nominal(name)).reasons if new else {}
+        new = [seen for k, seen in enumerate(new) if k not in reasons]
+        known = beliefs.seen(name)
+        rejected = (*taken.rejected, *(f"photograph: {text}" for text in reasons.values()))
         old = [] if known is None else [known.sightings]
         if not new:
             outcomes = CalibrationOutcome
