@@ -74,8 +74,8 @@ class ClockCheck:
         return (
             f"the clock may be wrong by {abs(self.error):.0f} s ± {self.sigma:.0f} s ({side}): by "
             f"that the sightings of {amount(self.heliostats, 'heliostat')} fit far better "
-            f"({abs(self.error) / self.sigma:.0f} standard deviations). Check the clock and zone, correct "
-            "times and suns, and calibrate again; the plant file keeps its parameters"
+            f"({abs(self.error) / self.sigma:.0f} standard deviations). Check it and its zone, "
+            "correct times and suns, and calibrate again; the plant file keeps its parameters"
         )
 
     def document(self) -> dict[str, float | bool]:

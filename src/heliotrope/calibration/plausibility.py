@@ -150,31 +150,35 @@ def copies(seen: Sightings) -> Rows:
 def _contradicted(
     seen: Sightings, site: Site, reasons: Mapping[int, str]
 ) -> tuple[Rows, Texts, str]:
-    """Return the suns that did not stand there at their time; a note instead if most did not."""
+    """Return the suns that did not stand there at their time; a note where a mirror has most."""
     able = seen.source_at_infinity & np.isfinite(seen.time)
     able[list(reasons)] = False
-    away = np.zeros(len(seen))
-    if able.any():
-        expected = solar.vector(seen.time[able], site)
-        away[able] = angle_between(seen.source[able], expected)
+    if not able.any():
+        return able, "", ""
+    expected, away = np.zeros((len(seen), 3)), np.zeros(len(seen))
+    expected[able] = solar.vector(seen.time[able], site)
+    away[able] = angle_between(seen.source[able], expected[able])
     rows = away > MOVED
-    if not rows.any():
-        return rows, "", ""
-    if 2 * rows.sum() > able.sum():
-        middle = float(np.degrees(np.median(away[rows])))
+    wrong, known = (np.bincount(seen.heliostat[mask]) for mask in (rows, able))
+    mostly = np.zeros(len(known), np.bool_)
+    mostly[: len(wrong)] = 2 * wrong > known[: len(wrong)]
+    whole = rows & mostly[seen.heliostat] if rows.any() else rows
+    note = ""
+    if whole.any():
+        middle = float(np.degrees(np.median(away[whole])))
         note = (
-            f"the suns of {rows.sum()} of {able.sum()} sightings do not stand where the sun stood "
+            f"the suns of {whole.sum()} of {able.sum()} sightings do not stand where the sun stood "
             f"at their times (median {middle:.1f}° off): check clock, time zone and the plant's "
             "[site]"
         )
-        return np.zeros_like(rows), "", note
-    where, there = azimuth_elevation(seen.source[rows]), azimuth_elevation(expected[rows[able]])
+        rows = rows & ~whole
+    where, there = azimuth_elevation(seen.source[rows]), azimuth_elevation(expected[rows])
     texts = [
         f"the sun is given at azimuth {a % 360.0:.1f}°, elevation {e:.1f}°, and stood at "
         f"{b % 360.0:.1f}°, {f:.1f}° at that time: correct one of them"
         for a, e, b, f in zip(*np.degrees(where), *np.degrees(there), strict=True)
     ]
-    return rows, texts, ""
+    return rows, texts, note
 
 
 def _off_target(
