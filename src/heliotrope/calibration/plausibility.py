@@ -18,7 +18,7 @@ from heliotrope.calibration.fit.estimator import FAR
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.field.target import Receiver, Target
 from heliotrope.files.cells import format_time
-from heliotrope.geometry import MOST_TURNS, TAU, FloatArray, angle_between, azimuth_elevation
+from heliotrope.geometry import MOST_TURNS, FloatArray, angle_between, azimuth_elevation
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS
 from heliotrope.sun import Site
@@ -234,8 +234,8 @@ def _beyond_machine(
         holds[row] = np.nan_to_num(np.median(miss[mine]), nan=np.inf) < FAR
     judged = holds[seen.heliostat]
     for drive, joint in enumerate(mechanism.driven):
-        value, low, high, unit = _reach(each, seen.counts, drive)
-        rows = judged & ~((value >= low) & (value <= high))
+        value, low, high, most, unit = _reach(each, seen.counts, drive)
+        rows = ~((value >= low) & (value <= high)) & (judged | ~(np.abs(value) <= most))
         yield (
             rows,
             [
@@ -253,14 +253,19 @@ def _beyond_machine(
 
 def _reach(
     each: Mechanism, counts: FloatArray, drive: int
-) -> tuple[FloatArray, FloatArray, FloatArray, str]:
-    """Return what a drive did, (M,), its limits with play, and their unit: counts, or degrees."""
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, str]:
+    """Return what a drive did, its limits with play, what no zero or sense explains, and the unit.
+
+    All (M,), in counts where the drive has limits of counts, else in degrees.
+    """
     table = each.drives.table[:, drive]
     low, high = (table[:, SLOTS[name]] for name in ("min_count", "max_count"))
     if np.isfinite(low).all() and np.isfinite(high).all():
         play = 0.02 * (high - low)
-        return counts[:, drive], low - play, high + play, " counts"
+        most = 2.0 * np.maximum(np.abs(low), np.abs(high))
+        return counts[:, drive], low - play, high + play, most, " counts"
     angle = each.drives.angles(counts)[:, drive]
     low, high = (table[:, SLOTS[name]] for name in ("min_angle", "max_angle"))
-    limits = np.clip(np.array([low - PLAY, high + PLAY]), -MOST_TURNS * TAU, MOST_TURNS * TAU)
-    return np.degrees(angle), *np.degrees(limits), "°"
+    limits = np.clip(np.array([low - PLAY, high + PLAY]), -MOST_TURNS, MOST_TURNS)
+    most = np.full(len(counts), np.degrees(MOST_TURNS))
+    return np.degrees(angle), *np.degrees(limits), most, "°"

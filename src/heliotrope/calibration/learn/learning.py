@@ -170,6 +170,9 @@ def relinearise(
     values = np.concatenate(
         [m.at(d.time, d.regime)[0] for m, d in zip(members, prepared.field, strict=True)]
     )
+    most = np.array([mechanism.most(name) for name in names])
+    lost = (np.abs(values) > most).any(axis=1)
+    values[lost] = 0.0
     seen = sightings.take(rows)
     line = linearise(moved_by(mechanism, seen.heliostat, names, values), seen, names)
     offsets = np.concatenate([[0], np.cumsum([len(d) for d in prepared.field])])
@@ -179,7 +182,8 @@ def relinearise(
         jacobian = np.ascontiguousarray(line.jacobian[part])
         value = np.einsum("nap,np->na", jacobian, values[part] - d.centre) - line.residual[part]
         field.append(replace(d, jacobian=jacobian, value=value))
-    return _without_unusable(replace(prepared, field=tuple(field)), is_usable(line))
+    # Parameters that no mechanism can have are extrapolated from sightings that show nothing.
+    return _without_unusable(replace(prepared, field=tuple(field)), is_usable(line) & ~lost)
 
 
 def repeatability(time: FloatArray, residual: FloatArray) -> float:

@@ -15,6 +15,8 @@ import numpy.typing as npt
 from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.fit._fit_kernels import CAUCHY_WIDTH
 from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome, fit
+from heliotrope.calibration.fit.residuals import linearise
+from heliotrope.calibration.learn.unusable import is_usable
 from heliotrope.calibration.sightings import Sightings, join, ray_directions
 from heliotrope.geometry import FloatArray, angle_between, bisector
 from heliotrope.mechanism import parameters as parameter_table
@@ -78,13 +80,20 @@ def find_misfits(
     used
         Mask of the sightings to judge by, (M,).
     """
-    seen = sightings if used is None else sightings.take(used)
+    given = sightings if used is None else sightings.take(used)
+    names = parameter_table.model("full", mechanism.parameters)
+    usable = is_usable(linearise(mechanism[given.heliostat], given, names))
+    seen = given.take(usable)
     unmoved = tuple(_unmoved(mechanism, seen))
     moved = seen.take(~np.isin(seen.heliostat, [misfit.row for misfit in unmoved]))
-    names = parameter_table.model("full", mechanism.parameters)
     fitted = fit(mechanism, moved, names, adapt_scale=False)
     error = _median_errors(mechanism, moved, fitted)
     found = list(unmoved)
+    # Counts beyond the reach of its drives are named as such, unless a mistake explains them.
+    for row in np.setdiff1d(given.heliostat, seen.heliostat):
+        reason = _mistake(mechanism, given.take(given.heliostat == row), int(row), names)
+        if reason is not None:
+            found.append(Misfit(int(row), FitOutcome.MISFIT, reason))
     for row in np.flatnonzero(fitted.count):
         outcome = FitOutcome(int(fitted.outcome[row]))
         strain = float(((fitted.values[row] / fitted.prior[row]) ** 2).sum())
@@ -179,7 +188,8 @@ def _mistake(mechanism: Mechanism, one: Sightings, row: int, names: tuple[str, .
     error, each = _median_errors(machines, seen, fitted), costs(fitted, machines)
     # The first trial is the sightings as they are given. A mistake explains them no worse: a zero
     # that is far off strains the priors too, but leaves smaller errors than another mirror does.
-    enough = np.clip(ALIKE * error[0], 2.0 * float(np.median(part.sigma)), ELSEWHERE)
+    least = 2.0 * float(np.median(part.sigma))
+    enough = np.clip(np.nan_to_num(ALIKE * error[0], nan=np.inf), least, ELSEWHERE)
     each = np.where(error <= enough, each, np.inf)
     given, best = costs(fitted, machines)[0], int(np.argmin(each))
     if best == 0 or not (each[best] < given - GAIN and each[best] < SHARE * given):
