@@ -16,6 +16,7 @@ import numpy.typing as npt
 from heliotrope import sun as solar
 from heliotrope.calibration.fit.estimator import FAR
 from heliotrope.calibration.sightings import Sightings, ray_directions
+from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
 from heliotrope.files.cells import format_time
 from heliotrope.geometry import MOST_TURNS, FloatArray, angle_between, azimuth_elevation
@@ -109,6 +110,20 @@ def judge(
         for rows, text in _beyond_machine(seen, mechanism, reasons):
             _add(reasons, rows, text)
     return Judgement(reasons, tuple(notes))
+
+
+def judge_in(
+    plant: Plant, seen: Sightings, kinds: Sequence[str] = (), now: float | None = None
+) -> Judgement:
+    """Return the judgement by all that a plant knows; rows are those of its heliostats."""
+    return judge(
+        seen,
+        mechanism=plant.nominal if len(plant.groups) == 1 else None,
+        site=plant.site,
+        surfaces=(*plant.targets, *plant.receivers),
+        kinds=kinds,
+        now=now,
+    )
 
 
 def _add(reasons: dict[int, str], rows: Rows, texts: Texts) -> None:

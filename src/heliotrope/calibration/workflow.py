@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration import evaluation, plausibility
+from heliotrope.calibration import evaluation
 from heliotrope.calibration.clock import ClockCheck, check_clock
 from heliotrope.calibration.evaluation import Split
 from heliotrope.calibration.learn import models
@@ -27,7 +27,7 @@ from heliotrope.calibration.learn.periodic import (
     with_ratios,
 )
 from heliotrope.calibration.learn.sequential import predict_by_stream, predict_in_turn
-from heliotrope.calibration.plausibility import Judgement
+from heliotrope.calibration.plausibility import Judgement, judge_in
 from heliotrope.calibration.report.content import CalibrationReport
 from heliotrope.calibration.sighting_table import read_sightings
 from heliotrope.calibration.sightings import Sightings, of_measurements
@@ -128,7 +128,7 @@ def _read_table(plant: Plant, place: Path, table: Path, now: float | None) -> Fi
     judged: list[Judgement] = []
 
     def judge(seen: Sightings, kinds: Sequence[str]) -> Mapping[int, str]:
-        judged.append(_judge(plant, heliostats, seen, kinds, now))
+        judged.append(judge_in(plant, seen, kinds, now))
         return judged[0].reasons
 
     seen, _, left = read_sightings(table, heliostats.names, judge)
@@ -145,7 +145,7 @@ def _read_folder(
     known = set(heliostats.names)
     pairs = zip(found.heliostat, found.ids, strict=True)
     ids = [f"{name} {number}" for name, number in pairs if name in known]
-    judged = _judge(plant, heliostats, seen, ["camera_target"] * len(seen), now)
+    judged = judge_in(plant, seen, ["camera_target"] * len(seen), now)
     kept = [k for k in range(len(seen)) if k not in judged.reasons]
     impossible = [f"{ids[k]}: {reason}" for k, reason in sorted(judged.reasons.items())]
     return FieldSightings(
@@ -155,23 +155,6 @@ def _read_folder(
         tuple(ids[k] for k in kept),
         (*found.left_out, *left, *impossible),
         judged.notes,
-    )
-
-
-def _judge(
-    plant: Plant,
-    heliostats: Heliostats,
-    seen: Sightings,
-    kinds: Sequence[str],
-    now: float | None,
-) -> Judgement:
-    return plausibility.judge(
-        seen,
-        mechanism=heliostats.mechanism,
-        site=plant.site,
-        surfaces=(*plant.targets, *plant.receivers),
-        kinds=kinds,
-        now=now,
     )
 
 

@@ -18,7 +18,7 @@ from heliotrope.airborne.evaluate.orientation import Mean, measure_field
 from heliotrope.airborne.evaluate.reading import read_many
 from heliotrope.airborne.evaluate.sightings import to_sightings
 from heliotrope.airborne.evaluate.tables import MeasuredFlight
-from heliotrope.calibration.plausibility import judge
+from heliotrope.calibration.plausibility import judge_in
 from heliotrope.calibration.sightings import Sightings, join
 from heliotrope.field.plant import Plant
 
@@ -117,8 +117,7 @@ class CampaignResult:
         if not parts:
             return None, {}
         seen = join(parts)
-        machines = self.plant.nominal if len(self.plant.groups) == 1 else None
-        return seen, judge(seen, mechanism=machines).reasons
+        return seen, judge_in(self.plant, seen).reasons
 
     def orientation_rows(self) -> list[dict[str, Any]]:
         """Return one record for each orientation, its systematic part split by cause."""
