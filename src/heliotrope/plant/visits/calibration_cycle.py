@@ -256,6 +256,16 @@ class CalibrationCycle:
         seen = join([self._sighting(shot, counts) for shot, counts in taken.used])
         return root_mean_square(beam_errors(self._plant.beliefs.present(heliostat), seen).beam)
 
+    def _plausible(
+        self, heliostat: str, taken: Photographs
+    ) -> tuple[list[Sightings], tuple[str, ...]]:
+        """Return the sightings that can have happened, and a line for each photograph rejected."""
+        made = [self._sighting(shot, counts) for shot, counts in taken.used]
+        nominal = self._plant.beliefs.nominal(heliostat)
+        reasons = judge(join(made), mechanism=nominal).reasons if made else {}
+        new = [seen for k, seen in enumerate(made) if k not in reasons]
+        return new, (*taken.rejected, *(f"photograph: {text}" for text in reasons.values()))
+
     def _sighting(self, shot: Shot, counts: FloatArray) -> Sightings:
         plant = self._plant
         utc = plant.clock.utc() - timedelta(seconds=plant.now() - shot.at)
@@ -334,11 +344,8 @@ class CalibrationCycle:
         """Fit all sightings once; push, verify and take a better fit."""
         name, beliefs = visit.heliostat, self._plant.beliefs
         surface = visit.target.name if production is None else production.surface
-        new = [self._sighting(shot, counts) for shot, counts in taken.used]
-        reasons = judge(join(new), mechanism=beliefs.nominal(name)).reasons if new else {}
-        new = [seen for k, seen in enumerate(new) if k not in reasons]
+        new, rejected = self._plausible(name, taken)
         known = beliefs.seen(name)
-        rejected = (*taken.rejected, *(f"photograph: {text}" for text in reasons.values()))
         old = [] if known is None else [known.sightings]
         if not new:
             outcomes = CalibrationOutcome
