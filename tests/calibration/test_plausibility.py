@@ -270,6 +270,9 @@ def test_a_wrong_clock_changes_no_parameter(tmp_path: Path) -> None:
     assert found.rows[0].outcome is FitOutcome.CLOCK
     assert found.remarks[0].startswith("the clock may be wrong by 3")
     assert found.calibrated is PLANT
+    tilt = found.results.names.index("tilt_north")
+    assert found.results.values[15, tilt] == 0.0
+    assert found.results.sigma[15, tilt] == pytest.approx(NOMINAL.parameter("tilt_north").prior)
     assert found.guo is None
 
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from heliotrope import __version__
 from heliotrope.calibration.fit.estimator import FitOutcome
-from heliotrope.calibration.learn.drift import DAY, TEACHERS
+from heliotrope.calibration.learn.drift import DAY, TEACHERS, posterior
 from heliotrope.calibration.learn.learned import Learned
 from heliotrope.calibration.learn.learning import FEWEST
 from heliotrope.errors import InputError
@@ -142,6 +142,10 @@ def at_moment(
     shared = np.abs(hyper.mean) > SUPPORTED * hyper.spread / np.sqrt(max(teachers, 1))
     shared &= teachers >= TEACHERS
     values[~learnt] = np.where(shared & (used[~learnt, None] == 0), hyper.mean, 0.0)
+    for i in np.flatnonzero(~learnt):
+        data = learned.members[i].data
+        unknown = posterior(hyper, data.take(np.zeros(len(data), np.bool_)))
+        spread[i] = unknown.at(np.array([when / DAY]), np.zeros(1, np.int64))[1][0]
     return FieldParameters(
         learned.model,
         learned.names,
