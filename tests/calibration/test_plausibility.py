@@ -20,10 +20,12 @@ from heliotrope.calibration.report.results import at_moment, read_json, write_js
 from heliotrope.calibration.sighting_table import write_sightings
 from heliotrope.calibration.sightings import Sightings, camera_target, join
 from heliotrope.field.example import example_plant
+from heliotrope.field.formats import paint
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import MRAD, FloatArray, reflect
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
+from support.data import juelich
 
 PLANT = example_plant()
 GROUP = PLANT.groups["azel"]
@@ -362,3 +364,24 @@ def test_no_row_and_no_mirror_ends_the_calibration_of_the_others(
         if kind in MISTAKES:
             outcome = FitOutcome(int(learned.static.outcome[3 * k]))
             assert outcome is FitOutcome.MISFIT, (kind, outcome)
+
+
+def test_a_folder_with_a_bad_year_and_a_copy_is_read(tmp_path: Path) -> None:
+    for part in (juelich() / "properties").iterdir():
+        (tmp_path / "properties").mkdir(exist_ok=True)
+        (tmp_path / "properties" / part.name).symlink_to(part)
+    (tmp_path / "tower-measurements.json").symlink_to(juelich() / "tower-measurements.json")
+    lines = (juelich() / "measurements.csv").read_text(encoding="utf-8").splitlines()
+    mine = [line for line in lines if line.startswith("BG15,") and ",,," not in line][:12]
+    for k, year in ((2, "9999"), (4, "2219")):
+        name, number, time, *rest = mine[k].split(",")
+        mine[k] = ",".join([name, number, year + time[4:], *rest])
+    table = "\n".join([lines[0], *mine, mine[7]])
+    (tmp_path / "measurements.csv").write_text(f"{table}\n", encoding="utf-8")
+    field = workflow.read_field_sightings(paint.read_plant(tmp_path), tmp_path)
+    assert len(field.seen) == 10
+    assert [line.split(": ", 1)[1].split(":")[0] for line in field.left_out] == [
+        "the year is out of range",
+        "the year is out of range, 1970 to 2099",
+        "an exact copy of another sighting",
+    ]

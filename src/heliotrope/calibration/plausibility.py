@@ -23,12 +23,9 @@ from heliotrope.geometry import MOST_TURNS, FloatArray, angle_between, azimuth_e
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS
 from heliotrope.sun import Site
-from heliotrope.sun.ephemeris import LAST_YEAR
 
 #: Years with sightings, Unix seconds: no heliostat is older, and later ones are typing errors.
 EARLIEST, LATEST = 0.0, datetime(2100, 1, 1, tzinfo=UTC).timestamp()
-#: Sightings hold no times from here on: the end of SPA's validity.
-UNKNOWABLE = float(np.datetime64(LAST_YEAR + 1 - 1970, "Y").astype("datetime64[s]").astype(int))
 YEAR = "the year is out of range, 1970 to 2099: correct the time"
 #: A time may be this far ahead of the computer's clock, which may be slow itself, s.
 AHEAD = 366 * 86400.0
