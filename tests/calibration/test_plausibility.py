@@ -225,14 +225,19 @@ def test_every_mirror_may_be_a_misfit() -> None:
 
 
 def test_a_fit_gives_no_parameters_that_no_mechanism_can_have() -> None:
-    wrong = _reversed(0)(seen_of([2], count=3))  # type: ignore[operator]
-    found = fit(GROUP, wrong, ("tilt_north", "tilt_east"), priors={"tilt_north": 50.0})
-    NOMINAL.with_parameters(found.parameters)
-    limit = NOMINAL.most("tilt_north")
-    far = seen_of([2], count=3)
-    far = replace(far, source=far.source[::-1] * [-1.0, -1.0, 1.0])
-    found = fit(GROUP, far, ("tilt_north",), priors={"tilt_north": 50.0}, loss="square")
-    assert (np.abs(found.values) <= limit).all()
+    wrong = _reversed(1)(seen_of([2], count=6))  # type: ignore[operator]
+    wide = {"tilt_north": 5.0, "tilt_east": 5.0}
+    found = fit(GROUP, wrong, ("tilt_north", "tilt_east"), priors=wide)[NAMES[2]]
+    assert FitOutcome(int(found.outcome)) is FitOutcome.MISFIT
+    assert (found.values == 0.0).all()
+    np.testing.assert_allclose(found.sigma, 5.0)
+
+
+def test_one_mirror_says_nothing_about_the_population() -> None:
+    one = learning.learn(GROUP, seen_of([15], shared=12e-3), "guo6")
+    assert (one.hyper.mean == 0.0).all()
+    many = learning.learn(GROUP, seen_of([0, 3, 9, 12, 15], shared=12e-3), "guo6")
+    assert many.hyper.mean[many.names.index("elevation_bias")] > 5e-3
 
 
 @pytest.mark.parametrize("fast", [3600.0, -3600.0, 1800.0])
