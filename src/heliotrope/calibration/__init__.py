@@ -14,6 +14,7 @@ room or module are imported from there: ``from heliotrope.calibration.fit import
 sightings``.
 """
 
+from heliotrope.calibration.clock import ClockCheck, check_clock
 from heliotrope.calibration.evaluation import (
     BeamErrors,
     ErrorSummary,
@@ -31,6 +32,7 @@ from heliotrope.calibration.plan import (
     plan_campaign,
     plan_sightings,
 )
+from heliotrope.calibration.plausibility import Judgement, judge
 from heliotrope.calibration.report import CalibrationReport, FieldParameters, write_report
 from heliotrope.calibration.sighting_table import read_malan, read_sightings, write_sightings
 from heliotrope.calibration.sightings import (
@@ -65,6 +67,7 @@ __all__ = [
     "BeamErrors",
     "BlindSpot",
     "CalibrationReport",
+    "ClockCheck",
     "ErrorSummary",
     "FieldFit",
     "FieldParameters",
@@ -72,6 +75,7 @@ __all__ = [
     "FitOutcome",
     "Fleet",
     "HeldOutEvaluation",
+    "Judgement",
     "Learned",
     "Prediction",
     "SightingLimits",
@@ -83,12 +87,14 @@ __all__ = [
     "calibrate",
     "camera_target",
     "candidate_sightings",
+    "check_clock",
     "drone",
     "error_form",
     "evaluate",
     "expected_error",
     "field_camera",
     "join",
+    "judge",
     "of_measurements",
     "plan_campaign",
     "plan_sightings",

@@ -6,7 +6,7 @@ heliostat, column, value, remedy); a file that cannot be used raises an error.
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration import plausibility
 from heliotrope.calibration.sightings import (
     LARGEST_SIGMA,
     Sightings,
@@ -35,6 +36,7 @@ from heliotrope.files.cells import (
 from heliotrope.files.limits import SIZE_LIMIT
 from heliotrope.files.text import write_file
 from heliotrope.geometry import FloatArray, direction
+from heliotrope.sun.ephemeris import END_OF_TIMES
 
 #: Kinds of sightings, with whether source and destination are at infinity.
 KINDS = {
@@ -58,7 +60,9 @@ _FARTHEST_OFFSET = 50.0
 
 
 def read_sightings(
-    path: str | Path, names: Sequence[str]
+    path: str | Path,
+    names: Sequence[str],
+    judge: Callable[[Sightings, Sequence[str]], Mapping[int, str]] | None = None,
 ) -> tuple[Sightings, tuple[str, ...], list[str]]:
     """Return the sightings of a table, their kinds, and a line for each row left out.
 
@@ -71,6 +75,9 @@ def read_sightings(
         is NaN. Other columns are ignored.
     names
         Names of the heliostats in the order of their rows, (N,).
+    judge
+        Gives the sightings that cannot have happened, by row, with the reason: it is called with
+        all sightings and their kinds. See `heliotrope.calibration.plausibility`.
 
     Returns
     -------
@@ -92,7 +99,7 @@ def read_sightings(
     drives = _check_columns(rows)
     heliostat = find_heliostats(rows, "heliostat", names)
     kinds = rows.texts("kind")
-    time = rows.times("time", optional=True) if "time" in rows.columns else None
+    time = _times(rows, "time", optional=True) if "time" in rows.columns else None
     counts = np.stack([rows.numbers(name, "drive counts") for name in drives], axis=-1)
     far = {end: rows.flags(f"{end}_at_infinity") for end in _ENDS}
     ends = {end: _points(rows, end, far[end]) for end in _ENDS}
@@ -113,7 +120,24 @@ def read_sightings(
         destination_covariance=spread["destination"][good],
     )
     named = replace(seen, names=tuple(names))
-    return named, tuple(kinds[i] for i in good), rows.left_out
+    if judge is not None:
+        named = _without(rows, named, judge(named, [kinds[i] for i in good]))
+    return named, tuple(kinds[i] for i in rows.good), rows.left_out
+
+
+def _times(rows: Rows, column: str, *, optional: bool) -> FloatArray:
+    """Return Unix seconds; times that sightings cannot hold leave their rows out."""
+    seconds = rows.times(column, optional=optional)
+    for i in np.flatnonzero(seconds >= END_OF_TIMES):
+        rows.refuse(i, column, plausibility.YEAR)
+    return seconds
+
+
+def _without(rows: Rows, seen: Sightings, reasons: Mapping[int, str]) -> Sightings:
+    """Refuse the rows of sightings with a reason, and return the others."""
+    good = rows.good
+    rows.reasons |= {int(good[k]): reason for k, reason in reasons.items()}
+    return seen.take(np.isin(good, rows.good))
 
 
 def write_sightings(
@@ -197,7 +221,7 @@ def read_malan(
     rows = read_rows(Path(path), "a table of Malan's measurements in CSV")
     rows.need(_MALAN)
     rows.heliostat = [heliostat] * len(rows)
-    time = rows.times("timestamp", optional=False)
+    time = _times(rows, "timestamp", optional=False)
     azimuth = rows.numbers("sun_azimuth_deg", "degrees clockwise from north")
     elevation = rows.numbers("sun_elevation_deg", "degrees above the horizon")
     offsets = [
@@ -233,6 +257,7 @@ def read_malan(
         time=time[good],
         sigma=sigma,
     )
+    seen = _without(rows, seen, plausibility.judge(seen).reasons)
     return replace(seen, names=tuple(names)), rows.left_out
 
 

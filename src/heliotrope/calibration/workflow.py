@@ -4,7 +4,7 @@
 `evaluate` only tests how well held-out sightings are predicted.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,11 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration import evaluation
+from heliotrope.calibration.clock import ClockCheck, check_clock
 from heliotrope.calibration.evaluation import Split
 from heliotrope.calibration.learn import models
 from heliotrope.calibration.learn.assessment import Assessment, assess
 from heliotrope.calibration.learn.learned import Learned
 from heliotrope.calibration.learn.learning import FEWEST, Runner, learn
+from heliotrope.calibration.learn.misfits import Misfit, find_misfits
 from heliotrope.calibration.learn.models import ScoredModel
 from heliotrope.calibration.learn.periodic import (
     PeriodicError,
@@ -25,6 +27,7 @@ from heliotrope.calibration.learn.periodic import (
     with_ratios,
 )
 from heliotrope.calibration.learn.sequential import predict_by_stream, predict_in_turn
+from heliotrope.calibration.plausibility import Judgement, judge_in
 from heliotrope.calibration.report.content import CalibrationReport
 from heliotrope.calibration.sighting_table import read_sightings
 from heliotrope.calibration.sightings import Sightings, of_measurements
@@ -54,6 +57,8 @@ class FieldSightings:
         Name of each sighting.
     left_out
         One line for each measurement that could not be used.
+    notes
+        Lines on what contradicts most of the sightings.
     """
 
     plant: Plant
@@ -61,6 +66,7 @@ class FieldSightings:
     seen: Sightings
     ids: tuple[str, ...]
     left_out: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def heliostats(self) -> Heliostats:
@@ -74,8 +80,9 @@ def read_field_sightings(
     table: Path | None = None,
     *,
     centroid: Literal["utis", "helios"] = "utis",
+    now: float | None = None,
 ) -> FieldSightings:
-    """Return the sightings of a folder in PAINT's form, or of a table.
+    """Return the plausible sightings of a folder in PAINT's form, or of a table.
 
     Parameters
     ----------
@@ -87,6 +94,8 @@ def read_field_sightings(
         Table of sightings; without one ``place`` must be a folder with measurements.
     centroid
         Which published centroid to use.
+    now
+        The computer's clock, Unix seconds: sightings that are still to come are left out.
 
     Raises
     ------
@@ -96,9 +105,9 @@ def read_field_sightings(
         If no measurement can be used.
     """
     if table is not None:
-        found = _read_table(plant, place, table)
+        found = _read_table(plant, place, table, now)
     elif place.is_dir():
-        found = _read_folder(plant, place, centroid)
+        found = _read_folder(plant, place, centroid, now)
     else:
         raise InputError(
             f"{place}: a plant without measurements; give --sightings TABLE, or a folder with both"
@@ -109,26 +118,44 @@ def read_field_sightings(
     return found
 
 
-def _read_table(plant: Plant, place: Path, table: Path) -> FieldSightings:
+def _read_table(plant: Plant, place: Path, table: Path, now: float | None) -> FieldSightings:
     if len(plant.groups) != 1:
         raise InputError(
             f"{place}: {len(plant.groups)} groups of heliostats; calibrate them one by one: "
             "give a plant with one group"
         )
     ((group, heliostats),) = plant.groups.items()
-    seen, _, left = read_sightings(table, heliostats.names)
+    judged: list[Judgement] = []
+
+    def judge(seen: Sightings, kinds: Sequence[str]) -> Mapping[int, str]:
+        judged.append(judge_in(plant, seen, kinds, now))
+        return judged[0].reasons
+
+    seen, _, left = read_sightings(table, heliostats.names, judge)
     ids = tuple(f"{heliostats.names[h]} {k}" for k, h in enumerate(seen.heliostat))
-    return FieldSightings(plant, group, seen, ids, tuple(left))
+    return FieldSightings(plant, group, seen, ids, tuple(left), judged[0].notes)
 
 
-def _read_folder(plant: Plant, place: Path, centroid: Literal["utis", "helios"]) -> FieldSightings:
+def _read_folder(
+    plant: Plant, place: Path, centroid: Literal["utis", "helios"], now: float | None
+) -> FieldSightings:
     ((group, heliostats),) = plant.groups.items()
     found = measurements.read_measurements(place, centroid=centroid)
     seen, left = of_measurements(found, heliostats)
     known = set(heliostats.names)
     pairs = zip(found.heliostat, found.ids, strict=True)
-    ids = tuple(f"{name} {number}" for name, number in pairs if name in known)
-    return FieldSightings(plant, group, seen, ids, (*found.left_out, *left))
+    ids = [f"{name} {number}" for name, number in pairs if name in known]
+    judged = judge_in(plant, seen, ["camera_target"] * len(seen), now)
+    kept = [k for k in range(len(seen)) if k not in judged.reasons]
+    impossible = [f"{ids[k]}: {reason}" for k, reason in sorted(judged.reasons.items())]
+    return FieldSightings(
+        plant,
+        group,
+        seen.take(kept),
+        tuple(ids[k] for k in kept),
+        (*found.left_out, *left, *impossible),
+        judged.notes,
+    )
 
 
 @dataclass(frozen=True)
@@ -242,6 +269,7 @@ def evaluate(
     runner: Runner | None = None,
     steps: Steps | None = None,
     learner: Learner = "stream",
+    misfits: tuple[Misfit, ...] | None = None,
 ) -> HeldOutEvaluation:
     """Learn from a part of each heliostat's sightings and assess the rest.
 
@@ -267,6 +295,8 @@ def evaluate(
     learner
         For the split "sequential": "stream" updates a belief by one sighting after another
         (`heliotrope.calibration.learn.stream`); "batch" learns every history afresh.
+    misfits
+        As for `learn`.
 
     Raises
     ------
@@ -275,8 +305,11 @@ def evaluate(
     """
     training, tested = evaluation.partition(sightings, split, fraction, seed)
     choice = None
+    if misfits is None:
+        misfits = find_misfits(mechanism, sightings, training)
     if model == "auto":
-        choice = find_model(mechanism, sightings, training, steps)
+        fits = ~np.isin(sightings.heliostat, [misfit.row for misfit in misfits])
+        choice = find_model(mechanism, sightings, training & fits, steps)
         model, mechanism = choice.parameters, choice.mechanism
     learned = learn(
         mechanism,
@@ -284,6 +317,7 @@ def evaluate(
         model,
         used=training,
         priors=priors,
+        misfits=misfits,
         runner=runner,
         progress=_step(steps, "learning from the training part"),
     )
@@ -322,11 +356,13 @@ def calibrate(
     if fraction != 1.0:
         evaluation.check_fraction(fraction)
     names, mechanism = field.heliostats.names, field.heliostats.mechanism
+    misfits = find_misfits(mechanism, field.seen)
+    fits = ~np.isin(field.seen.heliostat, [misfit.row for misfit in misfits])
     comparison: tuple[str, ...] = ()
     if model == "auto":
-        choice = find_model(mechanism, field.seen, None, steps)
+        choice = find_model(mechanism, field.seen, fits, steps)
         model, mechanism, comparison = choice.parameters, choice.mechanism, choice.describe()
-    options: dict[str, Any] = {"priors": priors, "runner": runner}
+    options: dict[str, Any] = {"priors": priors, "runner": runner, "misfits": misfits}
     tested = None
     if fraction != 1.0:
         tested = evaluate(
@@ -341,9 +377,10 @@ def calibrate(
             **options,
         ).assessment
     learned = learn(mechanism, field.seen, model, progress=_step(steps, "learning"), **options)
+    clock = clock_of(field, learned)
     return CalibrationReport(
         names,
-        learned,
+        learned if clock is None or not clock.found else learned.doubted(),
         _with_mechanism(field.plant, field.group, mechanism),
         field.group,
         tested,
@@ -351,7 +388,16 @@ def calibrate(
         field.left_out,
         f"{split} split, {100 * fraction:.0f} % to learn from, seed {seed}",
         comparison,
+        clock,
+        field.notes,
     )
+
+
+def clock_of(field: FieldSightings, learned: Learned) -> ClockCheck | None:
+    """Return the common error of the clock by the sightings of all mirrors that fit."""
+    rows = [misfit.row for misfit in learned.misfits]
+    seen = field.seen.take(~np.isin(field.seen.heliostat, rows))
+    return check_clock(learned.mechanism, seen, learned.model, field.plant.site)
 
 
 def _with_mechanism(plant: Plant, group: str, mechanism: Mechanism) -> Plant:

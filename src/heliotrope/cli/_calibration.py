@@ -1,7 +1,9 @@
 """Options and progress bars that the commands of calibration share."""
 
 import math
-from collections.abc import Callable, Iterator
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -122,3 +124,13 @@ def workers(scheduler: str | None) -> "Iterator[Runner | None]":
         from heliotrope.calibration.learn import on_dask
 
         yield on_dask.runner(client)
+
+
+def print_left_out(left_out: Sequence[str], listing: Path | None = None) -> None:
+    """Print how many measurements were left out for each reason, and the first of each."""
+    texts = [line.split(": ", 1)[-1] for line in left_out]
+    alike = [re.sub(r"[\d.]+", "0", text) for text in texts]
+    named = "" if listing is None else f" (all named in {listing})"
+    for reason, count in Counter(alike).most_common():
+        first = texts[alike.index(reason)]
+        print(f"left out: {count} measurements, the first: {first}{named}")

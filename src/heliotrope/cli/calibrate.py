@@ -1,7 +1,6 @@
 """``heliotrope calibrate``: learn the heliostats' imperfections from measurements."""
 
 import math
-from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -31,6 +30,8 @@ def calibrate(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Learn every heliostat from all its sightings, test on held-out ones, write a report."""
+    import time
+
     from heliotrope.calibration import evaluation, workflow
     from heliotrope.calibration.report.page import write_report
     from heliotrope.files.text import write_text
@@ -40,7 +41,9 @@ def calibrate(
         evaluation.check_fraction(fraction)
     plant = open_plant(place)
     with compiling():
-        field = workflow.read_field_sightings(plant, place, sightings, centroid=centroid)
+        field = workflow.read_field_sightings(
+            plant, place, sightings, centroid=centroid, now=time.time()
+        )
     with shared.workers(scheduler) as runner, shared.progress_of_steps(as_json) as steps:
         content = workflow.calibrate(
             field,
@@ -62,8 +65,7 @@ def calibrate(
         print_json({**content.document(), "left_out": left_out, "report": str(page)})
         return
     _print(content)
-    for reason, count in Counter(line.split(": ", 1)[-1] for line in left_out).most_common():
-        print(f"left out: {count} measurements: {reason} (named in {listing})")
+    shared.print_left_out(left_out, listing)
     print(f"report: {page}")
 
 
@@ -120,5 +122,5 @@ def _print(content: "CalibrationReport") -> None:
             f"{1e3 * a.median_of_medians:.2f} mrad of beam; {100 * a.coverage:.0f} % within the "
             "90 % ellipse"
         )
-    for line in content.comparison:
+    for line in (*content.remarks, *content.comparison):
         print(line)

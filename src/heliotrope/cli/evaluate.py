@@ -42,6 +42,8 @@ def evaluate(
     Everything, the model and the hyperparameters of the field included, is learnt from the
     training part alone.
     """
+    import time
+
     from heliotrope.calibration import evaluation, workflow
     from heliotrope.calibration.learn.assessment import unexplained_mirrors
 
@@ -49,7 +51,9 @@ def evaluate(
     priors = shared.parse_priors(prior or [])
     plant = open_plant(place)
     with compiling():
-        field = workflow.read_field_sightings(plant, place, sightings, centroid=centroid)
+        field = workflow.read_field_sightings(
+            plant, place, sightings, centroid=centroid, now=time.time()
+        )
         freed = _unobstructed(field) if neighbours else None
     with shared.workers(scheduler) as runner, shared.progress_of_steps(as_json) as steps:
         found = workflow.evaluate(
@@ -72,6 +76,8 @@ def evaluate(
         **found.document(),
         "left_out": list(field.left_out),
     }
+    clock = workflow.clock_of(field, found.learned)
+    document["clock"] = None if clock is None else clock.document()
     if freed is not None:
         document["neighbours"] = freed.summary()
     document["unexplained_mirrors"] = unexplained_mirrors(field.heliostats.names, found.learned)
@@ -81,7 +87,10 @@ def evaluate(
         print_json(document)
         return
     _print(document)
+    for line in (*field.notes, *([] if clock is None else [str(clock)])):
+        print(line)
     _print_left_out(document)
+    shared.print_left_out(field.left_out)
     if freed is not None:
         print(freed)
     for line in found.choice.describe() if found.choice else ():

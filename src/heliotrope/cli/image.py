@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from heliotrope.imaging.log import Entry, Log
     from heliotrope.imaging.memory import Memory
     from heliotrope.imaging.sources import Source
+    from heliotrope.mechanism.chain import Mechanism
     from heliotrope.sun import Site
 
 #: Frames after which models of empty targets are saved.
@@ -150,6 +151,8 @@ class Place:
         Names of its heliostats; empty if the file has none.
     folder
         Folder of the plant file, with the taught pictures.
+    mechanism
+        Nominal mechanisms of the heliostats named; None if the file has none, or several kinds.
     """
 
     targets: "tuple[Target, ...]"
@@ -157,6 +160,7 @@ class Place:
     site: "Site"
     names: tuple[str, ...]
     folder: Path
+    mechanism: "Mechanism | None" = None
 
 
 def open_place(path: Path) -> Place:
@@ -172,7 +176,8 @@ def open_place(path: Path) -> Place:
     else:
         found = open_plant(path)
         folder = path if path.is_dir() else path.parent
-        place = Place(found.targets, found.cameras, found.site, found.names, folder)
+        machines = found.nominal if len(found.groups) == 1 else None
+        place = Place(found.targets, found.cameras, found.site, found.names, folder, machines)
     if not place.targets:
         raise InputError(f"{path}: the plant has no targets; add [[targets]] with their marks")
     return place
@@ -245,12 +250,16 @@ def _write(
     path: Path, outcomes: "Sequence[Outcome]", entries: "Sequence[Entry | None]", place: Place
 ) -> tuple[int, list[str]]:
     """Write the table of sightings; return their number and a line for each photograph left out."""
+    import time
+
     from heliotrope.calibration.sighting_table import write_sightings
     from heliotrope.imaging.campaign import to_sightings
 
     # A tower file names no heliostats; use those of the log.
     names = place.names or tuple(sorted({e.heliostat for e in entries if e and e.heliostat}))
-    seen, left_out = to_sightings(outcomes, entries, names, place.site)
+    seen, left_out = to_sightings(
+        outcomes, entries, names, place.site, mechanism=place.mechanism, now=time.time()
+    )
     if seen is None:
         return 0, left_out
     write_sightings(path, seen, names, ["camera_target"] * len(seen))

@@ -210,9 +210,12 @@ def made_so_far(plant: "Plant", path: Path | None) -> "Sightings | None":
     """Return the sightings of a table, and say which were left out."""
     if path is None:
         return None
+    from heliotrope.calibration.plausibility import judge_in
     from heliotrope.calibration.sighting_table import read_sightings
 
-    seen, _, left_out = read_sightings(path, plant.names)
+    seen, _, left_out = read_sightings(
+        path, plant.names, lambda seen, kinds: judge_in(plant, seen, kinds).reasons
+    )
     if not len(seen):
         reason = f"; the first: {left_out[0]}" if left_out else ""
         raise FormatError(path, f"no sighting can be used{reason}")

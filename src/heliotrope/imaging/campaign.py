@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration.plausibility import judge
 from heliotrope.calibration.sightings import Sightings, camera_target
 from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.field.camera import Camera
@@ -30,6 +31,7 @@ from heliotrope.imaging.photograph import (
 )
 from heliotrope.imaging.spots.placed import PlacedSpot
 from heliotrope.imaging.targets.view import FaceView
+from heliotrope.mechanism.chain import Mechanism
 from heliotrope.processes import pool
 from heliotrope.sun import Site, Times, vector
 
@@ -410,8 +412,11 @@ def to_sightings(
     names: Sequence[str],
     site: Site,
     sigma: float = BEAM_SIGMA,
+    *,
+    mechanism: Mechanism | None = None,
+    now: float | None = None,
 ) -> tuple[Sightings | None, list[str]]:
-    """Return the sightings of photographs, and a line for each photograph left out.
+    """Return the plausible sightings of photographs, and a line for each photograph left out.
 
     Parameters
     ----------
@@ -423,6 +428,9 @@ def to_sightings(
         For the sun's direction, where the log does not give it.
     sigma
         Standard deviation of a beam in addition to that of its centroid, rad.
+    mechanism, now
+        Mechanisms of the heliostats named, and the computer's clock, for what cannot have
+        happened: see `heliotrope.calibration.plausibility.judge`.
 
     Returns
     -------
@@ -452,7 +460,11 @@ def to_sightings(
         sun_covariance=np.array([r[5] for r in rows]),
         centroid_covariance=np.array([r[3].covariance for r in rows]),
     )
-    return seen, left_out
+    judged = judge(seen, mechanism=mechanism, site=site, now=now)
+    left_out += [f"{rows[k][3].path.name}: {text}" for k, text in sorted(judged.reasons.items())]
+    left_out += judged.notes
+    kept = np.flatnonzero(~np.isin(np.arange(len(seen)), list(judged.reasons)))
+    return seen.take(kept) if len(kept) else None, left_out
 
 
 def sighting_of(

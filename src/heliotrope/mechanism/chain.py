@@ -363,17 +363,23 @@ class Mechanism(Value, Framed):
             moved[name] = value.reshape(()) if value.size == 1 else value
         return self.with_parameters(moved)
 
+    def most(self, name: str) -> float:
+        """Return the largest deviation of a parameter, either way, rad, m or 1."""
+        row = self.parameter(name)
+        if row.unit != "rad":
+            return _FARTHEST if row.unit == "m" else _LARGEST
+        # No pedestal leans by a right angle; the zero of a drive may be off by a turn.
+        return 0.5 * np.pi if row.code[0] == slot.MOVES_JOINT else TAU
+
     def _deviation(self, name: str, value: npt.ArrayLike) -> FloatArray:
         """Return the checked deviation of one parameter."""
         row, label = self.parameter(name), f"parameter {name}"
-        if row.unit == "m":
-            delta = as_numbers(value, label, -_FARTHEST, _FARTHEST, "m", "give metres")
-        elif row.unit == "1":
-            delta = as_numbers(value, label, -_LARGEST, _LARGEST)
+        if row.unit == "rad":
+            delta = as_angles(value, label, self.most(name))
         else:
-            # No pedestal leans by a right angle; the zero of a drive may be off by a turn.
-            most = 0.5 * np.pi if row.code[0] == slot.MOVES_JOINT else TAU
-            delta = as_angles(value, label, most)
+            most, metres = self.most(name), row.unit == "m"
+            unit = ("m", "give metres") if metres else ()
+            delta = as_numbers(value, label, -most, most, *unit)
         try:
             return np.broadcast_to(delta, self.shape)
         except ValueError:

@@ -1,7 +1,8 @@
 """The evaluation of a drone's flight, from its folder of photographs to sightings."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from heliotrope.airborne.evaluate.orientation import Mean, measure_field
 from heliotrope.airborne.evaluate.reading import read_many
 from heliotrope.airborne.evaluate.sightings import to_sightings
 from heliotrope.airborne.evaluate.tables import MeasuredFlight
+from heliotrope.calibration.plausibility import judge_in
 from heliotrope.calibration.sightings import Sightings, join
 from heliotrope.field.plant import Plant
 
@@ -94,9 +96,28 @@ class CampaignResult:
     warnings: tuple[str, ...]
 
     def sightings(self) -> Sightings | None:
-        """Return the sightings of all flights for the calibration; None if there are none."""
+        """Return the plausible sightings of all flights; None if there are none."""
+        seen, reasons = self._judged
+        if seen is None or len(reasons) == len(seen):
+            return None
+        return seen.take(~np.isin(np.arange(len(seen)), list(reasons)))
+
+    @property
+    def impossible(self) -> tuple[str, ...]:
+        """A line for each sighting that cannot have happened."""
+        seen, reasons = self._judged
+        if seen is None:
+            return ()
+        names = [self.plant.names[row] for row in seen.heliostat]
+        return tuple(f"{names[k]}: {text}" for k, text in sorted(reasons.items()))
+
+    @cached_property
+    def _judged(self) -> tuple[Sightings | None, Mapping[int, str]]:
         parts = [s for s in (f.sightings() for f in self.flights) if s is not None]
-        return join(parts) if parts else None
+        if not parts:
+            return None, {}
+        seen = join(parts)
+        return seen, judge_in(self.plant, seen).reasons
 
     def orientation_rows(self) -> list[dict[str, Any]]:
         """Return one record for each orientation, its systematic part split by cause."""
@@ -126,7 +147,7 @@ class CampaignResult:
             warnings.setdefault(name, []).append(warning)
         return {
             "photographs": [f.label(p.name) for f in self.flights for p in f.evaluation.photos],
-            "not_used": list(self.not_used),
+            "not_used": [*self.not_used, *self.impossible],
             "reflections": sum(len(f.evaluation.reflections) for f in self.flights),
             "rtk_offset_m": self.campaign.offset.tolist(),
             "rtk_offset_sigma_m": self.campaign.offset_sigma.tolist(),

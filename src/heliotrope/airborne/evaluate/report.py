@@ -85,7 +85,7 @@ def write_result(
     if not page:
         write_table(folder / "orientations.csv", result.orientation_rows())
         return
-    notes = (f"{result.campaign.offset_text()}.", *result.not_used)
+    notes = (f"{result.campaign.offset_text()}.", *result.not_used, *result.impossible)
     measured = [f.measured for f in result.flights]
     write_campaign_report(measured, folder, notes=notes, progress=progress)
 

@@ -53,6 +53,9 @@ class FitOutcome(IntEnum):
     NOT_CONVERGED = kernels.NOT_CONVERGED
     TOO_FEW = kernels.TOO_FEW
     FAILED = kernels.FAILED
+    MISFIT = kernels.FAILED + 1
+    UNMOVED = kernels.FAILED + 2
+    CLOCK = kernels.FAILED + 3
 
     @property
     def text(self) -> str:
@@ -65,6 +68,9 @@ _TEXTS = {
     FitOutcome.NOT_CONVERGED: "the iteration did not settle; the parameters may not be the best",
     FitOutcome.TOO_FEW: "no sightings: the parameters are the prior's",
     FitOutcome.FAILED: "the residuals are not finite from the start; check the nominal mechanism",
+    FitOutcome.MISFIT: "no plausible parameters explain the sightings; they are the prior's",
+    FitOutcome.UNMOVED: "the mirror did not move: the parameters are the prior's",
+    FitOutcome.CLOCK: "the clock may be wrong: the parameters would take up its error",
 }
 
 
@@ -350,8 +356,18 @@ def _fit(
     # The prior is centred on the start: a zero that is off by a radian is a wrong entry in the
     # plant file, not an improbable installation.
     result.values[:] += begin
+    _reject(result, mechanism)
     result.lengths[order] = np.sqrt(squares) / result.scale[ordered.heliostat]
     return result
+
+
+def _reject(result: FieldFit, mechanism: Mechanism) -> None:
+    """Take back parameters that no mechanism can have: the heliostat keeps its nominal ones."""
+    most = np.array([mechanism.most(name) for name in result.names])
+    beyond = ~(np.abs(result.values) <= most).all(axis=1)
+    result.outcome[beyond & (result.outcome != FitOutcome.FAILED)] = FitOutcome.MISFIT
+    result.values[beyond], result.centre[beyond] = 0.0, 0.0
+    result.covariance[beyond] = result.prior[beyond, :, None] ** 2 * np.eye(len(result.names))
 
 
 def _check_options(loss: str, max_iterations: int) -> None:

@@ -12,6 +12,7 @@ from heliotrope.calibration.learn.drift import Hyperparameters, Posterior, Proce
 from heliotrope.calibration.learn.forecast import Forecast
 from heliotrope.calibration.learn.learned import Learned, Prediction, left_out_errors, predict
 from heliotrope.calibration.learn.learning import learn
+from heliotrope.calibration.learn.misfits import Misfit, find_misfits
 from heliotrope.calibration.learn.models import (
     ScoredModel,
     candidate_models,
@@ -35,6 +36,7 @@ __all__ = [
     "HeliostatFigures",
     "Hyperparameters",
     "Learned",
+    "Misfit",
     "OwnModel",
     "PeriodicError",
     "Posterior",
@@ -48,6 +50,7 @@ __all__ = [
     "choose_model",
     "choose_own_model",
     "compare_models",
+    "find_misfits",
     "learn",
     "left_out_errors",
     "observe",

@@ -15,6 +15,7 @@ from heliotrope.calibration.learn.learned import (
     squared_distance,
 )
 from heliotrope.calibration.learn.learning import FEWEST
+from heliotrope.calibration.learn.misfits import ELSEWHERE
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.frames import Framed, Labelled, Variable
@@ -26,8 +27,6 @@ from heliotrope.mechanism.tracking import track
 FAR = 1e6
 #: Heliostats with fewer sightings are listed but do not enter the overall figures.
 ENOUGH = 20
-#: Beam error beyond which a sighting that the others contradict shows something else, rad.
-ELSEWHERE = 5e-3
 #: Share of such sightings from which a mirror is named, and share beyond which nothing agrees.
 SHARE, NOTHING = 0.15, 0.6
 
@@ -191,6 +190,9 @@ def assess(
     seen = learned.sightings.take(rows)
     if found is None:
         found = predict(learned, seen)
+    fits = ~np.isin(seen.heliostat, [misfit.row for misfit in learned.misfits])
+    beyond = rows[fits & ~found.usable]
+    found = replace(found, usable=found.usable & fits)
     counts = np.bincount(learned.sightings.heliostat, minlength=len(names))
     figures = [
         _one(
@@ -216,7 +218,7 @@ def assess(
     ]
     means = [m for m in means if len(m)]
     unusable = learned.unusable.copy()
-    unusable[rows[~found.usable]] = True
+    unusable[beyond] = True
     return Assessment(
         tuple(figures),
         float(np.median([h.beam.median for h in enough])) if enough else np.nan,
@@ -293,7 +295,7 @@ def _axes(learned: Learned, values: FloatArray, seen: Sightings) -> AxisAccuracy
 
 
 def unexplained_mirrors(names: tuple[str, ...], learned: Learned) -> tuple[str, ...]:
-    """Return a line on each mirror with many sightings that no parameters explain, with a reason.
+    """Return a line on each mirror that was not learnt, or that no parameters explain, and why.
 
     Parameters
     ----------
@@ -302,7 +304,7 @@ def unexplained_mirrors(names: tuple[str, ...], learned: Learned) -> tuple[str, 
     learned
         The sightings that were not used are not considered.
     """
-    lines = []
+    lines = [f"{names[misfit.row]}: {misfit.reason}" for misfit in learned.misfits]
     odd = np.flatnonzero(learned.outlier)
     where = predict(learned, learned.sightings.take(odd)).errors.beam
     elsewhere = np.zeros(len(learned.sightings), dtype=np.bool_)

@@ -602,12 +602,16 @@ def step_rate(members: Sequence["Posterior"]) -> float:
 TABLE_WORTH = 2.0
 #: Degrees of freedom of the population, so that one wrongly installed heliostat does not widen it.
 POPULATION_FREEDOM = 4.0
+#: Fewest mirrors to learn a group from: below, the tables of priors would say more than they do.
+TEACHERS = 4
 
 
 def fit_population(
     hyper: Hyperparameters, table: FloatArray, members: Sequence[Posterior]
 ) -> Hyperparameters:
     """Return ``hyper`` with new mean and spread of the population (one step of EM).
+
+    Below `TEACHERS` heliostats the mean stays: what one mirror shows says little about others.
 
     Parameters
     ----------
@@ -626,7 +630,7 @@ def fit_population(
         values.append((x[0] - member.data.centre)[still])
         variances.append(np.diagonal(c[0])[still])
         used.append(~member.data.own[still])
-    if not values:
+    if len(values) < TEACHERS:
         return hyper
     x, c, ok = np.array(values), np.maximum(np.array(variances), 0.0), np.array(used)
     mean, spread = hyper.mean[still].copy(), np.maximum(hyper.spread[still], 1e-3 * table[still])

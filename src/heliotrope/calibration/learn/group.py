@@ -15,15 +15,13 @@ from threadpoolctl import threadpool_limits
 
 from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome, fit
 from heliotrope.calibration.learn import drift, learning, present
-from heliotrope.calibration.learn.drift import DAY, Hyperparameters, Process
+from heliotrope.calibration.learn.drift import DAY, TEACHERS, Hyperparameters, Process
 from heliotrope.calibration.sightings import Sightings, join
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.values import amount
 
-#: Fewest mirrors to learn a group from: below, the tables of priors would say more than they do.
-TEACHERS = 4
 #: Most sightings of one mirror, whole visits spread over its history: the cost grows as their cube.
 MOST = 120
 #: Sightings further apart than this are of two visits, s.

@@ -10,11 +10,13 @@ from heliotrope import sun as solar
 from heliotrope.calibration.evaluation import BeamErrors, beam_errors
 from heliotrope.calibration.fit.estimator import (
     FieldFit,
+    FitOutcome,
     parameter_rows,
 )
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn.drift import DAY, Hyperparameters, Posterior
 from heliotrope.calibration.learn.forecast import Forecast
+from heliotrope.calibration.learn.misfits import Misfit
 from heliotrope.calibration.learn.regimes import regime_at
 from heliotrope.calibration.learn.unusable import is_usable
 from heliotrope.calibration.named import NOWHERE, Members, Surroundings
@@ -129,6 +131,8 @@ class Learned(Value, Framed):
         Names, (N,); () if unknown.
     around
         The place of the heliostats, as far as it is known.
+    misfits
+        Heliostats that their sightings do not describe, with the reason; they are not learnt.
     """
 
     mechanism: Mechanism
@@ -144,6 +148,7 @@ class Learned(Value, Framed):
     rows: tuple[npt.NDArray[np.intp], ...]
     heliostats: tuple[str, ...] = ()
     around: Surroundings = NOWHERE
+    misfits: tuple[Misfit, ...] = ()
 
     def row(self, heliostat: int | str) -> int:
         """Return the row of a heliostat, by name or by row.
@@ -181,7 +186,16 @@ class Learned(Value, Framed):
             unusable=self.unusable[mine],
             rows=(place[self.rows[i]],),
             heliostats=self.heliostats[i : i + 1],
+            misfits=tuple(replace(m, row=0) for m in self.misfits if m.row == i),
         )
+
+    def doubted(self) -> "Learned":
+        """Return the same, where the clock may be wrong: no heliostat counts as learnt."""
+        outcome = self.static.outcome.copy()
+        outcome[np.isin(outcome, (FitOutcome.CONVERGED, FitOutcome.NOT_CONVERGED))] = (
+            FitOutcome.CLOCK
+        )
+        return replace(self, static=replace(self.static, outcome=outcome))
 
     def _card(self) -> Card:
         model, all_names = len(self.model), len(self.names)

@@ -30,6 +30,7 @@ from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn import drift
 from heliotrope.calibration.learn.drift import DAY, Hyperparameters, Linear, Posterior
 from heliotrope.calibration.learn.learned import Learned, moved_by
+from heliotrope.calibration.learn.misfits import Misfit, find_misfits
 from heliotrope.calibration.learn.regimes import find_regimes
 from heliotrope.calibration.learn.unusable import find_unusable, is_usable
 from heliotrope.calibration.named import Field, Members, members
@@ -169,6 +170,9 @@ def relinearise(
     values = np.concatenate(
         [m.at(d.time, d.regime)[0] for m, d in zip(members, prepared.field, strict=True)]
     )
+    most = np.array([mechanism.most(name) for name in names])
+    lost = (np.abs(values) > most).any(axis=1)
+    values[lost] = 0.0
     seen = sightings.take(rows)
     line = linearise(moved_by(mechanism, seen.heliostat, names, values), seen, names)
     offsets = np.concatenate([[0], np.cumsum([len(d) for d in prepared.field])])
@@ -178,7 +182,8 @@ def relinearise(
         jacobian = np.ascontiguousarray(line.jacobian[part])
         value = np.einsum("nap,np->na", jacobian, values[part] - d.centre) - line.residual[part]
         field.append(replace(d, jacobian=jacobian, value=value))
-    return _without_unusable(replace(prepared, field=tuple(field)), is_usable(line))
+    # Parameters that no mechanism can have are extrapolated from sightings that show nothing.
+    return _without_unusable(replace(prepared, field=tuple(field)), is_usable(line) & ~lost)
 
 
 def repeatability(time: FloatArray, residual: FloatArray) -> float:
@@ -269,11 +274,15 @@ def learn(
     loss: Loss = "cauchy",
     own: bool = True,
     rounds: int = ROUNDS,
+    misfits: tuple[Misfit, ...] | None = None,
     runner: "Runner | None" = None,
     chunk: int = 100,
     progress: Progress | None = None,
 ) -> Learned:
     """Learn parameters, regimes, drift and noise of every heliostat.
+
+    A heliostat that its sightings do not describe keeps its nominal parameters and teaches the
+    field nothing; ``misfits`` of the result names it with the reason.
 
     Parameters
     ----------
@@ -298,6 +307,8 @@ def learn(
         Whether each heliostat's noise and drift may differ from the field's.
     rounds
         Rounds of expectation and maximisation over the population.
+    misfits
+        The heliostats not to learn, if known already; default: `find_misfits`.
     runner, chunk
         Learns chunks of this many heliostats elsewhere, for example
         `heliotrope.calibration.learn.on_dask.runner`. The results are the same bit for bit.
@@ -313,6 +324,9 @@ def learn(
     nominal, sightings = given.mechanism, given.rows_of(sightings)
     constant = names_of(model, nominal)
     keep = mask_of(used, len(sightings), "used")
+    if misfits is None:
+        misfits = find_misfits(nominal, sightings, keep)
+    keep = keep & ~np.isin(sightings.heliostat, [misfit.row for misfit in misfits])
     task = Task(constant, dict(priors or {}), loss, own)
     with threadpool_limits(1, "blas"):
         if hyper is None:
@@ -325,7 +339,7 @@ def learn(
         pieces = np.array_split(whole, max(1, -(-len(whole) // chunk)))
         cut = [_cut(nominal, sightings, keep, task, piece) for piece in pieces]
         parts = runner([(*c[:4], hyper) for c in cut], progress)
-    return _join(given, sightings, keep, constant, hyper, pieces, parts)
+    return _join(given, sightings, keep, constant, hyper, misfits, pieces, parts)
 
 
 @dataclass(frozen=True)
@@ -407,6 +421,7 @@ def _join(
     used: npt.NDArray[np.bool_],
     model: tuple[str, ...],
     hyper: Hyperparameters,
+    misfits: tuple[Misfit, ...],
     pieces: list[npt.NDArray[np.intp]],
     parts: list[Part],
 ) -> Learned:
@@ -430,6 +445,8 @@ def _join(
         heliostats=names,
         **{name: np.concatenate([getattr(fit, name) for fit in fits]) for name in BY_HELIOSTAT},
     )
+    for misfit in misfits:
+        static.outcome[misfit.row] = misfit.outcome
     members = tuple(m for part in parts for m in part.members)
     return Learned(
         given.mechanism,
@@ -445,6 +462,7 @@ def _join(
         tuple(rows),
         names,
         given.around,
+        misfits,
     )
 
 

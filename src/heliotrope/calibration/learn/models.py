@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from heliotrope.calibration.learn import learning
 from heliotrope.calibration.learn.learned import Learned
+from heliotrope.calibration.learn.misfits import find_misfits
 from heliotrope.calibration.named import Field, members
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError, UnknownNameError
@@ -155,11 +156,13 @@ def compare_models(
     place[chosen] = np.arange(len(chosen))
     part = sightings.take(np.flatnonzero(keep & (place[sightings.heliostat] >= 0)))
     part = part.renumbered(place[part.heliostat])
+    misfits = find_misfits(nominal[chosen], part)
+    part = part.take(~np.isin(part.heliostat, [misfit.row for misfit in misfits]))
     scores, evidence, good = {}, {}, np.ones(len(part), dtype=np.bool_)
     for name, names in trials.items():
         if progress:
             progress(name)
-        found = learning.learn(nominal[chosen], part, names, own=False, rounds=2)
+        found = learning.learn(nominal[chosen], part, names, own=False, rounds=2, misfits=())
         score, mask = _scores(found)
         scores[name], good = score, good & ~mask
         evidence[name] = float(sum(m.log_evidence() for m in found.members))

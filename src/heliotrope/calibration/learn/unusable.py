@@ -7,7 +7,7 @@ that the derivative is infinite and one such row would spoil the whole field. It
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.fit.estimator import FieldFit
+from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome
 from heliotrope.calibration.fit.residuals import Linearised, linearise
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.mechanism.chain import Mechanism
@@ -29,6 +29,8 @@ def find_unusable(
 ) -> npt.NDArray[np.bool_]:
     """Return the mask of sightings beyond the reach at the start of a fit or at its end, (M,).
 
+    Where a fit found no parameters that a mechanism can have, no sighting of it can be used.
+
     Parameters
     ----------
     mechanism
@@ -38,7 +40,8 @@ def find_unusable(
     found
         Fit of them.
     """
-    bad = np.zeros(len(sightings), dtype=np.bool_)
+    lost = np.isin(found.outcome, (FitOutcome.FAILED, FitOutcome.MISFIT))
+    bad = lost[sightings.heliostat]
     ended = np.where(np.isfinite(found.values), found.values, found.centre)
     for values in (found.centre, ended):
         moved = mechanism.with_parameters({n: values[:, p] for p, n in enumerate(found.names)})

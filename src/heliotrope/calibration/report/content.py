@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from heliotrope.calibration.clock import ClockCheck
 from heliotrope.calibration.evaluation import BeamErrors, ErrorSummary, beam_errors, summarise
 from heliotrope.calibration.fit.estimator import FitOutcome
-from heliotrope.calibration.learn.assessment import Assessment
+from heliotrope.calibration.learn.assessment import Assessment, unexplained_mirrors
 from heliotrope.calibration.learn.learned import Learned, left_out_errors
 from heliotrope.calibration.report.results import FieldParameters, at_moment
 from heliotrope.calibration.uncertainty import BlindSpot, unobservable
@@ -54,6 +55,10 @@ class CalibrationReport:
         How the held-out part was chosen.
     comparison
         Lines on the comparison of models.
+    clock
+        The common error of the clock, if it could be tested.
+    notes
+        Lines on what contradicts most of the sightings.
     """
 
     names: tuple[str, ...]
@@ -65,6 +70,30 @@ class CalibrationReport:
     left_out: tuple[str, ...] = ()
     note: str = ""
     comparison: tuple[str, ...] = ()
+    clock: ClockCheck | None = None
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def _applied(self) -> tuple[Plant, tuple[str, ...]]:
+        return self.results.applied_to(self.plant)
+
+    @property
+    def calibrated(self) -> Plant:
+        """The plant with what was learnt; see `FieldParameters.applied_to`."""
+        return self._applied[0]
+
+    @cached_property
+    def remarks(self) -> tuple[str, ...]:
+        """Lines on clock, contradictions, mirrors that do not fit, and those that were not learnt.
+
+        What calls the result into question comes first.
+        """
+        kept = self._applied[1]
+        if self.clock is not None and self.clock.found:
+            # What a wrong clock leaves is no fault of single mirrors.
+            return (str(self.clock), *self.notes, *kept)
+        clock = () if self.clock is None else (str(self.clock),)
+        return (*self.notes, *unexplained_mirrors(self.names, self.learned), *kept, *clock)
 
     @cached_property
     def results(self) -> FieldParameters:
@@ -138,7 +167,7 @@ class CalibrationReport:
         (`canting_secondary`) is not among them.
         """
         r = self.results
-        if not set(r.model) <= set(MODELS["guo6"]):
+        if not set(r.model) <= set(MODELS["guo6"]) or not r.learnt.any():
             return None
         moved = self.learned.mechanism.with_parameters(
             {name: r.values[:, r.names.index(name)] for name in r.model}
@@ -150,6 +179,7 @@ class CalibrationReport:
         return {
             row.name: {f"{n}_deg": float(found[n][row.index]) for n in found if n != "H_z"}
             for row in self.rows
+            if r.learnt[row.index]
         }
 
     def document(self) -> dict[str, Any]:
@@ -174,7 +204,12 @@ class CalibrationReport:
             }
             for row in self.rows
         }
-        document: dict[str, Any] = {"model": list(self.learned.model), "heliostats": heliostats}
+        document: dict[str, Any] = {
+            "model": list(self.learned.model),
+            "heliostats": heliostats,
+            "clock": None if self.clock is None else self.clock.document(),
+            "remarks": list(self.remarks),
+        }
         if self.assessment is not None:
             document["held_out_median_of_medians_mrad"] = 1e3 * self.assessment.median_of_medians
             document["held_out_coverage_90"] = self.assessment.coverage

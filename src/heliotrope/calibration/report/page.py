@@ -71,7 +71,7 @@ def write_report(
     write_json(folder / "calibration.json", report.names, learned, r, ids)
     units = {n: learned.mechanism.parameter(n).unit for n in r.names}
     write_parquet(folder / "calibration.parquet", units, r)
-    write_plant(report.plant.with_calibration(r), folder / "plant.toml")
+    write_plant(report.calibrated, folder / "plant.toml")
     rows = sorted(report.rows, key=lambda row: -np.nan_to_num(row.after.median))[:most]
     rows = sorted(rows, key=lambda row: row.name)
     sections = []
@@ -105,7 +105,7 @@ def _page(report: CalibrationReport, sections: list[dict[str, Any]]) -> str:
         note=report.note,
         drift=drift,
         noise=h.noise,
-        comparison=report.comparison,
+        comparison=(*report.remarks, *report.comparison),
         overview=picture(pictures.overview(report), "Median beam error"),
         map=picture(pictures.field_map(report), "Map of the field"),
         shown={section["name"] for section in sections},

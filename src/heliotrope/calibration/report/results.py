@@ -17,13 +17,16 @@ import numpy.typing as npt
 
 from heliotrope import __version__
 from heliotrope.calibration.fit.estimator import FitOutcome
-from heliotrope.calibration.learn.drift import DAY
+from heliotrope.calibration.learn.drift import DAY, TEACHERS, posterior
 from heliotrope.calibration.learn.learned import Learned
+from heliotrope.calibration.learn.learning import FEWEST
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.files import json as _json
 from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray
+from heliotrope.mechanism.parameters import shown_in
+from heliotrope.values import amount
 
 KIND = "heliotrope calibration"
 VERSION = 1
@@ -50,6 +53,12 @@ class FieldParameters:
         Noise of a sighting, in units of its sigma, (N,).
     used
         Number of sightings used, (N,).
+    learnt
+        Whether the heliostat's own sightings gave its parameters, (N,). The others have the
+        part that the field shares.
+    shared
+        Whether enough heliostats support a part of a parameter that the field shares, (P,); where
+        not, a heliostat that was not learnt has 0.
     """
 
     model: tuple[str, ...]
@@ -60,6 +69,45 @@ class FieldParameters:
     covariance: FloatArray
     noise: FloatArray
     used: npt.NDArray[np.int64]
+    learnt: npt.NDArray[np.bool_]
+    shared: npt.NDArray[np.bool_]
+
+    def only(self, rows: npt.NDArray[np.bool_]) -> "FieldParameters":
+        """Return the parameters of some heliostats, by a mask, (N,)."""
+        return replace(
+            self,
+            heliostats=tuple(n for n, kept in zip(self.heliostats, rows, strict=True) if kept),
+            **{name: getattr(self, name)[rows] for name in _BY_HELIOSTAT},
+        )
+
+    def applied_to(self, plant: Plant) -> tuple[Plant, tuple[str, ...]]:
+        """Return the plant with these parameters, and lines on the heliostats that were not learnt.
+
+        They keep their own parameters. One that has none gets the part that the field shares,
+        where enough heliostats support it.
+        """
+        own = np.zeros(len(self.heliostats), np.bool_)
+        for i, name in enumerate(self.heliostats):
+            group, row = plant.find(name)
+            own[i] = any(values[row] != 0.0 for values in group.parameters.values())
+        filled = ~self.learnt & ~own & (self.used == 0) & self.shared.any()
+        rest = ~(self.learnt | filled)
+        lines = []
+        if filled.any():
+            i = int(np.flatnonzero(filled)[0])
+            scaled = []
+            for p in np.flatnonzero(self.shared):
+                scale, unit = shown_in(self.names[p])
+                scaled.append(f"{self.names[p]} {scale * self.values[i, p]:+.2g} {unit}".strip())
+            lines.append(
+                f"{amount(int(filled.sum()), 'heliostat')} without sightings of their own: they "
+                f"get the part that {int(self.learnt.sum())} measured ones share: "
+                f"{', '.join(scaled)}"
+            )
+        if rest.any():
+            lines.append(f"{amount(int(rest.sum()), 'heliostat')} not learnt: parameters unchanged")
+        kept = self.learnt | filled
+        return plant.with_calibration(self.only(kept)) if kept.any() else plant, tuple(lines)
 
     @property
     def parameters(self) -> dict[str, FloatArray]:
@@ -72,6 +120,12 @@ class FieldParameters:
         return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
 
 
+#: The arrays with one row for each heliostat.
+_BY_HELIOSTAT = ("values", "covariance", "noise", "used", "learnt")
+#: The field shares a part of a parameter that is this many standard deviations from 0.
+SUPPORTED = 3.0
+
+
 def at_moment(
     names: tuple[str, ...], learned: Learned, time: float | None = None
 ) -> FieldParameters:
@@ -82,6 +136,16 @@ def at_moment(
         when = time
     rows = np.arange(len(names))
     values, spread = learned.parameters_at(rows, np.full(len(names), when))
+    learnt = np.isin(learned.static.outcome, (FitOutcome.CONVERGED, FitOutcome.NOT_CONVERGED))
+    used = np.array([len(m.data) for m in learned.members])
+    hyper, teachers = learned.hyper, int((used >= FEWEST).sum())
+    shared = np.abs(hyper.mean) > SUPPORTED * hyper.spread / np.sqrt(max(teachers, 1))
+    shared &= teachers >= TEACHERS
+    values[~learnt] = np.where(shared & (used[~learnt, None] == 0), hyper.mean, 0.0)
+    for i in np.flatnonzero(~learnt):
+        data = learned.members[i].data
+        unknown = posterior(hyper, data.take(np.zeros(len(data), np.bool_)))
+        spread[i] = unknown.at(np.array([when / DAY]), np.zeros(1, np.int64))[1][0]
     return FieldParameters(
         learned.model,
         learned.names,
@@ -90,7 +154,9 @@ def at_moment(
         values,
         spread,
         np.array([m.hyper.noise for m in learned.members]),
-        np.array([len(m.data) for m in learned.members]),
+        used,
+        learnt,
+        shared,
     )
 
 
@@ -166,6 +232,7 @@ def _heliostat(
         "values": results.values[i].tolist(),
         "covariance": results.covariance[i].tolist(),
         "sightings": int(results.used[i]),
+        "learnt": bool(results.learnt[i]),
         "outcome": FitOutcome(int(learned.static.outcome[i])).name.lower(),
         "noise": float(results.noise[i]),
         "regimes": regimes,
@@ -181,7 +248,7 @@ def _moment(seconds: float) -> str | None:
 
 
 def read_json(path: str | Path) -> FieldParameters:
-    """Return the parameters of a file that `write_json` wrote.
+    """Return the parameters of a file that `write_json` wrote, of the heliostats learnt.
 
     Raises
     ------
@@ -195,7 +262,11 @@ def read_json(path: str | Path) -> FieldParameters:
         )
     root["version"].number(VERSION, VERSION)
     names = tuple(node.text() for node in root["parameters"].elements())
-    members = root["heliostats"].items()
+    members = [
+        (name, node)
+        for name, node in root["heliostats"].items()
+        if not node.has("learnt") or node["learnt"].value is True
+    ]
     size = len(names)
     values, spread = np.empty((len(members), size)), np.empty((len(members), size, size))
     for i, (_, node) in enumerate(members):
@@ -213,6 +284,8 @@ def read_json(path: str | Path) -> FieldParameters:
         spread,
         np.array([node["noise"].number(0.0) for _, node in members]),
         np.array([node["sightings"].number(0.0) for _, node in members], dtype=np.int64),
+        np.ones(len(members), np.bool_),
+        np.zeros(size, np.bool_),
     )
 
 
@@ -433,4 +506,4 @@ def _given(plant: Plant, learned: Learned, time: float | None, what: str) -> Pla
         raise InputError(
             f"{what}: it was learnt without names; learn from the plant, or plant[name]"
         )
-    return plant.with_calibration(at_moment(learned.heliostats, learned, time))
+    return at_moment(learned.heliostats, learned, time).applied_to(plant)[0]

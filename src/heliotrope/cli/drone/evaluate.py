@@ -87,7 +87,7 @@ def evaluate(
             client=client,
             progress=progress,
         )
-    for line in (*result.warnings, *result.not_used):
+    for line in (*result.warnings, *result.not_used, *result.impossible):
         print(f"heliotrope: {line}", file=sys.stderr)
     with calibration.progress("drawing", as_json) as advance:
         write_result(result, out, page=report, progress=advance)

@@ -14,6 +14,7 @@ from heliotrope.errors import FormatError
 from heliotrope.field.formats.paint import find_tower, read_calibration_properties, read_tower
 from heliotrope.files import check_table
 from heliotrope.geometry import FloatArray, direction, geodetic_to_enu
+from heliotrope.sun.ephemeris import END_OF_TIMES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -131,7 +132,8 @@ def _seconds(texts: "pd.Series[str]") -> FloatArray:
     # A text without a zone is refused; PAINT writes Z.
     zoned = texts.where(texts.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$", regex=True), "")
     times = pd.to_datetime(zoned, utc=True, errors="coerce", format="ISO8601")
-    seconds = (times - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
+    # In nanoseconds the years end with 2262.
+    seconds = (times - pd.Timestamp(0, tz="UTC").as_unit("us")) / pd.Timedelta(seconds=1)
     return np.asarray(seconds, dtype=np.float64)
 
 
@@ -145,6 +147,7 @@ def _keep_good(frame: "pd.DataFrame", enu: FloatArray, centroid: Centroid) -> Me
         (~np.isfinite(counts).all(axis=1), "a motor position is missing or no number"),
         (~np.isfinite(azimuth) | ~np.isfinite(elevation), "the sun's angles are missing"),
         (~((elevation > -5.0) & (elevation <= 90.0)), "the sun's elevation is not above −5°"),
+        (time >= END_OF_TIMES, "the year is out of range: correct the time"),
         (~np.isfinite(enu).all(axis=1), f"there is no {centroid.upper()} centroid"),
         (np.linalg.norm(enu, axis=1) > 5e3, "the centroid lies more than 5 km from the plant"),
     ]

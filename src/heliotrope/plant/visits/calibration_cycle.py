@@ -19,6 +19,7 @@ import numpy as np
 
 from heliotrope import sun
 from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.plausibility import judge
 from heliotrope.calibration.record import (
     CalibrationOutcome,
     HeliostatCalibration,
@@ -264,6 +265,16 @@ class CalibrationCycle:
                 beliefs.record(heliostat), beliefs.present(heliostat), seen
             )
 
+    def _plausible(
+        self, heliostat: str, taken: Photographs
+    ) -> tuple[list[Sightings], tuple[str, ...]]:
+        """Return the sightings that can have happened, and a line for each photograph rejected."""
+        made = [self._sighting(shot, counts) for shot, counts in taken.used]
+        nominal = self._plant.beliefs.nominal(heliostat)
+        reasons = judge(join(made), mechanism=nominal).reasons if made else {}
+        new = [seen for k, seen in enumerate(made) if k not in reasons]
+        return new, (*taken.rejected, *(f"photograph: {text}" for text in reasons.values()))
+
     def _sighting(self, shot: Shot, counts: FloatArray) -> Sightings:
         plant = self._plant
         utc = plant.clock.utc() - timedelta(seconds=plant.now() - shot.at)
@@ -343,8 +354,8 @@ class CalibrationCycle:
         """Fit all sightings once; push, verify and take a better fit."""
         name, beliefs = visit.heliostat, self._plant.beliefs
         surface = visit.target.name if production is None else production.surface
-        new = [self._sighting(shot, counts) for shot, counts in taken.used]
-        known, rejected = beliefs.seen(name), tuple(taken.rejected)
+        new, rejected = self._plausible(name, taken)
+        known = beliefs.seen(name)
         old = [] if known is None else [known.sightings]
         if not new:
             outcomes = CalibrationOutcome

@@ -1,0 +1,237 @@
+"""A common error of the clock, tested as a hypothesis over all mirrors of a field.
+
+The sun's direction is computed from the time. A clock that is fast by a minute moves all suns by
+4 mrad, and each mirror's parameters take up most of that; what they cannot take up shows the error.
+Trials move the suns along their path by one time for all, and fit all mirrors again; the best is
+refined by Gauss-Newton. The uncertainty is that of the noise, or of the scatter between mirrors if
+that is larger. An error is stated, never corrected: the times and suns are the plant's to mend.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope import sun as solar
+from heliotrope.calibration.fit._fit_kernels import CAUCHY_WIDTH
+from heliotrope.calibration.fit.estimator import FieldFit, fit
+from heliotrope.calibration.fit.residuals import linearise, whitening
+from heliotrope.calibration.learn.misfits import costs
+from heliotrope.calibration.plausibility import MOVED
+from heliotrope.calibration.sightings import Sightings, ray_directions
+from heliotrope.geometry import FloatArray, angle_between, normalize, rotation
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.sun import Site
+from heliotrope.values import amount
+
+#: The sky turns by this, rad/s (a mean solar day: the sun).
+RATE = 2.0 * np.pi / 86400.0
+#: Trials reach this far, in steps of this, s: all zones of the Earth.
+REACH, STEP = 14 * 3600.0, 3600.0
+#: An error of the clock is stated from this many standard deviations on.
+CLEAR = 3.0
+#: Mirrors and sightings of each for the test: those with the most; fewer for the first search.
+MIRRORS, MOST, FIRST = 10, 60, 20
+#: Fewest sightings of a mirror that say something about the clock.
+FEWEST = 8
+#: Most steps from a start.
+ROUNDS = 8
+#: Weight of the stated sigma in the estimate of the noise, degrees of freedom.
+FREEDOM = 5.0
+
+
+@dataclass(frozen=True)
+class ClockCheck:
+    """A common error of the clock.
+
+    Attributes
+    ----------
+    error, sigma
+        Recorded less true time, and its standard deviation, s.
+    heliostats
+        Number of mirrors that were tested.
+    """
+
+    error: float
+    sigma: float
+    heliostats: int
+
+    @property
+    def found(self) -> bool:
+        """Whether the error explains the sightings far better than the clock as it is."""
+        return abs(self.error) > CLEAR * self.sigma
+
+    def __str__(self) -> str:
+        """One line."""
+        if not self.found:
+            least = abs(self.error) + CLEAR * self.sigma
+            return (
+                f"clock: no error shows, {self.error:+.0f} ± {self.sigma:.0f} s; one below "
+                f"{least:.0f} s ({1e3 * RATE * least:.1f} mrad of the sun) would not, so check it "
+                "by other means"
+            )
+        side = "fast" if self.error > 0.0 else "slow"
+        return (
+            f"the clock may be wrong by {abs(self.error):.0f} s ± {self.sigma:.0f} s ({side}): by "
+            f"that the sightings of {amount(self.heliostats, 'heliostat')} fit far better "
+            f"({abs(self.error) / self.sigma:.0f} standard deviations). Check it and its zone, "
+            "correct times and suns, and calibrate again; the plant file keeps its parameters"
+        )
+
+    def document(self) -> dict[str, float | bool]:
+        """Return the figures for JSON."""
+        return {
+            "error_s": self.error,
+            "sigma_s": self.sigma,
+            "found": self.found,
+        }
+
+
+def check_clock(
+    mechanism: Mechanism,
+    sightings: Sightings,
+    model: tuple[str, ...],
+    site: Site,
+) -> ClockCheck | None:
+    """Return the common error of the clock that explains the sightings best.
+
+    Parameters
+    ----------
+    mechanism
+        Nominal, (N,).
+    sightings
+        M of these heliostats; those with other light than the sun's say nothing.
+    model
+        The parameters to fit.
+    site
+        The plant's, for the path of the sun.
+
+    Returns
+    -------
+    None if no mirror has `FEWEST` sightings of the sun.
+    """
+    suns = sightings.take(sightings.source_at_infinity)
+    counts = np.bincount(suns.heliostat, minlength=len(mechanism))
+    chosen = np.argsort(-counts, kind="stable")[:MIRRORS]
+    chosen = chosen[counts[chosen] >= FEWEST]
+    if not len(chosen):
+        return None
+
+    def cost(seen: Sightings, shift: float) -> FloatArray:
+        moved = later(seen, site, shift)
+        return costs(fit(mechanism[chosen], moved, model, adapt_scale=False), mechanism[chosen])
+
+    few, many = (_part(suns, chosen, most) for most in (FIRST, MOST))
+    trials = np.arange(-REACH, REACH + 1.0, STEP)
+    totals = [float(cost(few, shift).sum()) for shift in trials]
+    starts = dict.fromkeys((0.0, float(trials[int(np.argmin(totals))])))
+    steps = [_settled(mechanism[chosen], many, model, site, start) for start in starts]
+    best = min(steps, key=lambda step: float(cost(many, step.shift).sum()))
+    return ClockCheck(-best.shift, best.sigma, len(chosen))
+
+
+@dataclass(frozen=True)
+class _Step:
+    """The shift of the suns that the sightings at another one ask for, and its sigma, s."""
+
+    shift: float
+    sigma: float
+
+
+def _settled(
+    mechanism: Mechanism, seen: Sightings, model: tuple[str, ...], site: Site, shift: float
+) -> _Step:
+    """Return the shift at which the sightings ask for no other, from a start."""
+    for _ in range(ROUNDS):
+        step = _step(mechanism, seen, model, site, shift)
+        done = abs(step.shift - shift) < 0.1 * step.sigma
+        shift = float(np.clip(step.shift, shift - STEP, shift + STEP))
+        if done:
+            break
+    return replace(step, shift=shift)
+
+
+def _step(
+    mechanism: Mechanism, seen: Sightings, model: tuple[str, ...], site: Site, shift: float
+) -> _Step:
+    """Return one Gauss-Newton step.
+
+    With H, B and Z the normal matrices of a mirror's own parameters, of their coupling with the
+    shift and of the shift, the mirror reveals Z - B^T H^-1 B of the shift (as in `fit.common`).
+    """
+    moved = later(seen, site, shift)
+    fitted = fit(mechanism, moved, model, adapt_scale=False)
+    row, names = seen.heliostat, fitted.names
+    each = mechanism.with_parameters(fitted.parameters)[row]
+    line = linearise(each, moved, names)
+    vertex = each.pose(seen.counts).vertex
+    axes, whiten = whitening(moved, vertex)
+    before, after = (
+        np.sum(ray_directions(later(seen, site, shift + side), vertex), axis=0)
+        for side in (-1.0, 1.0)
+    )
+    rate = -0.5 * (normalize(after) - normalize(before))
+    by_shift = np.einsum("mab,mbk,mk->ma", whiten, axes, rate)
+    weight = 1.0 / (1.0 + (fitted.lengths * fitted.scale[row] / CAUCHY_WIDTH) ** 2)
+    count = len(mechanism)
+    normal = fitted.prior[:, :, None] ** -2.0 * np.eye(len(names))
+    coupling, revealed, pulled = np.zeros((count, len(names))), np.zeros(count), np.zeros(count)
+    for total, term in (
+        (normal, np.einsum("m,map,maq->mpq", weight, line.jacobian, line.jacobian)),
+        (coupling, np.einsum("m,map,ma->mp", weight, line.jacobian, by_shift)),
+        (revealed, weight * (by_shift**2).sum(axis=1)),
+        (pulled, weight * (by_shift * line.residual).sum(axis=1)),
+    ):
+        np.add.at(total, row, term)
+    # The fit has ended: the parameters ask for no change of their own.
+    information = revealed - (coupling * np.linalg.solve(normal, coupling[..., None])[..., 0]).sum(
+        1
+    )
+    noise = _noise(fitted)
+    information, pulled = np.maximum(information, 1e-12) / noise, pulled / noise
+    known = float(information.sum())
+    change, variance = -float(pulled.sum()) / known, 1.0 / known
+    if count > 2:
+        # Where mirrors disagree by more than their noise, their scatter is the uncertainty.
+        away = -pulled / information - change
+        variance *= max(1.0, float((information * away**2).sum()) / (count - 1))
+    return _Step(shift + change, float(np.sqrt(variance)))
+
+
+def _noise(fitted: FieldFit) -> FloatArray:
+    """Return the variance of each mirror's sightings in units of their sigma, (N,)."""
+    square = (fitted.lengths * fitted.scale[fitted.rows]) ** 2
+    robust = CAUCHY_WIDTH**2 * np.log1p(square / CAUCHY_WIDTH**2)
+    count = len(fitted.scale)
+    data = np.bincount(fitted.rows, robust, count)
+    many = np.bincount(fitted.rows, minlength=count)
+    return np.asarray((data + FREEDOM) / (2.0 * many + FREEDOM))
+
+
+def later(seen: Sightings, site: Site, shift: float) -> Sightings:
+    """Return sightings of the sun with the suns as they stood ``shift`` s later.
+
+    Where a time is known and the given sun stood there, that is the sun of the other time; else the
+    given sun is turned about the pole.
+    """
+    latitude = np.radians(site.latitude_deg)
+    turn = rotation(np.array([0.0, np.cos(latitude), np.sin(latitude)]), -RATE * shift)
+    source = seen.source @ turn.T
+    rows = np.flatnonzero(np.isfinite(seen.time))
+    agree = angle_between(seen.source[rows], solar.vector(seen.time[rows], site)) < MOVED
+    rows = rows[agree]
+    source[rows] = solar.vector(seen.time[rows] + shift, site)
+    # A sun sensor looks at the sun too.
+    far = seen.destination_at_infinity[:, None]
+    return replace(seen, source=source, destination=np.where(far, source, seen.destination))
+
+
+def _part(suns: Sightings, chosen: npt.NDArray[np.intp], most: int) -> Sightings:
+    """Return at most so many sightings of each of some mirrors, spread over theirs."""
+    rows, place = [], []
+    for k, row in enumerate(chosen):
+        mine = np.flatnonzero(suns.heliostat == row)
+        kept = mine[np.linspace(0, len(mine) - 1, min(most, len(mine))).round().astype(np.intp)]
+        rows.append(kept)
+        place.append(np.full(len(kept), k))
+    return suns.take(np.concatenate(rows)).renumbered(np.concatenate(place))

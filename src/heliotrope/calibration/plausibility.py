@@ -1,0 +1,283 @@
+"""Physical plausibility of sightings: the one place that judges them, whatever their source.
+
+A table, a folder of measurements, a log of photographs, a flight and a plant's own camera all ask
+`judge`. It gives a reason for each sighting that cannot have happened; such a sighting is left out
+and named. What contradicts most sightings of a mirror is no mistake of single rows: the fit judges
+it (`learn.misfits`). What contradicts most rows of a source is a note.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope import sun as solar
+from heliotrope.calibration.fit.estimator import FAR
+from heliotrope.calibration.sightings import Sightings, ray_directions
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver, Target
+from heliotrope.files.cells import format_time
+from heliotrope.geometry import MOST_TURNS, FloatArray, angle_between, azimuth_elevation
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import SLOTS
+from heliotrope.sun import Site
+
+#: Years with sightings, Unix seconds: no heliostat is older, and later ones are typing errors.
+EARLIEST, LATEST = 0.0, datetime(2100, 1, 1, tzinfo=UTC).timestamp()
+YEAR = "the year is out of range, 1970 to 2099: correct the time"
+#: A time may be this far ahead of the computer's clock, which may be slow itself, s.
+AHEAD = 366 * 86400.0
+#: Lowest elevation of the sun's centre with a beam: its radius, and the dip of the horizon, rad.
+LOWEST = float(np.radians(-0.5))
+#: Largest angle between a given sun and the sun at the given time, rad: four minutes.
+MOVED = float(np.radians(1.0))
+#: Largest angle of incidence, rad: beyond it the mirror is seen edge-on.
+EDGE_ON = float(np.radians(89.0))
+#: Angle beyond a stop, or behind a mirror, that uncalibrated zeros may explain, rad.
+PLAY = float(np.radians(5.0))
+#: A destination may lie off its surface, m, and beyond its border by this share of its size.
+OFF, BEYOND = 0.5, 0.5
+#: A point nearer to the mirror than this lies on the mirror itself, m.
+NEAREST = 0.5
+
+Rows = npt.NDArray[np.bool_]
+#: A reason for all refused rows, or one for each of them.
+Texts = str | Sequence[str]
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What is implausible about M sightings.
+
+    Attributes
+    ----------
+    reasons
+        Why a sighting cannot have happened, by its row.
+    notes
+        Lines on what contradicts most of the sightings; these stay.
+    """
+
+    reasons: Mapping[int, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def judge(
+    seen: Sightings,
+    *,
+    mechanism: Mechanism | None = None,
+    site: Site | None = None,
+    surfaces: Sequence[Target | Receiver] = (),
+    kinds: Sequence[str] = (),
+    now: float | None = None,
+) -> Judgement:
+    """Return which sightings cannot have happened, and why.
+
+    A sighting gets the first reason that applies. The more is known of the plant, the more is
+    judged.
+
+    Parameters
+    ----------
+    seen
+        M sightings.
+    mechanism
+        The mechanisms of its rows, (N,): for stops, the back of a mirror, points on it.
+    site
+        For the sun at the time of each sighting.
+    surfaces
+        Targets and receivers of the plant: for the destinations of kind "camera_target".
+    kinds
+        Kind of each sighting, (M,), "" if unknown.
+    now
+        The computer's clock, Unix seconds: for times that are still to come.
+    """
+    reasons: dict[int, str] = {}
+    for rows, text in _impossible(seen, now):
+        _add(reasons, rows, text)
+    notes = []
+    if site is not None:
+        rows, text, note = _contradicted(seen, site, reasons)
+        _add(reasons, rows, text)
+        notes += [note] if note else []
+    if surfaces and kinds:
+        given = np.array([kind == "camera_target" for kind in kinds], np.bool_)
+        _add(reasons, *_off_target(seen, given & ~seen.destination_at_infinity, surfaces))
+    if mechanism is not None and len(seen):
+        for rows, text in _beyond_machine(seen, mechanism, reasons):
+            _add(reasons, rows, text)
+    return Judgement(reasons, tuple(notes))
+
+
+def judge_in(
+    plant: Plant, seen: Sightings, kinds: Sequence[str] = (), now: float | None = None
+) -> Judgement:
+    """Return the judgement by all that a plant knows; rows are those of its heliostats."""
+    return judge(
+        seen,
+        mechanism=plant.nominal if len(plant.groups) == 1 else None,
+        site=plant.site,
+        surfaces=(*plant.targets, *plant.receivers),
+        kinds=kinds,
+        now=now,
+    )
+
+
+def _add(reasons: dict[int, str], rows: Rows, texts: Texts) -> None:
+    """Give rows their reason, one text for all of them or one for each, where they have none."""
+    places = np.flatnonzero(rows)
+    each = [texts] * len(places) if isinstance(texts, str) else texts
+    for i, text in zip(places, each, strict=True):
+        reasons.setdefault(int(i), text)
+
+
+def _impossible(seen: Sightings, now: float | None) -> Iterator[tuple[Rows, Texts]]:
+    """Yield what is impossible for any mirror anywhere."""
+    time = seen.time
+    out = (time < EARLIEST) | (time > LATEST)
+    yield out, YEAR
+    if now is not None:
+        ahead = time > now + AHEAD
+        clock = format_time(float(np.floor(now)))
+        yield (
+            ahead,
+            f"the time is more than a year ahead of this computer's clock, {clock}: correct one",
+        )
+    low = seen.source_at_infinity & (seen.source[:, 2] < np.sin(LOWEST))
+    angles = np.degrees(np.arcsin(np.clip(seen.source[low, 2], -1.0, 1.0)))
+    yield low, [f"the sun is below the horizon: its elevation is {angle:.1f}°" for angle in angles]
+    yield copies(seen), "an exact copy of another sighting"
+
+
+def copies(seen: Sightings) -> Rows:
+    """Return which sightings repeat an earlier one: same mirror, time, counts and ray, (M,)."""
+    known = np.nan_to_num(seen.time, nan=-np.inf)[:, None]
+    table = np.hstack([seen.heliostat[:, None], known, seen.counts, seen.source, seen.destination])
+    again = np.ones(len(seen), np.bool_)
+    if len(seen):
+        again[np.unique(table, axis=0, return_index=True)[1]] = False
+    return again
+
+
+def _contradicted(
+    seen: Sightings, site: Site, reasons: Mapping[int, str]
+) -> tuple[Rows, Texts, str]:
+    """Return the suns that did not stand there at their time; a note where a mirror has most."""
+    able = seen.source_at_infinity & np.isfinite(seen.time)
+    able[list(reasons)] = False
+    if not able.any():
+        return able, "", ""
+    expected, away = np.zeros((len(seen), 3)), np.zeros(len(seen))
+    expected[able] = solar.vector(seen.time[able], site)
+    away[able] = angle_between(seen.source[able], expected[able])
+    rows = away > MOVED
+    wrong, known = (np.bincount(seen.heliostat[mask]) for mask in (rows, able))
+    mostly = np.zeros(len(known), np.bool_)
+    mostly[: len(wrong)] = 2 * wrong > known[: len(wrong)]
+    whole = rows & mostly[seen.heliostat] if rows.any() else rows
+    note = ""
+    if whole.any():
+        middle = float(np.degrees(np.median(away[whole])))
+        note = (
+            f"the suns of {whole.sum()} of {able.sum()} sightings do not stand where the sun stood "
+            f"at their times (median {middle:.1f}° off): check clock, time zone and the plant's "
+            "[site]"
+        )
+        rows = rows & ~whole
+    where, there = azimuth_elevation(seen.source[rows]), azimuth_elevation(expected[rows])
+    texts = [
+        f"the sun is given at azimuth {a % 360.0:.1f}°, elevation {e:.1f}°, and stood at "
+        f"{b % 360.0:.1f}°, {f:.1f}° at that time: correct one of them"
+        for a, e, b, f in zip(*np.degrees(where), *np.degrees(there), strict=True)
+    ]
+    return rows, texts, note
+
+
+def _off_target(
+    seen: Sightings, given: Rows, surfaces: Sequence[Target | Receiver]
+) -> tuple[Rows, Texts]:
+    away = np.full((len(surfaces), len(seen)), np.inf)
+    on = np.zeros(len(seen), np.bool_)
+    for k, surface in enumerate(surfaces):
+        gap = seen.destination - surface.center
+        away[k] = np.linalg.norm(gap, axis=1)
+        if isinstance(surface, Receiver):
+            on |= away[k] <= np.hypot(surface.width, surface.height)
+            continue
+        across = np.abs(gap @ surface.axes.T) - (0.5 + BEYOND) * np.array(
+            [surface.width, surface.height]
+        )
+        on |= (across <= OFF).all(axis=1) & (np.abs(gap @ surface.normal) <= OFF)
+    rows = given & ~on
+    nearest = np.argmin(away[:, rows], axis=0)
+    texts = [
+        f"the beam's point is on no target: {away[k, i]:.1f} m from the centre of "
+        f"{surfaces[k].name}, the nearest"
+        for k, i in zip(nearest, np.flatnonzero(rows), strict=True)
+    ]
+    return rows, texts
+
+
+def _beyond_machine(
+    seen: Sightings, mechanism: Mechanism, reasons: Mapping[int, str]
+) -> Iterator[tuple[Rows, Texts]]:
+    """Yield what the mirror of a sighting cannot do."""
+    each = mechanism[seen.heliostat]
+    pose = each.pose(seen.counts)
+    near = np.zeros(len(seen), np.bool_)
+    for points, far in (
+        (seen.source, seen.source_at_infinity),
+        (seen.destination, seen.destination_at_infinity),
+    ):
+        near |= ~far & (np.linalg.norm(points - pose.vertex, axis=1) < NEAREST)
+    yield near, f"the ray begins or ends within {NEAREST} m of the mirror"
+    with np.errstate(invalid="ignore", divide="ignore"):
+        source, way = ray_directions(seen, pose.vertex)
+        total = source + way
+        size = np.linalg.norm(total, axis=1)
+        edge = ~near & ~(size > 2.0 * np.cos(EDGE_ON))
+        miss = angle_between(pose.normal, total / np.maximum(size, 1e-9)[:, None])
+    yield edge, f"the beam passes the mirror edge-on, {np.degrees(EDGE_ON):.0f}° from its normal"
+    # Only a nominal mechanism that holds for most of a mirror's sightings judges the others.
+    good = np.flatnonzero(~(near | edge) & ~np.isin(np.arange(len(seen)), list(reasons)))
+    holds = np.zeros(len(mechanism), np.bool_)
+    for row in np.unique(seen.heliostat[good]):
+        mine = good[seen.heliostat[good] == row]
+        holds[row] = np.nan_to_num(np.median(miss[mine]), nan=np.inf) < FAR
+    judged = holds[seen.heliostat]
+    for drive, joint in enumerate(mechanism.driven):
+        value, low, high, most, unit = _reach(each, seen.counts, drive)
+        rows = ~((value >= low) & (value <= high)) & (judged | ~(np.abs(value) <= most))
+        yield (
+            rows,
+            [
+                f"the counts {seen.counts[i, drive]:.10g} of {mechanism.joints[joint]} are beyond "
+                f"its stops: {value[i]:.5g}{unit} is outside {low[i]:.5g} to {high[i]:.5g}{unit}"
+                for i in np.flatnonzero(rows)
+            ],
+        )
+    behind = judged & (
+        np.minimum((pose.normal * source).sum(axis=1), (pose.normal * way).sum(axis=1))
+        < -np.sin(PLAY)
+    )
+    yield behind, "the beam comes from the back of the mirror at these counts"
+
+
+def _reach(
+    each: Mechanism, counts: FloatArray, drive: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, str]:
+    """Return what a drive did, its limits with play, what no zero or sense explains, and the unit.
+
+    All (M,), in counts where the drive has limits of counts, else in degrees.
+    """
+    table = each.drives.table[:, drive]
+    low, high = (table[:, SLOTS[name]] for name in ("min_count", "max_count"))
+    if np.isfinite(low).all() and np.isfinite(high).all():
+        play = 0.02 * (high - low)
+        most = 2.0 * np.maximum(np.abs(low), np.abs(high))
+        return counts[:, drive], low - play, high + play, most, " counts"
+    angle = each.drives.angles(counts)[:, drive]
+    low, high = (table[:, SLOTS[name]] for name in ("min_angle", "max_angle"))
+    limits = np.clip(np.array([low - PLAY, high + PLAY]), -MOST_TURNS, MOST_TURNS)
+    most = np.full(len(counts), np.degrees(MOST_TURNS))
+    return np.degrees(angle), *np.degrees(limits), most, "°"
