@@ -27,13 +27,13 @@ from heliotrope.field.target import Target
 from heliotrope.files.cells import (
     Rows,
     find_heliostats,
-    format_time,
     read_parquet,
     read_rows,
     rows_of,
 )
 from heliotrope.files.limits import SIZE_LIMIT
 from heliotrope.files.text import write_file
+from heliotrope.files.times import format_time
 from heliotrope.geometry import FloatArray, direction
 
 #: Kinds of sightings, with whether source and destination are at infinity.

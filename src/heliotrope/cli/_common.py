@@ -21,8 +21,10 @@ def parse_time(text: str) -> datetime:
 
     if text == "now":
         return datetime.now(UTC)
+    from heliotrope.files.times import moment
+
     try:
-        time = datetime.fromisoformat(text)
+        time = moment(text)
     except ValueError:
         raise TimeError(
             f"time {text!r} is not ISO 8601; write it as 2026-06-21T12:00:00Z or with +02:00"

@@ -5,8 +5,6 @@ limits no reader takes more than 1.5 GB or a minute; a file beyond one gets one 
 the file, the value, the limit and what to do.
 """
 
-import csv
-import io
 import os
 import re
 import stat
@@ -42,8 +40,6 @@ PIXELS, PHOTOGRAPH_PIXELS = 64_000_000, 160_000_000
 ENTRIES = 1_000_000
 
 
-_BLOCK = MIB
-_SEPARATORS = ",;\t"
 _JSON_TOKEN = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+"|(?P<bracket>[\[\]{}])', re.DOTALL)
 _PART = r'(?:"[^"\\\n]*+(?:\\.[^"\\\n]*+)*+"|' + r"'[^'\n]*+'|[\w+-]++)"
 # Brackets and dots inside strings and comments are text.
@@ -109,46 +105,6 @@ def check_file(
 
 def _mib(size: int) -> str:
     return f"{size / MIB:.3g}" if size < 10 * MIB else f"{size / MIB:.0f}"
-
-
-def check_table(path: str | Path, what: str) -> Path:
-    """Return the path of a table in CSV if it has a plausible number of rows and cells.
-
-    Raises
-    ------
-    FormatError
-        As `check_file`, or if it has more rows, columns or cells than the limits.
-    """
-    file = check_file(path, what)
-    lines, separators = 1, dict.fromkeys(_SEPARATORS, 0)
-    columns = _columns(file)
-    with file.open("rb") as stream:
-        while block := stream.read(_BLOCK):
-            lines += max(block.count(b"\n"), block.count(b"\r"))
-            for separator in _SEPARATORS:
-                separators[separator] += block.count(separator.encode())
-    check_count(file, columns, COLUMNS, "columns", "remove those that are not needed", "line 1")
-    check_count(file, lines - 1, ROWS, "rows", "divide the table")
-    # A short row is filled up to the columns of the header.
-    cells = max(lines + max(separators.values()), lines * columns)
-    check_count(file, cells, CELLS, "cells", "divide the table")
-    return file
-
-
-def _columns(file: Path) -> int:
-    """Return the number of columns of the header, by the separator that gives the most."""
-    with file.open("rb") as stream:
-        text = stream.read(_BLOCK).decode("utf-8", "replace").lstrip("\r\n")
-    counts, problem = [], ""
-    for separator in filter(text.__contains__, _SEPARATORS):
-        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
-        try:
-            counts.append(len(next(reader, [])))
-        except csv.Error as error:
-            problem = str(error)
-    if problem and not counts:
-        raise FormatError(file, f"not a CSV table ({problem})", "line 1")
-    return max(counts, default=1)
 
 
 def check_count(

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, TimeError, UnknownNameError, kind_of
+from heliotrope.files.times import moment
 from heliotrope.frames import ENU, LATEST, Framed, Labelled, Variable, batched
 from heliotrope.frames import times as frame_times
 from heliotrope.geometry import FloatArray, as_float, direction, wrap_positive
@@ -600,7 +601,7 @@ def _one_time(value: Any, index: Sequence[int]) -> float:
     time = value
     if isinstance(value, str):
         try:
-            time = datetime.fromisoformat(value)
+            time = moment(value)
         except ValueError:
             raise TimeError(
                 f"{_label(index)}: '{value}' is not an ISO 8601 time; "

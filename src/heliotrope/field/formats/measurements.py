@@ -12,7 +12,7 @@ import numpy as np
 
 from heliotrope.errors import FormatError
 from heliotrope.field.formats.paint import find_tower, read_calibration_properties, read_tower
-from heliotrope.files import check_table
+from heliotrope.files import read_rows
 from heliotrope.geometry import FloatArray, direction, geodetic_to_enu
 
 if TYPE_CHECKING:
@@ -89,16 +89,10 @@ def read_measurements(folder: str | Path, centroid: Centroid = "utis") -> Measur
 def _read_table(path: Path, centroid: Centroid) -> "pd.DataFrame":
     import pandas as pd
 
-    check_table(path, "a table of measurements")
-    try:
-        frame = pd.read_csv(path, dtype=str, keep_default_na=False)
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise FormatError(path, f"not a CSV table ({str(error).strip()})") from None
     wanted = [*_COLUMNS, *(f"{centroid}_{c}" for c in ("lat", "lon", "alt"))]
-    for column in wanted:
-        if column not in frame.columns:
-            there = ", ".join(map(str, frame.columns[:12]))
-            raise FormatError(path, f"there is no column {column}; there are {there}", "line 1")
+    rows = read_rows(path, "a table of measurements", wanted)
+    rows.need(wanted)
+    frame = pd.DataFrame({column: rows.columns[column] for column in wanted})
     for column in wanted:
         if column not in ("heliostat", "id", "timestamp", "target"):
             frame[column] = pd.to_numeric(frame[column], errors="coerce")
