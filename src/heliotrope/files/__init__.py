@@ -1,6 +1,7 @@
 """Reading and writing files safely, with errors that name the file and the place in it.
 
 - `limits`: size, depth, count and expansion that no file may exceed, for all readers.
+- `kinds`: what a file is that another program, or another command, reads.
 - `text`: whole text files and binary files; written whole or not at all.
 - `json`, `xml`: documents whose values know their place in the file.
 - `documents`: TOML files of our own formats, checked against pydantic models. Its names stay

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.files.kinds import instead
 from heliotrope.files.limits import (
     CELLS,
     COLUMNS,
@@ -260,6 +261,8 @@ def read_cells(
         If it cannot be read, or is beyond the limits of `heliotrope.files.limits`.
     """
     text = unicodedata.normalize("NFC", read_text(path, what, spreadsheet=True))
+    if other := instead(text[:4096].encode(), what, "a table"):
+        raise FormatError(path, other)
     named = _SEP_LINE.match(text)
     if named is not None:
         text = "\n" + text[named.end() :]

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from heliotrope.errors import FormatError
+from heliotrope.files.kinds import foreign, instead
 
 MIB = 2**20
 #: Largest file that is read, bytes: a layout of 400,000 heliostats is 60 MB.
@@ -71,8 +72,8 @@ def check_file(
     Raises
     ------
     FormatError
-        If it does not exist, is a folder, a device or a pipe, cannot be read, is empty, is larger
-        than the limit or does not begin like text.
+        If it does not exist, is a folder, a device or a pipe, cannot be read, is empty, belongs to
+        another program, is larger than the limit or does not begin like text.
     """
     file = Path(path)
     try:
@@ -93,13 +94,15 @@ def check_file(
         raise FormatError(file, f"cannot be read ({error.strerror}); it should be {what}") from None
     if not start:
         raise FormatError(file, f"the file is empty; it should be {what}")
+    if text := foreign(file, start):
+        raise FormatError(file, text)
     if state.st_size > limit:
         raise FormatError(
             file,
             f"{_mib(state.st_size)} MiB exceed the limit of {_mib(limit)} MiB; this is not {what}",
         )
     if not binary and b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise FormatError(file, f"the file is binary; it should be {what}")
+        raise FormatError(file, instead(start, what) or f"the file is binary; it should be {what}")
     return file
 
 
