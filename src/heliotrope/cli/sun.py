@@ -4,7 +4,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from heliotrope.cli._common import parse_duration, parse_time, print_json, print_table
+from heliotrope.cli._common import day_of, parse_duration, parse_time, print_json, print_table
+from heliotrope.errors import InputError
 
 
 def sun(
@@ -31,6 +32,10 @@ def sun(
 
     from heliotrope import sun as solar
 
+    if pressure is not None and not 300.0 <= pressure <= 1200.0:
+        raise InputError(
+            f"pressure {pressure:g} hPa is not within 300 to 1200 hPa; give hPa (1013 at sea level)"
+        )
     moment = parse_time(time)
     site = solar.Site(
         latitude,
@@ -39,9 +44,10 @@ def sun(
         pressure=None if pressure is None else 100.0 * pressure,
         temperature_c=temperature,
     )
-    events = solar.events(moment.date(), site)
+    day = day_of(moment, site)
+    events = solar.events(day, site)
     if every is not None:
-        moments = solar.daylight(moment.date(), site, every=parse_duration(every))
+        moments = solar.daylight(day, site, every=parse_duration(every))
     else:
         import pandas as pd
 
@@ -57,14 +63,14 @@ def sun(
         }
         for i, t in enumerate(moments)
     ]
-    day = {
+    times = {
         "sunrise": events.sunrise,
         "culmination": events.culmination,
         "sunset": events.sunset,
         "kind": events.kind,
     }
     if as_json:
-        print_json({"positions": rows, **day} if every else {**rows[0], **day})
+        print_json({"positions": rows, **times} if every else {**rows[0], **times})
         return
     print_table(
         ["time", "azimuth", "elevation", "without refraction"],

@@ -7,12 +7,12 @@ import typer
 
 from heliotrope.cli._common import (
     open_plant,
-    parse_duration,
     parse_point,
     parse_site,
     parse_time,
     print_json,
     print_table,
+    sunlit,
 )
 from heliotrope.cli._track_guo import track_by_guo
 from heliotrope.errors import InputError
@@ -37,6 +37,12 @@ AimOption = Annotated[
     ),
 ]
 TargetOption = Annotated[str | None, typer.Option(help="Aim at the centre of this target.")]
+
+
+#: Outcomes with a pose that a mirror can take.
+_POSES = (0, 1, 2)
+_TAKE = "the one to take; shading and blocking by other mirrors are not considered"
+_NEAREST = "the nearest pose: the beam does not reach its aim"
 
 
 def track(
@@ -97,24 +103,37 @@ def track(
     moment = parse_time(time or "now")
     _check(every, law, local, trace)
     if every is not None:
-        times = solar.daylight(moment.date(), plant.site, every=parse_duration(every))
+        times = sunlit(moment, plant.site, every)
         followed = track_path(
             mechanism, solar.vector(times, plant.site), goal, local=local, over_the_top=over_the_top
         )
+        if not local:
+            check_front(plant, heliostat, goal, followed.vertex)
         _day(heliostat, [t.isoformat() for t in times], followed, mechanism.joints, as_json)
+        if not followed.reachable.any():
+            raise typer.Exit(1)
         return
     own = _sun_of(field) if sun is None and time is None else None
     if sun is not None:
         vector = normalize(parse_point(sun, "sun"), "sun")
     else:
         vector = solar.vector(moment, plant.site) if own is None else own
+    if vector[2] <= 0.0:
+        below = f"the sun is {np.degrees(np.arcsin(-vector[2])):.2f}° below the horizon"
+        when = f" at {moment.isoformat()}" if sun is None and own is None else ""
+        raise InputError(f"heliostat {heliostat}: {below}{when}; choose a time of daylight")
+    result = tracking.track(mechanism, vector, goal, local=local)
+    status = tracking.TrackingStatus(int(result.chosen(result.status)))
+    if status not in _POSES:
+        raise InputError(f"heliostat {heliostat}: {status.text}; choose another aim")
+    if not local:
+        check_front(plant, heliostat, goal, result.chosen(result.vertex))
     if law == "guo":
         track_by_guo(heliostat, mechanism, vector, goal, moment, as_json)
         return
     if trace:
         _trace(heliostat, tracking.trace(mechanism, vector, goal), as_json)
         return
-    result = tracking.track(mechanism, vector, goal, local=local)
     joints = [mechanism.joints[j] for j in mechanism.driven]
     document = {
         "heliostat": heliostat,
@@ -129,8 +148,10 @@ def track(
     }
     if as_json:
         print_json(document)
-        return
-    _print_branches(document, heliostat)
+    else:
+        _print_branches(document, heliostat)
+    if not result.reachable:
+        raise typer.Exit(1)
 
 
 def _check(every: str | None, law: str, local: bool, trace: bool) -> None:
@@ -169,6 +190,31 @@ def aim_of(plant: "Plant", heliostat: str, aim: str | None, target: str | None) 
     if not plant.targets:
         raise InputError("this plant has no target; give --aim east,north,up in metres")
     return plant.targets[0].center
+
+
+def check_front(plant: "Plant", heliostat: str, aim: Any, vertices: "np.ndarray") -> None:
+    """Refuse an aim that the beams from ``vertices`` (..., 3) reach only through a target's back.
+
+    Raises
+    ------
+    InputError
+        If the aim is on a target, or a target stands before it, and the mirror is behind that.
+    """
+    import numpy as np
+
+    at = vertices[np.isfinite(vertices).all(axis=-1)]
+    planar = [receiver.face for receiver in plant.receivers if receiver.kind == "planar"]
+    for surface in (*plant.targets, *planar):
+        behind = -((at - surface.center) @ surface.normal)
+        beyond = float((aim - surface.center) @ surface.normal)
+        if not (behind >= 0.0).any() or beyond < -0.01 or (surface in planar and beyond > 0.01):
+            continue
+        share = behind / np.maximum(behind + beyond, 1e-12)
+        if surface.holds(at + share[..., None] * (aim - at), 0.01)[behind >= 0.0].any():
+            raise InputError(
+                f"heliostat {heliostat}: it is {behind.max():.2f} m behind {surface.name}, and its "
+                "beam would come to the back; choose another target or aim"
+            )
 
 
 def _trace(heliostat: str, steps: "tuple[TraceStep, ...]", as_json: bool) -> None:
@@ -243,7 +289,8 @@ def _print_branches(document: dict[str, Any], heliostat: str) -> None:
     print(f"{heliostat}{when}, {whose} at {document['sun_elevation_deg']:.2f}° of elevation")
     names = "joints " + " and ".join(document["joints"])
     print_table(["branch", "azimuth", "elevation", names, "counts", "residual", ""], rows)
-    print("* the one to take")
+    served = document["branches"][document["best"]]["reachable"]
+    print(f"* {_TAKE if served else _NEAREST}")
 
 
 def _day(

@@ -65,8 +65,7 @@ _OWN: tuple[tuple[bytes, str, str], ...] = (
     (
         rb"(?:\s*#[^\n]*\n)*\s*(?=[^\n=]*(?:[,;\t|][^\n=,;\t|]*){2})[^\n=\[\]{}]+(?:\n|$)",
         "a table",
-        "`heliotrope track TABLE.csv --site LATITUDE,LONGITUDE,HEIGHT` reads a layout, and a "
-        "plant file names its table of heliostats",
+        "`heliotrope track TABLE.csv` reads a layout, and a plant file names its own table",
     ),
 )
 

@@ -95,7 +95,7 @@ class Site:
                 continue
             if not low <= _number(value) <= high:
                 raise InputError(
-                    f"site {self.name!r}: {field} = {value} {unit} is not a number from "
+                    f"{self.label}: {field} = {value} {unit} is not a number from "
                     f"{low:g} to {high:g} {unit}; {advice}"
                 )
 
@@ -108,6 +108,11 @@ class Site:
             float(location.altitude or 0.0),
             name=location.name or "",
         )
+
+    @property
+    def label(self) -> str:
+        """The site as a message names it."""
+        return f"site {self.name!r}" if self.name else "site"
 
     @property
     def origin(self) -> tuple[float, float, float]:
@@ -352,6 +357,23 @@ def events(
         culmination_elevation=float(position(noon + culmination, site).elevation),
         kind="polar night" if night else kind,
     )
+
+
+def solar_day(time: datetime, site: Site) -> date:
+    """Return the day of local mean solar time that an aware time falls on.
+
+    It is the day that people at the site call today, whatever the zone of ``time``: a California
+    afternoon is tomorrow in UTC.
+
+    Raises
+    ------
+    TimeError
+        If ``time`` has no time zone.
+    """
+    if time.tzinfo is None:
+        raise _no_time(time, ())
+    check_site(site)
+    return (time.astimezone(UTC) + timedelta(hours=site.longitude_deg / 15.0)).date()
 
 
 def daylight(
