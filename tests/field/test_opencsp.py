@@ -185,7 +185,7 @@ def test_a_wrong_field_gets_one_line(tmp_path: Path, old: str, new: str, problem
         (b"\n\n", "the file has no rows; it should be an OpenCSP table of facet centroids"),
         (b"Facet id,X,Y,Z\n1,0,0,0\n1,1,0,0\n", "1 is the name of line 2 too"),
         (b"Facet id,X,Y,Z\n1,1200,0,0\n", "1200 is outside -50 to 50 m from the mirror's vertex"),
-        (b"\x89PNG\0\0\0", "the file is binary"),
+        (b"\x89PNG\0\0\0", "this is a photograph, not an OpenCSP table of facet centroids; `helio"),
         (b"Facet id,X,Y,Z\n1,0,0,\xe9\n", "'é' is not a finite number"),
         (b"Facet id,X,Y,Z\n\xc3\xa9,0,0,\xe9\n", "not UTF-8 text"),
     ],

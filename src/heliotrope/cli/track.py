@@ -39,6 +39,8 @@ AimOption = Annotated[
 TargetOption = Annotated[str | None, typer.Option(help="Aim at the centre of this target.")]
 
 
+#: Largest distance of an aim from a target that it is on, m.
+_ON = 0.01
 #: Outcomes with a pose that a mirror can take.
 _POSES = (0, 1, 2)
 _TAKE = "the one to take; shading and blocking by other mirrors are not considered"
@@ -193,27 +195,35 @@ def aim_of(plant: "Plant", heliostat: str, aim: str | None, target: str | None) 
 
 
 def check_front(plant: "Plant", heliostat: str, aim: Any, vertices: "np.ndarray") -> None:
-    """Refuse an aim that the beams from ``vertices`` (..., 3) reach only through a target's back.
+    """Refuse an aim that beams from ``vertices`` (..., 3) do not reach because of a target.
 
     Raises
     ------
     InputError
-        If the aim is on a target, or a target stands before it, and the mirror is behind that.
+        If the aim is on a target or an aperture whose back the mirror sees, or a target stands
+        before it.
     """
     import numpy as np
 
     at = vertices[np.isfinite(vertices).all(axis=-1)]
     planar = [receiver.face for receiver in plant.receivers if receiver.kind == "planar"]
     for surface in (*plant.targets, *planar):
-        behind = -((at - surface.center) @ surface.normal)
+        ahead = (at - surface.center) @ surface.normal
         beyond = float((aim - surface.center) @ surface.normal)
-        if not (behind >= 0.0).any() or beyond < -0.01 or (surface in planar and beyond > 0.01):
-            continue
-        share = behind / np.maximum(behind + beyond, 1e-12)
-        if surface.holds(at + share[..., None] * (aim - at), 0.01)[behind >= 0.0].any():
+        if surface.holds(aim, _ON) and (ahead <= 0.0).any():
             raise InputError(
-                f"heliostat {heliostat}: it is {behind.max():.2f} m behind {surface.name}, and its "
+                f"heliostat {heliostat}: it is {-ahead.min():.2f} m behind {surface.name}, and its "
                 "beam would come to the back; choose another target or aim"
+            )
+        # An aperture may be crossed: the aim is inside a cavity.
+        crossed = ahead * beyond < 0.0
+        if surface in planar or abs(beyond) <= _ON or not crossed.any():
+            continue
+        share = ahead[crossed] / (ahead[crossed] - beyond)
+        if surface.holds(at[crossed] + share[:, None] * (aim - at[crossed])).any():
+            raise InputError(
+                f"heliostat {heliostat}: {surface.name} stands between it and the aim; choose "
+                "another aim"
             )
 
 

@@ -261,7 +261,7 @@ def read_cells(
         If it cannot be read, or is beyond the limits of `heliotrope.files.limits`.
     """
     text = unicodedata.normalize("NFC", read_text(path, what, spreadsheet=True))
-    if other := instead(text[:4096].encode(), what, "a table"):
+    if other := instead(text[:4096].encode(), what, "table"):
         raise FormatError(path, other)
     named = _SEP_LINE.match(text)
     if named is not None:

@@ -30,7 +30,7 @@ def read_toml(path: str | Path, what: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except ValueError as error:
         # Not a TOMLDecodeError: an integer of thousands of digits.
-        other = instead(text[:4096].encode(), what)
+        other = instead(text[:4096].encode(), what, "TOML")
         raise FormatError(path, other or f"not valid TOML: {str(error)[:200]}") from None
 
 

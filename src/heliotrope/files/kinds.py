@@ -33,37 +33,48 @@ _FOREIGN: tuple[tuple[str, bytes, str, str], ...] = (
     (".pdf", rb"%PDF-", "a PDF", "save its numbers as CSV"),
     (".mat", rb"MATLAB \d", "a MATLAB file", "save its numbers as CSV"),
 )
-#: Files that another command reads.
-_OWN: tuple[tuple[bytes, str, str], ...] = (
+#: Files that another command reads: first bytes, form, kind, and the command.
+_OWN: tuple[tuple[bytes, str, str, str], ...] = (
     (
         rb"\s*(?:<\?xml.{0,300}?>\s*)?(?:<!--.{0,2000}?-->\s*)*<HelioK\b",
+        "XML",
         "a HelioK scene",
         "`heliotrope track FILE.xml` reads it",
     ),
-    (rb"\s*<[?!\w]", "XML", "HelioK scenes are read by `heliotrope track FILE.xml`"),
+    (rb"\s*<[?!\w]", "XML", "XML", "`heliotrope track FILE.xml` reads HelioK scenes"),
     (
         rb"\s*(?:\{\s*(?:\"|\})|\[\s*[\[{\"])",
         "JSON",
+        "JSON",
         "PAINT's files are read as a folder: `heliotrope track FOLDER`",
     ),
-    (rb"PAR1", "a Parquet table", 'a plant file names its table: heliostats = "field.parquet"'),
+    (
+        rb"PAR1",
+        "Parquet",
+        "a Parquet table",
+        'a plant file names its table: heliostats = "field.parquet"',
+    ),
     (
         rb"\x89HDF",
+        "HDF5",
         "an HDF5 file",
         "of ARTIST's scenarios, give the PAINT folder that they were made of",
     ),
     (
         rb"\x89PNG|\xff\xd8\xff|II\*\x00|MM\x00\*",
+        "photograph",
         "a photograph",
         "`heliotrope image FILE --plant PLANT` reads it",
     ),
     (
         rb"(?:[^\n]*\n){0,50}?\s*format *= *\"heliotrope-plant\"",
+        "TOML",
         "a plant file",
         "`heliotrope field check FILE.toml` reads it",
     ),
     (
         rb"(?:\s*#[^\n]*\n)*\s*(?=[^\n=]*(?:[,;\t|][^\n=,;\t|]*){2})[^\n=\[\]{}]+(?:\n|$)",
+        "table",
         "a table",
         "`heliotrope track TABLE.csv` reads a layout, and a plant file names its own table",
     ),
@@ -98,10 +109,10 @@ def instead(start: bytes, what: str, own: str = "") -> str:
     what
         Kind of file expected, as an error names it.
     own
-        The form that ``what`` has: "JSON", "XML", "a table".
+        The form that ``what`` has: "JSON", "XML", "TOML", "table".
     """
     bare = start.removeprefix(b"\xef\xbb\xbf")
-    for mark, kind, advice in _OWN:
+    for mark, form, kind, advice in _OWN:
         if re.match(mark, bare, re.DOTALL):
-            return "" if kind == own else f"this is {kind}, not {what}; {advice}"
+            return "" if form == own else f"this is {kind}, not {what}; {advice}"
     return ""

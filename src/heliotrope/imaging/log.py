@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from heliotrope.field.formats.paint import read_calibration_properties
+from heliotrope.field.formats.paint import heliostat_of, read_calibration_properties
 from heliotrope.files import read_rows
 from heliotrope.geometry import FloatArray, direction
 
@@ -148,9 +148,8 @@ def beside(path: Path, heliostat: str = "") -> Entry | None:
     if not file.exists():
         return None
     found: Any = read_calibration_properties(file)
-    folder = path.parent.parent.name if path.parent.name == "Calibration" else ""
     return Entry(
-        heliostat=heliostat or folder,
+        heliostat=heliostat or heliostat_of(path),
         counts=np.array(found.motors),
         target=found.target,
         sun=_sun(found.sun_azimuth_deg, found.sun_elevation_deg),

@@ -353,11 +353,8 @@ def _start(text: str, design: "Plant") -> "datetime":
     from heliotrope.sun import solar_day
 
     try:
-        day = (
-            solar_day(datetime.now(UTC), design.site)
-            if text == "morning"
-            else date.fromisoformat(text)
-        )
+        today = solar_day(datetime.now(UTC), design.site)
+        day = today if text == "morning" else date.fromisoformat(text)
     except ValueError:
         start, shift = parse_time(text), 0.0
     else:
