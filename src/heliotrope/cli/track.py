@@ -121,7 +121,7 @@ def track(
     else:
         vector = solar.vector(moment, plant.site) if own is None else own
     if vector[2] <= 0.0:
-        below = f"the sun is {np.degrees(np.arcsin(-vector[2])):.2f}° below the horizon"
+        below = f"the sun is {abs(np.degrees(np.arcsin(vector[2]))):.2f}° below the horizon"
         when = f" at {moment.isoformat()}" if sun is None and own is None else ""
         raise InputError(f"heliostat {heliostat}: {below}{when}; choose a time of daylight")
     result = tracking.track(mechanism, vector, goal, local=local)
