@@ -1,8 +1,11 @@
 """Every table of the product in the fashions of spreadsheets: the same value, or one line."""
 
 import csv
+import errno
 import io
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +13,23 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tests.cli.test_bad_input import TOML
+from tests.cli.test_bad_input import PAINT, TOML, TOWER
 
 from heliotrope.airborne.photo import _read_table as read_photos
 from heliotrope.airborne.standing import read_commands
 from heliotrope.calibration.sighting_table import read_malan, read_sightings
+from heliotrope.calibration.workflow import read_field_sightings
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.example import example_plant
 from heliotrope.field.formats import open_plant, opencsp, solarpilot
 from heliotrope.field.formats.measurements import _read_table as read_measured
 from heliotrope.field.formats.plant_edit import values
 from heliotrope.field.formats.plant_file import check_plant, read_plant
 from heliotrope.field.target import Target
+from heliotrope.files.cells import check_names
+from heliotrope.files.text import write_file
 from heliotrope.geometry import geodetic_to_enu
-from heliotrope.imaging.log import read_log
+from heliotrope.imaging.log import beside, read_log
 from heliotrope.sun import Site
 
 SITE = Site(37.5, -5.25, 120.0)
@@ -476,3 +483,79 @@ def test_spoilt_tables_end_in_a_value_or_one_line(tmp_path: Path, data: st.DataO
     content = change(grid) if data.draw(st.booleans()) else _text(grid).encode("utf-8", "replace")
     (tmp_path / "table.csv").write_bytes(content)
     _one_line_or_value(tmp_path / "table.csv")
+
+
+# -- names, folders and disks ----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        (("A1", "A1"), "heliostat A1: the name occurs twice; names are unique"),
+        (("A1", "B", "a 1"), "heliostat a 1: there is A1 too; names differ by more than case"),
+        (("\u00e9", "e\u0301"), "too; names differ by more than case and blanks"),
+        (("A", " "), "heliostat: an empty name; each heliostat needs one"),
+        (("A", ""), "heliostat: an empty name"),
+    ],
+)
+def test_names_differ_at_a_glance(names: tuple[str, ...], says: str) -> None:
+    check_names("heliostat", ["X", "X1", "x2", "Ä", "A-1"])
+    check_names("heliostat", [])
+    with pytest.raises(InputError) as error:
+        check_names("heliostat", names)
+    assert says in str(error.value)
+
+
+def test_a_plant_refuses_alike_names_over_groups_and_surfaces() -> None:
+    plant = example_plant()
+    group = next(iter(plant.groups.values()))
+    other = replace(group, names=tuple(name.lower() for name in group.names))
+    with pytest.raises(InputError, match="heliostat p1a: there is P1A too"):
+        replace(plant, groups={"a": group, "b": other})
+    twin = replace(plant.targets[0], name=plant.targets[0].name.upper())
+    with pytest.raises(InputError, match=r"target or receiver .* too; names differ by more"):
+        replace(plant, targets=(plant.targets[0], twin), cameras=())
+    with pytest.raises(InputError, match="target or receiver: an empty name"):
+        replace(plant, targets=(replace(twin, name=""),), cameras=())
+
+
+def test_the_folders_of_artist_open_as_they_are(tmp_path: Path) -> None:
+    (tmp_path / "tower-measurements.json").write_text(json.dumps(TOWER), encoding="utf-8")
+    for name in ("AA31", "AA39"):
+        (tmp_path / name).mkdir()
+        file = tmp_path / name / "heliostat-properties.json"
+        file.write_text(json.dumps(PAINT), encoding="utf-8")
+    seen = {
+        "motor_position": {"axis_1_motor_position": 20000, "axis_2_motor_position": 30000},
+        "target_name": "target",
+        "sun_elevation": 50.0,
+        "sun_azimuth": 20.0,
+        "focal_spot": {"UTIS": [50.91339, 6.38782, 130.0]},
+    }
+    file = tmp_path / "AA39" / "123-calibration-properties.json"
+    file.write_text(json.dumps(seen), encoding="utf-8")
+    plant = open_plant(tmp_path)
+    assert plant.names == ("AA31", "AA39")
+    found = read_field_sightings(plant, str(tmp_path))
+    assert [plant.names[i] for i in found.seen.heliostat] == ["AA39"]
+    entry = beside(tmp_path / "AA39" / "123-flux.png")
+    assert entry is not None
+    assert entry.heliostat == "AA39"
+
+
+def test_a_full_disk_is_called_full(tmp_path: Path) -> None:
+    def write(_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(InputError, match=r"No space left on device\); free some space, or give a"):
+        write_file(tmp_path / "a.csv", write)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(InputError, match="give a folder that exists"):
+        write_file(tmp_path / "none" / "a.csv", lambda stream: stream.write(b""))
+
+
+def test_messages_do_not_begin_with_an_empty_name() -> None:
+    with pytest.raises(InputError, match=r"^site: latitude_deg = 95 ° is not a number from -90"):
+        Site(95, 0, 0)
+    with pytest.raises(InputError, match=r"^site 'A': latitude_deg = 95"):
+        Site(95, 0, 0, name="A")

@@ -32,18 +32,8 @@ def sun(
 
     from heliotrope import sun as solar
 
-    if pressure is not None and not 300.0 <= pressure <= 1200.0:
-        raise InputError(
-            f"pressure {pressure:g} hPa is not within 300 to 1200 hPa; give hPa (1013 at sea level)"
-        )
     moment = parse_time(time)
-    site = solar.Site(
-        latitude,
-        longitude,
-        height,
-        pressure=None if pressure is None else 100.0 * pressure,
-        temperature_c=temperature,
-    )
+    site = solar.Site(latitude, longitude, height, _pascal(pressure), temperature)
     day = day_of(moment, site)
     events = solar.events(day, site)
     if every is not None:
@@ -91,3 +81,12 @@ def sun(
     ):
         shown = event.strftime("%Y-%m-%d %H:%M:%S UTC") if event else f"none ({events.kind})"
         print(f"{name:12}{shown}")
+
+
+def _pascal(pressure: float | None) -> float | None:
+    """Return hPa of the option in Pa; refuse what no site has."""
+    if pressure is not None and not 300.0 <= pressure <= 1200.0:
+        raise InputError(
+            f"pressure {pressure:g} hPa is not within 300 to 1200 hPa; give hPa (1013 at sea level)"
+        )
+    return None if pressure is None else 100.0 * pressure

@@ -1,5 +1,6 @@
 """``heliotrope track``: drive positions of a heliostat."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     from heliotrope.field.plant import Plant
     from heliotrope.mechanism import TrackedPath
-    from heliotrope.mechanism.tracking import TraceStep, Tracking
+    from heliotrope.mechanism.tracking import TraceStep, Tracking, TrackingStatus
 
 
 FieldArgument = Annotated[
@@ -41,8 +42,6 @@ TargetOption = Annotated[str | None, typer.Option(help="Aim at the centre of thi
 
 #: Largest distance of an aim from a target that it is on, m.
 _ON = 0.01
-#: Outcomes with a pose that a mirror can take.
-_POSES = (0, 1, 2)
 _TAKE = "the one to take; shading and blocking by other mirrors are not considered"
 _NEAREST = "the nearest pose: the beam does not reach its aim"
 
@@ -120,14 +119,9 @@ def track(
         vector = normalize(parse_point(sun, "sun"), "sun")
     else:
         vector = solar.vector(moment, plant.site) if own is None else own
-    if vector[2] <= 0.0:
-        below = f"the sun is {abs(np.degrees(np.arcsin(vector[2]))):.2f}° below the horizon"
-        when = f" at {moment.isoformat()}" if sun is None and own is None else ""
-        raise InputError(f"heliostat {heliostat}: {below}{when}; choose a time of daylight")
+    _check_sun(heliostat, vector, "" if sun is not None or own is not None else moment.isoformat())
     result = tracking.track(mechanism, vector, goal, local=local)
-    status = tracking.TrackingStatus(int(result.chosen(result.status)))
-    if status not in _POSES:
-        raise InputError(f"heliostat {heliostat}: {status.text}; choose another aim")
+    _check_pose(heliostat, tracking.TrackingStatus(int(result.chosen(result.status))))
     if not local:
         check_front(plant, heliostat, goal, result.chosen(result.vertex))
     if law == "guo":
@@ -165,6 +159,20 @@ def _check(every: str | None, law: str, local: bool, trace: bool) -> None:
         )
     if trace and (every is not None or local):
         raise InputError("--trace prints one moment of global aiming; leave out --every, --local")
+
+
+def _check_sun(heliostat: str, vector: "np.ndarray", time: str) -> None:
+    """Refuse a sun that lights no mirror."""
+    if vector[2] <= 0.0:
+        below = f"the sun is {math.degrees(abs(math.asin(vector[2]))):.2f}° below the horizon"
+        when = f" at {time}" if time else ""
+        raise InputError(f"heliostat {heliostat}: {below}{when}; choose a time of daylight")
+
+
+def _check_pose(heliostat: str, status: "TrackingStatus") -> None:
+    """Refuse an outcome without a pose that a mirror can take."""
+    if status.name in ("NOT_CONVERGED", "DEGENERATE"):
+        raise InputError(f"heliostat {heliostat}: {status.text}; choose another aim")
 
 
 def _sun_of(field: Path) -> "np.ndarray | None":

@@ -67,7 +67,7 @@ _NAMES = {
     "z": "z locz zloc locationz zlocation posz zpos positionz zposition up",
     "focus x": "xfocus focusx",
     "focus y": "yfocus focusy",
-    "cant i": "cantvect canti",
+    "cant i": "canti",
     "cant j": "cantj",
     "cant k": "cantk",
     "aim x": "aimptx aimx",
@@ -79,6 +79,8 @@ _NAMES = {
 }
 #: Meaning of a name, and its place among those of the meaning.
 _KNOWN = {n: (meaning, k) for meaning, ns in _NAMES.items() for k, n in enumerate(ns.split())}
+#: Names of three columns side by side, and the axes that tell them apart.
+_THREE = {"cantvect": "ijk", "cant": "ijk", "aim": "xyz", "aimpt": "xyz"}
 _METRES, _DEGREES = ("x", "y", "z"), ("latitude", "longitude", "altitude")
 _GROUPS = (("focus x", "focus y"), ("cant i", "cant j", "cant k"), ("aim x", "aim y", "aim z"))
 _UNIT = re.compile(r"\s*(?:[\[(<]\s*(.*?)\s*[\])>]|_(m|mm|cm|km|ft|deg|rad))\s*", re.IGNORECASE)
@@ -236,9 +238,13 @@ def _by_header(file: Path, place: str, head: list[list[str]]) -> tuple[list[str]
     for cell, below in zip(names, units, strict=True):
         unit = _UNIT.search(below or cell)
         form = _form(cell if below else _UNIT.sub("", cell))
-        axis = "ijk"[sum("<" in name for name in header) % 3] if form == "cantvect" else ""
-        header.append(f"{cell} <{axis}>" if axis else cell)
-        meaning, rank = _KNOWN.get(f"cant{axis}" if axis else form, ("", 0))
+        if form in _THREE:
+            axis = _THREE[form][sum(name.startswith(f"{cell} <") for name in header) % 3]
+            form = f"{form[: 4 if form[0] == 'c' else 3]}{axis}"
+            header.append(f"{cell} <{axis}>")
+        else:
+            header.append(cell)
+        meaning, rank = _KNOWN.get(form, ("", 0))
         wanted = "deg" if meaning in _DEGREES[:2] else "m"
         given = "" if unit is None else (unit[1] or unit[2] or "").lower()
         if meaning in (*_METRES, *_DEGREES) and given not in ("", "°", "degrees", wanted):
