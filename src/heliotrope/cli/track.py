@@ -115,11 +115,9 @@ def track(
             raise typer.Exit(1)
         return
     own = _sun_of(field) if sun is None and time is None else None
-    if sun is not None:
-        vector = normalize(parse_point(sun, "sun"), "sun")
-    else:
-        vector = solar.vector(moment, plant.site) if own is None else own
-    _check_sun(heliostat, vector, "" if sun is not None or own is not None else moment.isoformat())
+    given = normalize(parse_point(sun, "sun"), "sun") if sun is not None else own
+    vector = solar.vector(moment, plant.site) if given is None else given
+    _check_sun(heliostat, vector, moment.isoformat() if given is None else "")
     result = tracking.track(mechanism, vector, goal, local=local)
     _check_pose(heliostat, tracking.TrackingStatus(int(result.chosen(result.status))))
     if not local:
