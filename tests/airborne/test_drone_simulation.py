@@ -105,5 +105,5 @@ def test_commands_of_a_plan(tmp_path) -> None:
     with pytest.raises(InputError, match="no heliostat of cluster 'c9'"):
         read_commands(path, ("A", "B", "C"), "c9")
     path.write_text("heliostat,count_1,count_2\nA,1,much\n")
-    with pytest.raises(FormatError, match="counts of A are not numbers"):
+    with pytest.raises(FormatError, match="heliostat A: 'much' is not a finite number"):
         read_commands(path, ("A",))

@@ -320,9 +320,9 @@ BAD: list[tuple[str, list[str], str]] = [
     ("photographs/p0.png", ["--target", "tower"], "there is no target 'tower'"),
     ("photographs/p0.png", ["--camera", "left"], "there is no camera 'left'"),
     ("photographs/p0.png", ["--log", "absent.csv"], "there is no such file"),
-    ("photographs/p0.png", ["--log", "bad.csv"], "column heliostat is missing"),
+    ("photographs/p0.png", ["--log", "bad.csv"], "there is no column heliostat; add it"),
     ("photographs/p0.png", ["--log", "naive.csv"], "line 2, column timestamp"),
-    ("photographs/p0.png", ["--log", "text.csv"], "'x' is not a number"),
+    ("photographs/p0.png", ["--log", "text.csv"], "'x' is not a finite number"),
     ("nothing", [], "no image in this folder"),
 ]
 

@@ -123,7 +123,10 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="the file is empty; it should be a HelioK file"):
         heliok.read(path)
     path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0")
-    with pytest.raises(FormatError, match="the file is binary"):
+    with pytest.raises(FormatError, match="this is a photograph, not a HelioK file"):
+        heliok.read(path)
+    path.write_bytes(b"\x7fELF\0\0\0")
+    with pytest.raises(FormatError, match="the file is binary; it should be a HelioK file"):
         heliok.read(path)
     path.write_text("<svg/>", encoding="utf-8")
     with pytest.raises(FormatError, match="the root element is <svg>; it should be <HelioK>"):

@@ -90,7 +90,8 @@ def test_short_rows(tmp_path: Path, row: str, enabled: bool) -> None:
 
 
 def test_blank_lines_a_mark_and_small_letters_are_fine(tmp_path: Path) -> None:
-    text = "\ufeffTemplate,x,y,z\n\n" + PUBLISHED.lower() + "\n,,,\n"
+    header = "Template,x,y,z,X focus,Y focus,Cant i,Cant j,Cant k,Aim x,Aim y,Aim z"
+    text = f"\ufeff{header}\n\n" + PUBLISHED.lower() + "\n,,,\n"
     assert_same(layout_of(tmp_path, text), layout_of(tmp_path, PUBLISHED))
 
 
@@ -133,17 +134,17 @@ ROW = "0,1,1,10,20,0,NULL,NULL,NULL,NULL,NULL,1,2,90\n"
     [
         ("0,1,2\n", "line 1: 3 columns; a layout has 14"),
         ("0,1,2,3,4\n", "5 columns; a layout has 14"),
-        (ROW * 2 + "0,1,1,10,20,0\n", "line 3: 6 columns, but the first row has 14"),
+        (ROW * 2 + "0,1,1,10,20,0\n", "line 3: 6 cells under 14 columns"),
         (ROW.replace("10", "ten"), "line 1, column 4 (Loc. X): 'ten' is not a finite number"),
-        (ROW.replace("10", "nan"), "'nan' is not a finite number; write a number or NULL"),
+        (ROW.replace("10", "nan"), "'nan' is not a finite number; give m from"),
         (ROW.replace("10", "inf"), "'inf' is not a finite number"),
         (ROW.replace("10", "1_0"), "'1_0' is not a finite number"),
         (
             ROW.replace(",", ";").replace("10", "10,5"),
-            "'10,5' is not a finite number; write a point",
+            "'10,5' is not a finite number; write a point, not a comma",
         ),
-        (ROW.replace("10", "NULL"), "column 4 (Loc. X): NULL; a location needs numbers"),
-        (ROW.replace("10", ""), "column 4 (Loc. X): '' is not a finite number"),
+        (ROW.replace("10", "NULL"), "column 4 (Loc. X): 'NULL' is not a finite number"),
+        (ROW.replace("10", ""), "column 4 (Loc. X): the cell is empty; give m"),
         (
             ROW.replace("2,90", "2,NULL"),
             "column 14 (Aim pt. Z): NULL beside numbers; all 3 columns",
@@ -155,13 +156,19 @@ ROW = "0,1,1,10,20,0,NULL,NULL,NULL,NULL,NULL,1,2,90\n"
         ("x" + ROW, "column 1 (Template): 'x0' is not a template's number"),
         ("-1" + ROW[1:], "'-1' is not a template's number"),
         ("1.5" + ROW[1:], "'1.5' is not a template's number"),
-        (ROW.replace("0,1,1", "0,2,1"), "column 2 (Enabled): '2' is not 0 or 1"),
-        ("0,732.3,-735.8,0,NULL,NULL\n", "'732.3' is not 0 or 1; 6 columns begin with template"),
-        ("Template,Loc. X,Loc. Y,Loc. Z\n", "no line holds a number"),
-        (" \n,,,\n\n", "there is no heliostat in it"),
-        ("Σ" * 40, "no line holds a number"),
+        (
+            ROW.replace("0,1,1", "0,2,1"),
+            "column 2 (Enabled): '2' is neither true nor false; give 0 or 1",
+        ),
+        (
+            "0,732.3,-735.8,0,NULL,NULL\n",
+            "'732.3' is neither true nor false; give 0 or 1; 6 columns begin",
+        ),
+        ("Template,Loc. X,Loc. Y,Loc. Z\n", "there is no heliostat in it"),
+        (" \n,,,\n\n", "the file has no rows; it should be a table of heliostats"),
+        ("Σ" * 40, "gives no positions; give id,x,y,z (m east, north, up), id,latitude"),
         ("NULL\n", "line 1: 1 columns; a layout has 14"),
-        ("", "the file is empty; it should be a SolarPILOT layout"),
+        ("", "the file is empty; it should be a table of heliostats (SolarPILOT or OpenCSP)"),
     ],
 )
 def test_a_wrong_file_gets_one_line(tmp_path: Path, text: str, problem: str) -> None:
@@ -176,7 +183,7 @@ def test_a_wrong_file_gets_one_line(tmp_path: Path, text: str, problem: str) -> 
     ("content", "problem"),
     [
         (b"\x00\x01\x02" * 100, "the file is binary"),
-        (b"0,1,2,3\n\xff\xfe\xfa", "not UTF-8 text .*byte 8|byte 8.*not UTF-8"),
+        (b"0,1,2,3\n\xff\xfe\xfa\x01", "not UTF-8 text .*byte 8|byte 8.*not UTF-8"),
     ],
 )
 def test_binary_files_are_refused(tmp_path: Path, content: bytes, problem: Any) -> None:

@@ -4,8 +4,6 @@ The camera model and its conventions are those of `heliotrope.field.camera`: cam
 right, y down, z forward, and rotations from camera axes to ENU.
 """
 
-import csv
-import io
 import math
 from collections import Counter
 from collections.abc import Mapping
@@ -19,9 +17,11 @@ import numpy.typing as npt
 from heliotrope.airborne._photo_metadata import Metadata, read_metadata
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.camera import checked_pinhole, checked_pose, local_pixels
+from heliotrope.files.cells import read_rows
 from heliotrope.files.documents import read_toml
-from heliotrope.files.limits import check_entries, check_table
-from heliotrope.files.text import read_text, write_text
+from heliotrope.files.limits import check_entries
+from heliotrope.files.text import write_text
+from heliotrope.files.times import moment
 from heliotrope.geometry import (
     FloatArray,
     as_float,
@@ -327,9 +327,8 @@ def _of_metadata(found: Metadata, file: Path, origin: tuple[float, float, float]
 
 
 def _read_table(path: Path) -> dict[str, dict[str, str]]:
-    what = "a table of photographs"
-    reader = csv.DictReader(io.StringIO(read_text(check_table(path, what), what)))
-    columns = set(reader.fieldnames or ())
+    rows = read_rows(path, "a table of photographs")
+    columns = set(rows.columns)
     places = ({"east_m", "north_m", "up_m"}, {"latitude_deg", "longitude_deg", "altitude_m"})
     needed = {"name", "yaw_deg", "pitch_deg", "roll_deg"}
     if needed - columns or not any(p <= columns for p in places):
@@ -338,7 +337,10 @@ def _read_table(path: Path) -> dict[str, dict[str, str]]:
             "needs the columns name, yaw_deg, pitch_deg, roll_deg and east_m, north_m, up_m "
             "(or latitude_deg, longitude_deg, altitude_m); time and sigma_m are optional",
         )
-    return {row["name"].strip(): row for row in reader}
+    names = rows.names("name", "photograph")
+    rows.refuse_bad()
+    cells = {column: rows.texts(column) for column in columns}
+    return {name: {c: texts[i] for c, texts in cells.items()} for i, name in enumerate(names)}
 
 
 def _of_row(
@@ -366,7 +368,7 @@ def _of_row(
     time, text = None, (row.get("time") or "").strip()
     if text:
         try:
-            time = datetime.fromisoformat(text)
+            time = moment(text)
         except ValueError:
             raise FormatError(table, f"time {text!r} is not ISO 8601", row["name"]) from None
         if time.tzinfo is None:

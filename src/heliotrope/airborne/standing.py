@@ -4,8 +4,6 @@ Concentrator coordinates: origin at the vertex, x to the right as seen from the 
 the mirror, z the normal.
 """
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.airborne.mirror import orientation
-from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.heliostats import Heliostats
-from heliotrope.files.limits import check_table
-from heliotrope.files.text import read_text, write_text
+from heliotrope.files.cells import read_rows
+from heliotrope.files.text import write_text
 from heliotrope.geometry import FloatArray, as_float
+
+_COUNTS = ("count_1", "count_2")
 
 
 @dataclass(frozen=True)
@@ -132,43 +132,30 @@ def read_commands(
     UnknownNameError
         If a heliostat is not in the plant: the wrong field.
     """
-    what = "a table of commands"
-    reader = csv.DictReader(io.StringIO(read_text(check_table(path, what), what)))
-    columns = list(reader.fieldnames or ())
-    counts = [c for c in ("count_1", "count_2") if c in columns]
-    if "heliostat" not in columns or not counts:
-        raise FormatError(path, "needs the columns heliostat, count_1, count_2")
-    index = {name: i for i, name in enumerate(names)}
-    found: dict[int, list[float]] = {}
-    for line, row in enumerate(reader, start=2):
-        other = [w for w, k in ((cluster, "cluster"), (point, "point")) if w and row.get(k) != w]
-        if other or row.get("reachable") == "false":
-            continue
-        name = (row["heliostat"] or "").strip()
-        if name not in index:
-            raise UnknownNameError(f"heliostat ({path}, line {line}) in this field:", name, names)
-        if index[name] in found:
-            raise FormatError(
-                path,
-                f"heliostat {name} is listed twice, but photographs show one pose; give "
-                "the cluster and the point of the photographs",
-                f"line {line}",
-            )
-        found[index[name]] = _counts(path, line, name, [row[c] for c in counts])
-    if not found:
+    rows = read_rows(Path(path), "a table of commands", ("heliostat", *_COUNTS))
+    rows.need(["heliostat", "count_1"])
+    clusters, points, reachable = (rows.texts(c) for c in ("cluster", "point", "reachable"))
+    rows = rows.take(
+        i
+        for i in range(len(rows))
+        if cluster in ("", clusters[i]) and point in ("", points[i]) and reachable[i] != "false"
+    )
+    if not len(rows):
         of = f" of cluster {cluster!r}, point {point!r}" if cluster or point else ""
         raise InputError(f"{path}: no heliostat{of} in it; list those that the photographs show")
-    return np.fromiter(found, dtype=np.intp), as_float(list(found.values()))
-
-
-def _counts(path: str | Path, line: int, name: str, texts: Sequence[str]) -> list[float]:
-    try:
-        values = [float(text) for text in texts]
-    except (TypeError, ValueError):
-        values = [np.nan]
-    if not np.isfinite(values).all():
-        raise FormatError(path, f"counts of {name} are not numbers", f"line {line}")
-    return values
+    rows.heliostat = rows.texts("heliostat")
+    index = {name: i for i, name in enumerate(names)}
+    found: dict[int, int] = {}
+    for i, name in enumerate(rows.heliostat):
+        if name not in index:
+            place = f"heliostat ({path}, {rows.places[i]}) in this field:"
+            raise UnknownNameError(place, name, names)
+        if found.setdefault(index[name], i) != i:
+            twice = "it is listed twice, but photographs show one pose; give the cluster and the"
+            rows.refuse(i, "heliostat", f"{twice} point of the photographs")
+    counts = [rows.numbers(name, "drive counts") for name in _COUNTS if name in rows.columns]
+    rows.refuse_bad()
+    return np.fromiter(found, dtype=np.intp), np.stack(counts, axis=-1)
 
 
 def write_commands(path: str | Path, names: Sequence[str], counts: npt.ArrayLike) -> None:

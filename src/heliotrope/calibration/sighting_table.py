@@ -28,13 +28,13 @@ from heliotrope.field.target import Target
 from heliotrope.files.cells import (
     Rows,
     find_heliostats,
-    format_time,
     read_parquet,
     read_rows,
     rows_of,
 )
 from heliotrope.files.limits import SIZE_LIMIT
 from heliotrope.files.text import write_file
+from heliotrope.files.times import format_time
 from heliotrope.geometry import FloatArray, direction
 from heliotrope.sun.ephemeris import END_OF_TIMES
 

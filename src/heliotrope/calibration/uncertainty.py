@@ -231,7 +231,7 @@ def suns_of_year(
     suns = found.vector[found.elevation >= min_elevation]
     if not len(suns):
         raise InputError(
-            f"site {site.name!r}: the sun never reaches {np.degrees(min_elevation):g}° in {year}; "
+            f"{site.label}: the sun never reaches {np.degrees(min_elevation):g}° in {year}; "
             "lower the least elevation"
         )
     return suns

@@ -76,8 +76,8 @@ class FieldSightings:
 
 def read_field_sightings(
     plant: Plant,
-    place: Path,
-    table: Path | None = None,
+    place: str | Path,
+    table: str | Path | None = None,
     *,
     centroid: Literal["utis", "helios"] = "utis",
     now: float | None = None,
@@ -104,8 +104,9 @@ def read_field_sightings(
     FormatError
         If no measurement can be used.
     """
+    place = Path(place)
     if table is not None:
-        found = _read_table(plant, place, table, now)
+        found = _read_table(plant, place, Path(table), now)
     elif place.is_dir():
         found = _read_folder(plant, place, centroid, now)
     else:

@@ -4,13 +4,15 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from datetime import datetime, timedelta
+from datetime import date, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from heliotrope.errors import InputError, TimeError
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from heliotrope.field.plant import Plant
     from heliotrope.sun import Site
 
@@ -21,8 +23,10 @@ def parse_time(text: str) -> datetime:
 
     if text == "now":
         return datetime.now(UTC)
+    from heliotrope.files.times import moment
+
     try:
-        time = datetime.fromisoformat(text)
+        time = moment(text)
     except ValueError:
         raise TimeError(
             f"time {text!r} is not ISO 8601; write it as 2026-06-21T12:00:00Z or with +02:00"
@@ -30,6 +34,33 @@ def parse_time(text: str) -> datetime:
     if time.tzinfo is None:
         raise TimeError(f"time {text!r} has no time zone; append Z for UTC or an offset as +02:00")
     return time
+
+
+def day_of(time: datetime, site: "Site") -> date:
+    """Return the day that a time names: in UTC the site's own, else that of the zone it is in."""
+    from heliotrope.sun import solar_day
+
+    return time.date() if time.utcoffset() else solar_day(time, site)
+
+
+def sunlit(time: datetime, site: "Site", every: str) -> "pd.DatetimeIndex":
+    """Return the times of a day with sunlight, at an interval such as "10min".
+
+    Raises
+    ------
+    InputError
+        If the sun does not rise on that day, or the interval is none.
+    """
+    from heliotrope.sun import daylight
+
+    day = day_of(time, site)
+    times = daylight(day, site, every=parse_duration(every))
+    if not len(times):
+        raise InputError(
+            f"{site.label}: the sun does not rise on {day} at a multiple of {every}; choose "
+            "another day or a shorter interval"
+        )
+    return times
 
 
 def parse_duration(text: str) -> timedelta:

@@ -30,7 +30,7 @@ def _root() -> None:
 @app.command()
 def info(place: Place, as_json: JsonOption = False) -> None:
     """Print the contents of a store."""
-    from heliotrope.files.cells import format_time
+    from heliotrope.files.times import format_time
     from heliotrope.store.backup import summary
     from heliotrope.store.database import Database
 

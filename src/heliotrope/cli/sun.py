@@ -4,7 +4,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from heliotrope.cli._common import parse_duration, parse_time, print_json, print_table
+from heliotrope.cli._common import day_of, parse_duration, parse_time, print_json, print_table
+from heliotrope.errors import InputError
 
 
 def sun(
@@ -32,16 +33,11 @@ def sun(
     from heliotrope import sun as solar
 
     moment = parse_time(time)
-    site = solar.Site(
-        latitude,
-        longitude,
-        height,
-        pressure=None if pressure is None else 100.0 * pressure,
-        temperature_c=temperature,
-    )
-    events = solar.events(moment.date(), site)
+    site = solar.Site(latitude, longitude, height, _pascal(pressure), temperature)
+    day = day_of(moment, site)
+    events = solar.events(day, site)
     if every is not None:
-        moments = solar.daylight(moment.date(), site, every=parse_duration(every))
+        moments = solar.daylight(day, site, every=parse_duration(every))
     else:
         import pandas as pd
 
@@ -57,14 +53,14 @@ def sun(
         }
         for i, t in enumerate(moments)
     ]
-    day = {
+    times = {
         "sunrise": events.sunrise,
         "culmination": events.culmination,
         "sunset": events.sunset,
         "kind": events.kind,
     }
     if as_json:
-        print_json({"positions": rows, **day} if every else {**rows[0], **day})
+        print_json({"positions": rows, **times} if every else {**rows[0], **times})
         return
     print_table(
         ["time", "azimuth", "elevation", "without refraction"],
@@ -85,3 +81,12 @@ def sun(
     ):
         shown = event.strftime("%Y-%m-%d %H:%M:%S UTC") if event else f"none ({events.kind})"
         print(f"{name:12}{shown}")
+
+
+def _pascal(pressure: float | None) -> float | None:
+    """Return hPa of the option in Pa; refuse what no site has."""
+    if pressure is not None and not 300.0 <= pressure <= 1200.0:
+        raise InputError(
+            f"pressure {pressure:g} hPa is not within 300 to 1200 hPa; give hPa (1013 at sea level)"
+        )
+    return None if pressure is None else 100.0 * pressure

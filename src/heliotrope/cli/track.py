@@ -1,5 +1,6 @@
 """``heliotrope track``: drive positions of a heliostat."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -7,12 +8,12 @@ import typer
 
 from heliotrope.cli._common import (
     open_plant,
-    parse_duration,
     parse_point,
     parse_site,
     parse_time,
     print_json,
     print_table,
+    sunlit,
 )
 from heliotrope.cli._track_guo import track_by_guo
 from heliotrope.errors import InputError
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     from heliotrope.field.plant import Plant
     from heliotrope.mechanism import TrackedPath
-    from heliotrope.mechanism.tracking import TraceStep, Tracking
+    from heliotrope.mechanism.tracking import TraceStep, Tracking, TrackingStatus
 
 
 FieldArgument = Annotated[
@@ -37,6 +38,12 @@ AimOption = Annotated[
     ),
 ]
 TargetOption = Annotated[str | None, typer.Option(help="Aim at the centre of this target.")]
+
+
+#: Largest distance of an aim from a target that it is on, m.
+_ON = 0.01
+_TAKE = "the one to take; shading and blocking by other mirrors are not considered"
+_NEAREST = "the nearest pose: the beam does not reach its aim"
 
 
 def track(
@@ -97,24 +104,30 @@ def track(
     moment = parse_time(time or "now")
     _check(every, law, local, trace)
     if every is not None:
-        times = solar.daylight(moment.date(), plant.site, every=parse_duration(every))
+        times = sunlit(moment, plant.site, every)
         followed = track_path(
             mechanism, solar.vector(times, plant.site), goal, local=local, over_the_top=over_the_top
         )
+        if not local:
+            check_front(plant, heliostat, goal, followed.vertex)
         _day(heliostat, [t.isoformat() for t in times], followed, mechanism.joints, as_json)
+        if not followed.reachable.any():
+            raise typer.Exit(1)
         return
     own = _sun_of(field) if sun is None and time is None else None
-    if sun is not None:
-        vector = normalize(parse_point(sun, "sun"), "sun")
-    else:
-        vector = solar.vector(moment, plant.site) if own is None else own
+    given = normalize(parse_point(sun, "sun"), "sun") if sun is not None else own
+    vector = solar.vector(moment, plant.site) if given is None else given
+    _check_sun(heliostat, vector, moment.isoformat() if given is None else "")
+    result = tracking.track(mechanism, vector, goal, local=local)
+    _check_pose(heliostat, tracking.TrackingStatus(int(result.chosen(result.status))))
+    if not local:
+        check_front(plant, heliostat, goal, result.chosen(result.vertex))
     if law == "guo":
         track_by_guo(heliostat, mechanism, vector, goal, moment, as_json)
         return
     if trace:
         _trace(heliostat, tracking.trace(mechanism, vector, goal), as_json)
         return
-    result = tracking.track(mechanism, vector, goal, local=local)
     joints = [mechanism.joints[j] for j in mechanism.driven]
     document = {
         "heliostat": heliostat,
@@ -129,8 +142,10 @@ def track(
     }
     if as_json:
         print_json(document)
-        return
-    _print_branches(document, heliostat)
+    else:
+        _print_branches(document, heliostat)
+    if not result.reachable:
+        raise typer.Exit(1)
 
 
 def _check(every: str | None, law: str, local: bool, trace: bool) -> None:
@@ -142,6 +157,20 @@ def _check(every: str | None, law: str, local: bool, trace: bool) -> None:
         )
     if trace and (every is not None or local):
         raise InputError("--trace prints one moment of global aiming; leave out --every, --local")
+
+
+def _check_sun(heliostat: str, vector: "np.ndarray", time: str) -> None:
+    """Refuse a sun that lights no mirror."""
+    if vector[2] <= 0.0:
+        below = f"the sun is {math.degrees(abs(math.asin(vector[2]))):.2f}° below the horizon"
+        when = f" at {time}" if time else ""
+        raise InputError(f"heliostat {heliostat}: {below}{when}; choose a time of daylight")
+
+
+def _check_pose(heliostat: str, status: "TrackingStatus") -> None:
+    """Refuse an outcome without a pose that a mirror can take."""
+    if status.name in ("NOT_CONVERGED", "DEGENERATE"):
+        raise InputError(f"heliostat {heliostat}: {status.text}; choose another aim")
 
 
 def _sun_of(field: Path) -> "np.ndarray | None":
@@ -169,6 +198,39 @@ def aim_of(plant: "Plant", heliostat: str, aim: str | None, target: str | None) 
     if not plant.targets:
         raise InputError("this plant has no target; give --aim east,north,up in metres")
     return plant.targets[0].center
+
+
+def check_front(plant: "Plant", heliostat: str, aim: Any, vertices: "np.ndarray") -> None:
+    """Refuse an aim that beams from ``vertices`` (..., 3) do not reach because of a target.
+
+    Raises
+    ------
+    InputError
+        If the aim is on a target or an aperture whose back the mirror sees, or a target stands
+        before it.
+    """
+    import numpy as np
+
+    at = vertices[np.isfinite(vertices).all(axis=-1)]
+    planar = [receiver.face for receiver in plant.receivers if receiver.kind == "planar"]
+    for surface in (*plant.targets, *planar):
+        ahead = (at - surface.center) @ surface.normal
+        beyond = float((aim - surface.center) @ surface.normal)
+        if surface.holds(aim, _ON) and (ahead <= 0.0).any():
+            raise InputError(
+                f"heliostat {heliostat}: it is {-ahead.min():.2f} m behind {surface.name}, and its "
+                "beam would come to the back; choose another target or aim"
+            )
+        # An aperture may be crossed: the aim is inside a cavity.
+        crossed = ahead * beyond < 0.0
+        if surface in planar or abs(beyond) <= _ON or not crossed.any():
+            continue
+        share = ahead[crossed] / (ahead[crossed] - beyond)
+        if surface.holds(at[crossed] + share[:, None] * (aim - at[crossed])).any():
+            raise InputError(
+                f"heliostat {heliostat}: {surface.name} stands between it and the aim; choose "
+                "another aim"
+            )
 
 
 def _trace(heliostat: str, steps: "tuple[TraceStep, ...]", as_json: bool) -> None:
@@ -243,7 +305,8 @@ def _print_branches(document: dict[str, Any], heliostat: str) -> None:
     print(f"{heliostat}{when}, {whose} at {document['sun_elevation_deg']:.2f}° of elevation")
     names = "joints " + " and ".join(document["joints"])
     print_table(["branch", "azimuth", "elevation", names, "counts", "residual", ""], rows)
-    print("* the one to take")
+    served = document["branches"][document["best"]]["reachable"]
+    print(f"* {_TAKE if served else _NEAREST}")
 
 
 def _day(

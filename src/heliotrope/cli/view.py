@@ -5,13 +5,14 @@ from typing import Annotated
 
 import typer
 
-from heliotrope.cli._common import open_plant, parse_duration, parse_time
+from heliotrope.cli._common import open_plant, parse_time, sunlit
 from heliotrope.cli.track import (
     AimOption,
     FieldArgument,
     HeliostatOption,
     TargetOption,
     aim_of,
+    check_front,
 )
 from heliotrope.errors import InputError
 
@@ -43,10 +44,11 @@ def view(
     one = plant[heliostat]
     mechanism, width, height = one.calibrated, one.width, one.height
     goal = np.array(aim_of(plant, heliostat, aim, target))
-    times = solar.daylight(parse_time(time).date(), plant.site, every=parse_duration(every))
+    times = sunlit(parse_time(time), plant.site, every)
     light = np.asarray(solar.vector(times, plant.site))
     found = tracking.track(mechanism, light, goal)
     good = found.reachable
+    check_front(plant, heliostat, goal, found.chosen(found.vertex)[good])
     if not good.any():
         raise InputError(f"heliostat {heliostat}: the beam reaches the aim at no time of this day")
     angles = np.unwrap(found.best_angles[good], axis=0)

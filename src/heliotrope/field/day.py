@@ -119,7 +119,7 @@ def track_day(
         )
     times = solar.daylight(day, place, every=every, min_elevation=min_elevation)
     if not len(times):
-        raise InputError(f"track_day: the sun does not rise on {day} at {place.name or 'the site'}")
+        raise InputError(f"{place.label}: the sun does not rise on {day}; choose another day")
     light = solar.vector(times, place)
     goal = _aim(heliostat, aim)
     path = track_path(heliostat, light, goal, over_the_top=over_the_top)

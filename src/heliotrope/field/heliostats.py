@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.files.cells import check_names
 from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.armature import Armature
@@ -85,13 +86,7 @@ class Heliostats(Value, Framed):
             raise InputError(
                 f"heliostats: {count} names but mechanisms of shape {self.mechanism.shape}"
             )
-        seen: set[str] = set()
-        for name in self.names:
-            if not name:
-                raise InputError("heliostats: an empty name; every heliostat needs one")
-            if name in seen:
-                raise InputError(f"heliostat {name}: the name occurs twice; names are unique")
-            seen.add(name)
+        check_names("heliostat", self.names)
         for what in ("width", "height"):
             values = np.broadcast_to(as_float(getattr(self, what)), (count,))
             wrong = ~(np.isfinite(values) & (values > 0))

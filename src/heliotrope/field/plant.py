@@ -15,6 +15,7 @@ from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Volume
+from heliotrope.files.cells import check_names
 from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.armature import Armature
@@ -76,29 +77,15 @@ class Plant(Value, Framed):
     def __post_init__(self) -> None:
         check_site(self.site)
         limited(CONDITIONS, self.safety)
-        seen: dict[str, str] = {}
-        for group, heliostats in self.groups.items():
-            for name in heliostats.names:
-                if name in seen:
-                    raise InputError(
-                        f"heliostat {name}: in group {seen[name]} and in group {group}; "
-                        "names are unique in a plant"
-                    )
-                seen[name] = group
-        surfaces = [t.name for t in self.targets] + [r.name for r in self.receivers]
-        for name in surfaces:
-            if surfaces.count(name) > 1:
-                raise InputError(f"target or receiver {name}: the name occurs twice")
-        names = [camera.name for camera in self.cameras]
+        groups = self.groups.values()
+        check_names("heliostat", (name for group in groups for name in group.names))
+        surfaces = [*(t.name for t in self.targets), *(r.name for r in self.receivers)]
+        check_names("target or receiver", surfaces)
+        check_names("camera", (camera.name for camera in self.cameras))
+        check_names("keep-out volume", (volume.name for volume in self.keep_outs))
         for camera in self.cameras:
-            if names.count(camera.name) > 1:
-                raise InputError(f"camera {camera.name}: the name occurs twice")
             for target in camera.targets:
                 self.target(target)
-        names = [volume.name for volume in self.keep_outs]
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"keep-out volume {name}: the name occurs twice")
         if self.receiver_visits is not None:
             # Both must be known: the camera's place, and a face that it can see.
             _ = self.receiver(self.receiver_visits.receiver).face

@@ -1,13 +1,15 @@
 """Reading and writing files safely, with errors that name the file and the place in it.
 
 - `limits`: size, depth, count and expansion that no file may exceed, for all readers.
+- `kinds`: what a file is that another program, or another command, reads.
 - `text`: whole text files and binary files; written whole or not at all.
 - `json`, `xml`: documents whose values know their place in the file.
 - `documents`: TOML files of our own formats, checked against pydantic models. Its names stay
   there, because pydantic is slow to load.
 - `disk`: work that waits for a disk, outside an event loop.
 - `archives`: members of a ZIP and arrays of NumPy, measured before they are expanded.
-- `cells`: tables (CSV, Parquet) cell by cell, and times in ISO 8601.
+- `cells`: the one reader of tables (CSV in the fashions of spreadsheets, Parquet), cell by cell.
+- `times`: times in ISO 8601.
 
 Begin with `read_text` and `write_text`.
 """
@@ -15,24 +17,26 @@ Begin with `read_text` and `write_text`.
 from heliotrope.files.cells import (
     Cells,
     Rows,
+    alike,
     find_heliostats,
-    format_time,
-    parse_time,
+    read_cells,
     read_parquet,
     read_rows,
     rows_of,
+    rows_under,
 )
 from heliotrope.files.json import (
     JsonNode,
     read_json,
 )
-from heliotrope.files.limits import SIZE_LIMIT, check_file, check_table
+from heliotrope.files.limits import SIZE_LIMIT, check_file
 from heliotrope.files.text import (
     read_bytes,
     read_text,
     write_file,
     write_text,
 )
+from heliotrope.files.times import format_time, moment, parse_time
 from heliotrope.files.xml import Document, XmlElement, read_xml
 
 __all__ = [
@@ -42,18 +46,21 @@ __all__ = [
     "JsonNode",
     "Rows",
     "XmlElement",
+    "alike",
     "check_file",
-    "check_table",
     "find_heliostats",
     "format_time",
+    "moment",
     "parse_time",
     "read_bytes",
+    "read_cells",
     "read_json",
     "read_parquet",
     "read_rows",
     "read_text",
     "read_xml",
     "rows_of",
+    "rows_under",
     "write_file",
     "write_text",
 ]

@@ -4,11 +4,10 @@ import csv
 import io
 import math
 import re
-from collections.abc import Sequence
+import unicodedata
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
-from decimal import Decimal
-from fractions import Fraction
+from datetime import datetime
 from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -17,16 +16,19 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.files.kinds import instead
 from heliotrope.files.limits import (
+    CELLS,
     COLUMNS,
     PARQUET_CELLS,
     PARQUET_EXPANDED,
     PARQUET_SIZE,
+    ROWS,
     check_count,
     check_file,
-    check_table,
 )
 from heliotrope.files.text import read_text
+from heliotrope.files.times import parse_time
 from heliotrope.geometry import FloatArray
 
 if TYPE_CHECKING:
@@ -36,13 +38,14 @@ if TYPE_CHECKING:
 #: A column as it was read: texts, or what Parquet holds.
 Cells: TypeAlias = list[Any] | FloatArray
 
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_TIME = re.compile(
-    r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d(?:[.,](\d+))?)?) ?(Z|[+-]\d\d(?::?\d\d)?)?", re.ASCII
-)
+#: Separators of cells, the likelier one first.
+SEPARATORS = "\t;,|"
+_SEP_LINE = re.compile(r'"?sep=(.)"?[ ;,\t]*\n', re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?", re.ASCII)
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[,.' \u00a0\u202f]\d{3})+(?:[,.]\d*)?", re.ASCII)
 #: Unknown names of a table for which close ones are suggested.
 _SUGGESTIONS = 20
-_TRUE, _FALSE = ("true", "1"), ("false", "0")
+_TRUE, _FALSE = ("true", "t", "1", "1.0"), ("false", "f", "0", "0.0")
 
 
 @dataclass
@@ -62,7 +65,7 @@ class Rows:
     heliostat
         Name of the heliostat in each row, for messages, (M,).
     reasons
-        Why a row cannot be used, by its index.
+        Column ("" for the whole row) and reason why a row cannot be used, by its index.
     """
 
     path: Path
@@ -70,7 +73,7 @@ class Rows:
     columns: dict[str, Cells]
     header: str = ""
     heliostat: Sequence[str] = ()
-    reasons: dict[int, str] = field(default_factory=dict)
+    reasons: dict[int, tuple[str, str]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.places)
@@ -84,12 +87,50 @@ class Rows:
     def left_out(self) -> list[str]:
         """One line for each row that cannot be used, in the order of the rows."""
         lines = []
-        for i, reason in sorted(self.reasons.items()):
-            name = self.heliostat[i] if len(self.heliostat) else ""
-            of = f", heliostat {name}" if name else ""
+        for i, (column, reason) in sorted(self.reasons.items()):
+            parts = [f"{self.path.name}: {self.places[i]}", self._heliostat(i)]
+            parts.append(f"column {column}: {reason}" if column else reason)
             # A quoted cell may hold line breaks; a message is one line.
-            lines.append(" ".join(f"{self.path.name}: {self.places[i]}{of}, {reason}".split()))
+            lines.append(" ".join(", ".join(filter(None, parts)).split()))
         return lines
+
+    @property
+    def problems(self) -> list[FormatError]:
+        """The errors of the rows that cannot be used, where a table is used whole or not at all."""
+        found = []
+        for i, (column, reason) in sorted(self.reasons.items()):
+            name = self._heliostat(i)
+            where = f"{self.places[i]}, column {column}" if column else self.places[i]
+            text = " ".join(f"{name}: {reason}".split()) if name else " ".join(reason.split())
+            found.append(FormatError(self.path, text, where))
+        return found
+
+    def refuse_bad(self) -> None:
+        """Raise the first of `problems`, if there is one."""
+        for problem in self.problems:
+            raise problem
+
+    def _heliostat(self, i: int) -> str:
+        name = self.heliostat[i] if len(self.heliostat) else ""
+        return f"heliostat {name}" if name else ""
+
+    def take(self, index: Iterable[int]) -> "Rows":
+        """Return the rows at ``index``, in that order."""
+        taken = list(index)
+        columns: dict[str, Cells] = {}
+        for name, cells in self.columns.items():
+            columns[name] = [cells[i] for i in taken]
+        reasons = {k: self.reasons[i] for k, i in enumerate(taken) if i in self.reasons}
+        names = [self.heliostat[i] for i in taken] if len(self.heliostat) else ()
+        places = [self.places[i] for i in taken]
+        return Rows(self.path, places, columns, self.header, names, reasons)
+
+    def rename(self, known: Iterable[str]) -> None:
+        """Give columns that differ from a known name in case or blanks only that name."""
+        by_form = {alike(name): name for name in known}
+        names = [by_form.get(alike(name), name) for name in self.columns]
+        if len(set(names)) == len(names):
+            self.columns = dict(zip(names, self.columns.values(), strict=True))
 
     def need(self, names: Sequence[str]) -> None:
         """Raise FormatError if one of the columns is not there."""
@@ -102,7 +143,7 @@ class Rows:
 
     def refuse(self, i: "int | np.integer[Any]", column: str, reason: str) -> None:
         """Leave a row out; only the first reason is kept."""
-        self.reasons.setdefault(int(i), f"column {column}: {reason}")
+        self.reasons.setdefault(int(i), (column, reason))
 
     def texts(self, column: str) -> list[str]:
         """Return the cells as texts, "" where empty or where there is no such column."""
@@ -127,32 +168,55 @@ class Rows:
             Value of an empty cell; None refuses it.
         """
         cells = self.columns[column]
-        values = cells if isinstance(cells, np.ndarray) else np.array([_number(c) for c in cells])
-        values = np.asarray(values, dtype=np.float64).copy()
+        values = _numbers(cells)
         for i in np.flatnonzero(~np.isfinite(values)):
             if not _empty(cells[i]):
-                self.refuse(i, column, f"{_shown(cells[i])} is not a finite number; give {what}")
+                hint = _hint(str(cells[i])) or f"give {what}"
+                self.refuse(i, column, f"{_shown(cells[i])} is not a finite number; {hint}")
             elif empty is None:
                 self.refuse(i, column, f"the cell is empty; give {what}")
             else:
                 values[i] = empty
         return values
 
+    def within(self, column: str, values: FloatArray, low: float, high: float, unit: str) -> None:
+        """Leave out the rows whose value lies outside ``low`` to ``high``, in ``unit``."""
+        outside = ~((values >= low) & (values <= high)) & np.isfinite(values)
+        limits = f" is outside {low:g} to {high:g} {unit}; is it in another unit?"
+        self.check(column, outside, values, limits)
+
+    def names(self, column: str, what: str) -> tuple[str, ...]:
+        """Return the names of a column; empty ones, and those of another row, are refused.
+
+        Names are the same if only case, blanks or the form of Unicode differ: see `alike`.
+        """
+        names = self.texts(column)
+        first: dict[str, int] = {}
+        for i, name in enumerate(names):
+            other = first.setdefault(alike(name), i)
+            if not name.strip():
+                self.refuse(i, column, f"a {what} without a name; give it one")
+            elif other != i:
+                close = "" if names[other] == name else f" but for case or blanks ({names[other]})"
+                place = self.places[other]
+                text = f"{name} is the name of {place} too{close}; names are unique"
+                self.refuse(i, column, text)
+        return tuple(names)
+
     def check(self, column: str, wrong: npt.ArrayLike, values: FloatArray, reason: str) -> None:
         """Leave out the rows where ``wrong`` holds; ``reason`` follows the value in the message."""
         for i in np.flatnonzero(wrong):
             self.refuse(i, column, f"{values[i]:.10g}{reason}")
 
-    def flags(self, column: str) -> npt.NDArray[np.bool_]:
+    def flags(self, column: str, advice: str = "give one") -> npt.NDArray[np.bool_]:
         """Return booleans; cells that are neither true nor false leave their rows out."""
         flags = np.zeros(len(self), dtype=np.bool_)
         for i, cell in enumerate(self.columns[column]):
-            text = str(int(cell) if isinstance(cell, float) and cell in (0.0, 1.0) else cell)
-            known = text.strip().casefold()
+            known = str(cell).strip().casefold()
             if known in _TRUE:
                 flags[i] = True
             elif known not in _FALSE:
-                self.refuse(i, column, f"{_shown(cell)} is neither true nor false; give one")
+                self.refuse(i, column, f"{_shown(cell)} is neither true nor false; {advice}")
         return flags
 
     def times(self, column: str, optional: bool) -> FloatArray:
@@ -171,27 +235,61 @@ class Rows:
         return seconds
 
 
-def read_rows(path: Path, what: str) -> Rows:
-    """Return the rows of a CSV file with a header, separated by comma, semicolon or tab.
+def read_cells(
+    path: Path, what: str, *, separators: str = SEPARATORS, record_end: str = ""
+) -> tuple[list[str], list[list[str]]]:
+    """Return place ("line 12") and cells of each row of a text table: the one reader of tables.
 
-    Empty lines are skipped; lines with more or fewer cells than the header are bad rows.
+    The text is UTF-8, UTF-16 with a byte-order mark, or Windows-1252, as spreadsheets write it.
+    Blanks around cells, and empty rows, are left out.
+
+    Parameters
+    ----------
+    path
+        The file.
+    what
+        Kind of table, as an error names it.
+    separators
+        Characters that may separate cells. A line ``sep=;`` before the table, as Excel writes it,
+        names another; else the first row decides.
+    record_end
+        A character that may end a row instead of a line end, where cells are separated by another.
 
     Raises
     ------
     FormatError
-        If it cannot be read, or its header is unusable.
+        If it cannot be read, or is beyond the limits of `heliotrope.files.limits`.
     """
-    text = read_text(check_table(path, what), what)
-    header = text.lstrip("\r\n").split("\n", maxsplit=1)[0]
-    separator = max(",;\t", key=header.count)
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
-    table: list[list[str]] = []
+    text = unicodedata.normalize("NFC", read_text(path, what, spreadsheet=True))
+    if other := instead(text[:4096].encode(), what, "table"):
+        raise FormatError(path, other)
+    named = _SEP_LINE.match(text)
+    if named is not None:
+        text = "\n" + text[named.end() :]
+    start = next((line for line in text.split("\n") if line.strip(" \t,;|")), "")
+    if record_end and any(piece.count(",") > 1 for piece in start.split(record_end)):
+        text = text.replace(f"{record_end}\n", "\n").replace(record_end, "\n")
+        separators = separators.replace(record_end, "")
+    separator = named[1] if named is not None else _separator(start, separators)
+    lines = text.count("\n") + (not text.endswith("\n"))
+    check_count(path, lines - 1, ROWS, "rows", "divide the table")
+    check_count(path, lines + text.count(separator), CELLS, "cells", "divide the table")
+    reader = csv.reader(
+        io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True, strict=True
+    )
     places: list[str] = []
+    table: list[list[str]] = []
     before = 0
     try:
-        for cells in reader:
+        for row in reader:
+            cells = [cell.strip() for cell in row]
             # A quoted cell may span several lines; the row is named by its first.
-            if any(cell.strip() for cell in cells):
+            if any(cells):
+                if not table:
+                    advice = "remove those that are not needed"
+                    check_count(path, len(cells), COLUMNS, "columns", advice, f"line {before + 1}")
+                    # A short row is filled up to the columns of the header.
+                    check_count(path, lines * len(cells), CELLS, "cells", "divide the table")
                 table.append(cells)
                 places.append(f"line {before + 1}")
             before = reader.line_num
@@ -199,8 +297,55 @@ def read_rows(path: Path, what: str) -> Rows:
         raise FormatError(path, f"not a CSV table ({error})", f"line {reader.line_num}") from None
     if not table:
         raise FormatError(path, f"the file has no rows; it should be {what}")
-    names = [_tidy(cell) for cell in table.pop(0)]
-    place = places.pop(0)
+    return places, table
+
+
+def _separator(line: str, separators: str) -> str:
+    """Return the separator of a row, which may have decimal commas between semicolons."""
+    bare = re.sub(r'"[^"]*"', "", line)
+    counts = {each: bare.count(each) for each in separators}
+    if counts.get(";") and all(piece.count(",") < 2 for piece in bare.split(";")):
+        return ";"
+    # Blanks separate only where nothing else does.
+    blanks = counts.pop(" ", 0)
+    best = max(counts, key=lambda each: counts[each])
+    return best if counts[best] else " " if blanks else ","
+
+
+def read_rows(path: Path, what: str, known: Iterable[str] = ()) -> Rows:
+    """Return the rows of a table with a header; lines of another length than it are bad rows.
+
+    Parameters
+    ----------
+    path, what
+        As for `read_cells`, with its errors.
+    known
+        Names of columns in which case and blanks do not count.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be read, or its header is unusable.
+    """
+    places, table = read_cells(path, what)
+    return rows_under(path, (places.pop(0), table.pop(0)), places, table, known)
+
+
+def rows_under(
+    path: Path,
+    header: tuple[str, list[str]],
+    places: list[str],
+    table: list[list[str]],
+    known: Iterable[str] = (),
+) -> Rows:
+    """Return rows from the place and the cells of a header, and those of the rows below it.
+
+    Raises
+    ------
+    FormatError
+        If a column has no name, or one of another.
+    """
+    place, names = header[0], [_tidy(cell) for cell in header[1]]
     while names and not names[-1]:
         names.pop()
     seen: set[str] = set()
@@ -210,13 +355,15 @@ def read_rows(path: Path, what: str) -> Rows:
             raise FormatError(path, f"{wrong}; name each column once", place)
         seen.add(name)
     rows = Rows(path, places, {}, place)
+    # Empty columns at the end; in a single row a further cell has moved all others.
+    widths = {len(cells) for cells in table}
+    allowed = {len(names), len(header[1]), *(widths if len(widths) == 1 else ())}
     for i, cells in enumerate(table):
-        while len(cells) > len(names) and not cells[-1].strip():
-            cells.pop()
-        if len(cells) != len(names):
-            rows.reasons[i] = f"{len(cells)} cells under {len(names)} columns; correct the line"
+        if len(cells) not in allowed or len(cells) < len(names) or any(cells[len(names) :]):
+            rows.reasons[i] = "", f"{len(cells)} cells under {len(names)} columns; correct the line"
         cells.extend(repeat("", len(names) - len(cells)))
     rows.columns.update({name: [cells[k] for cells in table] for k, name in enumerate(names)})
+    rows.rename(known)
     return rows
 
 
@@ -312,53 +459,9 @@ def find_heliostats(rows: Rows, column: str, names: Sequence[str]) -> npt.NDArra
     return found
 
 
-def parse_time(text: str) -> float:
-    """Return unix seconds of an ISO 8601 text, the nearest double to all its digits.
-
-    Raises
-    ------
-    InputError
-        If it is not a time, or has no time zone.
-    """
-    found = _TIME.fullmatch(text.strip())
-    if found is None:
-        raise InputError(
-            f"{_shown(text)} is not an ISO 8601 time; write it like 2026-06-21T12:00:00Z"
-        )
-    day, clock, digits, zone = found.groups()
-    if zone is None:
-        raise InputError(
-            f"{text.strip()} has no time zone; append Z if it is UTC, or an offset such as +02:00"
-        )
-    try:
-        moment = datetime.fromisoformat(f"{day}T{clock[:8]}{zone}")
-        whole = (moment - _EPOCH) // timedelta(seconds=1)
-        return float(whole + (Fraction(int(digits), 10 ** len(digits)) if digits else 0))
-    except (ValueError, OverflowError) as error:
-        raise InputError(f"{_shown(text)} is not a valid time ({error}); correct it") from None
-
-
-def format_time(seconds: float) -> str:
-    """Return unix seconds as ISO 8601 in UTC, with the digits that give the same double again.
-
-    Raises
-    ------
-    InputError
-        If they are infinite or lie outside the years 1 to 9999.
-    """
-    if math.isnan(seconds):
-        return ""
-    try:
-        whole = math.floor(seconds)
-        moment = (_EPOCH + timedelta(seconds=whole)).replace(tzinfo=None).isoformat()
-    except OverflowError:
-        raise InputError(f"time {seconds} s since 1970 lies outside the years 1 to 9999") from None
-    # repr is the shortest text that gives the same double; its decimals are kept exactly.
-    decimals = f"{Decimal(repr(float(seconds))):f}".partition(".")[2].rstrip("0")
-    if decimals and seconds < 0.0:
-        # Below the epoch the time of day still counts upwards.
-        decimals = f"{10 ** len(decimals) - int(decimals):0{len(decimals)}d}"
-    return f"{moment}.{decimals}Z" if decimals else f"{moment}Z"
+def alike(name: str) -> str:
+    """Return a name without what people do not see: case, blanks and the form of Unicode."""
+    return "".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 
 def _tidy(name: str) -> str:
@@ -371,13 +474,69 @@ def _empty(cell: Any) -> bool:
     return cell is None or cell != cell or (isinstance(cell, str) and not cell.strip())  # noqa: PLR0124
 
 
+def check_names(what: str, names: Iterable[str]) -> None:
+    """Refuse empty names, and names that are alike.
+
+    Parameters
+    ----------
+    what
+        Kind of thing that has them, for the message.
+    names
+        Its names.
+
+    Raises
+    ------
+    InputError
+        For the first of them.
+    """
+    listed = list(names)
+    # All at once: a field of 100,000 is checked each time that it is copied.
+    text = unicodedata.normalize("NFKC", "\n".join(listed)).casefold()
+    forms = re.sub(r"[^\S\n]+", "", text).split("\n") if listed else []
+    if len(forms) == len(listed) == len(set(forms)) and all(forms):
+        return
+    seen: dict[str, str] = {}
+    for name in listed:
+        if not name.strip():
+            raise InputError(f"{what}: an empty name; each {what} needs one")
+        if other := seen.get(alike(name), ""):
+            twice = "the name occurs twice; names are unique"
+            close = f"there is {other} too; names differ by more than case and blanks"
+            raise InputError(f"{what} {name}: {twice if other == name else close}")
+        seen[alike(name)] = name
+
+
+def _numbers(cells: Cells) -> FloatArray:
+    """Return numbers; NaN where a cell holds none."""
+    if isinstance(cells, np.ndarray):
+        return cells.copy()
+    try:
+        text = "".join(cells)
+        if text.isascii() and "_" not in text:
+            return np.fromiter(map(float, cells), np.float64, len(cells))
+    except (TypeError, ValueError):
+        pass
+    return np.array([_number(cell) for cell in cells], dtype=np.float64)
+
+
 def _number(cell: Any) -> float:
-    if isinstance(cell, bool) or (isinstance(cell, str) and "_" in cell):
+    if isinstance(cell, bool) or (isinstance(cell, str) and ("_" in cell or not cell.isascii())):
         return math.nan
     try:
         return float(cell)
     except (TypeError, ValueError, OverflowError):
         return math.nan
+
+
+def _hint(text: str) -> str:
+    """Return what to do about a number written in the fashion of another country, "" if none is."""
+    if _DECIMAL_COMMA.fullmatch(text):
+        return "write a point, not a comma"
+    if _THOUSANDS.fullmatch(text):
+        return "leave out the separators of thousands, and write a point for the decimals"
+    if text.startswith("\u2212"):
+        return "write the minus sign as -"
+    return ""
 
 
 def _shown(cell: Any) -> str:

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from heliotrope.errors import FormatError
+from heliotrope.files.kinds import instead
 from heliotrope.files.limits import TOML_SIZE, check_toml
 from heliotrope.files.text import read_text
 
@@ -29,7 +30,8 @@ def read_toml(path: str | Path, what: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except ValueError as error:
         # Not a TOMLDecodeError: an integer of thousands of digits.
-        raise FormatError(path, f"not valid TOML: {str(error)[:200]}") from None
+        other = instead(text[:4096].encode(), what, "TOML")
+        raise FormatError(path, other or f"not valid TOML: {str(error)[:200]}") from None
 
 
 def read_document(

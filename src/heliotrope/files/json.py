@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from heliotrope.errors import FormatError
+from heliotrope.files.kinds import instead
 from heliotrope.files.limits import check_json
 from heliotrope.files.text import read_text
 
@@ -110,9 +111,9 @@ def read_json(path: str | Path, what: str) -> JsonNode:
     try:
         return JsonNode(Path(path), json.loads(text))
     except json.JSONDecodeError as error:
-        raise FormatError(
-            path, f"not valid JSON ({error.msg}); the file may be cut off", f"line {error.lineno}"
-        ) from None
+        cut = f"not valid JSON ({error.msg}); the file may be cut off"
+        other = instead(text[:4096].encode(), what, "JSON")
+        raise FormatError(path, other or cut, "" if other else f"line {error.lineno}") from None
     except ValueError as error:
         # An integer of thousands of digits.
         raise FormatError(path, f"not usable JSON ({str(error)[:80]})") from None

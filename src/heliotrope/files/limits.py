@@ -5,8 +5,6 @@ limits no reader takes more than 1.5 GB or a minute; a file beyond one gets one 
 the file, the value, the limit and what to do.
 """
 
-import csv
-import io
 import os
 import re
 import stat
@@ -14,6 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from heliotrope.errors import FormatError
+from heliotrope.files.kinds import foreign, instead
 
 MIB = 2**20
 #: Largest file that is read, bytes: a layout of 400,000 heliostats is 60 MB.
@@ -42,8 +41,6 @@ PIXELS, PHOTOGRAPH_PIXELS = 64_000_000, 160_000_000
 ENTRIES = 1_000_000
 
 
-_BLOCK = MIB
-_SEPARATORS = ",;\t"
 _JSON_TOKEN = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+"|(?P<bracket>[\[\]{}])', re.DOTALL)
 _PART = r'(?:"[^"\\\n]*+(?:\\.[^"\\\n]*+)*+"|' + r"'[^'\n]*+'|[\w+-]++)"
 # Brackets and dots inside strings and comments are text.
@@ -75,8 +72,8 @@ def check_file(
     Raises
     ------
     FormatError
-        If it does not exist, is a folder, a device or a pipe, cannot be read, is empty, is larger
-        than the limit or does not begin like text.
+        If it does not exist, is a folder, a device or a pipe, cannot be read, is empty, belongs to
+        another program, is larger than the limit or does not begin like text.
     """
     file = Path(path)
     try:
@@ -97,58 +94,20 @@ def check_file(
         raise FormatError(file, f"cannot be read ({error.strerror}); it should be {what}") from None
     if not start:
         raise FormatError(file, f"the file is empty; it should be {what}")
+    if text := foreign(file, start):
+        raise FormatError(file, text)
     if state.st_size > limit:
         raise FormatError(
             file,
             f"{_mib(state.st_size)} MiB exceed the limit of {_mib(limit)} MiB; this is not {what}",
         )
     if not binary and b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise FormatError(file, f"the file is binary; it should be {what}")
+        raise FormatError(file, instead(start, what) or f"the file is binary; it should be {what}")
     return file
 
 
 def _mib(size: int) -> str:
     return f"{size / MIB:.3g}" if size < 10 * MIB else f"{size / MIB:.0f}"
-
-
-def check_table(path: str | Path, what: str) -> Path:
-    """Return the path of a table in CSV if it has a plausible number of rows and cells.
-
-    Raises
-    ------
-    FormatError
-        As `check_file`, or if it has more rows, columns or cells than the limits.
-    """
-    file = check_file(path, what)
-    lines, separators = 1, dict.fromkeys(_SEPARATORS, 0)
-    columns = _columns(file)
-    with file.open("rb") as stream:
-        while block := stream.read(_BLOCK):
-            lines += max(block.count(b"\n"), block.count(b"\r"))
-            for separator in _SEPARATORS:
-                separators[separator] += block.count(separator.encode())
-    check_count(file, columns, COLUMNS, "columns", "remove those that are not needed", "line 1")
-    check_count(file, lines - 1, ROWS, "rows", "divide the table")
-    # A short row is filled up to the columns of the header.
-    cells = max(lines + max(separators.values()), lines * columns)
-    check_count(file, cells, CELLS, "cells", "divide the table")
-    return file
-
-
-def _columns(file: Path) -> int:
-    """Return the number of columns of the header, by the separator that gives the most."""
-    with file.open("rb") as stream:
-        text = stream.read(_BLOCK).decode("utf-8", "replace").lstrip("\r\n")
-    counts, problem = [], ""
-    for separator in filter(text.__contains__, _SEPARATORS):
-        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
-        try:
-            counts.append(len(next(reader, [])))
-        except csv.Error as error:
-            problem = str(error)
-    if problem and not counts:
-        raise FormatError(file, f"not a CSV table ({problem})", "line 1")
-    return max(counts, default=1)
 
 
 def check_count(

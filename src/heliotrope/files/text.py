@@ -1,6 +1,8 @@
 """Whole files, read with one-line refusals and written whole or not at all."""
 
+import errno
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
@@ -8,24 +10,52 @@ from typing import BinaryIO
 from heliotrope.errors import FormatError, InputError
 from heliotrope.files.limits import SIZE_LIMIT, check_count, check_file
 
+#: A character of more than one byte in UTF-8, and bytes that no text has.
+_UTF_8 = re.compile(rb"[\xc2-\xdf][\x80-\xbf]|[\xe0-\xef][\x80-\xbf]{2}|[\xf0-\xf4][\x80-\xbf]{3}")
+_CONTROLS = re.compile(rb"[\x00-\x08\x0e-\x1f\x7f]")
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
-def read_text(path: str | Path, what: str, limit: int = SIZE_LIMIT) -> str:
+
+def read_text(
+    path: str | Path, what: str, limit: int = SIZE_LIMIT, *, spreadsheet: bool = False
+) -> str:
     """Return the text of a UTF-8 file (with or without a byte-order mark).
+
+    Parameters
+    ----------
+    path, what, limit
+        As for `check_file`.
+    spreadsheet
+        Read also what spreadsheets export: UTF-16 with a byte-order mark, and Windows-1252.
 
     Raises
     ------
     FormatError
-        As `check_file`, or if it is not UTF-8.
+        As `check_file`, or if it is not in one of these encodings.
     """
     file = check_file(path, what, limit=limit)
+    content = read_bytes(file, limit)
     try:
-        # "\r\n" and "\r" become "\n", as in a text file that Python opens.
-        text = read_bytes(file, limit).decode("utf-8-sig")
-        return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+        text = _decoded(content, spreadsheet)
     except UnicodeDecodeError as error:
+        name = error.encoding.upper().replace("UTF-8-SIG", "UTF-8")
         raise FormatError(
-            file, f"not UTF-8 text ({error.reason}); save it as UTF-8", f"byte {error.start}"
+            file, f"not {name} text ({error.reason}); save it as UTF-8", f"byte {error.start}"
         ) from None
+    # "\r\n" and "\r" become "\n", as in a text file that Python opens.
+    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+
+
+def _decoded(content: bytes, spreadsheet: bool) -> str:
+    if spreadsheet and content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return content.decode("utf-16")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        # A file that is UTF-8 but for some bytes is damaged.
+        if not spreadsheet or _UTF_8.search(content) or _CONTROLS.search(content):
+            raise
+    return content.decode("cp1252")
 
 
 def read_bytes(path: str | Path, limit: int = SIZE_LIMIT) -> bytes:
@@ -68,10 +98,10 @@ def write_file(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
             os.fsync(stream.fileno())
         beside.replace(file)
     except OSError as error:
-        raise InputError(
-            f"{file}: cannot be written ({error.strerror}); give a folder that exists and may be "
-            "written to"
-        ) from None
+        advice = "give a folder that exists and may be written to"
+        if error.errno in _FULL:
+            advice = "free some space, or give a folder on another disk"
+        raise InputError(f"{file}: cannot be written ({error.strerror}); {advice}") from None
     finally:
         beside.unlink(missing_ok=True)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from xml.parsers import expat
 
 from heliotrope.errors import FormatError
+from heliotrope.files.kinds import instead
 from heliotrope.files.limits import DEPTH, XML_PARTS, XML_TAG, check_count, check_file
 from heliotrope.files.text import read_bytes
 
@@ -91,11 +92,9 @@ def read_xml(path: str | Path, what: str) -> Document:
     try:
         builder.parser.Parse(content, True)
     except expat.ExpatError as error:
-        raise FormatError(
-            file,
-            f"not well-formed XML ({expat.ErrorString(error.code)}); it should be {what}",
-            f"line {error.lineno}",
-        ) from None
+        problem = f"not well-formed XML ({expat.ErrorString(error.code)}); it should be {what}"
+        other = instead(content[:4096], what, "XML")
+        raise FormatError(file, other or problem, "" if other else f"line {error.lineno}") from None
     return Document(builder.root, str(file))
 
 

@@ -2,15 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from heliotrope.errors import FormatError
-from heliotrope.field.formats.paint import read_calibration_properties
-from heliotrope.files import check_table
+from heliotrope.field.formats.paint import heliostat_of, read_calibration_properties
+from heliotrope.files import read_rows
 from heliotrope.geometry import FloatArray, direction
 
 #: Columns of a log; a row needs a file name or id, a heliostat and two counts.
@@ -18,6 +17,7 @@ COLUMNS = (
     "file", "id", "heliostat", "timestamp", "target", "axis_1_motor_position",
     "axis_2_motor_position", "sun_azimuth_deg_south0_east", "sun_elevation_deg_apparent", "empty",
 )  # fmt: skip
+_MOTORS, _ANGLES = COLUMNS[5:7], COLUMNS[7:9]
 
 
 @dataclass(frozen=True)
@@ -88,65 +88,38 @@ def read_log(path: str | Path) -> Log:
     Raises
     ------
     FormatError
-        If it cannot be read, or lacks a required value.
+        If it cannot be read, lacks a required value, or has two rows for a photograph.
     """
-    import pandas as pd
-
-    file = check_table(path, "a log of photographs (CSV)")
-    try:
-        table = pd.read_csv(file, dtype=str, keep_default_na=False)
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise FormatError(file, f"not a CSV table ({str(error).strip()})") from None
-    needed = ("heliostat", "axis_1_motor_position", "axis_2_motor_position")
-    missing = [c for c in needed if c not in table.columns]
-    if not {"file", "id"} & set(table.columns):
-        missing.insert(0, "file (or id)")
-    if missing:
-        there = ", ".join(map(str, table.columns[:12]))
-        raise FormatError(file, f"column {missing[0]} is missing; present are {there}", "line 1")
-    entries: dict[str, Entry] = {}
-    for number, row in enumerate(table.to_dict("records"), start=2):
-        key = str(row.get("file") or row.get("id") or "").strip()
-        if not key:
-            raise FormatError(file, "neither file nor id is given", f"line {number}")
-        entries[key] = _entry(file, number, {str(k): str(v) for k, v in row.items()})
-    return Log(entries)
-
-
-def _entry(file: Path, line: int, row: Mapping[str, str]) -> Entry:
-    def number(column: str) -> float:
-        text = row.get(column, "").strip()
-        try:
-            return float(text) if text else float("nan")
-        except ValueError:
-            raise FormatError(
-                file, f"{text!r} is not a number", f"line {line}, column {column}"
-            ) from None
-
-    counts = np.array([number("axis_1_motor_position"), number("axis_2_motor_position")])
-    angles = number("sun_azimuth_deg_south0_east"), number("sun_elevation_deg_apparent")
-    time = None
-    text = row.get("timestamp", "").strip()
-    if text:
-        try:
-            time = datetime.fromisoformat(text)
-        except ValueError:
-            time = None
-        if time is None or time.tzinfo is None:
-            raise FormatError(
-                file,
-                f"{text!r} is not a time with a zone; write 2026-06-21T12:00:00Z",
-                f"line {line}, column timestamp",
-            )
-    empty = row.get("empty", "").strip()
-    return Entry(
-        heliostat=row.get("heliostat", "").strip(),
-        counts=counts if np.isfinite(counts).all() else None,
-        target=row.get("target", "").strip(),
-        time=time,
-        sun=_sun(*angles),
-        empty=(file.parent / empty).resolve() if empty else None,
+    rows = read_rows(Path(path), "a log of photographs (CSV)", COLUMNS)
+    rows.need(["heliostat", *_MOTORS])
+    if not {"file", "id"} & set(rows.columns):
+        rows.need(["file"])
+    for name in COLUMNS:
+        rows.columns.setdefault(name, [""] * len(rows))
+    time = rows.times("timestamp", optional=True)
+    numbers = [rows.numbers(name, "a number", np.nan) for name in (*_MOTORS, *_ANGLES)]
+    files, ids, heliostats, targets, empties = (
+        rows.texts(name) for name in ("file", "id", "heliostat", "target", "empty")
     )
+    places: dict[str, int] = {}
+    entries: dict[str, Entry] = {}
+    for i, key in enumerate(file or number for file, number in zip(files, ids, strict=True)):
+        first = places.setdefault(key, i)
+        if not key:
+            rows.refuse(i, "file", "neither file nor id is given; give one")
+        elif first != i:
+            rows.refuse(i, "file", f"{key} has the row {rows.places[first]} too; keep the true one")
+        counts = np.array([numbers[0][i], numbers[1][i]])
+        entries[key] = Entry(
+            heliostat=heliostats[i],
+            counts=counts if np.isfinite(counts).all() else None,
+            target=targets[i],
+            time=None if np.isnan(time[i]) else datetime.fromtimestamp(float(time[i]), UTC),
+            sun=_sun(numbers[2][i], numbers[3][i]),
+            empty=(rows.path.parent / empties[i]).resolve() if empties[i] else None,
+        )
+    rows.refuse_bad()
+    return Log(entries)
 
 
 def _sun(azimuth_deg: float, elevation_deg: float) -> FloatArray | None:
@@ -175,9 +148,8 @@ def beside(path: Path, heliostat: str = "") -> Entry | None:
     if not file.exists():
         return None
     found: Any = read_calibration_properties(file)
-    folder = path.parent.parent.name if path.parent.name == "Calibration" else ""
     return Entry(
-        heliostat=heliostat or folder,
+        heliostat=heliostat or heliostat_of(path),
         counts=np.array(found.motors),
         target=found.target,
         sun=_sun(found.sun_azimuth_deg, found.sun_elevation_deg),

@@ -165,6 +165,8 @@ def track_path(
     batch = mechanism.armature.shape
     if light.ndim < 2:
         raise InputError(f"sun: shape {light.shape}; a path needs the suns of its times, (T, 3)")
+    if not len(light):
+        raise InputError("sun: no times; a path needs at least one")
     if light.ndim == 2 and batch:
         light = light.reshape(len(light), *(1,) * len(batch), 3)
     found = track(mechanism, light, aim, local=local)

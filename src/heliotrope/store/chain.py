@@ -23,7 +23,7 @@ from typing import Any
 from sqlalchemy import Connection, RowMapping, func, select
 
 from heliotrope.errors import InputError
-from heliotrope.files.cells import format_time
+from heliotrope.files.times import format_time
 from heliotrope.safety import Severity
 from heliotrope.store import _rows as rows
 from heliotrope.store import tables

@@ -19,8 +19,8 @@ from sqlalchemy import Connection, select
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.calibration.sighting_table import KINDS, write_sightings
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.files.cells import format_time
 from heliotrope.files.text import write_text
+from heliotrope.files.times import format_time
 from heliotrope.store import _rows as rows
 from heliotrope.store import tables
 from heliotrope.store.database import Database

@@ -21,6 +21,7 @@ from heliotrope.sun.ephemeris import (
     daylight,
     events,
     position,
+    solar_day,
     unix_seconds,
     vector,
 )
@@ -38,6 +39,7 @@ __all__ = [
     "events",
     "fast_vector",
     "position",
+    "solar_day",
     "unix_seconds",
     "vector",
     "vector_and_rate",

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, TimeError, UnknownNameError, kind_of
+from heliotrope.files.times import moment
 from heliotrope.frames import ENU, LATEST, Framed, Labelled, Variable, batched
 from heliotrope.frames import times as frame_times
 from heliotrope.geometry import FloatArray, as_float, direction, wrap_positive
@@ -96,7 +97,7 @@ class Site:
                 continue
             if not low <= _number(value) <= high:
                 raise InputError(
-                    f"site {self.name!r}: {field} = {value} {unit} is not a number from "
+                    f"{self.label}: {field} = {value} {unit} is not a number from "
                     f"{low:g} to {high:g} {unit}; {advice}"
                 )
 
@@ -109,6 +110,11 @@ class Site:
             float(location.altitude or 0.0),
             name=location.name or "",
         )
+
+    @property
+    def label(self) -> str:
+        """The site as a message names it."""
+        return f"site {self.name!r}" if self.name else "site"
 
     @property
     def origin(self) -> tuple[float, float, float]:
@@ -353,6 +359,23 @@ def events(
         culmination_elevation=float(position(noon + culmination, site).elevation),
         kind="polar night" if night else kind,
     )
+
+
+def solar_day(time: datetime, site: Site) -> date:
+    """Return the day of local mean solar time that an aware time falls on.
+
+    It is the day that people at the site call today, whatever the zone of ``time``: a California
+    afternoon is tomorrow in UTC.
+
+    Raises
+    ------
+    TimeError
+        If ``time`` has no time zone.
+    """
+    if time.tzinfo is None:
+        raise _no_time(time, ())
+    check_site(site)
+    return (time.astimezone(UTC) + timedelta(hours=site.longitude_deg / 15.0)).date()
 
 
 def daylight(
@@ -602,7 +625,7 @@ def _one_time(value: Any, index: Sequence[int]) -> float:
     time = value
     if isinstance(value, str):
         try:
-            time = datetime.fromisoformat(value)
+            time = moment(value)
         except ValueError:
             raise TimeError(
                 f"{_label(index)}: '{value}' is not an ISO 8601 time; "

@@ -62,8 +62,7 @@ def read_reference(path: str | Path) -> Reference:
     rows.need(_COLUMNS)
     angles = [rows.numbers(name, "degrees") for name in _COLUMNS[1:]]
     rows.check("elevation_deg", np.abs(angles[1]) > 90.0, angles[1], "° is beyond ±90°")
-    if rows.left_out:
-        raise FormatError(file, rows.left_out[0])
+    rows.refuse_bad()
     if not len(rows):
         raise FormatError(file, "no rows; give one for each heliostat")
     found: dict[tuple[str, str], FloatArray] = {}

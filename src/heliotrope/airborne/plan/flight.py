@@ -532,9 +532,7 @@ def camera_target(
     up = position(moments, site).elevation >= min_elevation
     sunny = 24.0 * float(up.mean()) * min(clear, 1.0)
     if sunny <= 0.0:
-        raise InputError(
-            f"site {site.name!r}: the sun is never {np.degrees(min_elevation):g}° high"
-        )
+        raise InputError(f"{site.label}: the sun is never {np.degrees(min_elevation):g}° high")
     hours = photographs * minutes / 60.0 / targets
     return CameraTarget(hours, hours / sunny, hours / sunny / 30.44, sunny)
 

@@ -449,7 +449,7 @@ def write_solarpilot(
 ) -> dict[str, tuple[str, ...]]:
     """Write a copy of SolarPILOT's layout with the positions that were learnt.
 
-    Its heliostats are H1, H2, … by their row. The parameters are those of `write_opencsp`.
+    SolarPILOT has no names: rows keep their order. The parameters are those of `write_opencsp`.
 
     Returns
     -------
@@ -464,10 +464,9 @@ def write_solarpilot(
     """
     from heliotrope.field.formats import solarpilot
 
-    old = solarpilot.read_layout(layout)
-    names = tuple(f"H{i + 1}" for i in range(len(old)))
+    old = solarpilot.read_layout(layout, plant.site)
     given = _given(plant, learned, time, "write_solarpilot")
-    moved, lost = _moved(given, learned.heliostats, names, old.location, layout)
+    moved, lost = _moved(given, learned.heliostats, old.names, old.location, layout)
     solarpilot.write_layout(path, replace(old, location=moved))
     return lost
 

@@ -350,9 +350,11 @@ def _start(text: str, design: "Plant") -> "datetime":
     from datetime import time as hour
 
     from heliotrope.errors import TimeError
+    from heliotrope.sun import solar_day
 
     try:
-        day = datetime.now(UTC).date() if text == "morning" else date.fromisoformat(text)
+        today = solar_day(datetime.now(UTC), design.site)
+        day = today if text == "morning" else date.fromisoformat(text)
     except ValueError:
         start, shift = parse_time(text), 0.0
     else:

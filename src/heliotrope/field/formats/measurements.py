@@ -11,8 +11,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from heliotrope.errors import FormatError
-from heliotrope.field.formats.paint import find_tower, read_calibration_properties, read_tower
-from heliotrope.files import check_table
+from heliotrope.field.formats.paint import (
+    find_tower,
+    heliostat_of,
+    read_calibration_properties,
+    read_tower,
+)
+from heliotrope.files import read_rows
 from heliotrope.geometry import FloatArray, direction, geodetic_to_enu
 from heliotrope.sun.ephemeris import END_OF_TIMES
 
@@ -66,7 +71,8 @@ def read_measurements(folder: str | Path, centroid: Centroid = "utis") -> Measur
     Parameters
     ----------
     folder
-        With ``measurements.csv``, or ``ID/Calibration/*-calibration-properties.json``.
+        With ``measurements.csv``, or ``ID/Calibration/*-calibration-properties.json`` (without
+        ``Calibration/`` as ARTIST has it).
     centroid
         Published extractor whose centroid is used.
 
@@ -78,38 +84,39 @@ def read_measurements(folder: str | Path, centroid: Centroid = "utis") -> Measur
     place = Path(folder)
     origin = read_tower(find_tower(place)).origin
     table = place / "measurements.csv"
-    frame = _read_table(table, centroid) if table.exists() else _read_files(place, centroid)
+    left_out: list[str] = []
+    if table.exists():
+        frame, left_out = _read_table(table, centroid)
+    else:
+        frame = _read_files(place, centroid)
     columns = ("lat", "lon", "alt")
     spots = frame[[f"{centroid}_{c}" for c in columns]].to_numpy(dtype=np.float64)
     enu = np.full((len(frame), 3), np.nan)
     known = np.isfinite(spots).all(axis=1)
     enu[known] = geodetic_to_enu(spots[known, 0], spots[known, 1], spots[known, 2], origin)
-    return _keep_good(frame, enu, centroid)
+    return _keep_good(frame, enu, centroid, left_out)
 
 
-def _read_table(path: Path, centroid: Centroid) -> "pd.DataFrame":
+def _read_table(path: Path, centroid: Centroid) -> "tuple[pd.DataFrame, list[str]]":
+    """Return the rows of a table, and a line for each that has another length than the header."""
     import pandas as pd
 
-    check_table(path, "a table of measurements")
-    try:
-        frame = pd.read_csv(path, dtype=str, keep_default_na=False)
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise FormatError(path, f"not a CSV table ({str(error).strip()})") from None
     wanted = [*_COLUMNS, *(f"{centroid}_{c}" for c in ("lat", "lon", "alt"))]
-    for column in wanted:
-        if column not in frame.columns:
-            there = ", ".join(map(str, frame.columns[:12]))
-            raise FormatError(path, f"there is no column {column}; there are {there}", "line 1")
+    rows = read_rows(path, "a table of measurements", wanted)
+    rows.need(wanted)
+    kept = rows.take(rows.good)
+    frame = pd.DataFrame({name: kept.columns[name] for name in wanted})
     for column in wanted:
         if column not in ("heliostat", "id", "timestamp", "target"):
             frame[column] = pd.to_numeric(frame[column], errors="coerce")
-    return frame
+    return frame, rows.left_out
 
 
 def _read_files(place: Path, centroid: Centroid) -> "pd.DataFrame":
     import pandas as pd
 
-    files = sorted(place.glob("*/Calibration/*-calibration-properties.json"))
+    name = "*-calibration-properties.json"
+    files = sorted(place.glob(f"*/Calibration/{name}")) or sorted(place.glob(f"*/{name}"))
     if not files:
         raise FormatError(
             place, "there is neither measurements.csv nor ID/Calibration/*.json; fetch some"
@@ -119,7 +126,7 @@ def _read_files(place: Path, centroid: Centroid) -> "pd.DataFrame":
         found = read_calibration_properties(file)
         key = {"utis": "UTIS", "helios": "HeliOS"}[centroid]
         spot = found.focal_spots.get(key, (np.nan, np.nan, np.nan))
-        name = file.parent.parent.name
+        name = heliostat_of(file) or file.parent.name
         numbers = (found.sun_azimuth_deg, found.sun_elevation_deg, *found.motors)
         rows.append((name, file.name.split("-")[0], "", found.target, *numbers, *spot))
     spots = [f"{centroid}_{c}" for c in ("lat", "lon", "alt")]
@@ -137,7 +144,9 @@ def _seconds(texts: "pd.Series[str]") -> FloatArray:
     return np.asarray(seconds, dtype=np.float64)
 
 
-def _keep_good(frame: "pd.DataFrame", enu: FloatArray, centroid: Centroid) -> Measurements:
+def _keep_good(
+    frame: "pd.DataFrame", enu: FloatArray, centroid: Centroid, left_out: list[str]
+) -> Measurements:
     azimuth = frame["sun_azimuth_deg_south0_east"].to_numpy(dtype=np.float64)
     elevation = frame["sun_elevation_deg_apparent"].to_numpy(dtype=np.float64)
     counts = frame[["axis_1_motor_position", "axis_2_motor_position"]].to_numpy(dtype=np.float64)
@@ -152,7 +161,7 @@ def _keep_good(frame: "pd.DataFrame", enu: FloatArray, centroid: Centroid) -> Me
         (np.linalg.norm(enu, axis=1) > 5e3, "the centroid lies more than 5 km from the plant"),
     ]
     good = np.ones(len(frame), dtype=np.bool_)
-    left_out = []
+    left_out = list(left_out)
     for wrong, reason in reasons:
         left_out += [
             f"{frame['heliostat'][i]} {frame['id'][i]}: {reason}"

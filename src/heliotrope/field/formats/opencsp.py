@@ -19,20 +19,17 @@ Facts from the sources and data of OpenCSP (Sandia National Laboratories).
 
 import csv
 import io
-import math
-from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.formats._plant_table import plausible
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.plant import Plant
-from heliotrope.files import check_table, read_text, write_text
+from heliotrope.files import Rows, alike, read_cells, read_rows, write_text
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.kinds import UP, azimuth_elevation
 from heliotrope.sun import Site
@@ -44,6 +41,14 @@ COLUMNS = (
 FACET_COLUMNS = ("Facet id", "X", "Y", "Z")
 
 _COUNTS = ("Num. Facets", "Num. Rows", "Num. Cols")
+_SIZES = {
+    "Pivot Height": "pivot_height_m",
+    "Pivot Offset": "pivot_offset_m",
+    "Facet Width": "mirror_width_m",
+    "Facet Height": "mirror_height_m",
+}
+#: Columns that no other table of heliostats has.
+_OWN = ("Name", "Num. Facets", "Pivot Height")
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,31 +117,54 @@ def read_field(path: str | Path) -> FieldTable:
         cells, a cell is not what its column needs, or a name occurs twice; with line and
         column.
     """
-    table = _Table.read(path, "an OpenCSP heliostat field", COLUMNS)
-    names = table.names("Name", "heliostat")
-    counts = {name: table.counts(name) for name in _COUNTS}
-    facets, rows, columns = counts.values()
-    wrong = np.flatnonzero(facets != rows * columns)
-    if len(wrong):
-        i = int(wrong[0])
-        raise table.error(
-            i,
-            "Num. Facets",
-            f"heliostat {names[i]}: {facets[i]} facets are not {rows[i]} rows × {columns[i]} "
-            "columns",
-        )
+    rows = _read(path, "an OpenCSP heliostat field", COLUMNS)
+    names = rows.names("Name", "heliostat")
+    rows.heliostat = names
+    location = _location(rows)
+    sizes = {column: plausible(rows, column, meaning) for column, meaning in _SIZES.items()}
+    facets, in_rows, in_columns = (_count(rows, column) for column in _COUNTS)
+    for i in np.flatnonzero(facets != in_rows * in_columns):
+        grid = f"{in_rows[i]:g} rows × {in_columns[i]:g} columns"
+        rows.refuse(i, "Num. Facets", f"{facets[i]:g} facets are not {grid}")
+    rows.refuse_bad()
     return FieldTable(
         names=names,
-        location=np.stack([table.numbers(axis) for axis in "XYZ"], axis=-1),
-        facets=facets,
-        rows=rows,
-        columns=columns,
-        pivot_height=table.numbers("Pivot Height"),
-        pivot_offset=table.numbers("Pivot Offset"),
-        facet_width=table.numbers("Facet Width", above_zero=True),
-        facet_height=table.numbers("Facet Height", above_zero=True),
-        extra={name: table.column(name) for name in table.header if name not in COLUMNS},
+        location=location,
+        facets=facets.astype(np.int64),
+        rows=in_rows.astype(np.int64),
+        columns=in_columns.astype(np.int64),
+        pivot_height=sizes["Pivot Height"],
+        pivot_offset=sizes["Pivot Offset"],
+        facet_width=sizes["Facet Width"],
+        facet_height=sizes["Facet Height"],
+        extra={name: tuple(rows.texts(name)) for name in rows.columns if name not in COLUMNS},
     )
+
+
+def is_field(path: Path) -> bool:
+    """Return whether the header of a table names OpenCSP's columns."""
+    _, table = read_cells(path, "a table of heliostats (SolarPILOT or OpenCSP)")
+    return {alike(name) for name in _OWN} <= {alike(cell) for cell in table[0]}
+
+
+def _read(path: str | Path, what: str, columns: tuple[str, ...]) -> Rows:
+    rows = read_rows(Path(path), what, columns)
+    rows.need(columns)
+    if not len(rows):
+        raise FormatError(path, f"there is no row below the header; {what} has some")
+    return rows
+
+
+def _location(rows: Rows) -> FloatArray:
+    meanings = zip("XYZ", ("east_m", "north_m", "up_m"), strict=True)
+    return np.stack([plausible(rows, axis, meaning) for axis, meaning in meanings], axis=-1)
+
+
+def _count(rows: Rows, column: str) -> FloatArray:
+    values = rows.numbers(column, "a number of pieces")
+    wrong = ~((values >= 1) & (values == np.floor(values)) & (values <= 1e6))
+    rows.check(column, wrong & np.isfinite(values), values, " is not a number of pieces")
+    return values
 
 
 def write_field(path: str | Path, table: FieldTable) -> None:
@@ -161,111 +189,13 @@ def read_centroids(path: str | Path) -> Centroids:
     FormatError
         As for `read_field`.
     """
-    table = _Table.read(path, "an OpenCSP table of facet centroids", FACET_COLUMNS)
-    center = np.stack([table.numbers(axis) for axis in "XYZ"], axis=-1)
-    return Centroids(table.names("Facet id", "facet"), center)
-
-
-@dataclass(frozen=True, eq=False)
-class _Table:
-    """A comma-separated table with a header, as text."""
-
-    path: Path
-    header: tuple[str, ...]
-    lines: tuple[int, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-    @classmethod
-    def read(cls, path: str | Path, what: str, needed: tuple[str, ...]) -> "_Table":
-        """Read a table that has at least the columns ``needed``."""
-        file = Path(path)
-        reader = csv.reader(io.StringIO(read_text(check_table(file, what), what)), strict=True)
-        found = list(cls._cells(file, reader))
-        header = found[0][1] if found else ()
-        for name, number in Counter(header).items():
-            if number > 1:
-                raise FormatError(file, f"column {name!r} occurs twice", "header")
-        missing = [name for name in needed if name not in header]
-        if missing:
-            raise FormatError(
-                file,
-                f"no column {', '.join(map(repr, missing))}; {what} has {', '.join(needed)}",
-                "header",
-            )
-        if len(found) == 1:
-            raise FormatError(file, f"there is no row below the header; {what} has some")
-        for line, row in found[1:]:
-            if len(row) != len(header):
-                raise FormatError(
-                    file, f"{len(row)} cells, but the header has {len(header)}", f"line {line}"
-                )
-        lines, rows = zip(*found[1:], strict=True)
-        return cls(file, header, lines, rows)
-
-    @staticmethod
-    def _cells(file: Path, reader: Any) -> Iterator[tuple[int, tuple[str, ...]]]:
-        line = 0
-        try:
-            for row in reader:
-                line = reader.line_num
-                cells = tuple(cell.strip() for cell in row)
-                if any(cells):
-                    yield line, cells
-        except csv.Error as error:
-            raise FormatError(file, f"not a table ({error})", f"line {line + 1}") from None
-
-    def column(self, name: str) -> tuple[str, ...]:
-        """Return the cells of a column."""
-        k = self.header.index(name)
-        return tuple(row[k] for row in self.rows)
-
-    def error(self, i: int, column: str, problem: str) -> FormatError:
-        """Return the error that names line and column."""
-        return FormatError(self.path, problem, f"line {self.lines[i]}, column {column}")
-
-    def names(self, column: str, what: str) -> tuple[str, ...]:
-        """Return a column of names that are unique and not empty."""
-        names = self.column(column)
-        seen: dict[str, int] = {}
-        for i, name in enumerate(names):
-            if not name:
-                raise self.error(i, column, f"a {what} without a name; give it one")
-            if name in seen:
-                raise self.error(
-                    i,
-                    column,
-                    f"{what} {name}: the name is that of line {self.lines[seen[name]]} "
-                    "too; names are unique",
-                )
-            seen[name] = i
-        return names
-
-    def numbers(self, column: str, *, above_zero: bool = False) -> FloatArray:
-        """Return a column of finite numbers."""
-        values = np.empty(len(self.rows))
-        for i, cell in enumerate(self.column(column)):
-            try:
-                value = float(cell.replace("_", "?"))
-            except ValueError:
-                value = math.nan
-            if not math.isfinite(value):
-                raise self.error(
-                    i, column, f"{self.rows[i][0]}: {cell!r} is not a finite number; give metres"
-                )
-            if above_zero and value <= 0.0:
-                raise self.error(i, column, f"{self.rows[i][0]}: {value:g} m must be above 0")
-            values[i] = value
-        return values
-
-    def counts(self, column: str) -> npt.NDArray[np.int64]:
-        """Return a column of whole numbers from 1."""
-        values = self.numbers(column)
-        wrong = np.flatnonzero((values < 1) | (values != np.floor(values)) | (values > 1e6))
-        if len(wrong):
-            i = int(wrong[0])
-            cell = self.column(column)[i]
-            raise self.error(i, column, f"{self.rows[i][0]}: {cell!r} is not a number of pieces")
-        return values.astype(np.int64)
+    rows = _read(path, "an OpenCSP table of facet centroids", FACET_COLUMNS)
+    ids = rows.names("Facet id", "facet")
+    center = np.stack([rows.numbers(axis, "metres") for axis in "XYZ"], axis=-1)
+    for axis, values in zip("XYZ", center.T, strict=True):
+        rows.within(axis, values, -50.0, 50.0, "m from the mirror's vertex")
+    rows.refuse_bad()
+    return Centroids(ids, center)
 
 
 def to_plant(table: FieldTable, site: Site, centroids: Centroids | None = None) -> Plant:

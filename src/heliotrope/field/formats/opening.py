@@ -6,7 +6,6 @@ from pathlib import Path
 from heliotrope.errors import FormatError
 from heliotrope.field.formats import heliok, opencsp, solarpilot
 from heliotrope.field.plant import Plant
-from heliotrope.files import check_table, read_text
 from heliotrope.sun import Site
 
 #: SolarPILOT's own default for the size of a mirror, m.
@@ -57,7 +56,7 @@ def open_plant(
     if suffix == ".xml":
         return _of_heliok(place, site)
     if suffix in _TABLES:
-        if _is_opencsp(place):
+        if opencsp.is_field(place):
             table = opencsp.read_field(place)
             known = None if centroids is None else opencsp.read_centroids(centroids)
             return opencsp.to_plant(table, _needed(place, site), known)
@@ -77,7 +76,7 @@ def _of_heliok(place: Path, site: Site | None) -> Plant:
 def _of_solarpilot(
     place: Path, site: Site, templates: Mapping[int, solarpilot.Template] | None
 ) -> Plant:
-    layout = solarpilot.read_layout(place)
+    layout = solarpilot.read_layout(place, site)
     if templates is not None:
         return solarpilot.to_plant(layout, site, templates)
     mirror = solarpilot.Template(DEFAULT_MIRROR, DEFAULT_MIRROR)
@@ -99,11 +98,3 @@ def _needed(place: Path, site: Site | None) -> Site:
     if site is None:
         raise FormatError(place, f"this format holds no place on Earth, {_GIVE}")
     return site
-
-
-def _is_opencsp(place: Path) -> bool:
-    """Return whether the first line names OpenCSP's columns."""
-    what = "a table of heliostats (SolarPILOT or OpenCSP)"
-    text = read_text(check_table(place, what), what)
-    first = text.lstrip("\ufeff").split("\n", 1)[0]
-    return all(column in first for column in ("Name", "Num. Facets", "Pivot Height"))

@@ -282,11 +282,24 @@ def _receiver(name: str, kind: str, node: JsonNode, points: dict[str, FloatArray
 
 
 def find_properties(folder: str | Path) -> list[Path]:
-    """Return the property files of a folder: ``properties/ID.json`` or PAINT's own layout."""
+    """Return the property files of a folder.
+
+    They are ``properties/ID.json``, as PAINT has them (``ID/Properties/…``), or as ARTIST has them
+    (``ID/heliostat-properties.json``).
+    """
     root = Path(folder)
     flat = sorted((root / "properties").glob("*.json"))
     nested = sorted(root.glob("*/Properties/*heliostat-properties*.json"))
-    return flat or nested
+    artist = sorted(root.glob("*/*heliostat-properties.json"))
+    return flat or nested or artist or sorted(root.glob("*-heliostat-properties.json"))
+
+
+def heliostat_of(file: Path) -> str:
+    """Return the heliostat whose folder holds a file of PAINT or ARTIST; "" if there is none."""
+    if file.parent.name in ("Properties", "Calibration"):
+        return file.parent.parent.name
+    own = (file.parent / "heliostat-properties.json").exists()
+    return file.parent.name if own else ""
 
 
 def find_tower(folder: str | Path) -> Path:
@@ -320,11 +333,11 @@ def read_plant(folder: str | Path) -> Plant:
     tower = read_tower(find_tower(place))
     files = find_properties(place)
     if not files:
-        raise FormatError(place, "there are no heliostat properties (properties/ID.json)")
-    listed = [
-        read_heliostat(file, file.parent.parent.name if file.parent.name == "Properties" else None)
-        for file in files
-    ]
+        raise FormatError(
+            place,
+            "no heliostat properties (properties/ID.json or ID/heliostat-properties.json)",
+        )
+    listed = [read_heliostat(file, heliostat_of(file) or None) for file in files]
     heliostats = to_heliostats(listed, tower.origin)
     latitude, longitude, height = tower.origin
     return Plant(

@@ -19,9 +19,10 @@ import numpy as np
 
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.field.formats._plant_surfaces import RENAMED, set_surface, surface_values
+from heliotrope.field.formats._plant_table import read_columns
 from heliotrope.field.formats.plant_file import check_plant, read_plant
 from heliotrope.field.heliostats import Heliostats
-from heliotrope.files import read_parquet, read_text, write_file, write_text
+from heliotrope.files import read_text, write_file, write_text
 from heliotrope.files.documents import read_toml
 
 #: Smaller units that a value may be given in, by the unit of its column, and their size there.
@@ -196,6 +197,7 @@ class _Files:
     """The text of a plant file and the cells of its table, to be changed and written."""
 
     def __init__(self, place: Path) -> None:
+        import pandas as pd
         import tomlkit
 
         self.plant = read_plant(place)
@@ -207,7 +209,7 @@ class _Files:
             raise FormatError(
                 place, f"{self.table} lies elsewhere; keep it beside the plant file", "heliostats"
             )
-        self.cells = _read_cells(place.parent / self.table)
+        self.cells: Any = pd.DataFrame(read_columns(place.parent / self.table).columns)
 
     # -- values ----------------------------------------------------------------------------
 
@@ -318,16 +320,6 @@ class _Files:
             self.cells.to_csv(text, index=False, lineterminator="\n")
             write_text(table, text.getvalue())
         write_text(home / self.place.name, tomlkit.dumps(self.document))
-
-
-def _read_cells(path: Path) -> Any:
-    """Return the table; cells of a CSV file as they stand there."""
-    import pandas as pd
-
-    if path.suffix == ".parquet":
-        return pd.DataFrame(read_parquet(path, "the table of heliostats").columns)
-    text = io.StringIO(read_text(path, "the table of heliostats"))
-    return pd.read_csv(text, dtype=str, keep_default_na=False, na_filter=False)
 
 
 def _parameters(group: Heliostats) -> dict[str, tuple[float, str]]:

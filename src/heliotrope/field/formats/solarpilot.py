@@ -1,6 +1,8 @@
-"""SolarPILOT's field layouts: text tables with one heliostat a line.
+"""Field layouts: text tables with one heliostat a line, with a header or as SolarPILOT has them.
 
-SolarPILOT reads a layout by position, not by the names of a header::
+A header is read: names or ids, and positions in metres (``id,x,y,z``) or in degrees
+(``id,latitude,longitude,altitude``); one that gives no positions is refused. SolarPILOT reads
+a layout by position, so without a header the columns are::
 
     14 columns   template, enabled, in layout, x, y, z, focus x, focus y,
                  cant i, cant j, cant k, aim x, aim y, aim z
@@ -14,15 +16,15 @@ semicolon, a tab or spaces; in the text that other programs hand over, records m
 with a semicolon instead of a line end.
 
 Its exports begin with two lines (names, units). Of the 14 columns they name "In layout"
-before "Enabled", but what follows is enabled before in layout, as it is read. Header
-lines are therefore skipped unread.
+before "Enabled", but what follows is enabled before in layout, as it is read: the flags are taken
+in that order whatever their names.
 
 Facts from the sources of SolarPILOT and of the library behind it (National Renewable
 Energy Laboratory).
 """
 
-import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,11 +32,12 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.formats._plant_table import PLAUSIBLE, plausible
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
-from heliotrope.files import check_table, read_text, write_text
-from heliotrope.files.limits import ROWS, check_count
-from heliotrope.geometry import FloatArray
+from heliotrope.files import Rows, alike, read_cells, rows_under, write_text
+from heliotrope.files.cells import SEPARATORS
+from heliotrope.geometry import FloatArray, geodetic_to_enu
 from heliotrope.mechanism.kinds import UP, azimuth_elevation
 from heliotrope.sun import Site
 
@@ -48,11 +51,45 @@ COLUMNS = (
 )  # fmt: skip
 #: Possible numbers of columns, and whether the two flags are among them.
 WIDTHS = {14: True, 12: False, 6: True, 4: False}
-SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
-
-_FLAGS = {"1": True, "true": True, "t": True, "0": False, "false": False, "f": False}
+#: Meanings of the columns, in order, and the three that occur in both kinds.
+_MEANINGS = (
+    "template", "enabled", "in layout", "x", "y", "z", "focus x", "focus y", "cant i", "cant j",
+    "cant k", "aim x", "aim y", "aim z",
+)  # fmt: skip
+#: Names that a header may give to a meaning, without unit, blanks and marks; the better one first.
+_NAMES = {
+    "name": "name heliostatname heliostat heliostatid helioid hid id label number no nr",
+    "template": "template templateid heliostattemplate",
+    "enabled": "enabled isenabled",
+    "in layout": "inlayout isinlayout",
+    "x": "x locx xloc locationx xlocation posx xpos positionx xposition east easting",
+    "y": "y locy yloc locationy ylocation posy ypos positiony yposition north northing",
+    "z": "z locz zloc locationz zlocation posz zpos positionz zposition up",
+    "focus x": "xfocus focusx",
+    "focus y": "yfocus focusy",
+    "cant i": "canti",
+    "cant j": "cantj",
+    "cant k": "cantk",
+    "aim x": "aimptx aimx",
+    "aim y": "aimpty aimy",
+    "aim z": "aimptz aimz",
+    "latitude": "latitude lat",
+    "longitude": "longitude long lon lng",
+    "altitude": "altitude alt height elevation",
+}
+#: Meaning of a name, and its place among those of the meaning.
+_KNOWN = {n: (meaning, k) for meaning, ns in _NAMES.items() for k, n in enumerate(ns.split())}
+#: Names of three columns side by side, and the axes that tell them apart.
+_THREE = {"cantvect": "ijk", "cant": "ijk", "aim": "xyz", "aimpt": "xyz"}
+_METRES, _DEGREES = ("x", "y", "z"), ("latitude", "longitude", "altitude")
+_GROUPS = (("focus x", "focus y"), ("cant i", "cant j", "cant k"), ("aim x", "aim y", "aim z"))
+_UNIT = re.compile(r"\s*(?:[\[(<]\s*(.*?)\s*[\])>]|_(m|mm|cm|km|ft|deg|rad))\s*", re.IGNORECASE)
+_EXAMPLE = (
+    "give id,x,y,z (m east, north, up), id,latitude,longitude,altitude (degrees, m), or the "
+    "columns of SolarPILOT"
+)
 _NULL = "null"
-_WHAT = "a SolarPILOT layout"
+_WHAT = "a table of heliostats (SolarPILOT or OpenCSP)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +110,10 @@ class Layout:
         Canting vectors, (N, 3); NaN where NULL.
     aim
         Aim points, m, in the frame of the locations, (N, 3); NaN where NULL.
+    names
+        Unique; H1, H2, … by their row where the file gives none.
+    unread
+        Columns of the file that have no place here.
     """
 
     template: npt.NDArray[np.int64]
@@ -82,6 +123,12 @@ class Layout:
     focus: FloatArray
     cant: FloatArray
     aim: FloatArray
+    names: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.names:
+            object.__setattr__(self, "names", tuple(f"H{i + 1}" for i in range(len(self))))
 
     def __len__(self) -> int:
         return len(self.template)
@@ -107,55 +154,179 @@ class Template:
     pivot_offset: float = 0.0
 
 
-def read_layout(path: str | Path) -> Layout:
+def read_layout(path: str | Path, site: Site | None = None) -> Layout:
     """Read a layout file.
 
     Parameters
     ----------
     path
-        A text file with 14, 12, 6 or 4 columns.
+        A table with a header, or one of 14, 12, 6 or 4 columns without.
+    site
+        The plant's reference point; only positions in degrees need it.
 
     Raises
     ------
     FormatError
-        If the file cannot be read, has no rows, has rows of a wrong or of differing length,
-        or a cell that does not fit its column; with line and column.
+        If the file cannot be read, has no rows, a header that gives no positions, rows of differing
+        length, or a cell that does not fit its column; with line and column.
     """
     file = Path(path)
-    rows = _rows(file, read_text(check_table(file, _WHAT), _WHAT))
-    width = len(rows[0][1])
+    places, table = read_cells(file, _WHAT, separators=f"{SEPARATORS} ", record_end=";")
+    first = next((i for i, cells in enumerate(table) if any(map(_is_value, cells))), len(table))
+    head, place = table[:first], places[0]
+    if first == 0:
+        header, columns = _by_position(file, place, table)
+    else:
+        header, columns = _by_header(file, place, head)
+    rows = rows_under(file, (place, header), places[first:], table[first:])
+    if not len(rows):
+        raise FormatError(file, "there is no heliostat in it; one line each is needed")
+    names = rows.names(columns["name"], "heliostat") if "name" in columns else ()
+    rows.heliostat = names
+    focus, cant, aim = (_group(rows, columns, group) for group in _GROUPS)
+    layout = Layout(
+        _templates(rows, columns.get("template")),
+        _flags(rows, columns.get("enabled")),
+        _flags(rows, columns.get("in layout")),
+        _location(rows, columns, site),
+        focus,
+        cant,
+        aim,
+        names,
+        tuple(name for name in rows.columns if name not in columns.values()),
+    )
+    rows.refuse_bad()
+    if first == 0 and len(layout) > 2 and len(set(layout.template)) == len(layout):
+        raise FormatError(
+            file,
+            "each row has another number in column 1, as ids have, but without a header it is the "
+            "template; begin the file with a line such as id,x,y,z",
+            place,
+        )
+    return layout
+
+
+def _by_position(
+    file: Path, place: str, table: list[list[str]]
+) -> tuple[list[str], dict[str, str]]:
+    """Return names of the columns of a file without a header, and those names by meaning."""
+    width = max(k + 1 for k, cell in enumerate(table[0]) if cell)
     if width not in WIDTHS:
         raise FormatError(
             file,
             f"{width} columns; a layout has 14 (template, enabled, in layout, location, "
-            "focus, cant, aim), 12 (without the flags), 6 or 4 (up to the location)",
-            f"line {rows[0][0]}",
+            "focus, cant, aim), 12 (without the flags), 6 or 4 (up to the location), or a header; "
+            "decimals take a point",
+            place,
         )
-    flags = WIDTHS[width]
-    names = [_column_name(k) for k in range(14) if flags or k not in {1, 2}][:width]
-    template = np.empty(len(rows), dtype=np.int64)
-    switches = np.ones((len(rows), 2), dtype=np.bool_)
-    numbers = np.full((len(rows), 11), np.nan)
-    for i, (line, cells) in enumerate(rows):
-        if len(cells) != width:
-            raise FormatError(
-                file, f"{len(cells)} columns, but the first row has {width}", f"line {line}"
-            )
-        reader = _Row(file, line, names, cells)
-        template[i] = reader.whole(0)
-        if flags:
-            switches[i] = reader.flag(1), reader.flag(2)
-        start = 3 if flags else 1
-        numbers[i, : width - start] = reader.numbers(start)
-    return Layout(
-        template,
-        switches[:, 0],
-        switches[:, 1],
-        numbers[:, :3],
-        numbers[:, 3:5],
-        numbers[:, 5:8],
-        numbers[:, 8:],
+    kept = [k for k in range(14) if WIDTHS[width] or k not in {1, 2}][:width]
+    header = [f"{i + 1} ({_column_name(k)})" for i, k in enumerate(kept)]
+    return header, {_MEANINGS[k]: name for k, name in zip(kept, header, strict=True)}
+
+
+def _by_header(file: Path, place: str, head: list[list[str]]) -> tuple[list[str], dict[str, str]]:
+    """Return unique names of the columns of a header, and those with a meaning by it.
+
+    ``head`` are the rows without a number: names, and units if there are two.
+    """
+    width = max(k + 1 for cells in head for k, cell in enumerate(cells) if cell)
+    names, units = ([*row, *[""] * width][:width] for row in (head[0], (*head[1:2], [])[0]))
+    if len(head) > 2 or not all(_UNIT.fullmatch(unit) for unit in units if unit):
+        raise FormatError(file, f"no number below the header; {_EXAMPLE}", place)
+    header: list[str] = []
+    found: dict[str, list[tuple[int, str]]] = {}
+    for cell, below in zip(names, units, strict=True):
+        unit = _UNIT.search(below or cell)
+        form = _form(cell if below else _UNIT.sub("", cell))
+        if form in _THREE:
+            axis = _THREE[form][sum(name.startswith(f"{cell} <") for name in header) % 3]
+            form = f"{form[: 4 if form[0] == 'c' else 3]}{axis}"
+            header.append(f"{cell} <{axis}>")
+        else:
+            header.append(cell)
+        meaning, rank = _KNOWN.get(form, ("", 0))
+        wanted = "deg" if meaning in _DEGREES[:2] else "m"
+        given = "" if unit is None else (unit[1] or unit[2] or "").lower()
+        if meaning in (*_METRES, *_DEGREES) and given not in ("", "°", "degrees", wanted):
+            raise FormatError(file, f"column {cell} is in {given}; give {wanted}", place)
+        found.setdefault(meaning, []).append((rank, header[-1]))
+    unknown = {_form(name) for _, name in found.pop("", ())}
+    if {"group", "eastm"} <= {_form(name) for name in names} | unknown:
+        text = "this is the table of a plant file; open the plant file (.toml) that names it"
+        raise FormatError(file, text, place)
+    for meaning, all_ in found.items():
+        all_.sort()
+        if len(all_) > 1 and (meaning != "name" or all_[0][0] == all_[1][0]):
+            raise FormatError(file, f"two columns give {meaning}; keep one", place)
+    columns = {meaning: given[0][1] for meaning, given in found.items()}
+    if not any(all(axis in columns for axis in axes) for axes in (_METRES, _DEGREES)):
+        shown = ", ".join(name[:30] for name in names[:8])
+        raise FormatError(file, f"the header ({shown}) gives no positions; {_EXAMPLE}", place)
+    flags = [columns.get("enabled", ""), columns.get("in layout", "")]
+    if "template" in columns and all(flags):
+        columns["enabled"], columns["in layout"] = sorted(flags, key=header.index)
+    return header, columns
+
+
+def _form(name: str) -> str:
+    return re.sub(r"[\W_]", "", alike(name))
+
+
+def _templates(rows: Rows, column: str | None) -> npt.NDArray[np.int64]:
+    found = np.zeros(len(rows), dtype=np.int64)
+    for i, cell in enumerate(rows.texts(column) if column else ()):
+        if cell.isascii() and cell.isdigit() and len(cell) < 10:
+            found[i] = int(cell)
+        else:
+            rows.refuse(i, column or "", f"{cell!r:.60} is not a template's number (0, 1, …)")
+    return found
+
+
+def _flags(rows: Rows, column: str | None) -> npt.NDArray[np.bool_]:
+    if column is None:
+        return np.ones(len(rows), dtype=np.bool_)
+    advice = f"give 0 or 1; {len(rows.columns)} columns begin with template, enabled, in layout"
+    return rows.flags(column, advice)
+
+
+def _location(rows: Rows, columns: dict[str, str], site: Site | None) -> FloatArray:
+    """Return positions, m east, north and up, (N, 3)."""
+    if all(axis in columns for axis in _METRES):
+        meanings = zip(_METRES, ("east_m", "north_m", "up_m"), strict=True)
+        return np.stack([plausible(rows, columns[a], meaning) for a, meaning in meanings], axis=-1)
+    if site is None:
+        raise FormatError(rows.path, "positions are in degrees; give the site", rows.header)
+    latitude, longitude, altitude = (
+        plausible(rows, columns[axis], meaning)
+        for axis, meaning in zip(
+            _DEGREES, ("latitude_deg", "longitude_deg", "altitude_m"), strict=True
+        )
     )
+    location, good = np.zeros((len(rows), 3)), rows.good
+    location[good] = geodetic_to_enu(latitude[good], longitude[good], altitude[good], site.origin)
+    for axis, values, metres in zip(
+        _DEGREES, (latitude, longitude, altitude), location[:, [1, 0, 2]].T, strict=True
+    ):
+        low, high, unit = PLAUSIBLE["up_m" if axis == "altitude" else "east_m"]
+        far = ~((metres >= low) & (metres <= high))
+        reason = f" puts it outside {low:g} to {high:g} {unit}; correct it, or the site"
+        rows.check(columns[axis], far, values, reason)
+    return location
+
+
+def _group(rows: Rows, columns: dict[str, str], group: tuple[str, ...]) -> FloatArray:
+    """Return columns that are all numbers or all NULL (or empty) in a row, NaN there."""
+    if not all(meaning in columns for meaning in group):
+        return np.full((len(rows), len(group)), np.nan)
+    names = [columns[meaning] for meaning in group]
+    for name in names:
+        rows.columns[name] = ["" if c.lower() == _NULL else c for c in rows.texts(name)]
+    values = np.stack([rows.numbers(name, "a number or NULL", np.nan) for name in names], axis=-1)
+    missing = np.isnan(values)
+    for i in np.flatnonzero(missing.any(axis=1) & ~missing.all(axis=1)):
+        what = f"all {len(group)} columns of {group[0].split()[0]} are numbers or NULL"
+        rows.refuse(i, names[int(np.argmax(missing[i]))], f"NULL beside numbers; {what}")
+    return values
 
 
 def write_layout(path: str | Path, layout: Layout) -> None:
@@ -178,121 +349,24 @@ def _column_name(k: int) -> str:
     return f"{name} {unit}" if unit.startswith("<") else name
 
 
-def _rows(file: Path, text: str) -> list[tuple[int, list[str]]]:
-    """Return line number and cells of each row behind the header."""
-    # A piece with the commas of a whole row between two semicolons is a row.
-    if ";" in text and any(piece.count(",") >= min(WIDTHS) - 1 for piece in text.split(";")):
-        text = text.replace(";\r\n", "\n").replace(";\n", "\n").replace(";", "\n")
-    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip(" ,;\t")]
-    check_count(file, len(lines), ROWS, "rows", "divide the layout")
-    if not lines:
-        raise FormatError(file, "there is no heliostat in it; one line each is needed")
-    separator = _separator(lines[-1][1])
-    rows = [(n, _cells(line, separator)) for n, line in lines]
-    for first, (_, cells) in enumerate(rows):
-        if any(_is_value(cell) for cell in cells):
-            return rows[first:]
-    raise FormatError(
-        file, "no line holds a number, so there is no heliostat in it; one line each is needed"
-    )
-
-
-def _separator(line: str) -> str:
-    """Return what cuts the line into the most cells, as SolarPILOT chooses."""
-    return max(SEPARATORS.values(), key=lambda s: len(_cells(line, s)))
-
-
-def _cells(line: str, separator: str) -> list[str]:
-    if separator == " ":
-        return line.split()
-    cells = [cell.strip().strip('"').strip() for cell in line.split(separator)]
-    # SolarPILOT ends the lines of its header with a separator.
-    return cells[:-1] if not cells[-1] else cells
-
-
 def _is_value(cell: str) -> bool:
     if cell.lower() == _NULL:
         return True
     try:
-        float(cell)
+        # A decimal comma is a number too, which is then refused.
+        float(cell.replace(",", ""))
     except ValueError:
         return False
     return True
-
-
-@dataclass(frozen=True)
-class _Row:
-    """Reads the cells of one row."""
-
-    file: Path
-    line: int
-    names: Sequence[str]
-    cells: Sequence[str]
-
-    def error(self, k: int, problem: str) -> FormatError:
-        return FormatError(
-            self.file, problem, f"line {self.line}, column {k + 1} ({self.names[k]})"
-        )
-
-    def whole(self, k: int) -> int:
-        """Return the template's number, from 0."""
-        if not self.cells[k].isascii() or not self.cells[k].isdigit() or len(self.cells[k]) > 9:
-            raise self.error(k, f"{self.cells[k]!r} is not a template's number (0, 1, …)")
-        return int(self.cells[k])
-
-    def flag(self, k: int) -> bool:
-        """Return a flag."""
-        value = _FLAGS.get(self.cells[k].lower())
-        if value is None:
-            raise self.error(
-                k,
-                f"{self.cells[k]!r} is not 0 or 1; {len(self.cells)} columns begin with "
-                "template, enabled, in layout",
-            )
-        return value
-
-    def numbers(self, start: int) -> list[float]:
-        """Return the numbers from column ``start`` on; groups behind the location may be NULL."""
-        values = [self.number(k) for k in range(start, len(self.cells))]
-        for first, count, what in (
-            (0, 3, "location"),
-            (3, 2, "focus"),
-            (5, 3, "cant"),
-            (8, 3, "aim"),
-        ):
-            group = values[first : first + count]
-            missing = [math.isnan(value) for value in group]
-            if any(missing) and what == "location":
-                raise self.error(start + missing.index(True), "NULL; a location needs numbers")
-            if any(missing) and not all(missing):
-                raise self.error(
-                    start + first + missing.index(True),
-                    f"NULL beside numbers; all {count} columns of {what} are numbers or NULL",
-                )
-        return values
-
-    def number(self, k: int) -> float:
-        """Return a number, NaN for NULL."""
-        cell = self.cells[k]
-        if cell.lower() == _NULL:
-            return math.nan
-        try:
-            value = float(cell.replace("_", "?"))
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            hint = "write a point, not a comma" if "," in cell else "write a number or NULL"
-            raise self.error(k, f"{cell!r} is not a finite number; {hint}")
-        return value
 
 
 def to_plant(layout: Layout, site: Site, templates: Mapping[int, Template]) -> Plant:
     """Return the plant of a layout: azimuth-elevation heliostats, one group a template.
 
     The origin of ENU is SolarPILOT's, so up = 0 is the height of the base pivot and the
-    feet stand ``pivot_height`` lower. Heliostats are named H1, H2, … by their row. Those
-    not enabled or not in the layout are left out and named in ``notes``; focus and cant
-    have no place in a plant and stay in the layout.
+    feet stand ``pivot_height`` lower. Heliostats not enabled or not in the layout are left
+    out and named in ``notes``, like columns that were not read; focus and cant have no
+    place in a plant and stay in the layout.
 
     Parameters
     ----------
@@ -314,16 +388,15 @@ def to_plant(layout: Layout, site: Site, templates: Mapping[int, Template]) -> P
     for i in np.flatnonzero(used):
         if int(layout.template[i]) not in templates:
             known = ", ".join(str(number) for number in sorted(templates)) or "none"
-            raise InputError(
-                f"row {i + 1}: template {layout.template[i]} is not among those given ({known})"
-            )
+            which = f"heliostat {layout.names[i]}: template {layout.template[i]}"
+            raise InputError(f"{which} is not among those given ({known})")
     groups = {}
     for number in np.unique(layout.template[used]).tolist():
         rows = np.flatnonzero(used & (layout.template == number))
         template = templates[number]
         aim = layout.aim[rows]
         groups[f"template-{number}"] = Heliostats(
-            names=tuple(f"H{i + 1}" for i in rows),
+            names=tuple(layout.names[i] for i in rows),
             mechanism=azimuth_elevation(
                 layout.location[rows] - template.pivot_height * UP,
                 pivot_height=template.pivot_height,
@@ -333,6 +406,7 @@ def to_plant(layout: Layout, site: Site, templates: Mapping[int, Template]) -> P
             height=np.full(len(rows), template.height),
             aim=None if np.isnan(aim).all() else aim,
         )
-    left_out = [f"H{i + 1}" for i in np.flatnonzero(~used)]
-    notes = {"left out": ", ".join(left_out)} if left_out else {}
+    left_out = [layout.names[i] for i in np.flatnonzero(~used)]
+    lists = {"left out": left_out, "columns not read": layout.unread}
+    notes = {subject: ", ".join(found) for subject, found in lists.items() if found}
     return Plant(site.name, site, groups, notes=notes)

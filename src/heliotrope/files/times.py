@@ -1,0 +1,83 @@
+"""Times in ISO 8601: texts to moments and back."""
+
+import math
+import re
+from datetime import UTC, datetime, timedelta
+from decimal import Decimal
+from fractions import Fraction
+
+from heliotrope.errors import InputError, shown
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_TIME = re.compile(
+    r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d(?:[.,](\d+))?)?) ?(Z|[+-]\d\d(?::?\d\d)?)?", re.ASCII
+)
+_SECOND_60 = re.compile(r"(.*[T ]\d\d:?\d\d:?)60(.*)", re.ASCII | re.DOTALL)
+
+
+def moment(text: str) -> datetime:
+    """Return the time of an ISO 8601 text, without a zone where the text has none.
+
+    A leap second (23:59:60 UTC on the last day of a month) is the second after it, as in Unix time.
+
+    Raises
+    ------
+    ValueError
+        If it is not a time.
+    """
+    found = _SECOND_60.fullmatch(text.strip())
+    if found is None:
+        return datetime.fromisoformat(text.strip())
+    time = datetime.fromisoformat(f"{found[1]}59{found[2]}") + timedelta(seconds=1)
+    after = time if time.tzinfo is None else time.astimezone(UTC)
+    if (after.day, after.hour, after.minute, after.second) != (1, 0, 0, 0):
+        raise ValueError("second 60 exists only at 23:59 UTC on the last day of a month")
+    return time
+
+
+def parse_time(text: str) -> float:
+    """Return unix seconds of an ISO 8601 text, the nearest double to all its digits.
+
+    Raises
+    ------
+    InputError
+        If it is not a time, or has no time zone.
+    """
+    found = _TIME.fullmatch(text.strip())
+    if found is None:
+        raise InputError(
+            f"{shown(text)} is not an ISO 8601 time; write it like 2026-06-21T12:00:00Z"
+        )
+    day, clock, digits, zone = found.groups()
+    if zone is None:
+        raise InputError(
+            f"{text.strip()} has no time zone; append Z if it is UTC, or an offset such as +02:00"
+        )
+    try:
+        whole = (moment(f"{day}T{clock[:8]}{zone}") - _EPOCH) // timedelta(seconds=1)
+        return float(whole + (Fraction(int(digits), 10 ** len(digits)) if digits else 0))
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{shown(text)} is not a valid time ({error}); correct it") from None
+
+
+def format_time(seconds: float) -> str:
+    """Return unix seconds as ISO 8601 in UTC, with the digits that give the same double again.
+
+    Raises
+    ------
+    InputError
+        If they are infinite or lie outside the years 1 to 9999.
+    """
+    if math.isnan(seconds):
+        return ""
+    try:
+        whole = math.floor(seconds)
+        stamp = (_EPOCH + timedelta(seconds=whole)).replace(tzinfo=None).isoformat()
+    except OverflowError:
+        raise InputError(f"time {seconds} s since 1970 lies outside the years 1 to 9999") from None
+    # repr is the shortest text that gives the same double; its decimals are kept exactly.
+    decimals = f"{Decimal(repr(float(seconds))):f}".partition(".")[2].rstrip("0")
+    if decimals and seconds < 0.0:
+        # Below the epoch the time of day still counts upwards.
+        decimals = f"{10 ** len(decimals) - int(decimals):0{len(decimals)}d}"
+    return f"{stamp}.{decimals}Z" if decimals else f"{stamp}Z"
