@@ -18,7 +18,7 @@ from heliotrope.calibration.fit.estimator import FAR
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
-from heliotrope.files.cells import format_time
+from heliotrope.files.times import format_time
 from heliotrope.geometry import MOST_TURNS, FloatArray, angle_between, azimuth_elevation
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS

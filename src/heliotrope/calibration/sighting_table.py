@@ -136,7 +136,7 @@ def _times(rows: Rows, column: str, *, optional: bool) -> FloatArray:
 def _without(rows: Rows, seen: Sightings, reasons: Mapping[int, str]) -> Sightings:
     """Refuse the rows of sightings with a reason, and return the others."""
     good = rows.good
-    rows.reasons |= {int(good[k]): reason for k, reason in reasons.items()}
+    rows.reasons |= {int(good[k]): ("", reason) for k, reason in reasons.items()}
     return seen.take(np.isin(good, rows.good))
 
 
