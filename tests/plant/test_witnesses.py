@@ -227,7 +227,7 @@ def test_a_common_wrong_time_keeps_a_calibrated_field_off_the_receiver(
     """Plant, clusters and boards agree, and every beam goes beside its aim."""
     keeper = Keeper(tmp_path / "store.sqlite", inline=True)
     required = PlantSettings(witnesses=frozenset({PHOTOGRAPHS}))
-    late, joined = 0.0, []
+    late, joined, versions = 0.0, [], []
 
     def sun(world: World) -> np.ndarray:
         return fast_vector(world.clock.utc().timestamp() + late, world.design.site)
@@ -243,14 +243,15 @@ def test_a_common_wrong_time_keeps_a_calibrated_field_off_the_receiver(
         told = {a.condition for a in plant.operations.alarms() if a.active}
         assert ("sun_contradicted" in told) is bool(late), told
         assert "beam_blocked" not in told, "it is no matter of single heliostats"
+        versions.append([plant.plant.beliefs.record(name).version for name in plant.names])
 
     monkeypatch.setattr(World, "sun", sun)
     work = AutomaticSettings(wanted=True)
     live(learn, work, records=keeper)
-    for wrong in (0.0, 45.0):
+    for day, wrong in enumerate((0.0, 45.0), start=1):
         late = wrong
-        day = START + timedelta(days=1)
-        live(look, work, records=keeper, plant=required, start=day)
+        live(look, work, records=keeper, plant=required, start=START + timedelta(days=day))
     keeper.close()
     assert joined[0] > 0
     assert joined[1] == 0
+    assert versions[0] == versions[1], "nothing was learnt from the wrong sun"

@@ -178,12 +178,13 @@ class Witnesses:
 
     def photographed(
         self, record: HeliostatCalibration | None, mechanism: Mechanism, seen: Sightings
-    ) -> None:
+    ) -> str:
         """Take photographs of a heliostat's beam on a target, before they are learnt from.
 
         The beam shows where the sun stands, if the mirror was calibrated before today: what it
         has learnt today may have come from the wrong sun. One mirror that misses by more may have
-        moved; two that put the sun at the same wrong place have not.
+        moved; two that put the sun at the same wrong place have not. Returns why nothing may be
+        learnt from the photographs, "" if they may be: the sun that they assume may be wrong.
 
         Parameters
         ----------
@@ -193,18 +194,19 @@ class Witnesses:
             Sightings of the photographs.
         """
         if self._names is None or record is None or not self.testifies(record):
-            return
+            return ""
         pose = mechanism.pose(seen.counts)
         source, path = ray_directions(seen, pose.vertex)
         offset = np.mean(reflect(path, pose.normal) - source, axis=0)
         if float(np.linalg.norm(offset)) <= BEAM_ERROR:
             self._offsets.clear()
             self._agrees(PHOTOGRAPHS)
-            return
+            return ""
         others = [each for name, each in self._offsets.items() if name != record.heliostat]
         self._offsets[record.heliostat] = offset
         if any(np.linalg.norm(offset - each) <= BEAM_ERROR for each in others):
             self._contradicts(PHOTOGRAPHS, offset)
+        return self.refusal
 
     def testifies(self, record: HeliostatCalibration | None) -> bool:
         """Return whether photographs of a heliostat show where the sun stands."""

@@ -256,14 +256,15 @@ class CalibrationCycle:
         seen = join([self._sighting(shot, counts) for shot, counts in taken.used])
         return root_mean_square(beam_errors(self._plant.beliefs.present(heliostat), seen).beam)
 
-    def _witness(self, heliostat: str, taken: Photographs) -> None:
-        """Let photographs show where the sun stands, before they are learnt from."""
-        if taken.used:
-            beliefs = self._plant.beliefs
-            seen = join([self._sighting(shot, counts) for shot, counts in taken.used])
-            self._plant.witnesses.photographed(
-                beliefs.record(heliostat), beliefs.present(heliostat), seen
-            )
+    def _witness(self, heliostat: str, taken: Photographs) -> str:
+        """Let photographs show where the sun stands; return why they may not be learnt from."""
+        if not taken.used:
+            return ""
+        beliefs = self._plant.beliefs
+        seen = join([self._sighting(shot, counts) for shot, counts in taken.used])
+        return self._plant.witnesses.photographed(
+            beliefs.record(heliostat), beliefs.present(heliostat), seen
+        )
 
     def _plausible(
         self, heliostat: str, taken: Photographs
@@ -324,7 +325,8 @@ class CalibrationCycle:
         """
         fewest = self.settings.least if least is None else least
         confirm, say = confirming or self.verification.problem, tell or _nobody
-        self._witness(visit.heliostat, taken)
+        if why := self._witness(visit.heliostat, taken):
+            return CycleResult(visit.heliostat, CalibrationOutcome.UNCHANGED, why)
         result = await self._learn(visit, taken, say, confirm, fewest, production)
         proof = self.verification.confirmed(visit.heliostat)
         if proof is not None and result.outcome.calibrated:
