@@ -16,6 +16,7 @@ from heliotrope.calibration.fit import FitOutcome, fit
 from heliotrope.calibration.learn import learning
 from heliotrope.calibration.learn.assessment import unexplained_mirrors
 from heliotrope.calibration.learn.misfits import find_misfits
+from heliotrope.calibration.report.content import CalibrationReport
 from heliotrope.calibration.report.results import at_moment, read_json, write_json
 from heliotrope.calibration.sighting_table import write_sightings
 from heliotrope.calibration.sightings import Sightings, camera_target, join
@@ -266,7 +267,7 @@ def test_a_minute_shows_where_several_mirrors_agree() -> None:
     assert check_clock(NOMINAL, seen_of(rows, count=5), tuple(SIZES), PLANT.site) is None
 
 
-def report(plant: Plant, table: Path, seen: Sightings) -> "workflow.CalibrationReport":
+def report(plant: Plant, table: Path, seen: Sightings) -> CalibrationReport:
     write_sightings(table, seen, NAMES, [KIND] * len(seen))
     field = workflow.read_field_sightings(plant, table, table)
     return workflow.calibrate(field, "guo6", fraction=1.0)
