@@ -128,6 +128,7 @@ def test_bad_photographs_get_one_line_each(tmp_path) -> None:
     )
     data = (tmp_path / "g0.jpg").read_bytes()
     (tmp_path / "float.jpg").write_bytes(data.replace(b'RtkFlag="50"', b'RtkFlag="34"'))
+    (tmp_path / "flagless.jpg").write_bytes(data.replace(b'RtkFlag="50"', b'GpsState="3"'))
     (tmp_path / "xml.jpg").write_bytes(data.replace(b"<rdf:RDF", b"<rdf;RDF"))
     found, problems = read_photos(tmp_path, ORIGIN)
     assert [p.name for p in found] == ["g0.jpg", "g1.jpg"]
@@ -135,9 +136,10 @@ def test_bad_photographs_get_one_line_each(tmp_path) -> None:
     assert "plain.jpg: its XMP lacks GpsLatitude, GpsLongitude" in text
     assert "broken.jpg: not a readable image" in text
     assert "float.jpg: RtkFlag 34 is not a fixed solution" in text
+    assert "flagless.jpg: its XMP has no RtkFlag, so nothing states how well its" in text
     assert "xml.jpg: its XMP is damaged" in text
     assert "other.jpg: 40 × 40 px, but most photographs have 80 × 60 px" in text
-    assert len(problems) == 5
+    assert len(problems) == 6
     assert all("\n" not in line for line in problems)
 
 
@@ -153,21 +155,24 @@ def test_folder_without_photographs(tmp_path) -> None:
     [
         ("name,yaw_deg\na,1\n", "needs the columns"),
         (
-            "name,east_m,north_m,up_m,yaw_deg,pitch_deg,roll_deg\na.jpg,1,x,3,0,0,0\n",
+            "name,east_m,north_m,up_m,yaw_deg,pitch_deg,roll_deg\na.jpg,1,2,3,0,0,0\n",
+            "needs the columns .* sigma_m and",
+        ),
+        (
+            "name,east_m,north_m,up_m,yaw_deg,pitch_deg,roll_deg,sigma_m\na.jpg,1,x,3,0,0,0,1\n",
             "column north_m: 'x' is not a number",
+        ),
+        (
+            "name,east_m,north_m,up_m,yaw_deg,pitch_deg,roll_deg,sigma_m\na.jpg,1,2,3,0,0,0,\n",
+            "a.jpg, column sigma_m: '' is not a number",
         ),
     ],
 )
 def test_bad_table(tmp_path, text: str, match: str) -> None:
     write_photo(tmp_path / "a.jpg", PICTURE, photo("a.jpg"), ORIGIN)
     (tmp_path / "photos.csv").write_text(text)
-    if "needs" in match:
-        with pytest.raises(FormatError, match=match):
-            read_photos(tmp_path, ORIGIN)
-    else:
-        found, problems = read_photos(tmp_path, ORIGIN)
-        assert found == ()
-        assert match in problems[0]
+    with pytest.raises(InputError, match=match):
+        read_photos(tmp_path, ORIGIN)
 
 
 def test_camera_file(tmp_path) -> None:

@@ -167,8 +167,11 @@ TABLES: dict[str, tuple[Callable[[Path], Any], str, list[list[str]]]] = {
     ),
     "photos": (
         read_photos,
-        "name,east_m,north_m,up_m,yaw_deg,pitch_deg,roll_deg",
-        [["Süd.jpg", "0.25", "2", "30", "0", "-90", "0"], ["b.jpg", "1", "2", "30", "0", "9", "0"]],
+        "name,east_m,north_m,up_m,yaw_deg,pitch_deg,roll_deg,sigma_m",
+        [
+            ["Süd.jpg", "0.25", "2", "30", "0", "-90", "0", "0.01"],
+            ["b.jpg", "1", "2", "30", "0", "9", "0", "0.5"],
+        ],
     ),
 }  # fmt: skip
 

@@ -15,6 +15,8 @@ from heliotrope.geometry import FloatArray
 DJI = "http://www.dji.com/drone-dji/1.0/"
 _RDF = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
 _XAP = "http://ns.adobe.com/xap/1.0/"
+#: RtkFlag of a fixed solution; lower values mean decimetres or metres.
+RTK_FIXED = 50
 _EXIF_IFD, _TAKEN, _OFFSET, _SUBSECOND = 0x8769, 0x9003, 0x9011, 0x9291
 
 
@@ -35,7 +37,7 @@ class Metadata:
     sigma
         Standard deviations east, north, up stated by the RTK receiver, m, (3,).
     rtk_flag
-        50 for a fixed solution; None if the file has none.
+        `RTK_FIXED` for a fixed solution; None if the file has none.
     """
 
     size: tuple[int, int]
@@ -164,7 +166,7 @@ def exif_and_xmp(found: Metadata) -> tuple[bytes, bytes]:
         "GimbalYawDegree": f"{found.yaw_deg:+.3f}",
         "GimbalPitchDegree": f"{found.pitch_deg:+.3f}",
         "GimbalRollDegree": f"{found.roll_deg:+.3f}",
-        "RtkFlag": str(RTK_FLAG if found.rtk_flag is None else found.rtk_flag),
+        **({} if found.rtk_flag is None else {"RtkFlag": str(found.rtk_flag)}),
         "RtkStdLon": f"{found.sigma[0]:.5f}",
         "RtkStdLat": f"{found.sigma[1]:.5f}",
         "RtkStdHgt": f"{found.sigma[2]:.5f}",
@@ -178,7 +180,3 @@ def exif_and_xmp(found: Metadata) -> tuple[bytes, bytes]:
         f'{inside}/></rdf:RDF></x:xmpmeta><?xpacket end="w"?>'
     )
     return exif.tobytes(), packet.encode()
-
-
-#: Written by default: a fixed solution.
-RTK_FLAG = 50

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne._photo_metadata import Metadata, read_metadata
+from heliotrope.airborne._photo_metadata import RTK_FIXED, Metadata, read_metadata
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.camera import checked_pinhole, checked_pose, local_pixels
 from heliotrope.files.cells import read_rows
@@ -36,8 +36,6 @@ SUFFIXES = (".jpg", ".jpeg")
 RTK_SIGMA = 0.01
 #: Points farther out than this multiple of the frame's corners are not seen.
 REACH = 1.3
-#: RtkFlag of a fixed solution; lower values mean decimetres or metres.
-RTK_FIXED = 50
 
 
 @dataclass(frozen=True)
@@ -235,13 +233,13 @@ def read_photos(
 
     Returns
     -------
-    Photographs, and a line for each that cannot be used: position or angles missing, no fixed RTK
-    solution, or a size unlike that of most others (mixed cameras).
+    Photographs, and a line for each that cannot be used: position or angles missing, no RTK
+    solution stated as fixed, or a size unlike that of most others (mixed cameras).
 
     Raises
     ------
     InputError
-        If there is no such folder, or no photograph in it.
+        If there is no such folder, or no photograph in it that can be used.
     FormatError
         If ``photos.csv`` is not such a table.
     """
@@ -270,6 +268,8 @@ def read_photos(
             problems.append(str(error))
     missing = sorted(set(rows) - {f.name for f in files})
     problems += [f"{place / name}: {table.name} names it, but there is no file" for name in missing]
+    if not photos:
+        raise InputError(f"{place}: no photograph of {len(problems)} can be used: {problems[0]}")
     return _of_one_camera(photos, problems, sizes, place)
 
 
@@ -308,12 +308,15 @@ def _of_metadata(found: Metadata, file: Path, origin: tuple[float, float, float]
             f"its XMP lacks {', '.join(missing)}; copy the original file from the drone, or "
             "write the values into photos.csv",
         )
-    if found.rtk_flag is not None and found.rtk_flag != RTK_FIXED:
-        raise FormatError(
-            file,
-            f"RtkFlag {found.rtk_flag} is not a fixed solution ({RTK_FIXED}): its position is "
-            "known to decimetres at best; leave it out, or correct it and write photos.csv",
+    if found.rtk_flag != RTK_FIXED:
+        what = (
+            "its XMP has no RtkFlag, so nothing states how well its position is known"
+            if found.rtk_flag is None
+            else f"RtkFlag {found.rtk_flag} is not a fixed solution ({RTK_FIXED}): its position is "
+            "known to decimetres at best"
         )
+        remedy = "leave it out, or write photos.csv with corrected positions and their sigma_m"
+        raise FormatError(file, f"{what}; {remedy}")
     position = geodetic_to_enu(found.latitude_deg, found.longitude_deg, found.altitude, origin)
     known = np.isfinite(found.sigma) & (found.sigma > 0.0)
     return Photo(
@@ -330,12 +333,12 @@ def _read_table(path: Path) -> dict[str, dict[str, str]]:
     rows = read_rows(path, "a table of photographs")
     columns = set(rows.columns)
     places = ({"east_m", "north_m", "up_m"}, {"latitude_deg", "longitude_deg", "altitude_m"})
-    needed = {"name", "yaw_deg", "pitch_deg", "roll_deg"}
+    needed = {"name", "yaw_deg", "pitch_deg", "roll_deg", "sigma_m"}
     if needed - columns or not any(p <= columns for p in places):
         raise FormatError(
             path,
-            "needs the columns name, yaw_deg, pitch_deg, roll_deg and east_m, north_m, up_m "
-            "(or latitude_deg, longitude_deg, altitude_m); time and sigma_m are optional",
+            "needs the columns name, yaw_deg, pitch_deg, roll_deg, sigma_m and east_m, north_m, "
+            "up_m (or latitude_deg, longitude_deg, altitude_m); time is optional",
         )
     names = rows.names("name", "photograph")
     rows.refuse_bad()
@@ -374,6 +377,5 @@ def _of_row(
         if time.tzinfo is None:
             raise FormatError(table, f"time {text} has no zone; append Z", row["name"])
         time = time.astimezone(UTC)
-    sigma = number("sigma_m") if (row.get("sigma_m") or "").strip() else RTK_SIGMA
     turned = rotation_of_gimbal(yaw, pitch, roll)
-    return Photo(file.name, time, position, turned, np.full(3, sigma), file)
+    return Photo(file.name, time, position, turned, np.full(3, number("sigma_m")), file)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne._photo_metadata import Metadata, exif_and_xmp
+from heliotrope.airborne._photo_metadata import RTK_FIXED, Metadata, exif_and_xmp
 from heliotrope.airborne.coded_targets import CELLS, CodedTarget, white_cells
 from heliotrope.airborne.coded_targets import MARGIN as SHEET_MARGIN
 from heliotrope.airborne.evaluate.reflections import Reflections
@@ -412,6 +412,7 @@ def write_photo(
             pitch,
             roll,
             recorded.sigma_position,
+            RTK_FIXED,
         )
     )
     good, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])
