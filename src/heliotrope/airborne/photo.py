@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from heliotrope.airborne._photo_metadata import RTK_FIXED, Metadata, read_metadata
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.camera import checked_pinhole, checked_pose, local_pixels
+from heliotrope.field.camera import check_unfolded, checked_pinhole, checked_pose, local_pixels
 from heliotrope.files.cells import read_rows
 from heliotrope.files.documents import read_toml
 from heliotrope.files.limits import check_entries
@@ -188,14 +188,16 @@ def read_camera(path: str | Path) -> LedCamera:
     (fx, fy), (cx, cy) = values["focal_px"], values["principal_point_px"]
     width, height = values["size_px"]
     try:
-        return LedCamera(
+        camera = LedCamera(
             (int(width), int(height)),
             np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
             as_float(values["distortion"]),
             as_float(values["led_offset_m"]),
         )
+        check_unfolded("camera", camera)
     except InputError as error:
         raise FormatError(path, str(error)) from None
+    return camera
 
 
 def write_camera(path: str | Path, camera: LedCamera) -> None:

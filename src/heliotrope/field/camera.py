@@ -22,6 +22,9 @@ from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
 
 #: Smallest depth in front of a camera at which a point counts as seen, m.
 _NEAREST = 1e-6
+#: Sides of the frame's border and steps along a ray at which a lens is checked for a fold, and how
+#: far the steps reach, in tangents of the angle to the farthest corner without distortion.
+_PER_SIDE, _STEPS, _FARTHEST = 4, 2000, 20.0
 
 
 class Pinhole(Protocol):
@@ -151,6 +154,58 @@ def checked_pose(
     if not np.allclose(square, np.eye(3), atol=1e-6) or np.linalg.det(turned) < 0.0:
         raise InputError(f"{name}: its rotation is not a right-handed rotation")
     return place, turned
+
+
+def check_unfolded(name: str, camera: Pinhole) -> None:
+    """Refuse a lens whose polynomial folds inside the frame: pixels there have two rays, or none.
+
+    From the principal point outwards, along rays to the frame's border, the lens must map
+    neighbours to neighbours (the determinant of its Jacobian stays above 0) until it has left the
+    frame.
+
+    Raises
+    ------
+    InputError
+        If it folds before; the message names the smallest radius at which it does, px.
+    """
+    if not camera.distortion.any():
+        return
+    size, center = as_float(camera.size), camera.matrix[:2, 2]
+    share = np.arange(_PER_SIDE) / _PER_SIDE
+    side = np.stack([share, np.zeros(_PER_SIDE)], axis=-1)
+    border = np.concatenate([side, side[:, ::-1] + [1, 0], 1 - side, 1 - side[:, ::-1] - [1, 0]])
+    towards = border * (size - 1.0) - center
+    towards = towards[np.hypot(*towards.T) > 1.0] / np.diag(camera.matrix)[:2]
+    rays = towards / np.hypot(*towards.T)[:, None]
+    reach = _FARTHEST * _corner_tangent(camera) / _STEPS * np.arange(1, _STEPS + 1)
+    plane = reach[:, None] * rays[:, None]
+    pixels = distort(camera, plane)
+    folded = _stretch(camera.distortion, plane) <= 0.0
+    folded[:, -1] = True
+    last = np.argmax(folded, axis=1)
+    ends = pixels[np.arange(len(rays)), last]
+    inside = ((ends > -0.5) & (ends < size - 0.5)).all(axis=1)
+    if inside.any():
+        radius = float(np.hypot(*(ends[inside] - center).T).min())
+        corners = np.hypot(*(border * (size - 1.0) - center).T)
+        raise InputError(
+            f"{name}: its lens polynomial folds {radius:.0f} px from the principal point, inside "
+            f"the frame (farthest corner: {corners.max():.0f} px): pixels beyond have no "
+            "direction; calibrate the lens again with pictures that fill the corners (heliotrope "
+            "camera calibrate)"
+        )
+
+
+def _stretch(distortion: FloatArray, plane: FloatArray) -> FloatArray:
+    """Return the determinant of the distortion's Jacobian at normalised places (..., 2)."""
+    x, y = plane[..., 0], plane[..., 1]
+    k1, k2, p1, p2, k3 = distortion
+    r2 = x * x + y * y
+    radial, slope = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
+    xx = radial + 2.0 * (x * x * slope + p1 * y + 3.0 * p2 * x)
+    yy = radial + 2.0 * (y * y * slope + 3.0 * p1 * y + p2 * x)
+    xy = 2.0 * (x * y * slope + p1 * x + p2 * y)
+    return as_float(xx * yy - xy * xy)
 
 
 # -- points to pixels and back ---------------------------------------------------------

@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.field.camera import Camera
+from heliotrope.field.camera import Camera, check_unfolded
 from heliotrope.field.heliostat import Heliostat
 from heliotrope.field.heliostats import Heliostats, rows_in
 from heliotrope.field.joint_visits import JointSettings
@@ -84,6 +84,7 @@ class Plant(Value, Framed):
         check_names("camera", (camera.name for camera in self.cameras))
         check_names("keep-out volume", (volume.name for volume in self.keep_outs))
         for camera in self.cameras:
+            check_unfolded(f"camera {camera.name}", camera)
             for target in camera.targets:
                 self.target(target)
         if self.receiver_visits is not None:
