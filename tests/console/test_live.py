@@ -189,7 +189,11 @@ def test_ctl_at_the_plant_itself(ctl: Callable[..., Any], console: LiveConsole) 
     assert asked.stdout.startswith(f"CALIBRATE: 1 waiting ({name}: it waits: "), asked.stdout
     called = ctl("viewer", *where, "emergency", "--reason", "smoke")
     assert "emergency in force" in called.stdout
-    assert ctl("operator", *where, "emergency", "--withdraw").exit_code == 0
+    assert "smoke" in called.stdout
+    mine = ctl("operator", *where, "emergency", "--withdraw")
+    assert mine.exit_code != 0, mine.output
+    withdrawn = ctl("engineer", *where, "emergency", "--withdraw", "--owner", "viewer")
+    assert withdrawn.exit_code == 0, withdrawn.output
     console.calm()
     for words, text in (
         (("show", "accounts"), "leave out --data"),

@@ -390,7 +390,7 @@ def test_persons_come_before_the_automat() -> None:
         shown.emergency(OPERATOR, reason="somebody on the tower")
         calls = [(call.who, call.act, call.reason) for call in shown.emergency_view().calls]
         assert calls == [("Vera", "STOW", "a fire"), ("Olga", "DEFOCUS", "somebody on the tower")]
-        shown.withdraw(VIEWER)
+        shown.withdraw(ENGINEER, "Vera")
         await asyncio.sleep(40.0)
         assert shown.summary().emergency
         with pytest.raises(RefusedError, match=r"Otto has ordered no emergency.*Olga \(DEFOCUS"):
@@ -749,7 +749,7 @@ def test_after_a_restart_in_an_emergency_a_person_resumes(tmp_path: Path) -> Non
         # The order stands until it is withdrawn and acknowledged, whatever program runs.
         (call,) = shown.emergency_view().calls
         assert (call.who, call.act, call.reason) == ("Vera", "STOW", "a fire")
-        shown.withdraw(VIEWER)
+        shown.withdraw(ENGINEER, "Vera")
         await asyncio.sleep(5.0)
         shown.acknowledge(OPERATOR, "operator_emergency")
         await asyncio.sleep(5.0)

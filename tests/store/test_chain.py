@@ -151,6 +151,10 @@ def test_an_old_store_is_linked_when_it_is_migrated(tmp_path: Path) -> None:
         "DROP TABLE event_link",
         "DROP TABLE audit_link",
         *(f"DROP TABLE {name}" for name in reversed(old_store.LATER)),
+        "DROP INDEX uq_hold_standing",
+        "ALTER TABLE hold DROP COLUMN kind",
+        "ALTER TABLE hold RENAME COLUMN name TO heliostat",
+        "CREATE UNIQUE INDEX uq_hold_standing ON hold (heliostat) WHERE ended IS NULL",
         "UPDATE alembic_version SET version_num = '0002'",
     ):
         keeper.do(lambda c, sql=sql: c.execute(text(sql)))

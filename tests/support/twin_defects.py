@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from heliotrope.cluster import _goals, _nodes, _reports, _runs, _watch
+from heliotrope.cluster import _nodes, _reports, _runs, _watch
 from heliotrope.lcu import (
     controller,
     journal,
@@ -306,12 +306,6 @@ def _sun_in_the_dark(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(_watch.Verdict, "dark", property(lambda self: False))
 
 
-def _off_when_acknowledged(patch: pytest.MonkeyPatch) -> None:
-    """The cluster reports DEFOCUS and STOW as done when a local controller acknowledges them."""
-    for name in ("DEFOCUS", "STOW"):
-        patch.delitem(_goals.GOALS, name)
-
-
 def _two_plants_obeyed(patch: pytest.MonkeyPatch) -> None:
     """A cluster takes the lease of every plant with its key."""
     patch.setattr(_runs.Runs, "admits", lambda self, run, now: True)
@@ -393,8 +387,6 @@ DEFECTS = (
                         for at in (70.0, 100.0, 130.0, 160.0, 190.0, 220.0) for i in range(3)),
            worlds=("calm",)),
     Defect((10, 11), "TRACK accepted straight from stow", _ready_after_stow, pause=12.0, first=2),
-    Defect((15,), "a cluster calls DEFOCUS done on its acknowledgement", _off_when_acknowledged,
-           ("line_drop",), 60.0),
     Defect((10,), "approach straight to the standby point", _straight_to_standby,
            ("line_drop",), 60.0, first=1),
     Defect((9,), "SUN sent although the table says dark", _sun_in_the_dark, ("time_jump",), 10.0),

@@ -399,6 +399,7 @@ def test_the_limits_of_the_site_hold_and_their_change_is_recorded(tmp_path: Path
     async def main(clock: VirtualClock) -> None:
         keeper = Keeper(tmp_path, inline=True)
         for safety, changes in (({}, set()), (limits, there), (limits, set()), ({}, back)):
+            keeper.keep_emergency("")  # each run is a plant of its own
             design = replace(lay_out("radial", 3), safety=safety)
             audit = KeptAudit(keeper, clock, START)
             plant = LivePlant(design, clock, feeding, records=keeper, audit=audit)

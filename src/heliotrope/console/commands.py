@@ -30,7 +30,7 @@ async def call_emergency(
 
 @router.delete("/emergency", response_model=models.EmergencyView, tags=["safety"])
 async def withdraw_emergency(
-    console: Here, who: Anyone, given: orders.Withdrawal | None = None
+    console: Here, who: Operator, given: orders.Withdrawal | None = None
 ) -> JSONResponse:
     """Withdraw your emergency order, or an owner's as an engineer; nothing moves because of it.
 

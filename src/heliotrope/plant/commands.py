@@ -100,6 +100,7 @@ class Commands:
             known = [r[1] for r in wire.MESSAGES if r[2] == wire.AUTHORITY and r[1] not in POINTS]
             raise UnknownNameError("command (points are given by aim and standby)", name, known)
         numbers = whole(values, row[3], name)
+        self._authority.check(person, token, name)
         names = tuple(dict.fromkeys(heliostats)) or self._field.names
         out = self._permission.locked_out(name, names, self._destined(name, names))
         others = tuple(n for n in names if n not in out)

@@ -648,8 +648,9 @@ class PlantController:
         Raises
         ------
         RefusedError
-            If the person has ordered none while others have, or is no engineer.
+            If the person has ordered none while others have, or their role is too low.
         """
+        person.must_be(Role.OPERATOR, "withdraw")
         who, calls = owner or person.name, self.calls
         if who != person.name:
             person.must_be(Role.ENGINEER, f"withdraw the emergency of {who}")

@@ -210,7 +210,7 @@ _URGENT = {
     ),
 }
 _ORDERS = {
-    "withdraw_emergency": Call(Role.VIEWER, orders.Withdrawal, _withdraw),
+    "withdraw_emergency": Call(Role.OPERATOR, orders.Withdrawal, _withdraw),
     "acknowledge": Call(
         Role.OPERATOR,
         orders.Acknowledged,
