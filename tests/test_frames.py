@@ -157,6 +157,20 @@ def test_every_record_has_a_frame_and_a_dataset(learned: ht.Learned, tmp_path: P
     assert value == pytest.approx(learned.parameters_at([0], TIMES[UP][-1])[0][0, 0])
 
 
+def test_the_frame_of_a_fit_is_short_unless_it_is_asked_in_full() -> None:
+    fitted = ht.fit(PLANT["P6A"], measured(), "guo6")
+    short, full = fitted.to_frame(), fitted.to_frame(full=True)
+    values, sigmas = ([f"{kind}_{name}" for name in fitted.names] for kind in ("value", "sigma"))
+    assert list(short) == [*values, *sigmas, "scale", "sightings", "outcome"]
+    added = [f"{kind}_{name}" for kind in ("prior", "centre") for name in fitted.names]
+    assert list(full) == [*values, *sigmas, *added, "scale", "sightings", "outcome"]
+    np.testing.assert_array_equal(full[added[:6]].to_numpy()[0], fitted.prior)
+    assert set(full.attrs["units"]) == set(full)
+    pd.testing.assert_frame_equal(full[list(short)], short)
+    # A dataset has everything.
+    assert {"prior", "centre", "covariance"} < set(fitted.to_xarray())
+
+
 def test_a_single_axis_has_the_models_by_role() -> None:
     from support.machines import every_kind
 

@@ -1,6 +1,7 @@
 """The pictures of `heliotrope.plot`: they draw what they are given, on the axes they are given."""
 
 from collections.abc import Iterator
+from datetime import timedelta
 from functools import cache
 
 import matplotlib as mpl
@@ -69,6 +70,22 @@ def test_a_day_marks_what_is_not_reached(ax: Axes) -> None:
     plot.day(TIMES, found, ax=ax)
     assert labels(ax)[-1] == "not reached"
     assert np.isnan(ax.lines[0].get_ydata()).sum() == missed.sum()
+
+
+def test_a_day_of_a_heliostat_is_drawn_from_the_day_alone(ax: Axes) -> None:
+    day = ht.track_day(plant()["P6A"], "2026-09-02", every=timedelta(hours=1))
+    assert plot.day(day, joints=("azimuth", "elevation"), ax=ax) is ax
+    assert labels(ax) == ["azimuth", "elevation"]
+    for drive, line in enumerate(ax.lines):
+        np.testing.assert_allclose(line.get_ydata(), np.degrees(day.path.angles[:, drive]))
+    np.testing.assert_array_equal(
+        ax.lines[0].get_xdata(), day.time.tz_localize(None).to_numpy("datetime64[us]")
+    )
+    with pytest.raises(InputError, match="the day has its own path; give the day alone"):
+        plot.day(day, day.path, ax=ax)
+    field = ht.track_day(plant(), "2026-09-02", every=timedelta(hours=6))
+    with pytest.raises(InputError, match="track one heliostat"):
+        plot.day(field, ax=ax)
 
 
 def test_residuals_are_in_mrad_and_outliers_do_not_set_the_limits(ax: Axes) -> None:
@@ -162,6 +179,7 @@ def test_a_mechanism_has_a_slider_of_time() -> None:
     [
         (lambda ax: plot.day(TIMES[:3], tracked(), ax=ax), r"tracked: shape \(12,\) for 3 times"),
         (lambda ax: plot.day(TIMES, np.zeros(3), ax=ax), "tracked: a numpy ndarray"),
+        (lambda ax: plot.day(TIMES, ax=ax), "give a day of track_day alone"),
         (lambda ax: plot.residuals([1.0], np.zeros((2, 2)), ax=ax), r"x: shape \(1,\) for 2"),
         (lambda ax: plot.residuals([1.0], [1.0], ax=ax), r"beam: shape \(1,\); give right and up"),
         (lambda ax: plot.ellipses(np.zeros((3, 2)), np.eye(3), ax=ax), r"covariance: shape \(3"),

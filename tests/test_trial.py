@@ -36,7 +36,7 @@ for name in ("heliok-scene.xml", "solarpilot-export.csv", "opencsp-field.csv"):
     plant = ht.open(files / name, site=site)
     day = ht.track_day(plant[plant.names[0]], "2026-06-21", (0.0, 0.0, 60.0))
     days[name] = day.to_frame()[["angle_1", "angle_2"]]
-    axes = ht.plot.day(day.time, day.path)
+    axes = ht.plot.day(day)
     axes.figure.savefig(out / f"{name}.png")
 """,
         files=FILES,

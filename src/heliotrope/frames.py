@@ -56,6 +56,8 @@ class Labelled:
         Names that only the dataset has, because they would be many columns.
     notes
         Attributes of the whole.
+    on_request
+        Names that a frame has only if it is full, because few readers need them.
     """
 
     rows: tuple[str, ...]
@@ -63,6 +65,7 @@ class Labelled:
     variables: Mapping[str, Variable]
     large: frozenset[str] = frozenset()
     notes: Mapping[str, str] = field(default_factory=dict)
+    on_request: frozenset[str] = frozenset()
 
 
 class Framed:
@@ -72,16 +75,24 @@ class Framed:
     def _labelled(self) -> Labelled:
         """Return the arrays with their axes."""
 
-    def to_frame(self) -> "pd.DataFrame":
-        """Return a pandas frame with one row for each label; ``attrs["units"]`` holds units."""
+    def to_frame(self, *, full: bool = False) -> "pd.DataFrame":
+        """Return a pandas frame with one row for each label; ``attrs["units"]`` holds units.
+
+        Parameters
+        ----------
+        full
+            Whether a fit has the columns ``prior_…`` and ``centre_…`` too; other records have the
+            same columns either way.
+        """
         import pandas as pd
 
         given = self._labelled()
+        left_out = given.large if full else given.large | given.on_request
         size = [len(np.asarray(given.labels[axis])) for axis in given.rows]
         columns: dict[str, Any] = {}
         units: dict[str, str] = {}
         for name, one in given.variables.items():
-            if name in given.large:
+            if name in left_out:
                 continue
             values, extra = np.asarray(one.values), [a for a in one.axes if a not in given.rows]
             order = [one.axes.index(a) for a in (*given.rows, *extra) if a in one.axes]

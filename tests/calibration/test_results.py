@@ -17,7 +17,7 @@ from heliotrope.calibration.report import results, write_paint
 from heliotrope.calibration.report.content import CalibrationReport
 from heliotrope.calibration.report.page import write_report
 from heliotrope.calibration.sightings import Sightings, of_measurements
-from heliotrope.errors import FormatError, InputError
+from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.field.example import example_plant
 from heliotrope.field.formats import measurements, paint
 from heliotrope.field.formats.plant_file import read_plant
@@ -117,12 +117,13 @@ def test_the_simplest_model_that_explains_is_chosen() -> None:
     trials = {
         "two": ("azimuth_bias", "elevation_bias"),
         "tilted": ("tilt_north", "tilt_east", "azimuth_bias", "elevation_bias"),
-        "guo6": tuple(PRIORS),
+        "guo6": "guo6",
         "more": (*PRIORS, "azimuth_scale", "elevation_scale", "sag", "pivot_offset"),
     }
     tried: list[str] = []
     scored = models.compare_models(nominal, seen, trials, progress=tried.append)
     assert tried == list(trials)
+    assert {c.name: c.parameters for c in scored} == {**trials, "guo6": tuple(PRIORS)}
     assert models.choose_model(scored).name == "guo6"
     by_name = {c.name: c for c in scored}
     assert by_name["two"].log_evidence < by_name["guo6"].log_evidence
@@ -131,6 +132,8 @@ def test_the_simplest_model_that_explains_is_chosen() -> None:
     assert "full" in known
     with pytest.raises(InputError, match="name the model instead of auto"):
         models.compare_models(nominal, seen.take(range(3)))
+    with pytest.raises(UnknownNameError, match="gou6"):
+        models.compare_models(nominal, seen, {"mine": "gou6"})
 
 
 @pytest.mark.parametrize("axes", [("elevation",), ("azimuth", "elevation")])

@@ -5,6 +5,7 @@ import contextlib
 import math
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import SendOutcome, Statistics
 from heliotrope.links.messages import Ask, ClusterStatus, Lease, encode
-from heliotrope.optics import air_loss, intercept_rectangle, predict_flux
+from heliotrope.optics import FluxView, air_loss, intercept_rectangle, predict_flux
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.logbook import Logbook
@@ -96,6 +97,26 @@ def test_the_map_is_mirrored_with_the_aim(right: float, up: float, error: float)
     ]
     assert np.allclose(views[0].flux, views[1].flux[:, ::-1], rtol=1e-3, atol=1e-2)
     assert 0.0 <= views[0].intercept <= 1.0
+
+
+def test_flux_leaves_out_neighbours_and_the_curvature_of_the_receiver() -> None:
+    light = normalize(np.array([0.0, -0.6, 0.8]))
+
+    def view(receiver: Receiver, *places: tuple[float, float, float]) -> FluxView:
+        beams = len(places)
+        aims = np.tile(receiver.center, (beams, 1))
+        return predict_flux(receiver, places, aims, [5.0] * beams, [1e-3] * beams, sun=light)
+
+    behind = (0.0, -200.0, 2.0)
+    # Halfway along the ray of the mirror behind it, which it blocks whole.
+    before = (0.0, -100.0, 31.0)
+    apart = view(RECEIVER, behind).power + view(RECEIVER, before).power
+    assert view(RECEIVER, behind, before).power == pytest.approx(apart)
+    curved = replace(RECEIVER, kind="external_cylinder", radius=3.0, opening_angle=2.0 * math.pi)
+    assert view(curved, behind) == view(RECEIVER, behind)
+    # At 2° from the plane of the aperture, and at 4°.
+    beside = [(100.0, -100.0 * math.tan(math.radians(angle)), 60.0) for angle in (2.0, 4.0)]
+    assert [view(curved, place).heliostats for place in beside] == [0, 1]
 
 
 def test_light_that_is_none() -> None:

@@ -12,9 +12,7 @@ a field of 10,000 beams is one product of two matrices. The power of a beam is
 $$P = A \, E \, ρ \, \sqrt{(1 + s·t)/2} \, (1 - l(d)),$$
 
 with the loss l in clear air after Vittitoe and Biggs as in DELSOL3 (Kistler 1986):
-$l = 0.006789 + 0.1046 d - 0.017 d^2 + 0.002845 d^3$, d in km. Shading and blocking by neighbours
-are left out, and so is the shape of the sun's limb. A curved receiver is represented by the plane
-of its aperture.
+$l = 0.006789 + 0.1046 d - 0.017 d^2 + 0.002845 d^3$, d in km. `predict_flux` says what is left out.
 """
 
 from dataclasses import dataclass
@@ -103,12 +101,12 @@ def predict_flux(
     slope: float = 1e-3,
     cells: tuple[int, int] = CELLS,
 ) -> FluxView:
-    """Return the flux of N beams on a receiver.
+    """Return the flux of N beams on a receiver, without shading, blocking, canting and curvature.
 
     Parameters
     ----------
     receiver
-        Its aperture is taken as the rectangle of its width and height.
+        Its aperture is taken as the flat rectangle of its width and height, whatever its kind.
     vertices, aims
         Mirror vertices and aim points, ENU, m, (N, 3).
     areas
@@ -130,6 +128,19 @@ def predict_flux(
     ------
     InputError
         If shapes do not fit or a number is out of range.
+
+    Notes
+    -----
+    This is left out:
+
+    - **shading and blocking** by neighbours and by the tower: every mirror counts in full, so the
+      power is too high;
+    - **canting, focus and size** of the mirrors: each is taken as focused on its aim, without
+      astigmatism, so the beams are too narrow where it is not;
+    - **curved receivers**: the map is that of the plane of the aperture, not of the surface behind
+      it, and beams that meet this plane from behind or within 3° of it do not count, so that an
+      external cylinder gets the light of one side only;
+    - the shape of the sun's limb, and reflection by the receiver.
     """
     places = as_vectors(np.reshape(as_float(vertices), (-1, 3)), "vertices")
     points = as_vectors(np.reshape(as_float(aims), (-1, 3)), "aims")

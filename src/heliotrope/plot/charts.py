@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError, kind_of
+from heliotrope.field.day import TrackedDay
 from heliotrope.geometry import FloatArray, as_numbers
 from heliotrope.mechanism.parameters import shown_in
 from heliotrope.mechanism.path import TrackedPath
@@ -86,8 +87,8 @@ def _date_axis(ax: "Axes") -> None:
 
 
 def day(
-    times: Times,
-    tracked: Tracking | TrackedPath,
+    times: Times | TrackedDay,
+    tracked: Tracking | TrackedPath | None = None,
     *,
     joints: Sequence[str] = ("first drive", "second drive"),
     ax: "Axes | None" = None,
@@ -97,10 +98,10 @@ def day(
     Parameters
     ----------
     times
-        T times, as for `heliotrope.sun.vector`.
+        A day of one heliostat, as `heliotrope.track_day` returns it; or T times, as for
+        `heliotrope.sun.vector`.
     tracked
-        Their solutions, batch shape (T,), of which the best branch is drawn; or a path, such as
-        ``track_day(…).path``.
+        For times: their solutions, batch shape (T,), of which the best branch is drawn; or a path.
     joints
         Names of the drives.
     ax
@@ -109,10 +110,17 @@ def day(
     Raises
     ------
     InputError
-        If there are not as many solutions as times.
+        If there are not as many solutions as times, or none, or a day and solutions.
     """
+    if isinstance(times, TrackedDay):
+        if tracked is not None:
+            raise InputError("tracked: the day has its own path; give the day alone")
+        tracked, times = times.path, times.time
     if not isinstance(tracked, Tracking | TrackedPath):
-        raise InputError(f"tracked: {kind_of(tracked)} is not a Tracking; give what track returns")
+        raise InputError(
+            f"tracked: {kind_of(tracked)} is not a Tracking; give a day of track_day alone, or "
+            "times and what track returns"
+        )
     dates = _dates(times)
     angles = np.degrees(tracked.angles if isinstance(tracked, TrackedPath) else tracked.best_angles)
     if angles.shape[:-1] != dates.shape:

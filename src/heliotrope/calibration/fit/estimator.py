@@ -155,6 +155,7 @@ class FieldFit(Value, Framed):
                 "outcome": Variable(row, np.atleast_1d(self.outcome)),
             },
             frozenset({"covariance"}),
+            on_request=frozenset({"prior", "centre"}),
         )
 
     @property

@@ -7,12 +7,13 @@ candidate within one standard error of the best is chosen (Breiman et al. 1984).
 """
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration.fit.estimator import names_of
 from heliotrope.calibration.learn import learning
 from heliotrope.calibration.learn.learned import Learned
 from heliotrope.calibration.learn.misfits import find_misfits
@@ -39,7 +40,7 @@ class ScoredModel:
     Attributes
     ----------
     name, parameters
-        Name and parameters of the model.
+        Name of the model, and names of its parameters.
     log_predictive
         Mean log probability density of a sighting given the others.
     behind, behind_error
@@ -116,12 +117,12 @@ def _worms(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
 def compare_models(
     mechanism: Field,
     sightings: Sightings,
-    models: Mapping[str, tuple[str, ...]] | None = None,
+    models: Mapping[str, str | Sequence[str]] | None = None,
     *,
     used: npt.ArrayLike | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[ScoredModel, ...]:
-    """Return models with their scores, the simplest first.
+    """Return models with their scores, in the order given.
 
     Parameters
     ----------
@@ -130,7 +131,8 @@ def compare_models(
     sightings
         M of these heliostats.
     models
-        Parameters by name; default: `candidate_models`.
+        By name, each the name of a model or the names of parameters; default:
+        `candidate_models`, the simplest first.
     used
         Mask of the sightings to learn from, (M,).
     progress
@@ -140,10 +142,13 @@ def compare_models(
     ------
     InputError
         If no heliostat has enough sightings, or there are no models.
+    UnknownNameError
+        If there is no such model or parameter.
     """
     given = members(mechanism)
     nominal, sightings = given.mechanism, given.rows_of(sightings)
-    trials = candidate_models(nominal) if models is None else dict(models)
+    candidates = candidate_models(nominal) if models is None else models
+    trials = {name: names_of(model, nominal) for name, model in candidates.items()}
     keep = np.ones(len(sightings), np.bool_) if used is None else np.asarray(used, np.bool_)
     counts = np.bincount(sightings.heliostat[keep], minlength=len(nominal))
     chosen = np.argsort(-counts, kind="stable")[:HELIOSTATS]
