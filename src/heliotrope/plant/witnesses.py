@@ -152,6 +152,8 @@ class Witnesses:
         self._contradicting: dict[str, str] = {}
         #: Offsets of the sun by photographs of today that contradict, (3,), by heliostat.
         self._offsets: dict[str, FloatArray] = {}
+        #: Heliostats whose photographs have agreed since one contradicted.
+        self._agreeing: set[str] = set()
 
     def _day(self, utc: float) -> int:
         """Return the number of the day at the site, from midnight to midnight of mean time."""
@@ -199,9 +201,14 @@ class Witnesses:
         source, path = ray_directions(seen, pose.vertex)
         offset = np.mean(reflect(path, pose.normal) - source, axis=0)
         if float(np.linalg.norm(offset)) <= BEAM_ERROR:
+            self._agreeing.add(record.heliostat)
+            # What two mirrors have contradicted, one does not settle.
+            if PHOTOGRAPHS in self._contradicting and len(self._agreeing) < 2:
+                return self.refusal
             self._offsets.clear()
             self._agrees(PHOTOGRAPHS)
             return ""
+        self._agreeing.clear()
         others = [each for name, each in self._offsets.items() if name != record.heliostat]
         self._offsets[record.heliostat] = offset
         if any(np.linalg.norm(offset - each) <= BEAM_ERROR for each in others):
