@@ -1,6 +1,7 @@
 """Targets in raw frames: found where they are, in any light and from any side, or not at all."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -38,6 +39,7 @@ from support.data import juelich
 SIZE = (480, 360)
 TARGET = example_target()
 CAMERA = example_camera(TARGET, size=SIZE, fill=0.84)
+Turn = Callable[[np.ndarray], np.ndarray]
 #: Centres this far off, m, are wrong.
 WRONG = 0.05
 
@@ -307,6 +309,34 @@ def test_upside_down_is_told_by_marks_or_by_the_pose() -> None:
     assert off(only(rendered.frame, TARGET, camera), camera) < 5e-3
     upright = view_of(only(rendered.frame))
     assert float(upright.scale(np.zeros(2))[1, 1]) < 0.0
+
+
+@pytest.mark.parametrize("kind", ["symmetric", "one disc", "tags"])
+@pytest.mark.parametrize(
+    ("turn", "name"),
+    [
+        (lambda p: p[::-1, ::-1], "turned by 180°"),
+        (lambda p: p[:, ::-1], "mirrored left to right"),
+        (lambda p: p[::-1], "mirrored top to bottom"),
+        (lambda p: np.rot90(p, -1), "turned by 90° clockwise"),
+        (np.rot90, "turned by 90° counterclockwise"),
+        (lambda p: p.T, "mirrored about its falling diagonal"),
+        (lambda p: p[::-1, ::-1].T, "mirrored about its rising diagonal"),
+    ],
+)
+def test_a_turned_frame_contradicts_the_pose(turn: Turn, name: str, kind: str) -> None:
+    aside = np.asarray(CAMERA.R_enu_camera) @ rotation([0.0, 1.0, 0.0], 0.004)
+    camera = replace(CAMERA, R_enu_camera=aside)
+    marks = (replace(TARGET.marks[0], kind="disc", stroke=0.0), *TARGET.marks[1:])
+    odd = {"symmetric": TARGET, "one disc": replace(TARGET, marks=marks)}
+    target = odd.get(kind) or with_marks("tag", 4, 0.9)
+    frame = render(scene(target, camera), 1).frame
+    assert off(only(frame, target, camera), camera) < 5e-3
+    found = only(Frame(np.ascontiguousarray(turn(frame.pixels))), target, camera)
+    assert not found.found
+    # Mirrored tags, and other marks that are unlike each other, are not found in the first place.
+    if kind == "symmetric" or "turned" in name:
+        assert f"the frame is {name} against the pose of camera" in found.reason
 
 
 def test_symmetries_of_marks() -> None:

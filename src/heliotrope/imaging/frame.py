@@ -15,6 +15,17 @@ Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 #: Values on a grid of pixels, of any type that OpenCV handles.
 Image = npt.NDArray[Any]
 
+#: Pixels above this share of a channel's white may be clipped; tone curves end below it.
+CLIPPED = 0.985
+#: Weights of blue, green and red in the brightness (Rec. 601), in 255ths.
+_SHARES = (29, 150, 76)
+_SQUARED = np.round(np.arange(256) ** 2 / 255.0).astype(np.uint8)
+#: A plateau below the full scale: it has this many times more pixels between CLIPPED and 1 of the
+#: highest value than an equal band below has; so many pixels may be higher (hot pixels); and so
+#: many values occur between _NEAR and 1, without which nothing is known of the bands. A beam's
+#: smooth top gives 1.
+_PLATEAU, _HOT, _VALUES, _NEAR = 8.0, 16, 4, 0.94
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -67,6 +78,25 @@ class Frame:
         """Greatest possible value of a pixel."""
         return float(np.iinfo(self.pixels.dtype).max)
 
+    @cached_property
+    def clipped(self) -> npt.NDArray[np.uint8]:
+        """How much each pixel is clipped, 0 to 255, (H, W).
+
+        The share of its brightness that is of channels at their white, squared: clipping moves a
+        centroid by that share, and so widens its variance by the square. White is the full scale,
+        or the plateau below it at which a channel ends: video levels end at 235, and a sensor of
+        12 bits at 4095 of 65535.
+        """
+        import cv2
+
+        grey = self.pixels.ndim == 2
+        channels = [self.pixels] if grey else cv2.split(self.pixels)
+        out = np.zeros(self.pixels.shape[:2], dtype=np.uint8)
+        for channel, share in zip(channels, (255,) if grey else _SHARES, strict=True):
+            limit = float(np.ceil(CLIPPED * _white(channel, self.full_scale)))
+            out += np.uint8(share) * (channel >= limit)
+        return _SQUARED[out]
+
     def linear(self, gamma: float) -> "Frame":
         """Return a 16-bit frame whose pixels are proportional to light; itself if gamma is 1.
 
@@ -96,3 +126,22 @@ class Frame:
         if self.pixels.ndim == 2:
             return np.ascontiguousarray(self.pixels)
         return cv2.cvtColor(self.pixels, cv2.COLOR_BGR2GRAY)
+
+
+def _white(channel: Image, full_scale: float) -> float:
+    """Return the value at which a channel (H, W) clips: its own plateau, or the full scale."""
+    import cv2
+
+    levels = int(full_scale) + 1
+    counts = cv2.calcHist([np.ascontiguousarray(channel)], [0], None, [levels], [0, levels]).ravel()
+    above = np.cumsum(counts[::-1], dtype=np.float64)[::-1]
+    high = above >= _HOT
+    if not high.any():
+        return full_scale
+    top = int(np.flatnonzero(high)[-1])
+    # Two bands below the limit, so that each holds several of 256 values.
+    upper, lower = (int(np.ceil(share * top)) for share in (CLIPPED, 3.0 * CLIPPED - 2.0))
+    below = 0.5 * (above[lower] - above[upper])
+    values = np.count_nonzero(counts[int(_NEAR * top) : top + 1])
+    plateau = above[upper] > _PLATEAU * max(below, 1.0)
+    return float(top) if plateau and values >= _VALUES else full_scale

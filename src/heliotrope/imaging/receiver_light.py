@@ -29,7 +29,6 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.imaging.frame import Frame, Image
-from heliotrope.imaging.targets.rectify import CLIPPED
 
 Mask = npt.NDArray[np.bool_]
 
@@ -426,8 +425,7 @@ class _Levels:
         part = Frame(frame.pixels[rows, columns], frame.name)
         linear = part.linear(sight.gamma)
         grey = np.asarray(linear.grey, dtype=np.float32) / np.float32(linear.full_scale)
-        highest = part.pixels if part.pixels.ndim == 2 else part.pixels.max(axis=2)
-        clipped = highest >= CLIPPED * part.full_scale
+        clipped = frame.clipped[rows, columns] > 0
         good = [side.sum() >= LEAST_SIDE for side in sight.sides]
         nan = math.nan
         pairs = [*zip(sight.sides, good, strict=True)]

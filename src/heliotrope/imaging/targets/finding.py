@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.field.camera import Camera, project
 from heliotrope.field.marks import Mark
@@ -34,6 +35,19 @@ _RATIOS = (0.72, 0.85)
 _LONGER = 700
 #: Of two faces in one place of the frame, one wins if this much more of it was seen.
 _CLEARER = 0.2
+#: How a frame may be turned against its camera, as maps of pixels about the frame's middle.
+_TURNS = {
+    "turned by 180°": ((-1, 0), (0, -1)),
+    "mirrored left to right": ((-1, 0), (0, 1)),
+    "mirrored top to bottom": ((1, 0), (0, -1)),
+    "turned by 90° clockwise": ((0, -1), (1, 0)),
+    "turned by 90° counterclockwise": ((0, 1), (-1, 0)),
+    "mirrored about its falling diagonal": ((0, 1), (1, 0)),
+    "mirrored about its rising diagonal": ((0, -1), (-1, 0)),
+}
+#: A turn fits if marks are this near, px, or this many deviations of the pose; and this many times
+#: nearer than without the turn.
+_TURN_PIXELS, _TURN_SIGMAS, _TURN_CLEARER = 2.0, 3.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -109,7 +123,8 @@ def find_targets(
         Targets with known marks. Targets in one plane are found together.
     camera
         Its lens is used; if its pose is known too, marks are searched for at their expected
-        places first. A camera of another frame size is ignored.
+        places first, and a target that is where the pose has it only in a turned or mirrored
+        frame is refused. The lens of a camera of another frame size is ignored.
     previous
         Views of earlier frames of the same camera, tried first.
     pictures
@@ -133,6 +148,9 @@ def find_targets(
         if any(each.best is not None and each.best.view is not None for each in searches):
             break
     _one_place_each(searches)
+    if camera is not None and camera.position is not None:
+        for each in searches:
+            each.compare(camera)
     found = {r.target.name: r for each in searches for r in each.results()}
     return [found[target.name] for target in targets]
 
@@ -339,6 +357,21 @@ class _Face:
         if found is not None:
             yield self._mapped(found.H_pixel_plane, 0.4)
 
+    def compare(self, camera: Camera) -> None:
+        """Reject a view that agrees with the camera's pose only if the frame is turned back."""
+        if self.best is None or self.best.view is None:
+            return
+        search = self.search
+        seen = self.best.view.to_pixels(search.plane)
+        turn = turn_of(seen, project(camera, search.face.point(search.plane)), camera, search.look)
+        if turn:
+            text = (
+                f"the frame is {turn} against the pose of camera {camera.name}; undo that in the "
+                "camera or in what stores its frames (if the camera itself was turned: delete its "
+                "position_m and rotation from the plant file and calibrate it again)"
+            )
+            self.best = replace(self.best, view=None, text=text)
+
     def results(self) -> list[FoundTarget]:
         """Return the result for each target of the face."""
         search, best = self.search, self.best
@@ -367,6 +400,37 @@ class _Face:
 
 def _rank(attempt: Attempt) -> tuple[bool, int]:
     return attempt.view is not None, len(attempt.used)
+
+
+def turn_of(seen: FloatArray, expected: FloatArray, camera: Camera, look: FrameSearch) -> str:
+    """Return which turn of the frame takes marks to where they are seen; empty if none is needed.
+
+    Marks are compared as sets: those of a turned frame may look like each other's.
+
+    Parameters
+    ----------
+    seen, expected
+        Pixels of marks in the frame and by the camera's pose, (M, 2).
+    camera, look
+        The camera, and the search in the frame.
+    """
+    if not np.isfinite(expected).all():
+        return ""
+    near = max(_TURN_PIXELS, _TURN_SIGMAS * camera.deviation)
+    middle, frame = 0.5 * (np.array(camera.size) - 1.0), 0.5 * (np.array(look.size) - 1.0)
+
+    def apart(turn: npt.ArrayLike) -> float:
+        if tuple(np.abs(np.array(turn) @ camera.size)) != look.size:
+            return np.inf
+        places = frame + (expected - middle) @ np.array(turn).T
+        gaps = np.linalg.norm(seen[:, None] - places[None], axis=-1)
+        return float(np.sqrt(np.mean(gaps.min(axis=1) ** 2)))
+
+    unturned = apart(np.eye(2, dtype=int))
+    best = min(_TURNS, key=lambda name: apart(_TURNS[name]))
+    least = apart(_TURNS[best])
+    fits = least < near < unturned and _TURN_CLEARER * least < unturned
+    return best if fits else ""
 
 
 def symmetries(marks: Sequence[Mark], plane: FloatArray) -> list[tuple[FloatArray, float]]:

@@ -20,8 +20,6 @@ Mask = npt.NDArray[np.bool_]
 #: Pixels across the narrower side of a target. A beam is tens of them wide, and a centroid is
 #: found to a twentieth of one.
 ACROSS = 256
-#: Pixels above this share of the full scale may be clipped; tone curves end below it.
-CLIPPED = 0.985
 #: Rim of a target whose pixels show part of what lies beyond: least width, multiple of the
 #: softness of the marks' edges, and greatest width, px.
 LEAST_RIM, _SOFT_RIM, _MOST_RIM = 2, 1.5, 8
@@ -48,7 +46,7 @@ class Rectified:
     marks
         Where marks are printed, (H, W).
     clipped
-        Share of each pixel at full scale, (H, W).
+        How much each pixel is clipped, 0 to 1, (H, W); see `Frame.clipped`.
     view
         How the face lies in the frame; None for a crop.
     """
@@ -142,11 +140,7 @@ def rectify(frame: Frame, view: FaceView, grey: Image | None = None, *, rim: int
     corner, part = _around(brightness, places, reduction)
     at = (places - corner + np.float32(0.5)) / np.float32(reduction) - np.float32(0.5)
     values = _resample(part, reduction, at, frame.full_scale)
-    clipped = np.zeros_like(values)
-    # Single clipped pixels do no harm; many make the mean bright too.
-    if float(values.max()) > 0.7 * CLIPPED:
-        limit = float(np.ceil(CLIPPED * frame.full_scale))
-        clipped = _resample(_at_least(part, limit), reduction, at, 255.0)
+    clipped = _resample(_around(frame.clipped, places, reduction)[1], reduction, at, 255.0)
     height, width = brightness.shape
     inside = (
         (places[..., 0] >= 0)
@@ -182,7 +176,7 @@ def from_crop(frame: Frame, target: Target, *, rim: int = 0) -> Rectified:
     step = target.width / grey.shape[1]
     rows = max(1, round(target.height / step))
     values = np.asarray(grey, dtype=np.float32) / np.float32(frame.full_scale)
-    top = (values >= CLIPPED).astype(np.float32)
+    top = frame.clipped.astype(np.float32) / np.float32(255.0)
     if rows != grey.shape[0]:
         size = (grey.shape[1], rows)
         values = np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_LINEAR), np.float32)
@@ -213,14 +207,6 @@ def _trimmed(surface: Mask, rim: int) -> Mask:
         borderValue=0,
     )
     return inner > 0
-
-
-def _at_least(brightness: Image, limit: float) -> Image:
-    """Return 255 where a frame is at its limit, else 0."""
-    import cv2
-
-    _, top = cv2.threshold(brightness, limit - 1.0, 255, cv2.THRESH_BINARY)
-    return np.asarray(top if brightness.dtype == np.uint8 else top.astype(np.uint8))
 
 
 def _places(view: FaceView, first: FloatArray, step: float, shape: tuple[int, int]) -> Image:
