@@ -141,7 +141,11 @@ def test_two_photographs_show_a_wrong_time_and_one_does_not() -> None:
     day.photograph(second, 120.0)
     assert day.standing() == {"sun_contradicted": Severity.ALARM}
     assert "mrad from where the plant computes it, as a clock that is 1" in day.witnesses.refusal
+    # What two mirrors have contradicted, one does not settle, however often; two do.
     day.photograph(second, 0.0)
+    day.photograph(second, 0.0)
+    assert day.standing() == {"sun_contradicted": Severity.ALARM}
+    day.photograph(first, 0.0)
     assert day.standing() == {}
     assert day.witnesses.refusal == ""
 
