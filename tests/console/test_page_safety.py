@@ -240,6 +240,30 @@ def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
     page.wait_for_function("!document.querySelector('.hx-legend .hx-out')")
 
 
+def test_a_target_is_locked_and_the_lock_returned(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    page, other = enter("operator"), enter("engineer")
+    target = field.live.operations.targets[0]
+    for each in (page, other):
+        each.click(".hx-tabs >> text=Schedule")
+    page.click(".hx-schedule >> text=Lock a target, receiver or the tower")
+    page.select_option("dialog [name=place]", f"target {target}")
+    page.fill("dialog [name=reason]", "marks are repainted")
+    page.click("dialog >> text='Lock'")
+    row = f".hx-schedule tr:has-text('target {target}'):has-text('marks are repainted')"
+    for each in (page, other):
+        each.wait_for_selector(row)
+    # Another person removes it by the owner's name, with a reason.
+    other.locator(row).locator("text=Remove lock").click()
+    other.wait_for_selector("dialog:has-text('Remove the lock of operator')")
+    other.keyboard.press("Escape")
+    page.locator(row).locator("text=Return lock").click()
+    page.click("dialog >> text='Return lock'")
+    page.wait_for_selector(row, state="detached")
+    assert field.live.operations.holds() == ()
+
+
 # -- scope -------------------------------------------------------------------------------------
 
 
