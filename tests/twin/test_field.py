@@ -133,6 +133,8 @@ class Both:
             if own is not None:
                 counts = [own.motion.place(k) for k in (0, 1)]
                 assert self.field.axes["count"][i].tolist() == counts, at
+                goals = [axis.goal for axis in own.motion.stepper.axes]
+                assert self.field.axes["goal"][i].tolist() == goals, at
             # Joints can be compared when the timers have played what was emitted.
             if all(axis.idle for axis in board.axes):
                 assert drives.turned[i].tolist() == [a.turned for a in board.axes], at
@@ -205,6 +207,23 @@ def test_a_lock_and_a_hold_end_with_the_cluster_as_on_the_boards() -> None:
     assert both.field.at_stow().all()
     assert [states.STATES[s] for s in both.field.state] == ["LOCKED", "STOWED", "LOCKED"]
     assert both.angles_apart() < 1e-9
+
+
+def test_a_lock_in_motion_gives_the_goals_up_as_on_the_boards() -> None:
+    both = Both()
+    both.run(2)
+    both.order("AIM", *RECEIVER)
+    both.order("APPROACH")
+    both.run(60)
+    both.order("TRACK")
+    both.run(0.5)
+    assert not both.field.still().any()
+    both.order("LOCK")
+    both.run(4)
+    assert both.field.still().all()
+    np.testing.assert_array_equal(both.field.axes["goal"], both.field.axes["count"])
+    both.order("UNLOCK")
+    both.run(2)
 
 
 def test_an_approach_called_off_at_once_ends_as_on_the_boards() -> None:

@@ -42,7 +42,14 @@ def _fastest(distance, change):
 @njit(**INNER)
 def _still(axes, i, k):
     a = axes[i, k]
-    return a["speed"] == 0 and (a["braking"] or (a["count"] == a["leg"] and a["leg"] == a["goal"]))
+    return a["speed"] == 0 and a["count"] == a["leg"] and a["leg"] == a["goal"]
+
+
+@njit(**INNER)
+def _stand(axes, i, k):
+    axes[i, k]["goal"] = axes[i, k]["count"]
+    axes[i, k]["leg"] = axes[i, k]["count"]
+    axes[i, k]["braking"] = False
 
 
 @njit(**INNER)
@@ -65,10 +72,6 @@ def _slot(axes, i, k, held):
     a = axes[i, k]
     if a["speed"] == 0:
         axes[i, k]["phase"] = 0
-        if a["braking"]:
-            axes[i, k]["goal"] = a["count"]
-            axes[i, k]["leg"] = a["count"]
-            axes[i, k]["braking"] = False
         if axes[i, k]["count"] == axes[i, k]["leg"]:
             axes[i, k]["leg"] = axes[i, k]["goal"]
         if held or axes[i, k]["count"] == axes[i, k]["leg"]:
@@ -85,6 +88,8 @@ def _slot(axes, i, k, held):
     axes[i, k]["speed"] = speed
     axes[i, k]["phase"] = moved % SCALE
     axes[i, k]["count"] += b["direction"] * (moved // SCALE)
+    if axes[i, k]["braking"] and speed == 0:
+        _stand(axes, i, k)
 
 
 @njit(**OPTIONS)
@@ -105,6 +110,16 @@ def go_rows(axes, order, rows, goals, how):
             elif error <= -max(1, lead):
                 _aim(axes, i, k, goals[j, k] - lead)
                 axes[i, k]["led"] = True
+
+
+@njit(**OPTIONS)
+def brake_rows(axes, rows):
+    """Slow down and stop, giving the goals up: `Axis.brake`."""
+    for i in rows:
+        for k in range(2):
+            axes[i, k]["braking"] = True
+            if axes[i, k]["speed"] == 0:
+                _stand(axes, i, k)
 
 
 @njit(**OPTIONS)
@@ -141,6 +156,8 @@ def advance_rows(axes, order, queued, drives, elapsed_ms, slot_ms, ahead_ms):
             for k in range(2):
                 axes[i, k]["speed"] = 0
                 axes[i, k]["phase"] = 0
+                if axes[i, k]["braking"]:
+                    _stand(axes, i, k)
             queued[i] = 0
         while queued[i] < ahead_ms:
             if _still(axes, i, 0) and _still(axes, i, 1):

@@ -258,7 +258,7 @@ class Field:
 
     def _hold(self, rows: Rows) -> None:
         self.kind[rows] = HOLD
-        self.axes["braking"][rows] = 1
+        kernels.brake_rows(self.axes, rows)
 
     def _begin(self, rows: Rows, kind: int, targets: FloatArray) -> None:
         self.kind[rows] = kind
@@ -378,7 +378,7 @@ class Field:
         self.kind[rows] = RETURN
         self._ready[rows] = False
         self._place[rows] = -1
-        self.axes["braking"][rows] = 1
+        kernels.brake_rows(self.axes, rows)
 
     def _way_back(self, i: np.intp) -> FloatArray:
         if self.kind[i] == APPROACH:
