@@ -72,6 +72,8 @@ def test_an_emergency_in_a_joint_visit_leaves_nothing_locked(
     page.click("dialog >> text='Withdraw'")
     field.calm()
     page.wait_for_function("!document.querySelector('.hx-alert.on')")
+    page.click(".hx-tabs >> text=Calibration")
+    page.wait_for_selector(".hx-calibration >> text=no heliostat is given to automatic control")
     page.select_option(".hx-to select", "field")
     page.click(".hx-orders >> text=Automatic")
     page.click("dialog >> text='Give to automatic control'")

@@ -547,6 +547,8 @@ class AutomaticControl:
         if not self._has_authority():
             grant = self._plant.authority.grant
             return f"{grant.holder.name} has the command authority" if grant else _STARTING
+        if not self._raising.wanted.any():
+            return "no heliostat is given to automatic control; select some, then Automatic"
         return ""
 
     async def _govern(self) -> None:
