@@ -34,6 +34,7 @@ _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 #: Rows with figures that their commands do not print yet.
 UNPRINTED = (
     "(6.1), figures 6.6 to 6.8, worm",
+    "detection and identification",
     "appendix A, figures 7 and 8, RTK",
 )
 
