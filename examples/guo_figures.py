@@ -63,6 +63,8 @@ def figure_1(ax: Any) -> dict[str, float]:
         "theta_deg": float(np.degrees(demanded.theta)),
         "tau_deg": float(np.degrees(demanded.tau)),
         "beam past target (µm)": 1e6 * float(np.linalg.norm(np.cross(ray, to_target))),
+        "tau_1 (deg)": float(np.degrees(MODEL.tau_1)),
+        "mu (deg)": float(np.degrees(MODEL.mu)),
         "between the axes (deg)": float(np.degrees(angle_between(azimuth_axis, elevation_axis))),
         "normal from the elevation axis (deg)": float(np.degrees(angle_between(n, elevation_axis))),
     }
@@ -88,6 +90,8 @@ def figure_2(ax: Any) -> dict[str, float]:
     ax.set_aspect("equal")
     ax.legend(fontsize=6)
     return {
+        "gamma_0 as printed (deg)": ZEROS["gamma_0"],
+        "gamma_0 as printed, plus a turn (deg)": ZEROS["gamma_0"] + 360.0,
         "gamma_0_deg": float(np.degrees(found.gamma_0)) - 360.0,
         "sigma_gamma_deg": float(np.degrees(found.sigma_gamma)),
         "alpha_0_deg": float(np.degrees(found.alpha_0)),
@@ -109,6 +113,9 @@ def figure_3(ax: Any) -> dict[str, float]:
     printed = np.sqrt(a * a + b * b + 2.0 * a * b * np.cos(at + slope)) - at_zero
     back = np.arccos(((place + at_zero) ** 2 - (a * a + b * b)) / (2.0 * a * b)) - slope
     return {
+        "a (m)": a,
+        "b (m)": b,
+        "beta_0 (deg)": float(np.degrees(slope)),
         "x of alpha = 40 deg (m)": place,
         "x by (41) (m)": float(printed),
         "alpha by (42) (deg)": float(np.degrees(back)),

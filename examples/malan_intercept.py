@@ -84,6 +84,12 @@ def main(folder: Path) -> dict[float, dict[str, float]]:
     for error in (0.0, 0.5, 0.75, 1.0, 2.0, 3.0, 5.0):
         row = (f"{100 * v:{len(n)}.1f}" for n, v in found[error].items())
         print(f"{error:4.2f}  " + "  ".join(row))
+    apart = max(
+        abs(f[f"Gaussian{which}"] - f[f"ray trace{which}"])
+        for f in found.values()
+        for which in ("", ", image")
+    )
+    print(f"Gaussian and ray trace differ by at most {100 * apart:.1f} points")
     print(path)
     return found
 

@@ -232,6 +232,10 @@ def draw_his(folder: Path) -> Path:
         ax.fill_between(levels, middle - band, middle + band, color=colour, alpha=0.2, lw=0)
         said = (f"{m:.3f} ± {b:.3f}" for m, b in zip(middle, band, strict=True))
         print(f"{name}: {', '.join(said)}")
+    held = [normalised(float(level), wide=1.0) for level in levels]
+    for priors, made in (("without priors", studies), ("with those of the installation", held)):
+        worse = [s["winter"].mean() / s["summer"].mean() for s in made[1:]]
+        print(f"winter over summer, {priors}: {min(worse):.1f} to {max(worse):.1f} times")
     ax.set(xlabel="normalised noise, (4.28)", ylabel="normalised RMS error", ylim=(0.0, None))
     ax.grid(alpha=0.3)
     ax.legend(frameon=False)

@@ -214,6 +214,11 @@ def main() -> dict[str, float]:
         table.add_row(short, *(f"{found[f'{radio.name}, {short}']:.4g}" for radio in RADIOS))
     console = Console(width=90)
     console.print(table)
+    slots, polling = (found[f"{first}, {name}, s"] for name in ("slots", "polling"))
+    console.print(
+        f"{HELIOSTATS:,} heliostats on {first}: slots save {100 * (1 - slots / polling):.0f} % of "
+        "the time of polling"
+    )
     for calls in (1, 2):
         trips = found[f"trips a day, {calls} a second"]
         console.print(f"sun called {calls} x a second: {trips:.3g} defocus a heliostat and day")

@@ -95,6 +95,15 @@ def test_malan_chapter_6(tmp_path: Path) -> None:
     assert imread(tmp_path / "malan-chapter-6.png")[..., :3].std() > 0.02
 
 
+def test_malan_search() -> None:
+    """Both pitches find every beam within their reach; the wider one finds far ones sooner."""
+    found = _load("malan_search").results(beams=(0.33, 0.8), drawn=400)
+    assert all(one.share > 0.995 for both in found.values() for one in both.values())
+    for beam in (0.33, 0.8):
+        far = found[beam, 1.9]
+        assert far["ours"].looks < 0.8 * far["Malan"].looks
+
+
 def test_malan_radio() -> None:
     """Times on the air as published, the channel's own loss, and what the study concludes."""
     radio = _load("malan_radio")

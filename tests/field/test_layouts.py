@@ -20,6 +20,7 @@ from heliotrope.field.layouts import (
     FREE,
     PACK,
     PATTERNS,
+    TWO_SIDED,
     Ground,
     HeliostatSize,
     lay_out,
@@ -103,7 +104,7 @@ def test_no_two_mirrors_can_touch(
     assert nearest_gap(plant.position, mirror) >= clearance - 1e-9
     away = np.linalg.norm(plant.position[:, :2], axis=1)
     assert away.min() >= 0.75 * tower - 1e-9
-    if kind != "rows":
+    if kind not in TWO_SIDED:
         assert ((plant.position[:, 1] > 0.0) == north).all()
     for camera in plant.cameras:
         assert camera.position is not None
@@ -144,14 +145,39 @@ def test_a_pack_is_a_triangle_of_six() -> None:
     assert places.names[-1] == "P0100F"
 
 
-def test_rows_lie_in_two_fields_each_with_its_target() -> None:
-    plant = lay_out("rows", 1001)
+@pytest.mark.parametrize("kind", TWO_SIDED)
+def test_two_fields_have_a_target_each(kind: str) -> None:
+    plant = lay_out(kind, 1001)
     north = plant.position[:, 1] > 0.0
     assert north.sum() == 501
     assert plant.receivers[0].kind == "external_cylinder"
     for half in (north, ~north):
         facing = [((plant.position[half] - t.center) @ t.normal > 0.0).all() for t in plant.targets]
         assert sorted(facing) == [False, True]
+
+
+@pytest.mark.parametrize("clearance", [0.0, 0.19])
+def test_malans_twin_field_covers_his_ground(clearance: float) -> None:
+    # 3.2.1: 10,000 heliostats of 5 m², a packing ratio of 0.5, 100,000 m² without tower and roads.
+    mirror = HeliostatSize(clearance=clearance)
+    place = lay_out("twin-field", 10_000, mirror=mirror).position
+    fields = []
+    for half in (place[place[:, 1] > 0.0], place[place[:, 1] < 0.0]):
+        rows = np.unique(np.round(half[:, 1], 6))
+        step = float(np.diff(rows).mean())
+        apart = 2.0 * step / np.sqrt(3.0)
+        wide, deep = np.ptp(half[:, 0]) + apart, len(rows) * step
+        fields.append(wide * deep)
+        assert wide == pytest.approx(2.0 * deep, rel=0.05)
+    assert fields[0] == pytest.approx(fields[1], rel=1e-9)
+    # The places of a camera and of the last, unfilled row are part of the ground.
+    assert sum(fields) == pytest.approx(100_000.0, rel=0.02)
+
+
+def test_a_wide_clearance_thins_the_twin_field() -> None:
+    mirror = HeliostatSize(clearance=0.6)
+    places = layouts.twin_field(2000, mirror, Ground())
+    assert nearest_gap(places.position, mirror) == pytest.approx(0.6)
 
 
 def test_every_mirror_can_serve_the_day() -> None:

@@ -113,6 +113,26 @@ def test_an_earlier_version_is_listed_and_brought_back(tmp_path: Path) -> None:
     play(tmp_path, scene)
 
 
+def test_a_surveyed_place_is_set_and_its_beam_is_proven_from_there(tmp_path: Path) -> None:
+    """Malan 3.4.1: the location of a heliostat, as far as a survey may be wrong."""
+    survey = {"position_east": 0.3, "position_north": -0.12}
+
+    async def scene(bench: Bench, token: int, typed: TypedParameters) -> None:
+        row = bench.plant.field.place(NAME)
+        before = bench.plant.beams.armature.origin_1[row].copy()
+        ticket = typed.change(ENGINEER, token, NAME, survey, "surveyed again")
+        assert await ticket.end(20.0), ticket.text
+        moved = bench.plant.beams.armature.origin_1[row] - before
+        assert moved == pytest.approx([0.3, -0.12, 0.0], abs=1e-9)
+        wanted = items_of(example_plant()[NAME].calibrated.with_parameters(survey))
+        assert bench.cluster_of(NAME).stored[NAME] == wanted
+        bench.plant.authority.keep(ENGINEER, token)
+        with pytest.raises(InputError, match="position_east 0.301 is beyond 6 standard deviations"):
+            typed.change(ENGINEER, token, NAME, {"position_east": 0.301}, "moved")
+
+    play(tmp_path, scene)
+
+
 def test_values_that_were_measured_keep_their_uncertainty(tmp_path: Path) -> None:
     async def scene(bench: Bench, token: int, typed: TypedParameters) -> None:
         covariance = np.array([[4e-8, 1e-8], [1e-8, 9e-8]])

@@ -32,6 +32,7 @@ from heliotrope.store.records import (
     OutlookEntry,
     PlannedVisit,
     StoreError,
+    TimetableRecord,
     VisitEntry,
 )
 from heliotrope.store.telemetry import Look, Telemetry
@@ -64,6 +65,7 @@ def fill(keeper: Keeper, seen: Sightings, key_file: Path) -> None:
     keeper.record_flight(FlightEntry("C1-1", 1.0, "anna", "{}"))
     keeper.record_learning(LearningEntry("field", 1, 1.0, "anna", 3, 10, 0.5, "{}"))
     keeper.record_outlook(OutlookEntry(1.0, "{}"))
+    keeper.record_timetable(TimetableRecord(1.0, "anna", "[]"))
     keeper.record_event(Event(1.0, "test", "hello", values={"x": float("nan")}))
     keeper.record_alarm("wind", "", "alarm", "too much", 1.0, active=True)
     keeper.hold([Hold("heliostat", "B", "broken", "anna", 5.0)])

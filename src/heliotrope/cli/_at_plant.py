@@ -18,6 +18,7 @@ from heliotrope.local import EMERGENCY, ORDINARY, CallError, ask_once, socket_fo
 _VIEWS = (
     "alarms", "authority", "calibration", "clusters", "emergency", "events", "field", "flights",
     "holds", "learning", "packets", "retries", "schedule", "summary", "sun",
+    "timetable",
 )  # fmt: skip
 #: Calls of the socket for emergencies.
 _URGENT = ("order_emergency", "stow", "defocus")
@@ -40,6 +41,7 @@ _CALLS = {
     ("POST", "calibration/next"): "calibrate",
     ("POST", "flights"): "take_flight",
     ("POST", "learning"): "learn",
+    ("PUT", "timetable"): "put_timetable",
     ("POST", "holds"): "hold",
     ("POST", "holds/release"): "unhold",
     ("POST", "parameters"): "set_parameters",

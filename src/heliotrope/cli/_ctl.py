@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from heliotrope.cli._common import parse_point, print_json, print_table
+from heliotrope.cli._common import parse_duration, parse_point, print_json, print_table
 from heliotrope.errors import InputError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -237,7 +237,7 @@ def show(
         str,
         typer.Argument(
             help="alarms, events, packets, clusters, calibration, flights, learning, schedule, "
-            "holds, retries, emergency, sun, accounts, tokens, or the name of a heliostat."
+            "timetable, holds, retries, emergency, sun, accounts, tokens, or a heliostat's name."
         ),
     ],
 ) -> None:
@@ -253,6 +253,7 @@ def show(
         "flights",
         "learning",
         "schedule",
+        "timetable",
         "holds",
         "retries",
         "emergency",
@@ -589,6 +590,69 @@ def learn(
     for one in found:
         print(f"group {one['group']}: {one['said']}")
         print(f"  in force: {one['drift']}")
+
+
+@app.command()
+def timetable(
+    context: typer.Context,
+    name: Annotated[
+        str, typer.Argument(help="Entry to set or remove; none: show all.", show_default=False)
+    ] = "",
+    heliostats: Whom = None,
+    target: Annotated[str, typer.Option(help="Target; any if left out.")] = "",
+    at: Annotated[
+        list[str] | None,
+        typer.Option(help="Time of day: 08:30Z, 10:30+02:00.", show_default=False),
+    ] = None,
+    every: Annotated[
+        str, typer.Option(help="Interval from midnight UTC: 10min, 2h.", show_default=False)
+    ] = "",
+    remove: Annotated[bool, typer.Option("--remove", help="Remove the entry.")] = False,
+    plant_file: Annotated[
+        bool, typer.Option("--plant-file", help="Put the plant file's timetable in force again.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Show or change the calibrations at times of day and at intervals."""
+    gives = bool(heliostats or target or at or every)
+    if plant_file and (name or gives or remove):
+        raise InputError("ctl timetable: --plant-file goes alone")
+    if bool(name) != (gives or remove):
+        raise InputError(
+            "ctl timetable: give NAME HELIOSTAT… with --at or --every, or NAME --remove"
+        )
+    with _client(context) as client:
+        found = client.get("timetable")
+        if plant_file or name:
+            entries = None if plant_file else _entries(found, name, remove)
+            if entries is not None and gives:
+                seconds = parse_duration(every).total_seconds() if every else None
+                entry = {"name": name, "heliostats": heliostats or [], "target": target}
+                entries.append({**entry, "at": at or [], "every_s": seconds})
+            found = client.ask("PUT", "timetable", {"entries": entries})
+    if as_json:
+        print_json(found)
+        return
+    rows = [
+        (
+            one["name"],
+            ", ".join(one["heliostats"][:3]) + ("…" if len(one["heliostats"]) > 3 else ""),
+            one["target"] or "any",
+            ", ".join(one["at"]) + (f" every {one['every_s']:g} s" if one["every_s"] else ""),
+            _utc(one["next"]),
+            one["text"] or "not due yet",
+        )
+        for one in found
+    ]
+    print_table(("entry", "heliostats", "target", "at", "next", "last"), rows, "timetable")
+
+
+def _entries(found: list[dict[str, Any]], name: str, remove: bool) -> list[dict[str, Any]]:
+    """Return the entries in force but for one, as the API takes them."""
+    if remove and name not in [one["name"] for one in found]:
+        raise UnknownNameError("timetable entry", name, [one["name"] for one in found])
+    keys = ("name", "heliostats", "target", "at", "every_s")
+    return [{key: one[key] for key in keys} for one in found if one["name"] != name]
 
 
 @app.command()

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def layout(
-    kind: Annotated[str, typer.Argument(help="six-packs, radial or rows.")],
+    kind: Annotated[str, typer.Argument(help="six-packs, twin-field, radial or rows.")],
     out: Annotated[Path, typer.Option("--out", help="Plant file to write (TOML).")],
     heliostats: Annotated[int, typer.Option(help="Number of heliostats.")] = 10_000,
     width: Annotated[float, typer.Option(help="Width of a mirror, m.")] = 2.5,
@@ -38,7 +38,8 @@ def layout(
 ) -> None:
     """Write a plant of a pattern: heliostats in clusters, tower, two targets with cameras.
 
-    The field lies on the side of the tower away from the equator; rows lie on both sides.
+    The field lies on the side of the tower away from the equator; rows and the twin field lie on
+    both sides.
     """
     from heliotrope.errors import InputError
     from heliotrope.field.formats.plant_file import write_plant

@@ -237,6 +237,13 @@ async def learning(console: Here, request: Request, who: Anyone) -> Response:
     return await shared(console, request, "learning")
 
 
+@router.get("/timetable", response_model=models.many(models.TimetableRow), tags=["calibration"])
+async def timetable(console: Here, who: Anyone) -> JSONResponse:
+    """Return the calibrations at times of day and at intervals that people want."""
+    del who
+    return answer(await console.plant.ask("timetable"))
+
+
 @router.get("/holds", response_model=models.many(models.Lockout), tags=["calibration"])
 async def holds(console: Here, who: Anyone) -> JSONResponse:
     """Return the heliostats that are out of service."""

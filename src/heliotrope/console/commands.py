@@ -173,6 +173,12 @@ async def calibrate(
     return models.TicketState(**found)
 
 
+@router.put("/timetable", response_model=models.many(models.TimetableRow), tags=["calibration"])
+async def put_timetable(console: Here, who: Operator, order: orders.TimetableOrder) -> JSONResponse:
+    """Put a timetable of calibrations in force, or with null that of the plant file."""
+    return answer(await console.plant.ask("put_timetable", who.person, **order.model_dump()))
+
+
 @router.post("/parameters", response_model=models.TicketState, tags=["calibration"])
 async def set_parameters(
     console: Here, who: Engineer, order: orders.ParameterOrder

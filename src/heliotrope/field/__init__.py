@@ -42,6 +42,9 @@ from heliotrope.field.target import (
     Receiver,
     Target,
 )
+from heliotrope.field.timetable import (
+    TimetableEntry,
+)
 from heliotrope.field.volumes import (
     Box,
     Cylinder,
@@ -66,6 +69,7 @@ __all__ = [
     "ReceiverSettings",
     "Sphere",
     "Target",
+    "TimetableEntry",
     "TrackedDay",
     "Volume",
     "example_plant",

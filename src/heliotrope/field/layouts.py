@@ -1,12 +1,14 @@
 """Generated fields: positions of heliostats, and whole plants around them.
 
-Three patterns: rings whose mirrors stand before the gaps of the ring in front (radial staggered),
-rows in two fields north and south of the tower, and Malan's triangles of six on arcs. A mirror
-turns in any direction about its pivot, so two mirrors stand further apart than a diagonal and a
-clearance; every generator keeps this distance, and `nearest_gap` checks it.
+Four patterns: rings whose mirrors stand before the gaps of the ring in front (radial staggered),
+rows in two fields north and south of the tower, and from Malan his twin field (figure 3.2) and his
+triangles of six on arcs (figure 5.5). A mirror turns in any direction about its pivot, so two
+mirrors stand further apart than a diagonal and a clearance; every generator keeps this distance,
+and `nearest_gap` checks it.
 
-Malan's sources give only the size of his plant: 5 MWe, 10,000 heliostats of 5 m²,
-a cluster controller for every 32 of them. Site, tower, receiver, targets and gears are ours.
+Malan's thesis gives the size of his plant: 5 MWe, 10,000 heliostats of 5 m² on 100,000 m² of
+ground, a cluster controller for every 32 of them. Site, tower, receiver, targets and gears are
+ours.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,6 +34,8 @@ from heliotrope.sun import Site
 CLUSTER = 32
 #: Heliostats of a triangle.
 PACK = 6
+#: Share of the ground that the mirrors of Malan's twin field cover.
+PACKING = 0.5
 #: Most heliostats that are laid out.
 MOST = 1_000_000
 #: Clear of mirrors around masts and cameras, m.
@@ -215,14 +219,47 @@ def rows(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
 
     Names: field, row and number, "N012-034".
     """
+    return _two_fields(
+        count,
+        ground,
+        1.1 * mirror.reach,
+        lambda north: max(mirror.reach, mirror.height / np.sin(ground.elevation(north))),
+    )
+
+
+def twin_field(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
+    """Return Malan's twin field: two fields alike, each evenly dense, on both sides of the tower.
+
+    Mirrors cover the share ``PACKING`` of the ground of a field, his 0.5 (3.2.1), or less where
+    the clearance asks for it: 0.47 with the default mirror, 0.5 up to a clearance of 0.19 m. Every
+    other row is shifted by half a place, so that neighbours form equal triangles. A field is twice
+    as wide as it is deep; that, the stagger and the names, those of `rows`, are ours.
+    """
+    even = np.sqrt(2.0 / np.sqrt(3.0) * mirror.width * mirror.height / PACKING)
+    pitch = max(mirror.reach, float(even))
+    return _two_fields(count, ground, pitch, lambda _: 0.5 * np.sqrt(3.0) * pitch)
+
+
+def _two_fields(count: int, ground: Ground, pitch: float, step: Callable[[float], float]) -> Places:
+    """Return staggered rows north and south of the tower.
+
+    Parameters
+    ----------
+    count
+        Heliostats of both fields.
+    ground
+        Its nearest distance and its masts.
+    pitch
+        Distance between neighbours in a row, m.
+    step
+        Returns the distance to the next row from the distance of a row to the tower, m.
+    """
     _check_count(count)
-    pitch = 1.1 * mirror.reach
-    halves = {"N": (count + 1) // 2, "S": count // 2}
     parts: list[FloatArray] = []
     names: list[str] = []
-    for field, wanted in halves.items():
+    for field, wanted in {"N": (count + 1) // 2, "S": count // 2}.items():
         sign = 1.0 if field == "N" else -1.0
-        across = _row_length(wanted, mirror, ground)
+        across = _row_length(wanted, ground.nearest, pitch, step)
         north, row, made = ground.nearest, 0, 0
         while made < wanted:
             shift = 0.5 if row % 2 else 0.0
@@ -235,17 +272,17 @@ def rows(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
             names += [f"{field}{row:03d}-{k:03d}" for k in range(1, len(flat) + 1)]
             parts.append(flat)
             made += len(flat)
-            north += max(mirror.reach, mirror.height / np.sin(ground.elevation(north)))
+            north += step(north)
     return _places(names, parts)
 
 
-def _row_length(wanted: int, mirror: HeliostatSize, ground: Ground) -> float:
+def _row_length(wanted: int, nearest: float, pitch: float, step: Callable[[float], float]) -> float:
     """Places of a row, so that a field of ``wanted`` mirrors is about twice as wide as deep."""
-    pitch, north, rows_made = 1.1 * mirror.reach, ground.nearest, 0
-    while rows_made * 2.0 * (north - ground.nearest) / pitch < wanted:
-        north += max(mirror.reach, mirror.height / np.sin(ground.elevation(north)))
+    north, rows_made = nearest, 0
+    while rows_made * 2.0 * (north - nearest) / pitch < wanted:
+        north += step(north)
         rows_made += 1
-    return 2.0 * (north - ground.nearest) / pitch
+    return 2.0 * (north - nearest) / pitch
 
 
 def six_packs(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
@@ -339,7 +376,10 @@ PATTERNS: dict[str, Callable[[int, HeliostatSize, Ground], Places]] = {
     "radial": radial_staggered,
     "rows": rows,
     "six-packs": six_packs,
+    "twin-field": twin_field,
 }
+#: Patterns with a field on either side of the tower.
+TWO_SIDED = ("rows", "twin-field")
 
 
 def clusters(count: int, each: int = CLUSTER) -> tuple[str, ...]:
@@ -423,7 +463,7 @@ def lay_out(
     """Return a whole plant: heliostats, tower, two targets with cameras.
 
     The field lies on the side of the tower that is away from the equator's sun: south in the
-    southern hemisphere; rows lie on both.
+    southern hemisphere; those of `TWO_SIDED` lie on both.
 
     Parameters
     ----------
@@ -456,7 +496,7 @@ def lay_out(
     if not 20.0 <= tall <= 500.0:
         raise InputError(f"layout: tower height {tall} m; give 20 to 500 m")
     facing = np.pi if site.latitude_deg < 0.0 else 0.0
-    targets, cameras, receiver = _middle(tall, size.pivot_height, facing, kind == "rows")
+    targets, cameras, receiver = _middle(tall, size.pivot_height, facing, kind in TWO_SIDED)
     masts = [t.center for t in targets] + [c.position for c in cameras if c.position is not None]
     radius = FREE + 0.5 * size.reach
     free = tuple((float(place[0]), float(place[1]), radius) for place in masts)

@@ -14,6 +14,7 @@ from heliotrope.field.heliostats import Heliostats, rows_in
 from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.target import Receiver, Target
+from heliotrope.field.timetable import TimetableEntry, check_timetable
 from heliotrope.field.volumes import Volume
 from heliotrope.files.cells import check_names
 from heliotrope.frames import ENU, Framed, Labelled, Variable
@@ -57,6 +58,8 @@ class Plant(Value, Framed):
         alone.
     receiver_visits
         How heliostats in production are measured on the receiver; None: they are not.
+    timetable
+        Calibrations at times of day and at intervals, as people want them.
     safety
         Numbers of the safety table that this plant sets; see `safety.limits`.
     """
@@ -72,6 +75,7 @@ class Plant(Value, Framed):
     eyes: Mapping[str, FloatArray] = field(default_factory=dict)
     joint_visits: JointSettings | None = field(default_factory=JointSettings)
     receiver_visits: ReceiverSettings | None = None
+    timetable: tuple[TimetableEntry, ...] = ()
     safety: Limits = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -91,6 +95,8 @@ class Plant(Value, Framed):
             # Both must be known: the camera's place, and a face that it can see.
             _ = self.receiver(self.receiver_visits.receiver).face
             _ = self.camera(self.receiver_visits.camera).pose
+        if self.timetable:
+            check_timetable(self.timetable, self.names, (t.name for t in self.targets))
 
     def _card(self) -> Card:
         s = self.site

@@ -35,6 +35,7 @@ from heliotrope.store.records import (
     OutlookEntry,
     PlannedVisit,
     StoreError,
+    TimetableRecord,
     VisitEntry,
 )
 from heliotrope.store.writer import Work, Writer
@@ -300,6 +301,16 @@ class Keeper:
             LearningEntry, select(tables.learning).order_by(tables.learning.c.version)
         )
         return list({entry.group: entry for entry in found}.values())
+
+    def record_timetable(self, timetable: TimetableRecord) -> None:
+        """Record a timetable; it replaces one of the same time."""
+        row = rows.row_of(tables.timetable, timetable)
+        self.writer.put(lambda c: rows.replace(c, tables.timetable, [row]))
+
+    def timetables(self) -> list[TimetableRecord]:
+        """Return the timetables that persons have put in force, the last first."""
+        order = tables.timetable.c.at.desc()
+        return self._records(TimetableRecord, select(tables.timetable).order_by(order))
 
     def record_outlook(self, outlook: OutlookEntry) -> None:
         """Record a prediction; it replaces one made at the same time."""

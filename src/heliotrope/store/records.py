@@ -294,6 +294,25 @@ class LearningEntry:
 
 
 @dataclass(frozen=True)
+class TimetableRecord:
+    """A timetable of calibrations that a person has put in force.
+
+    Attributes
+    ----------
+    at
+        When, POSIX s.
+    person
+        Who.
+    document
+        Its entries as JSON, with the keys of the plant file; "": that of the plant file.
+    """
+
+    at: float
+    person: str
+    document: str
+
+
+@dataclass(frozen=True)
 class OutlookEntry:
     """A prediction of the field's errors that the plant has made.
 
@@ -388,6 +407,10 @@ class Records(Protocol):
 
     def record_learning(self, entry: LearningEntry) -> None:
         """Record what was learnt of a group."""
+        ...
+
+    def record_timetable(self, timetable: TimetableRecord) -> None:
+        """Record a timetable; it replaces one of the same time."""
         ...
 
     def record_outlook(self, outlook: OutlookEntry) -> None:
@@ -495,6 +518,10 @@ class Records(Protocol):
 
     def learnings(self) -> list[LearningEntry]:
         """Return what was learnt last of each group."""
+        ...
+
+    def timetables(self) -> list[TimetableRecord]:
+        """Return the timetables that persons have put in force, the last first."""
         ...
 
     def outlooks(self, since: float) -> list[OutlookEntry]:

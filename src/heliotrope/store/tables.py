@@ -288,6 +288,15 @@ learning = Table(
     _text("document"),
 )
 
+#: Timetables of calibrations that persons have put in force.
+timetable = Table(
+    "timetable",
+    metadata,
+    Column("at", Double, primary_key=True),
+    _text("person"),
+    _text("document"),
+)
+
 #: Predictions of the field's errors, as JSON.
 outlook = Table(
     "outlook",

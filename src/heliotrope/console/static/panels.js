@@ -349,15 +349,39 @@ async function lockPlace() {
   if (v) await act(() => api("POST", "holds", { ...places(...named.get(v.place)), reason: v.reason, hours: Number(v.hours) || null }), `lock ${v.place}`);
 }
 
+// The operator's own timetable: heliostats calibrated at times of day or at intervals.
+const listed = (text) => text.split(",").map((one) => one.trim()).filter(Boolean);
+async function putTimetable(entries, what) { await act(() => api("PUT", "timetable", { entries }), what); }
+const asGiven = ({ name, heliostats, target, at, every_s }) => ({ name, heliostats, target, at, every_s });
+async function addEntry(rows) {
+  const v = await ask("Calibrate heliostats at times of day, at an interval, or both? They come before all that automatic control would choose.", [
+    { name: "name", label: "Name of the entry" }, { name: "heliostats", label: "Heliostats, separated by commas" },
+    { name: "target", label: "Target", options: ["any", ...store.field.targets] },
+    { name: "at", label: "Times of day with zone (08:30Z, 10:30+02:00)", required: false },
+    { name: "every", label: "Interval from midnight UTC (minutes)", type: "number", required: false }], "Put in force");
+  if (!v) return;
+  const entry = { name: v.name, heliostats: listed(v.heliostats), target: v.target === "any" ? "" : v.target, at: listed(v.at || ""), every_s: v.every ? 60 * Number(v.every) : null };
+  await putTimetable([...rows.filter((one) => one.name !== v.name).map(asGiven), entry], `put ${v.name} on the timetable`);
+}
+async function removeEntry(rows, name) {
+  if (await ask(`Remove ${name} from the timetable? What it has asked for goes on.`, [], "Remove")) await putTimetable(rows.filter((one) => one.name !== name).map(asGiven), `remove ${name} from the timetable`);
+}
+
 export function schedule(box) {
   const body = h("div");
   box.append(body);
   return refreshed(async () => {
-    const [plan, retries, holds, progress] = await Promise.all([api("GET", "schedule?limit=50"), api("GET", "retries"), api("GET", "holds"), api("GET", "calibration")]);
+    const [plan, retries, holds, progress, timed] = await Promise.all([api("GET", "schedule?limit=50"), api("GET", "retries"), api("GET", "holds"), api("GET", "calibration"), api("GET", "timetable")]);
     body.replaceChildren(h("h3", {}, "Next measurements"),
       progress.reason || progress.choice ? h("p", { className: "hx-hint" }, `Automatic control: ${progress.reason || progress.choice}`) : "",
       plan.length ? table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target], ["Gain (mrad)", (r) => mrad(r.gain), "num"], ["Why", (r) => r.reason]], plan, (r) => look(r.heliostat))
         : h("p", { className: "hx-hint" }, "No measurement is planned."),
+      h("h3", {}, "Timetable"),
+      canCommand() ? h("button", { className: "hx-button", onclick: () => addEntry(timed) }, "Calibrate at times of day or intervals…") : "",
+      timed.length ? table([["Entry", (r) => r.name], ["Heliostats", (r) => r.heliostats.join(", ")], ["Target", (r) => r.target || "any"],
+        ["At", (r) => [...r.at, ...(r.every_s ? [`every ${span(r.every_s)}`] : [])].join(", ")], ["Next", (r) => minute(r.next)], ["Last", (r) => minute(r.last)], ["Result", (r) => r.text],
+        ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => removeEntry(timed, r.name) }, "Remove…") : "")]], timed)
+        : h("p", { className: "hx-hint" }, "Empty."),
       h("h3", {}, `Tried again, or given up (${count(retries.length)})`),
       retries.length ? table([["Work", (r) => r.work], ["Of", (r) => r.subject], ["Failed", (r) => `${r.count} of ${r.most}`, "num"], ["Reason", (r) => r.reason],
         ["Next try", (r) => h("span", { className: r.given_up ? "warn" : "" }, r.given_up ? "given up" : "", r.left === null ? "" : ` ${r.left > 0 ? `in ${span(r.left)}` : "at the next turn"}`)],

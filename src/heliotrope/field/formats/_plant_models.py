@@ -419,6 +419,18 @@ class ReceiverVisitsTable(StrictTable):
     )
 
 
+class TimetableTable(StrictTable):
+    """``[[timetable]]``: heliostats that are calibrated at times of day or at intervals."""
+
+    name: str = Field(min_length=1)
+    heliostats: list[str] = Field(min_length=1, description="In the order of calibration.")
+    target: str = Field("", description="Default: any target that is free.")
+    at: list[str] = Field(
+        default_factory=list, description="Times of day with their zone: 08:30Z, 10:30+02:00."
+    )
+    every_s: Number | None = Field(None, description="Interval, from midnight UTC; 60 to 86400.")
+
+
 class PlantDocument(StrictTable):
     """The whole file."""
 
@@ -442,6 +454,9 @@ class PlantDocument(StrictTable):
     )
     receiver_visits: ReceiverVisitsTable | None = Field(
         None, description="Without: no heliostat in production is measured."
+    )
+    timetable: list[TimetableTable] = Field(
+        default_factory=list, description="Calibrations at times of day and at intervals."
     )
     safety: Annotated[
         dict[str, dict[str, Number]],

@@ -292,6 +292,9 @@ class _Files:
             for place, name in enumerate(names):
                 if name == old:
                     names[place] = new
+        for entry in self.document.get("timetable", ()):
+            if entry.get("target") == old:
+                entry["target"] = new
 
     # -- files -----------------------------------------------------------------------------
 

@@ -26,11 +26,17 @@ from heliotrope.field.formats._plant_joint import (
     joint_document,
     receiver_visits_document,
 )
-from heliotrope.field.formats._plant_models import PlantDocument, ReceiverTable, TargetTable
+from heliotrope.field.formats._plant_models import (
+    PlantDocument,
+    ReceiverTable,
+    TargetTable,
+    TimetableTable,
+)
 from heliotrope.field.formats._plant_table import HeliostatColumns, read_table, write_table
 from heliotrope.field.formats._plant_volumes import build_volume, volume_document
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
+from heliotrope.field.timetable import TimetableEntry
 from heliotrope.files import write_text
 from heliotrope.files.documents import read_document
 from heliotrope.geometry import FloatArray, direction
@@ -94,6 +100,7 @@ def _models() -> list[Any]:
         models.CylinderTable,
         models.PrismTable,
         models.JointVisitsTable,
+        models.TimetableTable,
     ]
 
 
@@ -136,6 +143,7 @@ def _assemble(
     joint = _one(path, "joint_visits", document.joint_visits, build_joint, problems)
     given = document.receiver_visits
     receiver_visits = _one(path, "receiver_visits", given, build_receiver_visits, problems)
+    timetable = _each(path, "timetable", document.timetable, _timetable_entry, problems)
     _one(path, "safety", document.safety, lambda given: limited(CONDITIONS, given or {}), problems)
     if problems:
         return None
@@ -151,6 +159,7 @@ def _assemble(
             eyes=eyes,
             joint_visits=joint,
             receiver_visits=receiver_visits,
+            timetable=timetable,
             safety=document.safety,
         )
     except InputError as error:
@@ -188,6 +197,10 @@ def _each(
         except InputError as error:
             problems.append(FormatError(path, str(error), f"{key}[{k}]"))
     return tuple(made)
+
+
+def _timetable_entry(table: TimetableTable) -> TimetableEntry:
+    return TimetableEntry.of(table.model_dump())
 
 
 def _receiver(table: ReceiverTable) -> Receiver:
@@ -294,6 +307,7 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
         "eyes_m": {name: np.asarray(point).tolist() for name, point in plant.eyes.items()},
         **joint_document(plant.joint_visits),
         **receiver_visits_document(plant.receiver_visits),
+        **({"timetable": [e.document for e in plant.timetable]} if plant.timetable else {}),
         **({"safety": {k: dict(v) for k, v in plant.safety.items()}} if plant.safety else {}),
         "groups": groups,
     }

@@ -18,7 +18,7 @@ ORDERS = frozenset(
     (
         "withdraw_emergency", "acknowledge", "take_authority", "seize_authority", "command", "aim",
         "standby", "automatic", "resume", "switch_calibration", "calibrate", "take_photograph",
-        "hold", "unhold", "take_flight", "learn", "bus_frames", "set_parameters",
+        "hold", "unhold", "put_timetable", "take_flight", "learn", "bus_frames", "set_parameters",
         "begin_marks", "mark_corners", "picture_to_mark", "give_reading",
     )
 )  # fmt: skip

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from heliotrope.errors import InputError
+from heliotrope.field.timetable import TimetableEntry
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.interface import orders
 from heliotrope.plant.interface.desk import Desk, reading_of
@@ -152,6 +153,13 @@ def _unhold(desk: Desk, who: Person, given: orders.GivenBack, _: bytes) -> Any:
     return desk.operations.holds()
 
 
+def _timetable(desk: Desk, who: Person, given: orders.TimetableOrder, _: bytes) -> Any:
+    entries = given.model_dump()["entries"]
+    made = None if entries is None else [TimetableEntry.of(entry) for entry in entries]
+    desk.operations.put_timetable(who, made)
+    return desk.operations.timetable()
+
+
 _VIEWS = {
     "field": _see(lambda desk: desk.field()),
     "size": _see(lambda desk: len(desk.operations.names)),
@@ -163,6 +171,7 @@ _VIEWS = {
     "flights": _see(lambda desk: desk.operations.flights()),
     "learning": _see(lambda desk: desk.operations.learning()),
     "retries": _see(lambda desk: desk.operations.retries()),
+    "timetable": _see(lambda desk: desk.operations.timetable()),
     "holds": _see(lambda desk: desk.operations.holds()),
     "emergency": _see(lambda desk: desk.operations.emergency_view()),
     "commands": _see(lambda desk: desk.tickets.last()),
@@ -263,6 +272,7 @@ _ORDERS = {
         lambda d, who, a, _: d.readings.take(who, a.name, a.value, a.at),
     ),
     "hold": Call(Role.OPERATOR, orders.HoldOrder, _hold),
+    "put_timetable": Call(Role.OPERATOR, orders.TimetableOrder, _timetable),
     "unhold": Call(Role.OPERATOR, orders.GivenBack, _unhold),
 }
 _CONSOLES = {

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from heliotrope.errors import InputError
+from heliotrope.field.timetable import DAY, LEAST_INTERVAL, MOST, MOST_TIMES
 from heliotrope.geometry import FloatArray
 from heliotrope.plant.operations.security import SecurityEvent
 
@@ -104,6 +105,25 @@ class OneGroup(Strict):
     """A group of mirrors to be learnt now ("": all)."""
 
     group: Annotated[str, Field(max_length=64)] = ""
+
+
+class TimetableOrderEntry(Strict):
+    """Heliostats that are calibrated at times of day, at intervals (from midnight UTC), or both."""
+
+    name: Name
+    heliostats: Annotated[list[Name], Field(min_length=1, max_length=20_000, fail_fast=True)]
+    target: Annotated[str, Field(max_length=64)] = ""
+    at: Annotated[
+        list[Annotated[str, Field(max_length=20)]],
+        Field(max_length=MOST_TIMES, description="Times of day with their zone, as 08:30Z."),
+    ] = []
+    every_s: Annotated[float, Field(ge=LEAST_INTERVAL, le=DAY)] | None = None
+
+
+class TimetableOrder(Strict):
+    """The whole timetable to put in force; null: that of the plant file."""
+
+    entries: Annotated[list[TimetableOrderEntry], Field(max_length=MOST)] | None
 
 
 class Reading(Strict):

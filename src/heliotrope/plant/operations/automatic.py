@@ -40,6 +40,7 @@ from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.production import ProductionVisits
 from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.operations.service import Service
+from heliotrope.plant.operations.timetable import Timetable
 from heliotrope.plant.operations.views import CalibrationView, Planned
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.joint_cycle import JointCycle
@@ -166,6 +167,8 @@ class AutomaticControl:
         Takes flights of a drone.
     learning
         What is learnt of each group of mirrors at night.
+    timetable
+        Calibrations at times of day and at intervals.
     installed
         Tracking error that the priors allow an uncalibrated heliostat, rad.
     """
@@ -212,6 +215,7 @@ class AutomaticControl:
         self.learning = Learning(
             plant, logbook, self._keeping, visits.first_model, learner, AUTOMATIC
         )
+        self.timetable = Timetable(plant, logbook, self._keeping)
         self._calibrating: Calibrating | None = None
         self._foresight: Foresight | None = None
         if cycle is not None and scheduler is not None:
@@ -239,6 +243,7 @@ class AutomaticControl:
             self._keeping.recall()
             self.learning.recall()
             self.flights.recall()
+            self.timetable.recall()
         if self._foresight is not None:
             self._foresight.recall()
 
@@ -487,6 +492,8 @@ class AutomaticControl:
                 name = part.__name__.strip("_")
                 group.create_task(self._again(name, part, self._settings.beat))
             if self._calibrating is not None:
+                due = self._due(self._calibrating)
+                group.create_task(self._again("timetable", due, self._settings.beat))
                 for target in self._plant.design.targets:
                     visits = self._visits(self._calibrating, target.name)
                     group.create_task(self._again(f"target {target.name}", visits, 1.0))
@@ -634,6 +641,16 @@ class AutomaticControl:
                 self._raising.release(name)
 
         return visit
+
+    def _due(self, calibrating: Calibrating) -> Callable[[], Awaitable[None]]:
+        def ask(heliostat: str, target: str) -> None:
+            if heliostat not in calibrating.asked:
+                self.calibrate(heliostat, target, search=False, together=(), receiver=False)
+
+        async def look() -> None:
+            self.timetable.step(ask)
+
+        return look
 
     def _in_production(self, calibrating: Calibrating) -> Callable[[], Awaitable[None]]:
         async def visit() -> None:

@@ -22,6 +22,7 @@ from heliotrope.store.records import (
     OutlookEntry,
     Records,
     StoreError,
+    TimetableRecord,
     VisitEntry,
 )
 
@@ -127,6 +128,20 @@ class Keeping:
             return
         try:
             self._records.record_learning(entry)
+        except StoreError as error:
+            self.lost = str(error)
+
+    def timetable(self) -> TimetableRecord | None:
+        """Return the timetable that a person has put in force last; None: nobody has."""
+        kept = [] if self._records is None else self._records.timetables()
+        return kept[0] if kept else None
+
+    def keep_timetable(self, timetable: TimetableRecord) -> None:
+        """Keep a timetable that a person has put in force."""
+        if self._records is None:
+            return
+        try:
+            self._records.record_timetable(timetable)
         except StoreError as error:
             self.lost = str(error)
 

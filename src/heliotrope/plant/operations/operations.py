@@ -24,6 +24,7 @@ from heliotrope.calibration.flights import parse_flight
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
+from heliotrope.field.timetable import TimetableEntry
 from heliotrope.geometry import FloatArray
 from heliotrope.links.clock import sleep_until
 from heliotrope.optics import FluxView, predict_flux
@@ -58,6 +59,7 @@ from heliotrope.plant.operations.views import (
     Planned,
     Summary,
     SunView,
+    TimetableRow,
 )
 from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
@@ -457,6 +459,14 @@ class Operations:
     def schedule(self, limit: int = 20) -> tuple[Planned, ...]:
         """Return the plan of the next visits."""
         return self.automatic.plan(limit)
+
+    def timetable(self) -> tuple[TimetableRow, ...]:
+        """Return the calibrations at times of day and at intervals that people want."""
+        return self.automatic.timetable.rows()
+
+    def put_timetable(self, person: Person, entries: Sequence[TimetableEntry] | None) -> None:
+        """Put a timetable in force, or with None that of the plant file; see `Timetable.put`."""
+        self.automatic.timetable.put(person, entries)
 
     def holds(self) -> tuple[Lockout, ...]:
         """Return the locks of persons on heliostats, targets, receivers and the tower."""

@@ -569,6 +569,36 @@ class LearningView:
 
 
 @dataclass(frozen=True)
+class TimetableRow:
+    """An entry of the timetable: calibrations at times of day or at intervals.
+
+    Attributes
+    ----------
+    name
+        Unique.
+    heliostats, target
+        Names; target "": any that is free.
+    at
+        Times of day with their zone, as "08:30Z".
+    every_s
+        Interval, s, from midnight UTC; None: there is none.
+    next, last
+        When it is due, and when it was, POSIX s; NaN before the first time.
+    text
+        What came of the last time.
+    """
+
+    name: str
+    heliostats: tuple[str, ...]
+    target: str
+    at: tuple[str, ...]
+    every_s: float | None
+    next: float
+    last: float
+    text: str
+
+
+@dataclass(frozen=True)
 class CameraView:
     """The last photograph of a target.
 

@@ -74,6 +74,8 @@ class Centring:
     ----------
     pitch
         Distance between neighbouring aims of the search, as a share of the target's shorter side.
+        Malan's is 0.5, which finds as many beams of any size and takes longer
+        (``examples/malan_search.py``).
     most
         Aims to try beside the middle.
     near

@@ -1,0 +1,144 @@
+"""The timetable of calibrations: which heliostats people want on a target, and when.
+
+It is Malan's calibration schedule (5.6.1): the operator chooses heliostats and times, and the
+commands follow from that. The schedule of automatic control, which chooses by expected gain, goes
+on beside it.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, time
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.files.cells import check_names
+from heliotrope.geometry import FloatArray
+
+#: Length of a day, s; the shortest interval, s; most entries, and most times of day of one.
+DAY, LEAST_INTERVAL, MOST, MOST_TIMES = 86_400.0, 60.0, 100, 96
+
+
+@dataclass(frozen=True)
+class TimetableEntry:
+    """Heliostats that are calibrated at times of day, at intervals, or both.
+
+    Attributes
+    ----------
+    name
+        Unique in its timetable.
+    heliostats
+        Names, in the order in which they are calibrated.
+    target
+        Name; "": any that is free.
+    at
+        Times of day with their zone, as "08:30Z" or "10:30+02:00".
+    every
+        Interval, s, counted from midnight UTC; None: only ``at``.
+
+    Raises
+    ------
+    InputError
+        If it has no heliostat or no time, or a time or the interval cannot be.
+    """
+
+    name: str
+    heliostats: tuple[str, ...]
+    target: str = ""
+    at: tuple[str, ...] = ()
+    every: float | None = None
+
+    def __post_init__(self) -> None:
+        who = f"timetable entry {self.name!r}"
+        if not self.name or not self.heliostats:
+            raise InputError(f"{who}: give it a name and at least one heliostat")
+        if len(set(self.heliostats)) < len(self.heliostats):
+            twice = next(n for n in self.heliostats if self.heliostats.count(n) > 1)
+            raise InputError(f"{who}: heliostat {twice} stands in it twice; name it once")
+        if not self.at and self.every is None:
+            raise InputError(f"{who}: no time; give times of day (at) or an interval (every_s)")
+        if len(self.at) > MOST_TIMES:
+            raise InputError(f"{who}: {len(self.at)} times of day; give at most {MOST_TIMES}")
+        if self.every is not None and not LEAST_INTERVAL <= self.every <= DAY:
+            raise InputError(
+                f"{who}: an interval of {self.every:g} s; give {LEAST_INTERVAL:g} to {DAY:g} s"
+            )
+        for text in self.at:
+            _second_of_day(who, text)
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> "TimetableEntry":
+        """Return the entry of a document with the keys of the plant file."""
+        return cls(
+            document["name"],
+            tuple(document["heliostats"]),
+            document.get("target") or "",
+            tuple(document.get("at") or ()),
+            document.get("every_s"),
+        )
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The entry with the keys of the plant file; what is not set is left out."""
+        rest = {"target": self.target, "at": list(self.at), "every_s": self.every}
+        given = {key: value for key, value in rest.items() if value}
+        return {"name": self.name, "heliostats": list(self.heliostats), **given}
+
+    @cached_property
+    def seconds(self) -> FloatArray:
+        """When it is due on each day, s after midnight UTC, ascending, (K,)."""
+        often = np.arange(0.0, DAY, self.every) if self.every is not None else np.zeros(0)
+        named = [_second_of_day(self.name, text) for text in self.at]
+        return np.unique(np.concatenate([often, named]))
+
+    def due(self, since: float, until: float) -> bool:
+        """Return whether it was due after ``since`` and up to ``until``, POSIX s."""
+        return self.next(since) <= until
+
+    def next(self, after: float) -> float:
+        """Return when it is due first after a time, POSIX s."""
+        day = math.floor(after / DAY) * DAY
+        left = self.seconds[self.seconds > after - day]
+        return day + (float(left[0]) if len(left) else DAY + float(self.seconds[0]))
+
+
+def check_timetable(
+    entries: Iterable[TimetableEntry], heliostats: Iterable[str], targets: Iterable[str]
+) -> None:
+    """Check a timetable against the names of a plant.
+
+    Raises
+    ------
+    InputError
+        More than ``MOST`` entries, or two whose names are alike.
+    UnknownNameError
+        A heliostat or a target that the plant does not have.
+    """
+    listed = tuple(entries)
+    if len(listed) > MOST:
+        raise InputError(f"timetable: {len(listed)} entries; give at most {MOST}")
+    check_names("timetable entry", (entry.name for entry in listed))
+    known, surfaces = set(heliostats), tuple(targets)
+    for entry in listed:
+        for name in entry.heliostats:
+            if name not in known:
+                raise UnknownNameError("heliostat", name, known)
+        if entry.target and entry.target not in surfaces:
+            raise UnknownNameError("target", entry.target, surfaces)
+
+
+def _second_of_day(who: str, text: str) -> float:
+    """Return the time of day, s after midnight UTC."""
+    try:
+        found = time.fromisoformat(text)
+    except (ValueError, TypeError):
+        raise InputError(
+            f"{who}: {text!r} is no time of day; write 08:30Z or 10:30+02:00"
+        ) from None
+    if found.tzinfo is None:
+        raise InputError(f"{who}: {text!r} has no zone; write {text}Z for UTC, or {text}+02:00")
+    utc = datetime.combine(date(2000, 1, 2), found).astimezone(UTC)
+    return 3600.0 * utc.hour + 60.0 * utc.minute + utc.second

@@ -1,0 +1,134 @@
+"""The timetable of a running plant: calibrations that people want at times of day or at intervals.
+
+An entry that is due asks for its heliostats as a person does, so they come before all that the
+schedule would choose. The timetable of the plant file is in force until a person puts another one
+in force, which outlasts a restart.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from heliotrope.errors import HeliotropeError
+from heliotrope.field.timetable import TimetableEntry, check_timetable
+from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.keeping import Keeping
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.views import TimetableRow
+from heliotrope.plant.refusals import by_reason
+from heliotrope.store.records import TimetableRecord
+
+#: Asks for the calibration of a heliostat on a target, "" for any.
+Ask = Callable[[str, str], None]
+
+
+@dataclass
+class _Turn:
+    """The last time that an entry was due, POSIX s, and what came of it."""
+
+    at: float = float("nan")
+    text: str = ""
+
+
+class Timetable:
+    """The timetable in force, and its due entries.
+
+    Parameters
+    ----------
+    plant
+        Gives the time and the names.
+    log
+        Takes events.
+    keeping
+        Keeps the timetables of persons.
+    """
+
+    def __init__(self, plant: PlantController, log: Logbook, keeping: Keeping) -> None:
+        self._plant, self._log, self._keeping = plant, log, keeping
+        self._entries = plant.design.timetable
+        self._turns: dict[str, _Turn] = {}
+        self._looked = self._now()
+
+    def recall(self) -> None:
+        """Put in force what a person had put in force before a restart."""
+        kept = self._keeping.timetable()
+        if kept is None or not kept.document:
+            return
+        try:
+            entries = tuple(TimetableEntry.of(one) for one in json.loads(kept.document))
+            self._check(entries)
+        except (ValueError, KeyError, TypeError, HeliotropeError) as error:
+            text = f"timetable of {kept.person}: {error}; that of the plant file is in force"
+            self._log.event("calibration", "", text)
+        else:
+            self._entries = entries
+
+    def put(self, person: Person, entries: Sequence[TimetableEntry] | None) -> None:
+        """Put a timetable in force, or with None again that of the plant file.
+
+        Raises
+        ------
+        RefusedError
+            If the person is a viewer.
+        InputError, UnknownNameError
+            If it cannot be, or names what the plant does not have.
+        """
+        person.must_be(Role.OPERATOR, "timetable")
+        made = self._plant.design.timetable if entries is None else tuple(entries)
+        self._check(made)
+        document = "" if entries is None else json.dumps([entry.document for entry in made])
+        self._entries, self._turns = made, {}
+        self._keeping.keep_timetable(TimetableRecord(self._now(), person.name, document))
+        names = ", ".join(entry.name for entry in made) or "empty"
+        origin = " (that of the plant file)" if entries is None else ""
+        self._log.event("calibration", person.name, f"timetable{origin}: {names}")
+        self._plant.note(person, "TIMETABLE", f"{names}{origin}")
+
+    def step(self, ask: Ask) -> None:
+        """Ask for the heliostats of the entries that have come due since the last step."""
+        since, self._looked = self._looked, self._now()
+        for entry in self._entries:
+            if entry.due(since, self._looked):
+                self._ask(entry, ask)
+
+    def rows(self) -> tuple[TimetableRow, ...]:
+        """Return the entries in force, with their last and next times."""
+        now, rows = self._now(), []
+        for entry in self._entries:
+            turn = self._turns.get(entry.name, _Turn())
+            row = TimetableRow(
+                entry.name,
+                entry.heliostats,
+                entry.target,
+                entry.at,
+                entry.every,
+                entry.next(now),
+                turn.at,
+                turn.text,
+            )
+            rows.append(row)
+        return tuple(rows)
+
+    def _ask(self, entry: TimetableEntry, ask: Ask) -> None:
+        refused = {}
+        for name in entry.heliostats:
+            try:
+                ask(name, entry.target)
+            except RefusedError as error:
+                refused[name] = str(error)
+        asked = len(entry.heliostats) - len(refused)
+        text = f"{asked} of {len(entry.heliostats)} heliostats asked for"
+        text += f"; not {by_reason(refused)}" if refused else ""
+        before = self._turns.get(entry.name, _Turn())
+        # By night each turn ends alike, and one event says so.
+        if text != before.text:
+            self._log.event("calibration", entry.name, f"timetable: {text}")
+        self._turns[entry.name] = _Turn(self._looked, text)
+
+    def _check(self, entries: Sequence[TimetableEntry]) -> None:
+        design = self._plant.design
+        check_timetable(entries, self._plant.field.names, (t.name for t in design.targets))
+
+    def _now(self) -> float:
+        return self._plant.clock.utc().timestamp()

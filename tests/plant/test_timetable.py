@@ -1,0 +1,150 @@
+"""The timetable of a running plant: what is due is asked for, kept, and refused with a reason."""
+
+import asyncio
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.layouts import lay_out
+from heliotrope.field.plant import Plant
+from heliotrope.field.timetable import TimetableEntry
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.store.keeper import Keeper
+from heliotrope.store.records import TimetableRecord
+from support.live import LiveOptions, LivePlant
+
+VIEWER, OPERATOR = Person("vera", Role.VIEWER), Person("olga", Role.OPERATOR)
+START = datetime(2026, 10, 21, 9, tzinfo=UTC)
+
+
+def design(*entries: TimetableEntry) -> Plant:
+    return replace(lay_out("radial", 4), timetable=entries)
+
+
+def said(plant: LivePlant) -> list[str]:
+    return [e.text for e in plant.operations.events(500) if e.text.startswith("timetable")]
+
+
+async def until(plant: LivePlant, hour: int, minute: int) -> None:
+    while plant.clock.utc() < START.replace(hour=hour, minute=minute):
+        await asyncio.sleep(1.0)
+
+
+def test_heliostats_are_calibrated_at_their_time() -> None:
+    last = design().names[-1]
+
+    async def main(clock: VirtualClock) -> None:
+        entry = TimetableEntry("ten", (last,), "right", ("12:00+02:00",))
+        plant = LivePlant(design(entry), clock, LiveOptions(threads=0))
+        async with plant.running():
+            operations = plant.operations
+            (row,) = operations.timetable()
+            assert row.next == START.replace(hour=10).timestamp()
+            assert row.text == ""
+            await until(plant, 9, 59)
+            assert last not in operations.calibration().asked
+            assert not said(plant)
+            await until(plant, 10, 1)
+            assert said(plant) == ["timetable: 1 of 1 heliostats asked for"]
+            begun = START.replace(hour=10).timestamp()
+
+            def results() -> list[str]:
+                found = operations.calibration().results
+                return [r.target for r in found if r.heliostat == last and r.at > begun]
+
+            while not results():
+                await asyncio.sleep(1.0)
+            # It stood on the target of the entry, whatever the schedule would have chosen.
+            assert results() == ["right"]
+            (row,) = operations.timetable()
+            assert row.next == begun + 86_400.0
+            assert begun <= row.last < begun + 10.0
+            await plant.end()
+
+    run_virtual(main, start=START)
+
+
+def test_what_cannot_be_calibrated_is_named_once() -> None:
+    names = design().names
+
+    async def main(clock: VirtualClock) -> None:
+        entry = TimetableEntry("often", names[:2], every=60.0)
+        plant = LivePlant(design(entry), clock, LiveOptions(threads=0))
+        async with plant.running():
+            plant.operations.switch_calibration(OPERATOR, on=False)
+            await until(plant, 9, 5)
+            (row,) = plant.operations.timetable()
+            assert row.text.startswith("0 of 2 heliostats asked for; not ")
+            assert "it is switched off" in row.text
+            assert len(said(plant)) == 1
+            await plant.end()
+
+    run_virtual(main, start=START)
+
+
+def test_a_person_replaces_the_timetable_and_it_outlasts_a_restart(tmp_path: Path) -> None:
+    names = design().names
+    filed = TimetableEntry("file", names[:1], "", ("11:00Z",))
+    mine = TimetableEntry("mine", names[1:3], "left", (), 7200.0)
+
+    def run(expected: list[str], entries: tuple[TimetableEntry, ...] | None, *, put: bool) -> None:
+        keeper = Keeper(tmp_path)
+
+        async def main(clock: VirtualClock) -> None:
+            plant = LivePlant(design(filed), clock, LiveOptions(threads=0), records=keeper)
+            async with plant.running():
+                operations = plant.operations
+                assert [row.name for row in operations.timetable()] == expected
+                if put:
+                    operations.put_timetable(OPERATOR, entries)
+                await plant.end()
+
+        run_virtual(main, start=START)
+        keeper.close()
+
+    run(["file"], (filed, mine), put=True)
+    run(["file", "mine"], (), put=True)
+    run([], None, put=True)
+    run(["file"], None, put=False)
+
+
+def test_a_kept_timetable_of_other_heliostats_gives_way_to_the_file(tmp_path: Path) -> None:
+    filed = TimetableEntry("file", design().names[:1], "", ("11:00Z",))
+    keeper = Keeper(tmp_path)
+    document = '[{"name": "old", "heliostats": ["gone"], "every_s": 3600.0}]'
+    keeper.record_timetable(TimetableRecord(1.0, "olga", document))
+    keeper.writer.confirmed().result(10.0)
+
+    async def main(clock: VirtualClock) -> None:
+        plant = LivePlant(design(filed), clock, LiveOptions(threads=0), records=keeper)
+        async with plant.running():
+            assert [row.name for row in plant.operations.timetable()] == ["file"]
+            (text,) = said(plant)
+            assert "timetable of olga: there is no heliostat 'gone'" in text
+            await plant.end()
+
+    run_virtual(main, start=START)
+    keeper.close()
+
+
+def test_only_people_who_may_command_change_it_and_only_to_what_can_be() -> None:
+    entry = TimetableEntry("mine", ("gone",), "", ("11:00Z",))
+
+    async def main(clock: VirtualClock) -> None:
+        plant = LivePlant(design(), clock, LiveOptions(threads=0))
+        async with plant.running():
+            with pytest.raises(RefusedError, match="vera is viewer"):
+                plant.operations.put_timetable(VIEWER, ())
+            with pytest.raises(UnknownNameError, match="gone"):
+                plant.operations.put_timetable(OPERATOR, (entry,))
+            good = replace(entry, heliostats=design().names[:1])
+            with pytest.raises(InputError, match="timetable entry"):
+                plant.operations.put_timetable(OPERATOR, (good, good))
+            assert plant.operations.timetable() == ()
+            await plant.end()
+
+    run_virtual(main, start=START)
