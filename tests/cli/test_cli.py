@@ -18,7 +18,6 @@ from heliotrope.calibration.sighting_table import write_sightings
 from heliotrope.calibration.sightings import join, sightings
 from heliotrope.cli import main
 from heliotrope.field.example import example_plant
-from heliotrope.field.formats import open_plant
 from heliotrope.field.formats.plant_file import read_plant, write_plant
 from heliotrope.geometry import azimuth_elevation, reflect
 from heliotrope.mechanism.tracking import track
@@ -241,22 +240,34 @@ def test_track_traces_the_iteration_of_both_branches(call: Any) -> None:
 
 
 def test_track_aims_at_a_point_fixed_to_the_mirror(call: Any) -> None:
-    mechanism = open_plant(HELIOK)["HeliostatA"].calibrated
-    zero, there = mechanism.pose([0.0, 0.0]), mechanism.pose([0.3, 0.7])
-    # A point on the mirror's own normal is met where the mirror looks at the sun.
-    aim, light = zero.vertex + 2.0 * zero.normal, there.normal
-    words = [
-        "--aim",
-        ",".join(map(str, aim)),
-        "--sun",
-        ",".join(map(str, light)),
-        "--local",
-        "--json",
-    ]
-    found = json.loads(call("track", HELIOK, "--heliostat", "HeliostatA", *words))
+    # A point on the mirror's own normal, in the heliostat's frame: the mirror looks at the sun.
+    words = ("track", HELIOK, "--heliostat", "HeliostatB", "--local")
+    found = json.loads(call(*words, "--aim", "0,5.1,1.5", "--json"))
     best = found["branches"][found["best"]]
     assert best["reachable"]
-    np.testing.assert_allclose(best["normal"], light, rtol=0, atol=1e-9)
+    assert (best["azimuth_deg"], best["elevation_deg"]) == pytest.approx((120.0, 45.0), abs=1e-8)
+    with pytest.raises(AssertionError, match="the aim is fixed behind the mirror"):
+        call(*words, "--aim", "0,-5.1,1.5")
+    with pytest.raises(AssertionError, match="--target is not fixed to a mirror"):
+        call(*words, "--target", "Receiver")
+
+
+def test_track_follows_the_sun_with_a_single_axis(call: Any, tmp_path: Path) -> None:
+    text = HELIOK.read_text(encoding="utf-8")
+    line = next(row for row in text.splitlines() if "<Secondary" in row)
+    path = tmp_path / "trough.xml"
+    path.write_text(text.replace(line, "").replace('"0, 0, -1"', '"1, 0, 0"'), encoding="utf-8")
+    words = ("track", path, "--heliostat", "HeliostatA")
+    (branch,) = json.loads(call(*words, "--json"))["branches"]
+    assert branch["reachable"]
+    assert len(branch["angles_rad"]) == 1
+    assert "one axis: sun and aim are taken in the plane across it" in call(*words)
+    assert "Grigoriev's iteration" in call(*words, "--trace")
+    day = json.loads(call(*words, "--time", "2026-06-21T10:00Z", "--every", "3h", "--json"))
+    assert day["joints"] == ["rotation"]
+    assert any(row["reachable"] for row in day["day"])
+    with pytest.raises(AssertionError, match="give one heliostat with two drives"):
+        call("view", path, tmp_path / "day.glb", "--heliostat", "HeliostatA")
 
 
 def test_view_writes_a_page_and_a_model(call: Any, tmp_path: Path) -> None:

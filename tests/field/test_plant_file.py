@@ -20,9 +20,11 @@ from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.stellenbosch import prototype
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere
+from heliotrope.geometry import direction
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.machine import AxisLimits, Machine
+from heliotrope.mechanism.tracking import track
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.sun import Site
 from support.data import juelich
@@ -69,8 +71,6 @@ def _same(a: Plant, b: Plant) -> None:
 def test_every_kind_survives(table: str, tmp_path: Path) -> None:
     groups = {}
     for kind, one in every_kind().items():
-        if kind == "single_axis":
-            continue
         field = imperfect(_spread(one, 3), seed=1)
         rng = np.random.default_rng(2)
         groups[kind] = Heliostats(
@@ -86,6 +86,45 @@ def test_every_kind_survives(table: str, tmp_path: Path) -> None:
     plant_file.write_plant(plant, tmp_path / "plant.toml", table)  # type: ignore[arg-type]
     _same(plant, plant_file.read_plant(tmp_path / "plant.toml"))
     assert sorted(p.name for p in tmp_path.iterdir()) == [f"plant.{table}", "plant.toml"] or table
+
+
+def test_single_axis_trackers_are_a_kind_of_a_plant_file(tmp_path: Path) -> None:
+    text = """format = "heliotrope-plant"
+version = 1
+heliostats = "p.csv"
+[plant]
+name = "troughs"
+[site]
+latitude_deg = 37
+longitude_deg = -2
+[groups.t]
+kind = "single_axis"
+axis = [0, 1, 0]
+mirror_width_m = 2
+mirror_height_m = 8
+pivot_height_m = 0.5
+vertex_m = [0, 0, 0.2]
+[groups.t.drives.rotation]
+kind = "direct"
+min_angle_deg = -95
+max_angle_deg = 95
+"""
+    path = tmp_path / "p.toml"
+    path.write_text(text)
+    (tmp_path / "p.csv").write_text("name,group,east_m,north_m,up_m\nA,t,8,0,0\n")
+    found = plant_file.read_plant(path)["A"]
+    wanted = kinds.single_axis((8, 0, 0), (0, 1, 0), pivot_height=0.5, vertex=(0, 0, 0.2))
+    sun, aim = direction(2.0, 0.7), (0.0, 0.0, 10.0)
+    one, other = track(found, sun, aim), track(wanted, sun, aim)
+    assert one.reachable
+    np.testing.assert_allclose(one.best_angles, other.best_angles, rtol=0, atol=1e-12)
+    path.write_text(text.replace("axis = [0, 1, 0]\n", ""))
+    with pytest.raises(FormatError, match="axis is missing; kind single_axis needs it"):
+        plant_file.read_plant(path)
+    machine = "[groups.t.machine]\nstow_deg = [0, 0]\n[groups.t.machine.axes.rotation]\n"
+    path.write_text(f"{text}{machine}acceleration_steps_per_s2 = 100\nbacklash_steps = 0\n")
+    with pytest.raises(FormatError, match="local controllers drive two joints"):
+        plant_file.read_plant(path)
 
 
 def _spread(one: Mechanism, count: int) -> Mechanism:

@@ -66,7 +66,7 @@ def every_kind() -> dict[str, Mechanism]:
             concentrator_translation=(0.0, 0.175, 0.0),
         ),
         "single_axis": kinds.single_axis(
-            place, (0.1, 1.0, 0.0), pivot_height=0.5, vertex=(0.0, 0.0, 0.2), drive=steppers()[0]
+            place, (0.1, 1.0, 0.0), pivot_height=0.5, vertex=(0.0, 0.0, 0.2), drives=steppers()[:1]
         ),
     }
 

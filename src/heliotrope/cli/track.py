@@ -44,6 +44,7 @@ TargetOption = Annotated[str | None, typer.Option(help="Aim at the centre of thi
 _ON = 0.01
 _TAKE = "the one to take; shading and blocking by other mirrors are not considered"
 _NEAREST = "the nearest pose: the beam does not reach its aim"
+_LINE = "one axis: sun and aim are taken in the plane across it; along it the light goes on"
 
 
 def track(
@@ -78,7 +79,9 @@ def track(
     ] = "armature",
     local: Annotated[
         bool,
-        typer.Option(help="The aim is fixed to the mirror: its place at zero joint angles."),
+        typer.Option(
+            help="The aim is fixed to the mirror: a point of the heliostat's frame at zero angles."
+        ),
     ] = False,
     trace: Annotated[
         bool, typer.Option(help="Print each iteration of both branches: angles and miss.")
@@ -100,9 +103,12 @@ def track(
 
         plant = plant.with_calibration(read_json(calibration))
     mechanism = plant[heliostat].calibrated
-    goal = np.array(aim_of(plant, heliostat, aim, target))
+    _check(every, law, local, trace, target)
+    goal = np.array(
+        _local_aim(plant, heliostat, aim) if local else aim_of(plant, heliostat, aim, target)
+    )
+    joints = tuple(mechanism.joints[j] for j in mechanism.driven)
     moment = parse_time(time or "now")
-    _check(every, law, local, trace)
     if every is not None:
         times = sunlit(moment, plant.site, every)
         followed = track_path(
@@ -110,7 +116,7 @@ def track(
         )
         if not local:
             check_front(plant, heliostat, goal, followed.vertex)
-        _day(heliostat, [t.isoformat() for t in times], followed, mechanism.joints, as_json)
+        _day(heliostat, [t.isoformat() for t in times], followed, joints, as_json)
         if not followed.reachable.any():
             raise typer.Exit(1)
         return
@@ -128,7 +134,8 @@ def track(
     if trace:
         _trace(heliostat, tracking.trace(mechanism, vector, goal), as_json)
         return
-    joints = [mechanism.joints[j] for j in mechanism.driven]
+    # The two branches of one axis are the same pose.
+    branches = range(min(2, len(joints)))
     document = {
         "heliostat": heliostat,
         "time": moment,
@@ -138,7 +145,7 @@ def track(
         "aim": goal,
         "joints": joints,
         "best": int(result.best),
-        "branches": [_branch(result, b) for b in range(2)],
+        "branches": [_branch(result, b) for b in branches],
     }
     if as_json:
         print_json(document)
@@ -148,8 +155,10 @@ def track(
         raise typer.Exit(1)
 
 
-def _check(every: str | None, law: str, local: bool, trace: bool) -> None:
+def _check(every: str | None, law: str, local: bool, trace: bool, target: str | None) -> None:
     """Refuse options that do not fit together."""
+    if local and target is not None:
+        raise InputError("--target is not fixed to a mirror; give --aim, or leave out --local")
     if law == "guo" and (every is not None or local or trace):
         raise InputError(
             "--law guo prints one moment of global aiming; leave out --every, --local and --trace, "
@@ -169,7 +178,7 @@ def _check_sun(heliostat: str, vector: "np.ndarray", time: str) -> None:
 
 def _check_pose(heliostat: str, status: "TrackingStatus") -> None:
     """Refuse an outcome without a pose that a mirror can take."""
-    if status.name in ("NOT_CONVERGED", "DEGENERATE"):
+    if status.name in ("NOT_CONVERGED", "DEGENERATE", "BEHIND"):
         raise InputError(f"heliostat {heliostat}: {status.text}; choose another aim")
 
 
@@ -198,6 +207,19 @@ def aim_of(plant: "Plant", heliostat: str, aim: str | None, target: str | None) 
     if not plant.targets:
         raise InputError("this plant has no target; give --aim east,north,up in metres")
     return plant.targets[0].center
+
+
+def _local_aim(plant: "Plant", heliostat: str, aim: str | None) -> Any:
+    """Return the point fixed to the mirror that --aim or the heliostat's own aim names, (3,)."""
+    if aim is not None:
+        return parse_point(aim, "aim")
+    own = plant[heliostat].aim
+    if own is None:
+        raise InputError(
+            f"heliostat {heliostat}: it has no aim of its own; give --aim x,y,z in metres, in its "
+            "frame at zero angles"
+        )
+    return own
 
 
 def check_front(plant: "Plant", heliostat: str, aim: Any, vertices: "np.ndarray") -> None:
@@ -307,6 +329,8 @@ def _print_branches(document: dict[str, Any], heliostat: str) -> None:
     print_table(["branch", "azimuth", "elevation", names, "counts", "residual", ""], rows)
     served = document["branches"][document["best"]]["reachable"]
     print(f"* {_TAKE if served else _NEAREST}")
+    if len(document["joints"]) == 1:
+        print(_LINE)
 
 
 def _day(

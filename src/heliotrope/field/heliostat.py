@@ -93,6 +93,11 @@ class Heliostat(Value, Framed):
         return self.calibrated.drives
 
     @property
+    def attachment(self) -> FloatArray:
+        """Of the calibrated mechanism, (4, 4); see `Mechanism.attachment`."""
+        return self.calibrated.attachment
+
+    @property
     def position(self) -> FloatArray:
         """Nominal position, ENU metres, (3,)."""
         return self.nominal.position

@@ -180,6 +180,11 @@ class Heliostats(Value, Framed):
         """Drives of the calibrated mechanisms, (N, D)."""
         return self.calibrated.drives
 
+    @property
+    def attachment(self) -> FloatArray:
+        """Of the calibrated mechanisms, (N, 4, 4); see `Mechanism.attachment`."""
+        return self.calibrated.attachment
+
     def own_aim(self, row: int) -> FloatArray | None:
         """Return the aim point of a row, ENU metres, (3,); None where none is given."""
         if self.aim is None or not np.isfinite(self.aim[row]).all():

@@ -273,9 +273,26 @@ class Plant(Value, Framed):
 
     @cached_property
     def drives(self) -> Drive:
-        """Calibrated drives of all heliostats, batch shape (N, 2)."""
+        """Calibrated drives of all heliostats, batch shape (N, D).
+
+        Raises
+        ------
+        InputError
+            If some heliostats have one drive and others two; take the groups one by one then.
+        """
         tables = [g.calibrated.drives.table for g in self.groups.values()]
+        if len({table.shape[-2] for table in tables}) > 1:
+            raise InputError(
+                "a plant of heliostats with one drive and with two: take its groups one by one "
+                "(plant.groups)"
+            )
         return Drive(np.concatenate(tables or [np.empty((0, 2, 19))]))
+
+    @cached_property
+    def attachment(self) -> FloatArray:
+        """Of all calibrated heliostats, (N, 4, 4); see `Mechanism.attachment`."""
+        frames = [g.attachment for g in self.groups.values()]
+        return np.concatenate(frames or [np.empty((0, 4, 4))])
 
     def with_notes(self, notes: Mapping[str, str]) -> "Plant":
         """Return the plant with further remarks."""

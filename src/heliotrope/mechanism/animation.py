@@ -96,8 +96,8 @@ def _angles(mechanism: Mechanism, angles: npt.ArrayLike) -> FloatArray:
     theta = np.asarray(angles, dtype=np.float64)
     if mechanism.shape or len(mechanism.driven) != 2:
         raise InputError(
-            f"animation: mechanisms of shape {mechanism.shape}, {len(mechanism.driven)} drives; "
-            "give one heliostat with two drives"
+            f"animation: {mechanism.kind} of shape {mechanism.shape}, driven joints: "
+            f"{len(mechanism.driven)}; give one heliostat with two drives"
         )
     if theta.ndim != 2 or theta.shape[1] != 2 or not len(theta) or not np.isfinite(theta).all():
         raise InputError(f"animation: angles of shape {theta.shape}; give finite ones, (T, 2)")

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError, kind_of
 from heliotrope.frames import ENU, Framed, Labelled, Variable, batch_rows, batched
-from heliotrope.geometry import TAU, FloatArray, as_angles, as_numbers
+from heliotrope.geometry import TAU, FloatArray, as_angles, as_numbers, rotation
 from heliotrope.jit import as_input
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.armature import Armature
@@ -454,6 +454,21 @@ class Mechanism(Value, Framed):
         return Armature(table.reshape(*self.shape, slot.ARMATURE_SIZE))
 
     @cached_property
+    def attachment(self) -> FloatArray:
+        """The heliostat's frame to ENU, for points fixed to the mirror, (..., 4, 4).
+
+        It places a point that is given in the heliostat's frame at zero joint angles of the
+        machine as designed: ``position`` and ``orientation`` (Grigoriev et al. 2021, (5)), and
+        whatever the deviations between the foot and the last driven joint add, because the point
+        is carried by that joint.
+        """
+        designed = self.with_parameters({name: -v for name, v in self.deviations.items()})
+        frame = _transformation(designed.orientation, designed.position)
+        if not self.deviations:
+            return frame
+        return np.asarray(_carrier(self) @ np.linalg.inv(_carrier(designed)) @ frame)
+
+    @cached_property
     def kernel_arrays(self) -> tuple[np.ndarray, ...]:
         """The arrays that compiled kernels read, with one batch axis (N, …)."""
         joints, drives = len(self.joints), len(self.driven)
@@ -494,6 +509,22 @@ class Mechanism(Value, Framed):
         rows = as_input(np.broadcast_to(index, shape)).reshape(-1)
         flat = as_input(np.broadcast_to(given, (*shape, drives)))
         return flat.reshape(-1, drives), rows, shape
+
+
+def _transformation(turned: FloatArray, at: FloatArray) -> FloatArray:
+    """Return rotations (..., 3, 3) and points (..., 3) as one matrix each, (..., 4, 4)."""
+    frame = np.zeros((*at.shape[:-1], 4, 4))
+    frame[..., :3, :3], frame[..., :3, 3], frame[..., 3, 3] = turned, at, 1.0
+    return frame
+
+
+def _carrier(mechanism: Mechanism) -> FloatArray:
+    """Return the frame beyond the last driven joint at zero joint angles, to ENU, (..., 4, 4)."""
+    turned, at = mechanism.orientation, mechanism.position
+    for j in range(max(mechanism.driven) + 1):
+        at = at + np.einsum("...ij,...j->...i", turned, mechanism.origins[..., j, :])
+        turned = turned @ rotation(mechanism.axes[..., j, :], mechanism.angles[..., j])
+    return _transformation(turned, at)
 
 
 def join_mechanisms(parts: Sequence[Mechanism]) -> Mechanism:

@@ -572,9 +572,12 @@ def single_axis(
     axis: npt.ArrayLike,
     normal: npt.ArrayLike = (0.0, 0.0, 1.0),
     *,
+    leans: tuple[str, str] | None = None,
     pivot_height: npt.ArrayLike = 0.0,
+    origin: npt.ArrayLike = (0.0, 0.0, 0.0),
     vertex: npt.ArrayLike = (0.0, 0.0, 0.0),
-    drive: Drive | None = None,
+    orientation: npt.ArrayLike | None = None,
+    drives: tuple[Drive] | None = None,
 ) -> Mechanism:
     """Return single-axis trackers (parabolic trough, linear Fresnel).
 
@@ -586,32 +589,37 @@ def single_axis(
     position
         ENU metres, (..., 3).
     axis, normal
-        Axis, and normal at zero angle, ENU, (..., 3).
+        Axis, and normal at zero angle, in the tracker's frame, (..., 3).
+    leans
+        As for `two_axis`.
     pivot_height
         Axis above the position, m.
+    origin
+        Point on the axis, from the position and ``pivot_height``, m, (..., 3).
     vertex
-        Mirror's vertex from the axis at zero angle, m.
-    drive
-        Default: counts are radians.
+        Mirror's vertex from that point at zero angle, m.
+    orientation
+        Rotation from the tracker's frame to ENU, (..., 3, 3); default identity.
+    drives
+        One drive; default: counts are radians.
 
     Raises
     ------
     InputError
-        If the normal lies along the axis.
+        If the normal lies along the axis, or the orientation is no rotation.
     """
     p, a, n = as_vectors(position, "position"), normalize(axis, "axis"), normalize(normal, "normal")
     if (np.linalg.norm(np.cross(a, n), axis=-1) < 1e-6).any():
         raise InputError("normal: it lies along the axis, which then cannot turn it")
     height = _lengths(pivot_height, "pivot_height")
-    lean_names = _lean_names(a)
+    lean_names = _lean_names(a) if leans is None else leans
     steps: list[tuple[str, FloatArray, npt.ArrayLike]] = [
         (
             f"tilt_{lean_names[0]}",
             normalize(np.cross(a, _LEANS[lean_names[0]])),
-            height[..., None] * UP,
+            as_vectors(origin, "origin") + height[..., None] * UP,
         ),
         (f"tilt_{lean_names[1]}", normalize(np.cross(a, _LEANS[lean_names[1]])), 0.0),
         ("rotation", a, 0.0),
     ]
-    drives = None if drive is None else (drive,)
-    return _assemble("single_axis", steps, (2,), p, None, drives, vertex, n)
+    return _assemble("single_axis", steps, (2,), p, orientation, drives, vertex, n)

@@ -14,13 +14,14 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError, kind_of, shown
 from heliotrope.frames import ENU, Framed, Labelled, Variable
-from heliotrope.geometry import FloatArray, as_numbers, as_vectors, reflect
+from heliotrope.geometry import FloatArray, as_numbers, as_vectors, normalize, reflect
 from heliotrope.jit import as_input
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive, direct
 from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.mechanism.kernels.block import track_block
 from heliotrope.mechanism.kernels.track import (
+    BEHIND,
     DEGENERATE,
     NOT_CONVERGED,
     OK,
@@ -44,6 +45,10 @@ class Steered(Protocol):
     def drives(self) -> Drive:
         """Batch shape (..., D)."""
 
+    @property
+    def attachment(self) -> FloatArray:
+        """Heliostats' frames to ENU, for points fixed to the mirrors, (..., 4, 4)."""
+
 
 class TrackingStatus(IntEnum):
     """Outcome of a solution."""
@@ -53,6 +58,7 @@ class TrackingStatus(IntEnum):
     STOPPED = STOPPED
     NOT_CONVERGED = NOT_CONVERGED
     DEGENERATE = DEGENERATE
+    BEHIND = BEHIND
 
     @property
     def text(self) -> str:
@@ -67,6 +73,7 @@ _TEXTS = {
     TrackingStatus.NOT_CONVERGED: "the iteration did not settle; do not use this pose",
     TrackingStatus.DEGENERATE: "no mirror can do it: source and aim are opposite, or the aim is in "
     "the mirror",
+    TrackingStatus.BEHIND: "the aim is fixed behind the mirror or in its plane, where no beam goes",
 }
 
 
@@ -196,7 +203,8 @@ def track(
         Unit vectors to the source, ENU, (..., 3).
     aim
         Points in ENU metres, (..., 3); with ``local`` points fixed to the mirror, at their
-        positions for zero joint angles.
+        positions for zero joint angles in the heliostat's frame (see `Mechanism.attachment`), or
+        in that of the armature.
     drives
         Batch shape (..., D); default the mechanism's, or radians for an armature.
     current
@@ -205,7 +213,7 @@ def track(
     branch
         "both", or the one to solve (0: −, 1: + in Paden-Kahan), which takes half the time.
     local
-        Aim at a point fixed to the mirror.
+        Aim at a point fixed to the mirror (Grigoriev et al. 2021, "Local aiming").
     tolerance
         Largest miss of the beam at the aim, m.
     max_iterations
@@ -247,6 +255,10 @@ def track(
             f"shapes of mechanism {armature.shape}, sun {s.shape[:-1]}, aim {p.shape[:-1]} and "
             "current counts do not fit together"
         ) from None
+    if local and not isinstance(mechanism, Armature):
+        frame = mechanism.attachment
+        p = np.einsum("...ij,...j->...i", frame[..., :3, :3], p) + frame[..., :3, 3]
+        batches[3] = p.shape[:-1]
     rows = int(np.prod(shape, dtype=np.int64))
     index = np.full((rows, 5), -1, dtype=np.int64)
     for column, batch in enumerate(batches):
@@ -289,7 +301,8 @@ class TraceStep:
     angles
         Joint angles, rad, (D,).
     miss
-        Lateral distance of the reflected ray from the aim point with these angles, m.
+        Lateral distance of the reflected ray from the aim point with these angles, m; of a single
+        axis in the plane across it.
     """
 
     iteration: int
@@ -334,7 +347,11 @@ def trace(
         min_angle=free[slot.MIN_ANGLE], max_angle=free[slot.MAX_ANGLE]
     )
     steps: list[TraceStep] = []
-    for branch in (0, 1):
+    single = table.shape[-2] == 1
+    along = armature.axis_1 if single else np.zeros(3)
+    flat = np.eye(3) - np.outer(along, along)
+    light = normalize(flat @ s, "sun across the axis")
+    for branch in range(1 if single else 2):  # the branches of a single axis are the same
         before = np.inf
         for k in range(1, most + 1):
             # A tolerance that no step reaches, so that each step is made.
@@ -342,7 +359,8 @@ def trace(
                 armature, s, p, drives=free_drives, tolerance=1e-300, max_iterations=k, newton=False
             )
             normal, vertex = found.normal[branch], found.vertex[branch]
-            miss = float(np.linalg.norm(np.cross(p - vertex, reflect(s, normal))))
+            ray = reflect(light, normalize(flat @ normal))
+            miss = float(np.linalg.norm(np.cross(flat @ (p - vertex), ray)))
             steps.append(TraceStep(k, branch, found.angles[branch], miss))
             if miss < tolerance or miss > 0.999 * before:
                 break
@@ -363,7 +381,7 @@ def _tables(mechanism: Steered | Armature, drives: Drive | None) -> tuple[Armatu
         )
     if isinstance(mechanism, Armature):
         armature = mechanism
-        own = np.stack([direct().table] * 2)
+        own = np.stack([direct().table] * (2 if armature.axis_2.any() else 1))
     else:
         armature, own = mechanism.armature, mechanism.drives.table
     table = own if drives is None else drives.table

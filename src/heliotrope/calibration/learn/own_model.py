@@ -103,8 +103,10 @@ class OwnModel:
         """Return a fit from `start` with the ratios among the values."""
         if not self.errors:
             return fitted
-        count, ratios = len(fitted.names), np.array([e.ratio for e in self.errors])
+        count, ratios = len(fitted.names), np.array([e.ratio - e.known for e in self.errors])
         sigmas = np.array([e.sigma for e in self.errors])
+        # A harmonic of a known ratio is as exact as that, and as far away as its turns.
+        priors = np.where(sigmas > 0.0, sigmas, np.abs(ratios))
         covariance = np.zeros((1, count + len(ratios), count + len(ratios)))
         covariance[:, :count, :count] = fitted.covariance
         covariance[:, count:, count:] = np.diag(sigmas**2)
@@ -117,7 +119,7 @@ class OwnModel:
             names=fitted.names + tuple(f"{e.joint}_worm_ratio" for e in self.errors),
             values=more(fitted.values, ratios),
             centre=more(fitted.centre, ratios),
-            prior=more(fitted.prior, sigmas),
+            prior=more(fitted.prior, priors),
             covariance=covariance,
         )
 

@@ -1,4 +1,4 @@
-r"""Searches the residuals for a periodic error of a drive whose ratio is unknown.
+r"""Searches the residuals for a periodic error: of unknown ratio, or a harmonic of a known one.
 
 A worm or gear that runs out of true adds A cos(r x − δ) to the angle of its joint: x is the ideal
 angle of the drive (the stroke of a jack) and r the unknown ratio (Malan, thesis, (6.1), knew his:
@@ -14,6 +14,10 @@ a mirror in place of his polynomial). −ln P is exponential, so its sum over N 
 follows a gamma law of shape N. The probability of the highest peak by chance is at most the number
 of trials times that of one (Bonferroni). Residuals of real machines are not white: the height of a
 peak counts in units of the spectrum that remains around it.
+
+Once a wave is found, ratio and σ come from fits that hold it: to the first fit it was noise, and
+with too large a noise the constants are stiff and draw the ratio to one side. A constant that the
+fit moved further than its prior floats as far there.
 """
 
 from dataclasses import dataclass, replace
@@ -49,6 +53,11 @@ AROUND = 5.0
 OVERSAMPLING = 6
 #: Photographs this close together, s, are one visit: their errors are alike.
 VISIT = 300.0
+#: Harmonics of a known ratio: a bore off centre errs once in a turn of the worm, an oval worm twice
+#: (Malan, thesis, 6.4), one with three lobes three times.
+HARMONICS = np.array([1.0, 2.0, 3.0])
+#: Fits that take the wave of a ratio that is found into account, each from the ratio of the last.
+REFINEMENTS = 3
 #: Residuals of the robust fit longer than this, in units of its scale, do not count.
 OUTLIER = 5.0
 
@@ -64,13 +73,15 @@ class PeriodicError:
     ratio
         Periods in a turn of the joint (rotary), or radians in a metre of stroke (jack).
     sigma
-        Standard deviation of the ratio.
+        Standard deviation of the ratio; 0 for a harmonic of a known one.
     amplitude, phase
         A and δ of each heliostat, rad, (N,); NaN where a heliostat has too few sightings.
     false_alarm
         Probability that chance makes so high a peak anywhere in the search, at most.
     clear
         Whether no other ratio explains the sightings nearly as well.
+    known
+        Ratio that the plant gives, of which ``ratio`` is a harmonic; 0 if unknown.
     """
 
     joint: str
@@ -80,11 +91,18 @@ class PeriodicError:
     phase: FloatArray
     false_alarm: float
     clear: bool
+    known: float = 0.0
 
     @property
     def found(self) -> bool:
         """Whether the error is significant and its ratio unambiguous."""
         return self.clear and self.false_alarm < LEVEL
+
+    @property
+    def _ratio(self) -> str:
+        if not self.known:
+            return f"{self.ratio:.2f} ± {self.sigma:.2f}"
+        return f"{self.ratio:g}, {self.ratio / self.known:.0f} times the known {self.known:g}"
 
     def document(self) -> dict[str, Any]:
         """Return the error for JSON."""
@@ -92,6 +110,7 @@ class PeriodicError:
             "joint": self.joint,
             "ratio": self.ratio,
             "ratio_sigma": self.sigma,
+            "known_ratio": self.known or None,
             "amplitude_mrad": [float(1e3 * a) if np.isfinite(a) else None for a in self.amplitude],
             "phase_deg": [float(np.degrees(p)) if np.isfinite(p) else None for p in self.phase],
             "false_alarm": self.false_alarm,
@@ -104,9 +123,9 @@ class PeriodicError:
         seen = int(np.isfinite(self.amplitude).sum())
         phase = f", phase {np.degrees(self.phase[0]):.0f}°" if len(self.phase) == 1 else ""
         return (
-            f"Periodic error on {self.joint}: ratio {self.ratio:.2f} ± {self.sigma:.2f}, amplitude "
-            f"{size:.2f} mrad{phase}, from {seen} heliostat{'s' if seen != 1 else ''}, "
-            f"false-alarm probability {max(self.false_alarm, 1e-99):.0e}"
+            f"Periodic error on {self.joint}: ratio {self._ratio}, amplitude {size:.2f} mrad"
+            f"{phase}, from {seen} heliostat{'s' if seen != 1 else ''}, false-alarm probability "
+            f"{max(self.false_alarm, 1e-99):.0e}"
         )
 
 
@@ -159,11 +178,13 @@ class _Member:
 def search_periodic_errors(
     mechanism: Mechanism, sightings: Sightings, *, used: npt.ArrayLike | None = None
 ) -> tuple[PeriodicError, ...]:
-    """Return the best periodic error of each drive without a known ratio, the clearest first.
+    """Return the best periodic error of each drive whose ratio is unknown, the clearest first.
 
     Each has its probability of chance; take those that are `PeriodicError.found`. The search is
     over `FEWEST_TURNS` to as many turns within the range of the drive as there are visits: more
-    turns than visits cannot be told from fewer. Empty if the sightings are too few.
+    turns than visits cannot be told from fewer. Of a drive whose ratio is known only the
+    `HARMONICS` are tried, and an error is returned only if one of them is found. Empty if the
+    sightings are too few.
 
     Parameters
     ----------
@@ -175,32 +196,23 @@ def search_periodic_errors(
         Mask of the sightings to learn from, (M,).
     """
     keep = np.ones(len(sightings), np.bool_) if used is None else np.asarray(used, np.bool_)
-    members = _members(mechanism, sightings.take(np.flatnonzero(keep)))
-    open_drives = [
-        k
-        for k, ratio in enumerate(_ratios(mechanism))
-        if not (ratio != 0.0).any() and f"{_joint(mechanism, k)}_worm_cos" in mechanism.parameters
-    ]
-    found: list[PeriodicError] = []
-    while members and open_drives:
-        best = _strongest(mechanism, members, open_drives)
-        if best is None:
-            break
+    s = sightings.take(np.flatnonzero(keep))
+    drives, found = _known_ratios(mechanism), list[PeriodicError]()
+    while drives and (best := _strongest(mechanism, s, drives, tuple(found))) is not None:
         drive, error = best
         found.append(error)
-        open_drives.remove(drive)
+        del drives[drive]
         if not error.found:
             break
-        members = [_without(m, drive, error.ratio) for m in members]
-        members = [m for m in members if m.freedom >= FREEDOM]
-    return tuple(found)
+    return tuple(e for e in found if not e.known or (e.found and e.ratio != e.known))
 
 
 def with_ratios(mechanism: Mechanism, errors: tuple[PeriodicError, ...]) -> Mechanism:
     """Return the mechanism with the ratios of the errors that are found."""
     for error in errors:
         if error.found:
-            mechanism = mechanism.with_parameters({f"{error.joint}_worm_ratio": error.ratio})
+            shift = {f"{error.joint}_worm_ratio": error.ratio - error.known}
+            mechanism = mechanism.with_parameters(shift)
     return mechanism
 
 
@@ -208,10 +220,17 @@ def _joint(mechanism: Mechanism, drive: int) -> str:
     return mechanism.joints[mechanism.driven[drive]]
 
 
-def _ratios(mechanism: Mechanism) -> FloatArray:
-    """Known ratios, (D, N)."""
-    table = mechanism.drives.table[..., SLOTS["worm_ratio"]]
-    return np.asarray(table.reshape(-1, len(mechanism.driven)).T)
+def _known_ratios(mechanism: Mechanism) -> dict[int, float]:
+    """Ratio of each drive that may have a periodic error, 0 if unknown.
+
+    A drive whose heliostats have several ratios is left out: an error has one ratio.
+    """
+    table = mechanism.drives.table[..., SLOTS["worm_ratio"]].reshape(-1, len(mechanism.driven))
+    return {
+        k: float(table[0, k])
+        for k in range(table.shape[1])
+        if np.ptp(table[:, k]) == 0.0 and f"{_joint(mechanism, k)}_worm_cos" in mechanism.parameters
+    }
 
 
 def arguments(drives: Drive, counts: FloatArray) -> FloatArray:
@@ -221,32 +240,41 @@ def arguments(drives: Drive, counts: FloatArray) -> FloatArray:
     return np.asarray(np.where(t[..., slot.KIND] == slot.LINEAR, moved, t[..., slot.ZERO] + moved))
 
 
-def _members(mechanism: Mechanism, s: Sightings) -> list[_Member]:
-    """Heliostats with enough visits after a robust fit of all constants."""
-    names = parameter_table.model("full", mechanism.parameters)
+def _members(
+    mechanism: Mechanism, s: Sightings, worms: tuple[str, ...] = (), out: int = 0
+) -> list[_Member]:
+    """Heliostats with enough visits after a robust fit of all constants and of known worms.
+
+    The last ``out`` of the ``worms`` are fitted, so that the noise is known without them, but they
+    do not float with the constants.
+    """
+    names = (*parameter_table.model("full", mechanism.parameters), *worms)
     fitted = fit(mechanism, s, names)
     s = s.take(np.flatnonzero(np.isfinite(fitted.lengths) & (fitted.lengths < OUTLIER)))
     biases = tuple(f"{_joint(mechanism, k)}_bias" for k in range(len(mechanism.driven)))
     moved = mechanism.with_parameters(fitted.parameters)
     line = linearise(moved[s.heliostat], s, names + biases)
     x = arguments(Drive(mechanism.drives.table[s.heliostat]), s.counts)
+    floating = len(names) - out
     members = []
     for row in range(len(mechanism)):
         mine = np.flatnonzero(s.heliostat == row)
-        if 2 * len(mine) < len(names) + FREEDOM:
+        if 2 * len(mine) < floating + FREEDOM:
             continue
         mean = _visit_means(s.time[mine], x[mine])
         slope = np.einsum("vm,map->vap", mean, line.jacobian[mine])
-        constants, lever = np.split(slope, [len(names)], axis=2)
+        at = fitted.values[row] - fitted.centre[row]
+        # Errors of installation beyond the priors would bias a ratio, but hardly hide one.
+        far = np.maximum(fitted.prior[row], np.abs(at) if out else 0.0)
+        residual = mean @ line.residual[mine] - slope[..., : len(names)] @ at
         member = _Member(
             row,
             mean @ x[mine],
-            lever,
+            slope[..., len(names) :],
             *_whitened(
-                (mean @ line.residual[mine]).ravel(),
-                constants.reshape(-1, len(names)),
-                fitted.values[row] - fitted.centre[row],
-                WIDER * fitted.prior[row] / max(float(fitted.scale[row]), 1e-9),
+                residual.ravel(),
+                slope[..., :floating].reshape(-1, floating),
+                WIDER * far[:floating] / max(float(fitted.scale[row]), 1e-9),
             ),
         )
         if member.freedom >= FREEDOM and float(member.rest @ member.rest) > 0.0:
@@ -255,13 +283,13 @@ def _members(mechanism: Mechanism, s: Sightings) -> list[_Member]:
 
 
 def _whitened(
-    residual: FloatArray, constants: FloatArray, at: FloatArray, prior: FloatArray
+    residual: FloatArray, constants: FloatArray, prior: FloatArray
 ) -> tuple[FloatArray, FloatArray, int]:
     """Whitening matrix, whitened residuals at the centre of the priors, degrees of freedom."""
     moved = constants * prior
     spread = np.eye(len(residual)) + moved @ moved.T
     whiten = np.linalg.inv(np.linalg.cholesky(spread))
-    return whiten, whiten @ (residual - constants @ at), len(residual) - constants.shape[1]
+    return whiten, whiten @ residual, len(residual) - constants.shape[1]
 
 
 def visit_means(mechanism: Mechanism, s: Sightings) -> FloatArray:
@@ -298,8 +326,8 @@ def _without(member: _Member, drive: int, ratio: float) -> _Member:
     )
 
 
-def _trials(members: list[_Member], drive: int) -> tuple[FloatArray, float]:
-    """Trial ratios (T,) of a drive, and the width of a peak."""
+def _grid(members: list[_Member], drive: int) -> tuple[FloatArray, float]:
+    """Trial ratios (T,) of a drive of unknown ratio, and the width of a peak."""
     span = float(max(np.ptp(m.x[:, drive]) for m in members))
     visits = float(np.median([len(m.x) for m in members]))
     if span <= 0.0 or visits < FEWEST_TURNS:
@@ -309,55 +337,91 @@ def _trials(members: list[_Member], drive: int) -> tuple[FloatArray, float]:
     return np.arange(FEWEST_TURNS * width, visits * width, step), width
 
 
+def _power(members: list[_Member], drive: int, ratios: FloatArray) -> FloatArray:
+    """−ln P of trial ratios, summed over the heliostats, (T,)."""
+    return as_float(np.sum([m.solved(drive, ratios)[1] for m in members], axis=0))
+
+
+def _peak(
+    members: list[_Member], drive: int, near: float, step: float
+) -> tuple[float, float, float]:
+    """Ratio of the highest −ln P within a step of ``near``, its height, and the ratio's σ."""
+
+    def lost(ratio: float) -> float:
+        return -float(_power(members, drive, np.array([ratio]))[0])
+
+    bounds = (near - step, near + step)
+    found = minimize_scalar(lost, bounds=bounds, method="bounded")
+    ratio, height = float(found.x), -float(found.fun)
+    # −ln P is a log likelihood ratio but for terms of order 1/ν: its curvature gives the variance.
+    far = 0.25 * step
+    curvature = (lost(ratio + far) + 2.0 * height + lost(ratio - far)) / far**2
+    return ratio, height, float(1.0 / np.sqrt(max(curvature, 1e-12)))
+
+
 def _strongest(
-    mechanism: Mechanism, members: list[_Member], drives: list[int]
+    mechanism: Mechanism, s: Sightings, drives: dict[int, float], taken: tuple[PeriodicError, ...]
 ) -> tuple[int, PeriodicError] | None:
-    """The drive with the highest peak, and its error."""
+    """The drive with the highest peak, and its error; the waves of ``taken`` errors float."""
+    members = _members(with_ratios(mechanism, taken), s, _worms(taken))
     spectra: dict[int, tuple[FloatArray, FloatArray, float]] = {}
-    for drive in drives:
-        ratios, width = _trials(members, drive)
+    grids = {k: _grid(members, k) for k in drives} if members else {}
+    for drive, (grid, width) in grids.items():
+        known, ratios = drives[drive], grid
+        if known and len(grid):
+            turns = np.abs(known) * HARMONICS
+            ratios = known * HARMONICS[(turns >= grid[0]) & (turns <= grid[-1])]
         if len(ratios):
-            power = np.sum([m.solved(drive, ratios)[1] for m in members], axis=0)
-            spectra[drive] = ratios, power, width
+            spectra[drive] = ratios, _power(members, drive, ratios), width
     if not spectra:
         return None
     drive = max(spectra, key=lambda k: float(spectra[k][1].max()))
     ratios, power, width = spectra[drive]
-    top = float(ratios[np.argmax(power)])
-    step = width / OVERSAMPLING
-
-    def lost(ratio: float) -> float:
-        return -sum(float(m.solved(drive, np.array([ratio]))[1][0]) for m in members)
-
-    refined = minimize_scalar(lost, bounds=(top - step, top + step), method="bounded")
-    ratio, height = float(refined.x), -float(refined.fun)
-    # −ln P is a log likelihood ratio but for terms of order 1/ν: its curvature gives the variance.
-    far = 0.25 * step
-    curvature = (lost(ratio + far) - 2.0 * lost(ratio) + lost(ratio - far)) / far**2
+    known, step = drives[drive], width / OVERSAMPLING
+    ratio, height = float(ratios[np.argmax(power)]), float(power.max())
+    sigma, slow, near = 0.0, False, 0.0
+    if not known:
+        ratio, height, sigma = _peak(members, drive, ratio, step)
+        # Power that grows up to the first trial belongs to slower waves: no peak.
+        slow, near = ratio <= ratios[0] + 0.5 * step, width
     others = [
-        spectrum[1][np.abs(spectrum[0] - ratio) > spectrum[2]] if k == drive else spectrum[1]
+        spectrum[1][np.abs(spectrum[0] - ratio) > near] if k == drive else spectrum[1]
         for k, spectrum in spectra.items()
     ]
     rival = max((float(o.max()) for o in others if len(o)), default=0.0)
     trials = sum(len(spectrum[0]) for spectrum in spectra.values())
-    # Power that grows up to the first trial belongs to slower waves: no peak.
-    clear = height - rival > RIVAL and ratio > ratios[0] + 0.5 * step
-    height /= _colour(members, drive, ratio, ratios, width)
-    chance = min(1.0, trials * float(gammaincc(len(members), height)))
-    amplitude, phase = np.full((2, len(mechanism)), np.nan)
+    colour = _colour(members, drive, abs(ratio), grids[drive][0], width)
+    error = PeriodicError(
+        joint=_joint(mechanism, drive),
+        ratio=ratio,
+        sigma=sigma * float(np.sqrt(colour)),
+        amplitude=np.full(len(mechanism), np.nan),
+        phase=np.full(len(mechanism), np.nan),
+        false_alarm=min(1.0, trials * float(gammaincc(len(members), height / colour))),
+        clear=height - rival > RIVAL and not slow,
+        known=known,
+    )
+    for _ in range(REFINEMENTS if error.found else 0):
+        # The wave was noise to the fit that found it: too large a noise makes the constants stiff,
+        # and stiff constants bias the ratio.
+        errors = (*taken, error)
+        members = _members(with_ratios(mechanism, errors), s, _worms(errors), out=2)
+        if not known:
+            ratio, _, sigma = _peak(members, drive, error.ratio, step)
+            error = replace(error, ratio=ratio, sigma=sigma * float(np.sqrt(colour)))
     for m in members:
         # The residual is model minus measurement: the error has the opposite sign.
-        cosine, sine = -m.solved(drive, np.array([ratio]))[0][0]
-        amplitude[m.row], phase[m.row] = np.hypot(cosine, sine), np.arctan2(sine, cosine)
-    return drive, PeriodicError(
-        _joint(mechanism, drive),
-        ratio,
-        float(1.0 / np.sqrt(max(curvature, 1e-12))),
-        amplitude,
-        phase,
-        chance,
-        clear,
-    )
+        cosine, sine = -m.solved(drive, np.array([error.ratio]))[0][0]
+        error.amplitude[m.row], error.phase[m.row] = (
+            np.hypot(cosine, sine),
+            np.arctan2(sine, cosine),
+        )
+    return drive, error
+
+
+def _worms(errors: tuple[PeriodicError, ...]) -> tuple[str, ...]:
+    """Parameters of the waves that are found."""
+    return tuple(f"{e.joint}_worm_{part}" for e in errors if e.found for part in ("cos", "sin"))
 
 
 def _colour(
@@ -369,8 +433,8 @@ def _colour(
     Jülich twice as high as noise up to some ten turns.
     """
     rest = [_without(m, drive, ratio) for m in members if m.freedom > FREEDOM]
-    near = ratios[np.abs(ratios - ratio) < AROUND * width]
     if not rest:
         return 1.0
-    power = np.sum([m.solved(drive, near)[1] for m in rest], axis=0)
+    near = ratios[np.abs(ratios - ratio) < AROUND * width]
+    power = _power(rest, drive, near)
     return max(1.0, float(np.median(power)) / float(gammaincinv(len(rest), 0.5)))

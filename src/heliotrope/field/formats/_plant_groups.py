@@ -147,7 +147,11 @@ class _Reader:
         if group.kind == "pitch_roll" and "facing_deg" in arguments:
             arguments["azimuth"] = np.radians(arguments.pop("facing_deg"))
         builder = getattr(kinds, group.kind)
-        needed = {"target_aligned": ("aim_m",), "two_axis": ("axis_1", "axis_2", "normal")}
+        needed = {
+            "target_aligned": ("aim_m",),
+            "two_axis": ("axis_1", "axis_2", "normal"),
+            "single_axis": ("axis",),
+        }
         for key in needed.get(group.kind, ()):
             if getattr(group, key) is None:
                 raise self.fail(f"{key} is missing; kind {group.kind} needs it")
@@ -285,6 +289,10 @@ class _Reader:
         first = table.leaves_stow_first or joints[0]
         if first not in joints:
             raise self.fail(f"{first!r} is no driven joint; they are {joints}", "machine")
+        if len(joints) != 2:
+            raise self.fail(
+                "local controllers drive two joints, and this kind has one; remove it", "machine"
+            )
         drives = Drive(
             np.broadcast_to(mechanism.drives.table, (len(self.rows), 2, slot.DRIVE_SLOTS))
         )
@@ -375,8 +383,9 @@ class _Reader:
         return spread_defocus(given * ANGLE_UNITS[units[0]], names, table.defocus_spread)
 
 
-def _joint_names(kind: str) -> tuple[str, str]:
+def _joint_names(kind: str) -> tuple[str, ...]:
     return {
+        "single_axis": ("rotation",),
         "azimuth_elevation": ("azimuth", "elevation"),
         "two_jacks": ("elevation", "azimuth"),
         "polar": ("hour_angle", "declination"),

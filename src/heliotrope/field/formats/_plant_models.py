@@ -19,6 +19,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     "pitch_roll": ("facing_deg", "pivot_height_m", "spacing_m", "pivot_offset_m"),
     "polar": ("latitude_deg", "pivot_height_m", "pivot_offset_m"),
     "two_axis": ("axis_1", "axis_2", "normal", "origin_1_m", "origin_2_m", "arm_m", "vertex_m"),
+    "single_axis": ("axis", "normal", "pivot_height_m", "vertex_m"),
     "two_jacks": (
         "joint_translation_1_m", "joint_translation_2_m", "concentrator_translation_m",
     ),

@@ -8,9 +8,12 @@ functions below read its meaning::
       Factory  Material; HeliostatKit (name): Primary, Secondary (translation,
                rotationAxis, rotationAngles = stops), Facet (translation, rotation;
                ShapeKit), Angles, Tracking (point, normal), Aiming (point)
+               without Secondary: a single-axis tracker
       Scene    Node (name, translation, rotation), nested; in it ShapeKit or HeliostatKit ref
 
-The frame is ENU; the sun's azimuth is clockwise from north. A rotation is three Euler
+The frame is ENU; the sun's azimuth is clockwise from north. ``Aiming`` is a point of ENU for
+global aiming; the same element holds a point of the heliostat's frame for local aiming, and the
+file does not say which it is. A rotation is three Euler
 angles about the fixed axes x, then y, then z: R = Rz·Ry·Rx. A mirror or another surface
 lies in x and y of its own frame, its normal along z.
 
@@ -35,7 +38,7 @@ from heliotrope.files import Document, XmlElement, read_xml
 from heliotrope.geometry import FloatArray, angle_between, as_float, direction, normalize
 from heliotrope.mechanism.armature import check_axes
 from heliotrope.mechanism.drives import Drive, direct
-from heliotrope.mechanism.kinds import two_axis
+from heliotrope.mechanism.kinds import single_axis, two_axis
 from heliotrope.sun import Site
 
 __all__ = [
@@ -111,25 +114,31 @@ class Model:
     name
         Unique.
     primary, secondary
-        The driven axes.
+        The driven axes; ``secondary`` is None for a single-axis tracker.
     facets
-        Facets in the frame beyond the secondary axis.
+        Facets in the frame beyond the last axis.
     angles
-        Primary and secondary angle at the start, rad, (2,).
+        Angle of each axis at the start, rad, (2,) or (1,).
     point, normal
-        Vertex (m) and unit normal that tracking uses, beyond the secondary axis, (3,).
+        Vertex (m) and unit normal that tracking uses, beyond the last axis, (3,).
     aim
-        Aim point, ENU metres, (3,); None if the file gives none.
+        Aim point in metres, ENU (global aiming) or in the heliostat's frame at zero angles (local
+        aiming), (3,); None if the file gives none.
     """
 
     name: str
     primary: DrivenAxis
-    secondary: DrivenAxis
+    secondary: DrivenAxis | None
     facets: tuple[Surface, ...]
     angles: FloatArray
     point: FloatArray
     normal: FloatArray
     aim: FloatArray | None
+
+    @property
+    def axes(self) -> tuple[DrivenAxis, ...]:
+        """The driven axes from the ground to the mirror, one or two."""
+        return (self.primary,) if self.secondary is None else (self.primary, self.secondary)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,16 +220,19 @@ def _model(values: Values, element: XmlElement, name: str) -> Model:
     if not normal.any():
         raise values.error(tracking, "<Tracking> normal: a vector of length 0 has no direction")
     primary = _axis(values, values.child(element, "Primary"))
-    secondary = _axis(values, values.child(element, "Secondary"))
-    try:
-        check_axes(primary.direction, secondary.direction)
-    except InputError as error:
-        raise values.error(element, f"HeliostatKit {name}: {error}") from None
+    parts, last, secondary = ["primary"], primary, None
+    if any(True for _ in element.elements("Secondary")):
+        secondary = last = _axis(values, values.child(element, "Secondary"))
+        parts.append("secondary")
+        try:
+            check_axes(primary.direction, secondary.direction)
+        except InputError as error:
+            raise values.error(element, f"HeliostatKit {name}: {error}") from None
     normal = normalize(normal)
-    if np.linalg.norm(np.cross(normal, secondary.direction)) < ALONG_LIMIT:
+    if np.linalg.norm(np.cross(normal, last.direction)) < ALONG_LIMIT:
         raise values.error(
             tracking,
-            f"HeliostatKit {name}: the normal lies along the secondary axis, which "
+            f"HeliostatKit {name}: the normal lies along the {parts[-1]} axis, which "
             "then cannot turn it",
         )
     return Model(
@@ -228,9 +240,7 @@ def _model(values: Values, element: XmlElement, name: str) -> Model:
         primary=primary,
         secondary=secondary,
         facets=tuple(_facet(values, facet, normal) for facet in element.elements("Facet")),
-        angles=np.concatenate(
-            [values.angles(angles, part, 1) for part in ("primary", "secondary")]
-        ),
+        angles=np.concatenate([values.angles(angles, part, 1) for part in parts]),
         point=values.lengths(tracking, "point", 3),
         normal=normal,
         aim=values.lengths(aiming[0], "point", 3) if aiming else None,
@@ -409,8 +419,9 @@ def sun(document: Document) -> FloatArray:
 def to_plant(document: Document, site: Site) -> Plant:
     """Return the plant that a document describes.
 
-    Heliostats become mechanisms of kind "two_axis" with angles as counts; those with parallel
-    primary axes and the same number of facets share a group. Surfaces below a
+    Heliostats become mechanisms of kind "two_axis", or "single_axis" where there is no secondary
+    axis, with angles as counts; those of one kind with parallel primary axes and the same number
+    of facets share a group. Surfaces below a
     node named "Targets" become targets, all others receivers. Materials, curved
     shapes, the sun and starting angles have no place in a plant and stay in the document.
 
@@ -428,7 +439,7 @@ def to_plant(document: Document, site: Site) -> Plant:
         parallel or a name occurs twice.
     """
     path = document.path or "HelioK document"
-    members: dict[tuple[int, int], list[PlacedModel]] = {}
+    members: dict[tuple[int, int, int], list[PlacedModel]] = {}
     for placed in heliostats(document):
         model = placed.model
         if not model.facets:
@@ -436,11 +447,12 @@ def to_plant(document: Document, site: Site) -> Plant:
                 path, f"HeliostatKit {model.name}: no <Facet>, so its mirror has no size; add one"
             )
         upright = int(np.argmax(np.abs(model.primary.direction)))
-        members.setdefault((upright, len(model.facets)), []).append(placed)
+        key = (upright, len(model.facets), len(model.axes))
+        members.setdefault(key, []).append(placed)
     several = len(members) > 1
     groups = {
         f"heliostats-{k}" if several else "heliostats": _group(same, upright)
-        for k, ((upright, _), same) in enumerate(members.items(), start=1)
+        for k, ((upright, *_), same) in enumerate(members.items(), start=1)
     }
     targets: list[Target] = []
     receivers: list[Receiver] = []
@@ -492,21 +504,38 @@ def _receiver(surface: Surface, name: str) -> Receiver:
 def _group(placed: list[PlacedModel], upright: int) -> Heliostats:
     """Return heliostats whose primary axes all lie nearest to axis ``upright`` of their frame."""
     models_ = [one.model for one in placed]
-    primary, secondary = [m.primary for m in models_], [m.secondary for m in models_]
     normal, point = np.array([m.normal for m in models_]), np.array([m.point for m in models_])
     first, second = (name for k, name in enumerate(_LEANS) if k != upright)
-    mechanism = two_axis(
-        np.array([one.position for one in placed]),
-        np.array([axis.direction for axis in primary]),
-        np.array([axis.direction for axis in secondary]),
-        normal,
-        leans=(first, second),
-        origin_1=np.array([axis.origin for axis in primary]),
-        origin_2=np.array([axis.origin for axis in secondary]),
-        vertex=point,
-        orientation=np.array([one.orientation for one in placed]),
-        drives=(_drive(primary), _drive(secondary)),
-    )
+    position = np.array([one.position for one in placed])
+    orientation = np.array([one.orientation for one in placed])
+    axes = list(zip(*(m.axes for m in models_), strict=True))
+    along = [np.array([axis.direction for axis in each]) for each in axes]
+    origin = [np.array([axis.origin for axis in each]) for each in axes]
+    drives = [_drive(each) for each in axes]
+    if len(axes) == 1:
+        mechanism = single_axis(
+            position,
+            along[0],
+            normal,
+            leans=(first, second),
+            origin=origin[0],
+            vertex=point,
+            orientation=orientation,
+            drives=(drives[0],),
+        )
+    else:
+        mechanism = two_axis(
+            position,
+            along[0],
+            along[1],
+            normal,
+            leans=(first, second),
+            origin_1=origin[0],
+            origin_2=origin[1],
+            vertex=point,
+            orientation=orientation,
+            drives=(drives[0], drives[1]),
+        )
     facets = _facets(models_, mirror_frame(normal), point)
     corners = facets.center[:, :, None] + np.stack(
         [a * facets.half_width + b * facets.half_height for a in (-1, 1) for b in (-1, 1)], axis=2
@@ -523,7 +552,7 @@ def _group(placed: list[PlacedModel], upright: int) -> Heliostats:
     )
 
 
-def _drive(axes: list[DrivenAxis]) -> Drive:
+def _drive(axes: tuple[DrivenAxis, ...]) -> Drive:
     """Return drives whose counts are radians, one an axis, with its stops."""
     stops = np.array([axis.stops for axis in axes])
     each = Drive(np.tile(direct().table, (len(axes), 1)))

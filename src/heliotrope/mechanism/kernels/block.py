@@ -172,9 +172,11 @@ def solve_branch(g, s, p, m, sign, local, tolerance, limit, newton, stops, near)
     n = (g[15], g[16], g[17])
     u, v, rest = n, s, np.nan
     if local:
-        u = local_direction(g, p)
-        if u == (0.0, 0.0, 0.0) or s == (0.0, 0.0, 0.0):
-            return DEGENERATE, 0, np.nan, np.nan, np.nan, nothing, nothing
+        status, u = local_direction(g, p)
+        if s == (0.0, 0.0, 0.0):
+            status = DEGENERATE
+        if status != OK:
+            return status, 0, np.nan, np.nan, np.nan, nothing, nothing
         reached, t = solve_direction(g, constants(g, u), u, v, sign)
         status, iterations, m = OK if reached else UNREACHABLE, 1, place_vertex(g, t)
     else:

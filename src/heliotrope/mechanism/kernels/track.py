@@ -35,6 +35,7 @@ UNREACHABLE = 1  # inside the dead cone around the primary axis
 STOPPED = 2  # beyond a stop
 NOT_CONVERGED = 3
 DEGENERATE = 4  # source opposite to aim, aim in the vertex, or a value not finite
+BEHIND = 5  # an aim fixed to the mirror that its front does not face
 
 #: The fixed point is left for Newton when a step gains less than this factor.
 SLOW = 0.3
@@ -374,13 +375,15 @@ def solve_aim(g, s, p, m, sign, tolerance, limit, newton):
 def local_direction(g, aim):
     """Where the source must stand, at zero angles, to light point ``aim`` fixed to the mirror.
 
-    It is the aim's direction reflected in the normal; a zero vector if the aim is in the vertex.
+    It is the aim's direction reflected in the normal. Returns (status, direction): DEGENERATE if
+    the aim is in the vertex, BEHIND if it is not before the mirror.
     """
-    way = (aim[0] - g[12], aim[1] - g[13], aim[2] - g[14])
+    n = mirror_normal(g, (0.0, 1.0, 0.0, 1.0))
+    way = served(g, minus(aim, (g[12], g[13], g[14])))
     size = norm(way)
     if not size > DEGENERATE_LIMIT:
-        return 0.0, 0.0, 0.0
+        return DEGENERATE, way
     way = times(1.0 / size, way)
-    n = (g[15], g[16], g[17])
-    u = minus(times(2.0 * dot(way, n), n), way)
-    return served(g, u)
+    if not dot(way, n) > 0.0:
+        return BEHIND, way
+    return OK, minus(times(2.0 * dot(way, n), n), way)
