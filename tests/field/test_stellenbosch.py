@@ -8,9 +8,12 @@ import pytest
 
 from heliotrope.field.layouts import HeliostatSize, nearest_gap
 from heliotrope.field.stellenbosch import MICROSTEPS, STEPS, WORM, prototype
+from heliotrope.geometry import angle_between, normalize
 from heliotrope.mechanism import track
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.kernels import slots as slot
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.schedule.settings import Settings
 from heliotrope.sun import vector
 
 MRAD = 1e-3
@@ -35,6 +38,19 @@ def test_targets_are_four_square_metres_forty_metres_away() -> None:
     assert receiver.center[2] + 0.5 * receiver.height <= 18.0
     place = GROUP.position[GROUP.names.index("S3B")]
     np.testing.assert_allclose(place, [19.2, -30.8, 0.0], atol=1e-9)
+
+
+def test_no_sun_of_the_year_dazzles_the_camera() -> None:
+    (camera,), (target,) = PLANT.cameras, PLANT.targets
+    assert camera.position is not None
+    begin = datetime(2026, 1, 1, tzinfo=UTC).timestamp()
+    suns = vector(begin + np.arange(0.0, 365.0 * 86_400.0, 1200.0), PLANT.site)
+    high = suns[suns[:, 2] > np.sin(AutomaticSettings().lowest)]
+    line = np.broadcast_to(normalize(target.center - camera.position), high.shape)
+    assert angle_between(line, high).min() > 1.5 * Settings().glare
+    # It stands clear of the beams, which come from the heliostats straight ahead of the target.
+    apart = np.linalg.norm(GROUP.position - camera.position, axis=-1)
+    assert apart.min() > 10.0
 
 
 def test_a_turn_has_48_000_steps_and_a_full_step_is_a_milliradian() -> None:

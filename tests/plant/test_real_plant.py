@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from heliotrope.field.camera import Camera
 from heliotrope.field.layouts import malan_plant
@@ -29,13 +30,14 @@ from heliotrope.twin.drawing import PEAK
 from heliotrope.twin.live import World
 from support.live import in_thread
 
-#: Heliostats that must have learnt, and the time for it, s.
-LEARNT, PATIENCE = 2, 200.0
+#: Heliostats of the plant, two of which must have learnt, and the time for it, s. A target has six
+#: of them at a time, whose stack takes eight photographs, one in three seconds.
+HELIOSTATS, LEARNT, PATIENCE = 12, 2, 200.0
 
 
 def at_noon() -> Plant:
-    """A small plant where the sun stands in the meridian now."""
-    design, now = malan_plant(32), datetime.now(UTC)
+    """A plant where the sun stands in the meridian now, small enough for a short stack."""
+    design, now = malan_plant(HELIOSTATS), datetime.now(UTC)
     longitude = (12.0 - now.hour - now.minute / 60.0) * 15.0
     return replace(design, site=replace(design.site, longitude_deg=longitude))
 
@@ -61,7 +63,7 @@ def drawn(world: World) -> Any:
 
 @pytest.mark.slow
 def test_a_real_plant_learns_from_its_cameras(tmp_path: Path) -> None:
-    async def main() -> dict[str, tuple[float, float]]:
+    async def main() -> NDArray[np.float64]:
         clock, design = SystemClock(), at_noon()
         world = World(design, clock)
         cameras = RealCameras(
@@ -82,16 +84,17 @@ def test_a_real_plant_learns_from_its_cameras(tmp_path: Path) -> None:
                 while plant.operations.calibration().done < LEARNT:
                     await asyncio.sleep(0.5)
             after = world.errors()
-            rows = np.flatnonzero(np.isfinite(plant.operations.automatic.book.error))
-            found = {str(row): (float(before[row]), float(after[row])) for row in rows}
+            said = plant.operations.automatic.book.error
+            found = np.stack([before, after, said], axis=1)[np.isfinite(said)]
             assert await plant.stowed()
             assert plant.left() == ""
             await plant.end()
         return found
 
-    found = asyncio.run(main())
-    print(found)
-    assert len(found) >= LEARNT
-    # One target tells not everything: but every mirror stands better than it was installed.
-    assert np.median([after for _, after in found.values()]) < 2e-3
+    before, after, said = asyncio.run(main()).T
+    assert len(before) >= LEARNT
+    # One target and one sun do not tell everything: on the receiver mirrors miss by less than they
+    # did as installed, and by no more than the plant says.
+    assert np.median(after) < 0.6 * np.median(before)
+    assert np.sqrt(np.mean((after / said) ** 2)) < 2.0
     assert list((tmp_path / "m").glob("*.npz"))

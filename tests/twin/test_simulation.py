@@ -1,9 +1,11 @@
 """Deterministic simulation: no invariant broken; each planted defect found, replayed, shrunk."""
 
 import re
+import runpy
 import shlex
 from dataclasses import replace
 from math import sin
+from pathlib import Path
 
 import pytest
 from _pytest.mark import ParameterSet
@@ -26,6 +28,7 @@ from heliotrope.twin.world.tour import TOUR_LENGTH
 from heliotrope.twin.world.worlds import DAYS, MIX, RARE, WORLDS, mixed
 from support.twin_defects import DEFECTS, Defect
 
+ROOT = Path(__file__).parents[2]
 #: Seeds that may be spent on a defect.
 SEEDS = 8
 
@@ -54,6 +57,24 @@ def test_a_planted_defect_is_found_and_nothing_without_it(defect: Defect) -> Non
     sound = run(replace(found.plan, seconds=seconds))
     assert sound.good, f"{sound.text}; {sound.command}"
     assert sum(sound.checks.values()) > 100
+
+
+def test_the_page_has_a_row_for_each_planted_defect() -> None:
+    script = runpy.run_path(str(ROOT / "scripts" / "defects.py"))
+    page = script["PAGE"].read_text(encoding="utf-8")
+    names = [defect.name for defect in DEFECTS]
+    # Written anew without a new row, it is the same, and has one for each.
+    assert script["written"]({}, names, page) == page
+    table = page.partition(script["BEGIN"])[2].partition(script["END"])[0]
+    assert len(table.splitlines()) == len(script["HEAD"]) + len(names)
+
+
+def test_rows_of_the_page_are_written_anew_and_others_stay() -> None:
+    script = runpy.run_path(str(ROOT / "scripts" / "defects.py"))
+    begin, end, head = script["BEGIN"], script["END"], "\n".join(script["HEAD"])
+    page = f"Before\n{begin}{head}\n| one | 1 |\n| gone | 2 |\n| two | 3 |\n{end}After\n"
+    new = script["written"]({"two": "| two | 4 |"}, ["one", "two", "three"], page)
+    assert new == f"Before\n{begin}{head}\n| one | 1 |\n| two | 4 |\n{end}After\n"
 
 
 def test_there_is_a_defect_for_each_invariant() -> None:

@@ -37,6 +37,10 @@ _MIRROR, _TARGET = 0.3, 2.0
 _LOWER, _UPPER = 13.0, 17.0
 #: Distance of neighbouring heliostats of a structure, and of the structures' middles, m.
 _SPACING, _APART = 0.75, 3.0
+#: The camera, m: in front of the lower target, above the ground, and to the right of the target.
+#: From here, no sun of the year above 8° comes nearer than 17° to its line of sight; from the
+#: middle, a winter's sun is behind the target for an hour in the afternoon.
+_CAMERA = (30.0, 3.0, -20.0)
 #: Steps/s of the motors: 7.5 °/s of the joint.
 _RATE = 1000.0
 
@@ -66,7 +70,7 @@ def prototype() -> Plant:
         },
         targets=(lower,),
         receivers=(receiver,),
-        cameras=(watching_camera(lower, "camera", 20.0, 2.0, 2.0),),
+        cameras=(watching_camera(lower, "camera", *_CAMERA),),
     )
 
 

@@ -49,9 +49,10 @@ EVERY, _ARCHIVED = 10.0, 5.0
 FORESEE = 1800.0
 #: Time in which a program ends after a second Ctrl-C, s, and its exit code if it had to be killed.
 AT_ONCE, _INTERRUPTED = 2.0, 130
-#: Thresholds of the collector: the last makes full collections rare. Each holds the loop for up to
-#: 0.08 s at 10,000 heliostats; one every ten seconds found next to nothing.
-_COLLECTED = (700, 10, 1000)
+#: Thresholds of the collector. At 10,000 heliostats a beat makes thousands of objects: collecting
+#: the young ones every 700 was most of the longest beats, and a full collection holds the loop for
+#: up to 0.08 s and finds next to nothing.
+_COLLECTED = (50_000, 10, 1000)
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 #: Time between lines while the field goes to stow, and for visits to a simulated field to end, s.
 _SAID, _HALTED = 10.0, 1.0
