@@ -328,6 +328,7 @@ class PlantController:
     def _dispatching(self) -> JoinDispatcher:
         """Return what sends heliostats whose turn to join has come."""
         return JoinDispatcher(
+            self.now,
             self._joining,
             self._orders,
             self._ways,

@@ -6,15 +6,17 @@ as motions are accepted.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 
 import numpy as np
 
+from heliotrope.files.disk import Work
 from heliotrope.geometry import FloatArray
 from heliotrope.plant.audit import AuditError
 from heliotrope.plant.authority import Authority, RefusedError
 from heliotrope.plant.beam_watch import BeamError
-from heliotrope.plant.commands import Commands
+from heliotrope.plant.commands import Commands, NewPoints
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.locks import Locks
 from heliotrope.plant.movements import Movements
@@ -108,25 +110,27 @@ class GivingBack:
             return
         wanted = np.stack([due[name] for name in names])
 
-        def assign() -> frozenset[str]:
-            aimed = [name for name in names if name not in self._movements.names]
-            if aimed:  # while the record was written
-                raise BeamError("AIM", dict.fromkeys(aimed, "it has another aim now"))
-            self._commands.assign("AIM", names, wanted)
-            return self._movements.small(names)
+        def check(some: tuple[str, ...]) -> None:
+            aimed, moved = self._commands.aimed, self._movements.names
+            # While the record was written.
+            if elsewhere := [n for n in some if n in aimed or n not in moved]:
+                raise BeamError("AIM", dict.fromkeys(elsewhere, "it has another aim now"))
 
-        note = f"{len(names)} beams go back to their aims"
-        try:
-            store = self._commands.storing("AIM", names, wanted)
+        def accept(store: tuple[Work, Work] | None) -> Ticket:
+            note = f"{len(names)} beams go back to their aims"
             ticket = self._orders.accept((*_PLANT, "AIM"), (), names, note, store=store)
-        except AuditError:
-            return
-        self._movements.sent(ticket, now)
-        self._commands.when_recorded(ticket, names, wanted, token, assign)
+            self._movements.sent(ticket, now)
+            return ticket
+
+        free = partial(self._movements.small, names)
+        new = NewPoints("AIM", names, wanted, token, check=check, free=free)
+        with suppress(AuditError):
+            self._commands.give_points(new, accept)
 
     def _free_to_return(self, due: Mapping[str, FloatArray]) -> tuple[str, ...]:
         """Return the moved beams that may go back now."""
-        names = tuple(due)
+        aimed = self._commands.aimed  # they go elsewhere when their turn comes
+        names = tuple(name for name in due if name not in aimed)
         while names:
             try:
                 self._permission.refuse_now("AIM", names)
