@@ -1,6 +1,6 @@
 """What a visit holds when the plant's program ends: a new program gives it back, once."""
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Collection
 from datetime import timedelta
 from pathlib import Path
 
@@ -10,7 +10,9 @@ import pytest
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.messages import Command, Emergency
 from heliotrope.plant.assigned import HELD, AssignedFile, Points
+from heliotrope.plant.audit import read
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.lockouts import Kind, Lockout
 from heliotrope.plant.locks import CERTAIN
@@ -280,3 +282,54 @@ def test_an_order_that_is_not_sent_leaves_what_was_held(store: AssignedFile) -> 
     assert store.read()["LOCKED"] == {}
     take_back()
     assert Points(("A",), store).held["LOCKED"] == {"A": (5.0, 0.0, 0.0)}
+
+
+@pytest.mark.parametrize("what", ["UNLOCK", "STOW", "ROUGH"])
+def test_a_cluster_that_may_begin_no_motion_keeps_nothing_from_the_others(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An order to mirrors of two clusters was refused as a whole."""
+    reason = "its clock is wrong"
+
+    async def main(clock: VirtualClock) -> None:
+        async with running(Bench(clock, tmp_path)) as bench:
+            plant, token = bench.plant, await bench.commanded(ENGINEER)
+            homes = list(bench.clusters.values())[:2]
+            names = tuple(home.names[0] for home in homes)
+            held = {homes[1].name}
+
+            def refusal(clusters: Collection[str]) -> str:
+                return reason if held.intersection(clusters) else ""
+
+            def given() -> set[str]:
+                each = [(home, m) for home in homes for m in home.of((Command, Emergency))]
+                return {n for h, m in each if m.name == what for n in m.heliostats or h.names}
+
+            monkeypatch.setattr(plant._sentinel, "refusal", refusal)
+            if what == "ROUGH":
+                for home in homes:
+                    home.rows["flags"][0] = ROUGH
+            else:
+                plant.locks.take(names, 0, plant.now())
+                for home in homes:
+                    home.set(states.LOCKED, home.names[0])
+                if what == "STOW":
+                    plant._ways.ordered.sent("DEFOCUS", names, plant.now() + 0.5)
+            await bench.wait(2.0)
+            with plant.stepping.fine(names if what == "ROUGH" else ()):
+                await bench.wait(6.0)
+                assert given() == {names[0]}
+                if what != "ROUGH":
+                    text = f"command authority; now they are not: {reason}"
+                    assert plant.locked_for(names[1]).endswith(text)
+                plant.authority.keep(ENGINEER, token)
+                held.clear()
+                await bench.wait(8.0)
+                assert given() == set(names)
+
+    run_virtual(main)
+    results = [r.result for r in read(tmp_path / "audit.jsonl")[0] if r.what == what]
+    if what != "STOW":
+        assert f"1 done, 1 failed (P2A: {reason})" in results[0]
+        named = [result for result in results if reason in result]
+        assert all("1 done" in result for result in named), "no order is for that one alone"
