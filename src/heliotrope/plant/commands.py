@@ -31,6 +31,8 @@ from heliotrope.plant.tickets import Ticket
 
 #: Commands that assign points; `Commands.point` proves their beams.
 POINTS = frozenset({"AIM", "STANDBY"})
+#: Work of the disk, and its reverse.
+Storing = tuple[Work, Callable[..., object]]
 #: States in which a beam is at its aim.
 _ON_AIM = (states.TRACKING, states.SEARCHING)
 #: A new point so near the last one, and both so far off all receivers, bring no light there, m.
@@ -49,27 +51,26 @@ class NewPoints:
         Heliostats (K,), and their points, ENU, m, (K, 3).
     token
         The holder's, or a mandate's.
-    held, note
-        Called with the heliostats that are sent and their points: the first returns what visits
-        hold then, to be stored with the points; the second notes that they are being assigned.
+    store
+        Called with some heliostats and their points: returns work of the disk that must be done
+        before they are sent, and its reverse.
+    note
+        Called with those that are being assigned, and their points.
     check
         Called with the heliostats whose turn it is; raises `RefusedError` if their points may no
         longer be assigned.
     free
         Returns the heliostats that need no turn; None: those that bring no light to a receiver.
-    lasting
-        Whether the points are stored; a small movement is not.
     """
 
     name: str
     names: tuple[str, ...]
     wanted: FloatArray
     token: int
-    held: Callable[[tuple[str, ...], FloatArray], Held] = lambda *_: NOTHING
+    store: Callable[[tuple[str, ...], FloatArray], Storing]
     note: Callable[[tuple[str, ...], FloatArray], None] = lambda *_: None
     check: Callable[[tuple[str, ...]], None] = lambda _: None
     free: Callable[[], frozenset[str]] | None = None
-    lasting: bool = True
 
     def of(self, names: Sequence[str]) -> FloatArray:
         """Return the points of some heliostats, (M, 3)."""
@@ -247,10 +248,11 @@ class Commands:
         self.prove_points(name, names, wanted)
         visit = self._authority.mandate_of(token) is not None
 
-        def held(some: tuple[str, ...], places: FloatArray) -> Held:
-            if name == "AIM" and visit:
-                return self._lent(some, places)
-            return {"LENT": dict.fromkeys(some)} if name == "AIM" else NOTHING
+        def store(some: tuple[str, ...], places: FloatArray) -> Storing:
+            held: Held = NOTHING
+            if name == "AIM":
+                held = self._lent(some, places) if visit else {"LENT": dict.fromkeys(some)}
+            return self.storing(name, some, places, held)
 
         def note(some: tuple[str, ...], places: FloatArray) -> None:
             if name == "AIM" and visit:
@@ -269,7 +271,7 @@ class Commands:
             each = person, token, name, values, all_names, text, store, out
             return self._permission.accept(*each)
 
-        return self.give_points(NewPoints(name, names, wanted, token, held, note), accept)
+        return self.give_points(NewPoints(name, names, wanted, token, store, note), accept)
 
     def move(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
         """Move beams a little beside their aims; see `PlantController.move`."""
@@ -278,6 +280,9 @@ class Commands:
         if wrong := self._movements.refused(names, rows, aims, wanted, tracking):
             raise BeamError("AIM", wrong)
         self.prove_points("AIM", names, wanted)
+
+        def store(some: tuple[str, ...], places: FloatArray) -> Storing:
+            return self.holding(self._lent(some, places))
 
         def check(some: tuple[str, ...]) -> None:
             rows, on = self._places(some), np.ones(len(some), dtype=np.bool_)
@@ -293,9 +298,7 @@ class Commands:
             return self._permission.accept(*each, store, out)
 
         every = frozenset(names)
-        new = NewPoints(
-            "AIM", names, wanted, token, self._lent, note, check, lambda: every, lasting=False
-        )
+        new = NewPoints("AIM", names, wanted, token, store, note, check, lambda: every)
         return self.give_points(new, accept)
 
     @property
@@ -327,6 +330,12 @@ class Commands:
         rows = self._places(tuple(points))
         return tuple(points), rows, points_of(name, points), out
 
+    def storing(
+        self, name: str, names: tuple[str, ...], places: FloatArray, held: Held = NOTHING
+    ) -> Storing:
+        """Return work that stores points (K, 3) and what visits hold then, and its reverse."""
+        return self._ways.points.storing(name, self._places(names), places, held)
+
     def _lent(self, names: tuple[str, ...], places: FloatArray) -> Held:
         """Return what is to be stored before a visit sends beams to points (K, 3)."""
         return self._movements.record(names, self._aims(self._places(names)), places)
@@ -346,7 +355,7 @@ class Commands:
         """
         waiting = self._joins(new)
         early = tuple(n for n in new.names if n not in waiting)
-        store = self._storing(new, early) if early else None
+        store = new.store(early, new.of(early)) if early else None
         ticket = accept(store)
 
         def send(again: bool) -> None:
@@ -379,7 +388,7 @@ class Commands:
         send: Callable[[tuple[str, ...]], None],
     ) -> None:
         """Store and assign the points of heliostats whose turn has come, then send them."""
-        store = self._storing(new, names)
+        store = new.store(names, new.of(names))
 
         def stored(again: bool) -> None:
             new.check(names)
@@ -393,16 +402,6 @@ class Commands:
             send(left)
 
         self._orders.when_stored(ticket, names, store, stored)
-
-    def _storing(
-        self, new: NewPoints, names: tuple[str, ...]
-    ) -> tuple[Work, Callable[..., object]]:
-        """Return work that stores points before they are assigned, and its reverse."""
-        places, points = new.of(names), self._ways.points
-        held = new.held(names, places)
-        if not new.lasting:
-            return points.holding(held)
-        return points.storing(new.name, self._places(names), places, held)
 
     def _assign(self, new: NewPoints, ticket: Ticket, names: tuple[str, ...]) -> None:
         """Assign the points of some heliostats, which are sent now."""

@@ -145,7 +145,8 @@ class GivingBack:
             return ticket
 
         free = partial(self._movements.small, names)
-        new = NewPoints("AIM", names, wanted, token, check=check, free=free)
+        store = partial(self._commands.storing, "AIM")
+        new = NewPoints("AIM", names, wanted, token, store, check=check, free=free)
         with suppress(AuditError):
             self._commands.give_points(new, accept)
 
