@@ -1,6 +1,6 @@
 """What a visit holds when the plant's program ends: a new program gives it back, once."""
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Collection
 from datetime import timedelta
 from pathlib import Path
 
@@ -10,10 +10,14 @@ import pytest
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.messages import Command, Emergency
 from heliotrope.plant.assigned import HELD, AssignedFile, Points
+from heliotrope.plant.audit import read
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.lockouts import Kind, Lockout
 from heliotrope.plant.locks import CERTAIN
+from heliotrope.plant.operations import Logbook, Operations
+from heliotrope.plant.operations.automatic import AutomaticSettings
 from support.plant_bench import OPERATOR, Bench, running
 
 ENGINEER = Person("Egon", Role.ENGINEER)
@@ -33,21 +37,22 @@ class Mirror:
         self.orders: list[str] = []
 
     def join(self, bench: Bench) -> None:
-        cluster = bench.cluster_of(NAME)
-        row, obey = cluster.names.index(NAME), cluster._obey
+        self._cluster = cluster = bench.cluster_of(NAME)
+        obey = cluster._obey
 
         async def obeyed(identity: str, name: str, heliostats: tuple[str, ...]) -> None:
             await obey(identity, name, heliostats)
             if NAME in (heliostats or cluster.names):
                 self.take(name)
-            show()
-
-        def show() -> None:
-            cluster.rows["state"][row] = self.state
-            cluster.rows["flags"][row] = self.flags | (ROUGH if self.rough else 0)
+            self.show()
 
         cluster._obey = obeyed  # type: ignore[method-assign]
-        show()
+        self.show()
+
+    def show(self) -> None:
+        row = self._cluster.names.index(NAME)
+        self._cluster.rows["state"][row] = self.state
+        self._cluster.rows["flags"][row] = self.flags | (ROUGH if self.rough else 0)
 
     def take(self, name: str) -> None:
         self.orders.append(name)
@@ -64,7 +69,7 @@ class Mirror:
         elif name == "IDLE" and not locked:
             self.state = states.IDLE
         elif name == "ROUGH":
-            self.rough = False
+            self.rough = bool(self._cluster.commands(name)[-1].values[0])
 
 
 def play(mirror: Mirror, store: AssignedFile, scene: Scene, *, later: float = 0.0) -> None:
@@ -244,6 +249,91 @@ def test_a_new_program_sends_a_beam_back_to_its_aim(store: AssignedFile) -> None
     assert mirror.orders[-1] == "AIM"
 
 
+def test_a_new_program_ends_a_small_movement(store: AssignedFile) -> None:
+    """Its beam stands on the receiver, a little beside its aim."""
+    mirror, kept, base = Mirror(states.IDLE), list[object](), (0.0, 0.0, 16.5)
+
+    async def before(bench: Bench) -> None:
+        plant, token = bench.plant, await bench.commanded(ENGINEER)
+        assert await plant.aim(ENGINEER, token, {NAME: base}).end(5.0)
+        assert await plant.command(ENGINEER, token, "TRACK", (NAME,)).end(5.0)
+        await bench.wait(2.0)
+        entered = plant.authority.mandate(ENGINEER, token, (NAME,), "receiver")
+        mandate = entered.__enter__()
+        kept.append(entered)
+        for east in (0.01, -0.01):
+            assert await plant.move(ENGINEER, mandate.token, {NAME: (east, 0.0, 16.5)}).end(5.0)
+        assert (store.read()["LENT"], store.read()["AIM"]) == ({NAME: base}, {NAME: base})
+
+    async def after(bench: Bench) -> None:
+        token = await bench.commanded()
+        for _ in range(12):
+            await bench.wait(1.0)
+            bench.plant.authority.keep(OPERATOR, token)
+        (back,) = bench.cluster_of(NAME).commands("AIM")
+        assert (back.heliostats, back.values) == ((NAME,), base)
+        assert (store.read()["LENT"], store.read()["AIM"]) == ({}, {NAME: base})
+
+    play(mirror, store, before)
+    mirror.orders = []
+    play(mirror, store, after, later=20.0)
+    assert mirror.orders == ["AIM"]
+
+
+def test_a_new_program_lets_a_mirror_step_roughly_again(store: AssignedFile) -> None:
+    """By the plant file its drivers do not rest, so only the record of the visit says so."""
+    mirror, kept = Mirror(states.IDLE), list[object]()
+    mirror.rough = True
+
+    async def before(bench: Bench) -> None:
+        plant, token = bench.plant, await bench.commanded(ENGINEER)
+        visit = plant.stepping.fine((NAME,))
+        visit.__enter__()
+        kept.append(visit)
+        await bench.wait(4.0)
+        plant.authority.keep(ENGINEER, token)
+        assert [m.values for m in bench.cluster_of(NAME).commands("ROUGH")] == [(0.0,)]
+        assert not mirror.rough
+        assert store.read()["ROUGH"] == {NAME: (0.0, 0.0, 0.0)}
+
+    async def after(bench: Bench) -> None:
+        token = await bench.commanded()
+        for _ in range(12):
+            await bench.wait(1.0)
+            bench.plant.authority.keep(OPERATOR, token)
+        assert {m.values for m in bench.cluster_of(NAME).commands("ROUGH")} == {(1.0,)}
+        assert mirror.rough
+        assert store.read()["ROUGH"] == {}
+
+    play(mirror, store, before)
+    play(mirror, store, after, later=20.0)
+
+
+def test_one_heliostat_in_detail_says_why_it_is_locked(tmp_path: Path) -> None:
+    mirror = Mirror(states.IDLE)
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path)
+        mirror.join(bench)
+        async with running(bench):
+            plant, work = bench.plant, AutomaticSettings(calibrate=False)
+            shown = Operations(plant, Logbook(clock), settings=work)
+            await bench.wait(2.0)
+            assert shown.heliostat(NAME).locked == ""
+            assert shown.calibration().choice == "", "it calibrates nothing"
+            kept = await locked_by_a_visit(bench)
+            await bench.wait(2.0)
+            text = shown.heliostat(NAME).locked
+            assert text.startswith("the visit to left of Egon has locked it since ")
+            assert text.endswith(" UTC, until its parameters are written and read back")
+            assert kept
+            bench.cluster_of(NAME).mute = True
+            await bench.wait(30.0)
+            assert shown.heliostat(NAME).locked == "", "its state is not known"
+
+    run_virtual(main)
+
+
 def test_only_changes_of_what_is_held_are_written() -> None:
     class Counting:
         count = 0
@@ -280,3 +370,54 @@ def test_an_order_that_is_not_sent_leaves_what_was_held(store: AssignedFile) -> 
     assert store.read()["LOCKED"] == {}
     take_back()
     assert Points(("A",), store).held["LOCKED"] == {"A": (5.0, 0.0, 0.0)}
+
+
+@pytest.mark.parametrize("what", ["UNLOCK", "STOW", "ROUGH"])
+def test_a_cluster_that_may_begin_no_motion_keeps_nothing_from_the_others(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An order to mirrors of two clusters was refused as a whole."""
+    reason = "its clock is wrong"
+
+    async def main(clock: VirtualClock) -> None:
+        async with running(Bench(clock, tmp_path)) as bench:
+            plant, token = bench.plant, await bench.commanded(ENGINEER)
+            homes = list(bench.clusters.values())[:2]
+            names = tuple(home.names[0] for home in homes)
+            held = {homes[1].name}
+
+            def refusal(clusters: Collection[str]) -> str:
+                return reason if held.intersection(clusters) else ""
+
+            def given() -> set[str]:
+                each = [(home, m) for home in homes for m in home.of((Command, Emergency))]
+                return {n for h, m in each if m.name == what for n in m.heliostats or h.names}
+
+            monkeypatch.setattr(plant._sentinel, "refusal", refusal)
+            if what == "ROUGH":
+                for home in homes:
+                    home.rows["flags"][0] = ROUGH
+            else:
+                plant.locks.take(names, 0, plant.now())
+                for home in homes:
+                    home.set(states.LOCKED, home.names[0])
+                if what == "STOW":
+                    plant._ways.ordered.sent("DEFOCUS", names, plant.now() + 0.5)
+            await bench.wait(2.0)
+            with plant.stepping.fine(names if what == "ROUGH" else ()):
+                await bench.wait(6.0)
+                assert given() == {names[0]}
+                if what != "ROUGH":
+                    text = f"command authority; now they are not: {reason}"
+                    assert plant.locked_for(names[1]).endswith(text)
+                plant.authority.keep(ENGINEER, token)
+                held.clear()
+                await bench.wait(8.0)
+                assert given() == set(names)
+
+    run_virtual(main)
+    results = [r.result for r in read(tmp_path / "audit.jsonl")[0] if r.what == what]
+    if what != "STOW":
+        assert f"1 done, 1 failed (P2A: {reason})" in results[0]
+        named = [result for result in results if reason in result]
+        assert all("1 done" in result for result in named), "no order is for that one alone"

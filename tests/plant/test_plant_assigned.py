@@ -20,13 +20,14 @@ from heliotrope.plant.assigned import (
     rest_on,
 )
 from heliotrope.plant.audit import read
-from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.kept_audit import KeptPoints
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.store.backup import backup, restore
 from heliotrope.store.keeper import Keeper
 from support.plant_bench import OPERATOR, Bench, SlowDisk, running
 
+ENGINEER = Person("Egon", Role.ENGINEER)
 AIM, OTHER, STANDBY = (0.1, 0.2, 16.5), (0.0, 0.0, 16.0), (4.0, 0.0, 14.0)
 
 
@@ -504,5 +505,108 @@ def test_a_beam_that_did_not_leave_its_standby_point_counts_in_an_eye(tmp_path: 
             bench.cluster_of(first).stubborn.clear()
             assert await plant.standby(OPERATOR, token, {first: away}).end(5.0)
             plant.standby(OPERATOR, token, {second: balcony})
+
+    run_virtual(main)
+
+
+@pytest.mark.parametrize("giver", ["a person", "a visit"])
+def test_an_aim_that_is_given_up_before_its_turn_was_never_assigned(
+    giver: str, tmp_path: Path
+) -> None:
+    """Simulated day 50: the beam was shown on a target, while it was on the receiver."""
+    store, settings = AssignedFile(tmp_path / "a.json"), PlantSettings(join_rate=0.2, join_burst=1)
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path, settings=settings, assigned=store)
+        async with running(bench):
+            plant, token = bench.plant, await bench.commanded(ENGINEER)
+            names = plant.field.names[:2]
+            rows = [plant.field.place(name) for name in names]
+            await idle(bench, *names)
+            assert await plant.aim(ENGINEER, token, dict.fromkeys(names, AIM)).end(5.0)
+            bench.cluster_of(names[0]).set(states.TRACKING, *names)
+            await bench.wait(2.0)
+            target = tuple(plant.design.targets[0].center.tolist())
+            with plant.authority.mandate(ENGINEER, token, names, "target") as mandate:
+                own = mandate.token if giver == "a visit" else token
+                ticket = plant.aim(ENGINEER, own, dict.fromkeys(names, target))
+                await bench.wait(1.0)
+                assert ticket.stage(names[1]) is None, "it waits for its turn"
+                places = dict(zip(names, (target, AIM), strict=True))
+                assert store.read()["AIM"] == places
+                assert plant.aims[rows].tolist() == [list(target), list(AIM)]
+            lent = names[:1] if giver == "a visit" else ()
+            assert plant.movements.names == frozenset(lent)
+            plant.release_authority(ENGINEER, token)
+            await bench.wait(1.0)
+            assert ticket.stage(names[1]) is Stage.FAILED
+            assert "changed while it waited its turn" in ticket.refusals[names[1]]
+            assert plant.aims[rows].tolist() == [list(target), list(AIM)]
+            assert store.read()["AIM"] == places
+            # It has the aim that it had, so it may track.
+            token = await bench.commanded()
+            assert await plant.command(OPERATOR, token, "TRACK", names[1:]).end(10.0)
+
+    run_virtual(main)
+
+
+def test_a_beam_that_waits_for_a_persons_aim_is_not_brought_back(tmp_path: Path) -> None:
+    """A person takes it out of a visit; what the visit left must not undo the order."""
+    settings = PlantSettings(join_rate=0.2, join_burst=1)
+
+    async def main(clock: VirtualClock) -> None:
+        async with running(Bench(clock, tmp_path, settings=settings)) as bench:
+            plant, token = bench.plant, await bench.commanded(ENGINEER)
+            name, other = plant.field.names[:2]
+            await idle(bench, name, other)
+            both = dict.fromkeys((name, other), AIM)
+            assert await plant.aim(ENGINEER, token, both).end(5.0)
+            bench.cluster_of(name).set(states.TRACKING, name, other)
+            await bench.wait(2.0)
+            target, base = plant.design.targets[0].center, plant.design.receivers[0].center
+            with plant.authority.mandate(ENGINEER, token, (name,), "target") as mandate:
+                assert await plant.aim(ENGINEER, mandate.token, {name: target}).end(5.0)
+                assert plant.movements.names == {name}
+                mine = plant.aim(ENGINEER, token, {other: base, name: base})
+                for _ in range(12):
+                    await bench.wait(1.0)
+                    plant.authority.keep(ENGINEER, token)
+            assert mine.good, mine.text
+            sent = [m.values for m in bench.cluster_of(name).commands("AIM") if m.heliostats]
+            assert sent[-1] == tuple(base)
+            assert sent.count(AIM) <= 1, "only its first aim"
+            assert plant.aims[plant.field.place(name)].tolist() == base.tolist()
+            assert not plant.movements.names
+
+    run_virtual(main)
+
+
+def test_an_aim_whose_path_is_blocked_while_it_is_stored_is_not_assigned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, settings = AssignedFile(tmp_path / "a.json"), PlantSettings(join_burst=1)
+
+    async def main(clock: VirtualClock) -> None:
+        disk = SlowDisk(clock)
+        bench = Bench(clock, tmp_path, settings=settings, assigned=store, disk=disk)
+        async with running(bench):
+            plant, token = bench.plant, await bench.commanded()
+            name = plant.field.names[0]
+            await idle(bench, name)
+            assert await plant.aim(OPERATOR, token, {name: AIM}).end(5.0)
+            bench.cluster_of(name).set(states.TRACKING, name)
+            await bench.wait(2.0)
+            disk.delay = 0.9
+            ticket = plant.aim(OPERATOR, token, {name: plant.design.targets[0].center})
+            await bench.wait(1.3)
+            monkeypatch.setattr(
+                plant.doubts, "barred", lambda n, _=None: dict.fromkeys(n, "in doubt")
+            )
+            assert not await ticket.end(5.0)
+            assert ticket.refusals[name] == "in doubt"
+            assert plant.aims[plant.field.place(name)].tolist() == list(AIM)
+            disk.delay = 0.0
+            await bench.wait(3.0)
+            assert store.read()["AIM"] == {name: AIM}
 
     run_virtual(main)

@@ -13,11 +13,13 @@ from heliotrope.geometry import direction
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.messages import Stage
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.operations import Logbook
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.raising import Raising
+from heliotrope.plant.settings import PlantSettings
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 #: The sun stands at 5°: below the limit of automatic control, above that of the safety table.
@@ -105,6 +107,9 @@ def test_a_cluster_that_may_not_move_keeps_no_other_at_stow(tmp_path: Path) -> N
         log = Logbook(bench.clock)
         raising = Raising(plant, log, ENGINEER, most=99, patience=60.0, clearance=0.0, wanted=True)
         await raising.step(token, frozenset, np.zeros(len(plant.field), dtype=np.bool_))
+        (waits,) = raising.waits((NAME, OTHER)).items()
+        assert waits[0] == NAME
+        assert waits[1].startswith("cluster_time_differs")
         await bench.wait(2.0)
         assert [message.heliostats or good.names for message in good.commands("APPROACH")] == [
             good.names
@@ -187,6 +192,38 @@ def test_who_is_stowed_while_its_aim_is_on_its_way_is_not_sent_to_the_receiver(
         assert OTHER not in sent
 
     play(tmp_path, scene)
+
+
+def test_a_mirror_at_standby_names_the_witness_that_it_waits_for(tmp_path: Path) -> None:
+    """It was shown as waiting for its turn, which no order could bring."""
+
+    async def main(clock: VirtualClock) -> None:
+        settings = PlantSettings(witnesses=frozenset({"sun sensor"}))
+        async with running(Bench(clock, tmp_path, settings=settings)) as bench:
+            for cluster in bench.clusters.values():
+                cluster.set(states.IDLE)
+                cluster.rows["flags"] = READY
+            other = bench.cluster_of(OTHER)
+            other.rows["flags"][other.names.index(OTHER)] = 0
+            plant, work = bench.plant, AutomaticSettings(wanted=True, calibrate=False, margin=0.0)
+            control = AutomaticControl(
+                plant, Logbook(clock), None, scheduler=None, records=None, truth=None, settings=work
+            )
+            tasks = asyncio.create_task(control.run())
+            await bench.wait(6.0)
+            why = "it waits: no independent witness confirms the sun of this plant: none of its"
+            steps = control.following(plant.now(), (NAME, OTHER))
+            assert steps[NAME].text.startswith(f"automatic control has it: IDLE; {why}")
+            assert steps[NAME].stage is Stage.DONE
+            assert steps[OTHER].text == "it waits for its turn: IDLE", "it cannot join"
+            assert bench.count(states.TRACKING) == 0
+            plant.witnesses.take("sun sensor", plant.sun_vector(), 0.0)
+            await bench.until(lambda: bench.count(states.TRACKING) > 0)
+            assert "waits" not in control.following(plant.now(), (NAME,))[NAME].text
+            tasks.cancel()
+            await asyncio.gather(tasks, return_exceptions=True)
+
+    run_virtual(main)
 
 
 def test_what_is_found_up_at_dusk_is_stowed_unless_a_person_commands(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ def test_a_plant_at_work_asks_its_schedule_and_tells_what_became_of_it() -> None
                 assert isinstance(schedule, PlantSchedule)
                 await _visits(live, schedule)
                 _what_came_of_it(live, schedule)
+                _what_was_chosen(live, schedule)
                 _what_is_to_come(live, schedule)
                 _after_a_restart(live, schedule)
             finally:
@@ -63,6 +64,13 @@ def _what_came_of_it(live: LivePlant, schedule: PlantSchedule) -> None:
     found = chosen.compared()
     assert found.visits == len(chosen.finished)
     assert 0.1 < found.ratio < 2.0
+
+
+def _what_was_chosen(live: LivePlant, schedule: PlantSchedule) -> None:
+    """The page says why the last visit was chosen."""
+    shown = live.operations.calibration().choice
+    assert shown
+    assert shown == schedule.reason
 
 
 def _what_is_to_come(live: LivePlant, schedule: PlantSchedule) -> None:

@@ -108,8 +108,8 @@ class ScriptedCluster:
         self.settings = ""
         self.found: list[dict[str, Any]] | None = None
 
-    def of(self, kind: type[Any]) -> list[Any]:
-        """The messages of a kind."""
+    def of(self, kind: type[Any] | tuple[type[Any], ...]) -> list[Any]:
+        """The messages of a kind, or of some."""
         return [message for _, message in self.taken if isinstance(message, kind)]
 
     def commands(self, name: str) -> list[Command]:

@@ -71,8 +71,8 @@ class _Points:
     ----------
     before
         The points before the assigned ones, the latest first, (`assigned.BEFORE`, N, 3); NaN from
-        where the beam was found: an assigned point may wait for its turn, or be refused by the
-        local controller, and then the beam goes on to one before.
+        where the beam was found: an assigned point may be refused by the local controller, and
+        then the beam goes on to one before.
     changed_at
         When each point was seen to change, monotonic s, (N,).
     """

@@ -1,9 +1,11 @@
 """Aims and standby points of heliostats, assigned by people and kept across restarts of the plant.
 
 A plant that has forgotten where its beams are cannot prove where they may go. So points are on the
-disk before the commands that assign them are sent. `Assigned` is the protocol of their store.
-`AssignedFile` is one small file, written under another name and renamed, so that the old or the new
-file is always there.
+disk before the commands that assign them are sent. They are assigned when they are sent: one that
+waits for its turn, and may be given up there, is not assigned yet.
+
+`Assigned` is the protocol of their store. `AssignedFile` is one small file, written under another
+name and renamed, so that the old or the new file is always there.
 
 A local controller may refuse a point, or never get it. So the points before are kept too until it
 has acknowledged the new one: a program that starts anew then knows where a beam may still be.
@@ -15,7 +17,7 @@ program that starts anew gives it back (`giving_back`).
 import json
 import math
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Protocol
@@ -226,12 +228,12 @@ class Points:
 
     def storing(
         self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray, held: Held = NOTHING
-    ) -> tuple[Work, Work]:
+    ) -> tuple[Work, Callable[..., None]]:
         """Return work of a disk that stores points (K, 3) of heliostats (K,), and its reverse.
 
         ``held`` is stored in the same piece; see `holding`. Both raise `AssignedError` if they
         cannot be stored. The reverse leaves points alone that were replaced meanwhile; it may be
-        done again.
+        done again, and be called with the heliostats that it is about, by default all.
         """
         new = {self._names[i]: tuple(p) for i, p in zip(rows, points.tolist(), strict=True)}
         present = self._arrays[kind][rows]
@@ -253,9 +255,9 @@ class Points:
             keep({n: _followed(old[n], point, before[n]) for n, point in new.items()}, held)
             self._marks[kind].update(dict.fromkeys(new, mark))
 
-        def take_back() -> None:
+        def take_back(some: Collection[str] = tuple(new)) -> None:
             marks = self._marks[kind]
-            keep({n: chain for n, chain in old.items() if marks.get(n) is mark})
+            keep({n: old[n] for n in some if marks.get(n) is mark})
 
         return store, take_back
 

@@ -341,11 +341,15 @@ class BeamWatch:
     def joining(
         self, name: str, values: Sequence[float], heliostats: tuple[str, ...], now: float
     ) -> dict[str, str]:
-        """Return which heliostats may not join their aims now, and why."""
+        """Return which heliostats may not join their aims now, and why.
+
+        AIM brings a new aim, its values; every other command leads to those that they may have.
+        """
         if not self._check.volumes:
             return {}
         rows = np.array([self._field.index[n] for n in heliostats], dtype=np.intp)
-        aims = self.points.aims[rows]
+        new = name == "AIM"
+        aims = np.tile(values, (len(rows), 1)) if new else self.points.aims[rows]
         unknown = ~np.isfinite(aims).all(axis=-1)
         found = {
             heliostats[i]: f"{name}: its aim is not known here; give it one (AIM) first"
@@ -354,9 +358,8 @@ class BeamWatch:
         if not unknown.all():
             light = self._sun(0.0)
             found |= self.ordered.unshown(rows, OFF) | self.ordered.silent(rows, now)
-            # AIM itself brings the new one; TRACK may come before it, and leads to one before.
             possible = self.points.possible("AIM", rows[~unknown])
-            for known, places in possible[:1] if name == "AIM" else possible:
+            for known, places in [(rows, aims)] if new else possible:
                 found |= self._by_earlier(known, places)
                 for some, begin in self._begins(known):
                     to = known[some], begin, places[some], light, self._ways.motion

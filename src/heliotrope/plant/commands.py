@@ -1,7 +1,8 @@
 """Commands of people: permitted, proven, recorded, and sent, at once or when their turn comes."""
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -19,7 +20,7 @@ from heliotrope.plant.authority import Authority, Person
 from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.given import Given
-from heliotrope.plant.joining import JoiningJob, JoinQueue, in_slices
+from heliotrope.plant.joining import Assign, Clear, JoiningJob, JoinQueue, in_slices
 from heliotrope.plant.locks import Locks
 from heliotrope.plant.movements import Movements
 from heliotrope.plant.ordered import JOINING
@@ -30,10 +31,56 @@ from heliotrope.plant.tickets import Ticket
 
 #: Commands that assign points; `Commands.point` proves their beams.
 POINTS = frozenset({"AIM", "STANDBY"})
+#: Work of the disk, and its reverse.
+Storing = tuple[Work, Callable[..., object]]
 #: States in which a beam is at its aim.
 _ON_AIM = (states.TRACKING, states.SEARCHING)
 #: A new point so near the last one, and both so far off all receivers, bring no light there, m.
 _BESIDE = 3.0
+
+
+@dataclass(frozen=True)
+class NewPoints:
+    """Points that are given to heliostats; each is assigned when it is sent.
+
+    Attributes
+    ----------
+    name
+        AIM or STANDBY.
+    names, wanted
+        Heliostats (K,), and their points, ENU, m, (K, 3).
+    token
+        The holder's, or a mandate's.
+    store
+        Called with some heliostats and their points: returns work of the disk that must be done
+        before they are sent, and its reverse.
+    note
+        Called with those that are being assigned, and their points.
+    check
+        Called with the heliostats whose turn it is; raises `RefusedError` if their points may no
+        longer be assigned.
+    free
+        Returns the heliostats that need no turn; None: those that bring no light to a receiver.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    wanted: FloatArray
+    token: int
+    store: Callable[[tuple[str, ...], FloatArray], Storing]
+    note: Callable[[tuple[str, ...], FloatArray], None] = lambda *_: None
+    check: Callable[[tuple[str, ...]], None] = lambda _: None
+    free: Callable[[], frozenset[str]] | None = None
+
+    def of(self, names: Sequence[str]) -> FloatArray:
+        """Return the points of some heliostats, (M, 3)."""
+        row = {name: i for i, name in enumerate(self.names)}
+        return self.wanted[np.array([row[name] for name in names], dtype=np.intp)]
+
+    def grouped(self, names: Iterable[str]) -> dict[tuple[float, ...], list[str]]:
+        """Return the heliostats of each point, which share one command."""
+        some = tuple(names)
+        return grouped(some, self.of(some))
 
 
 class Commands:
@@ -197,34 +244,34 @@ class Commands:
         self, person: Person, token: int, name: str, points: Mapping[str, npt.ArrayLike]
     ) -> Ticket:
         """Give AIM or STANDBY with a point (3,) for each heliostat; see `PlantController.aim`."""
-        names, rows, wanted, out = self._pointed(name, points)
+        names, _, wanted, out = self._pointed(name, points)
         self.prove_points(name, names, wanted)
         visit = self._authority.mandate_of(token) is not None
 
-        def assign() -> frozenset[str]:
-            here = self._stays(rows, wanted)
+        def store(some: tuple[str, ...], places: FloatArray) -> Storing:
+            held: Held = NOTHING
+            if name == "AIM":
+                held = self._lent(some, places) if visit else {"LENT": dict.fromkeys(some)}
+            return self.storing(name, some, places, held)
+
+        def note(some: tuple[str, ...], places: FloatArray) -> None:
             if name == "AIM" and visit:
-                self._movements.lend(names, self._aims(rows), wanted, token)
+                self._movements.lend(some, self._aims(self._places(some)), places, token)
             elif name == "AIM":
-                self._movements.forget(names)
+                self._movements.forget(some)
             else:
-                for each, place in zip(names, wanted, strict=True):
+                for each, place in zip(some, places, strict=True):
                     self._wanted.rest(each, tuple(place))
-            self.assign(name, names, wanted)
-            return frozenset(names[i] for i in np.flatnonzero(here))
 
         groups = grouped(names, wanted)
         values = next(iter(groups)) if len(groups) == 1 else ()
-        all_names, note = (*names, *out), f"{len(groups)} points"
-        held: Held = NOTHING
-        if name == "AIM" and visit:
-            held = self._movements.record(names, self._aims(rows), wanted)
-        elif name == "AIM":
-            held = {"LENT": dict.fromkeys(names)}
-        store = self._ways.points.storing(name, rows, wanted, held)
-        ticket = self._permission.accept(person, token, name, values, all_names, note, store, out)
-        self.when_recorded(ticket, names, wanted, token, assign)
-        return ticket
+        all_names, text = (*names, *out), f"{len(groups)} points"
+
+        def accept(store: tuple[Work, Work] | None) -> Ticket:
+            each = person, token, name, values, all_names, text, store, out
+            return self._permission.accept(*each)
+
+        return self.give_points(NewPoints(name, names, wanted, token, store, note), accept)
 
     def move(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
         """Move beams a little beside their aims; see `PlantController.move`."""
@@ -234,32 +281,34 @@ class Commands:
             raise BeamError("AIM", wrong)
         self.prove_points("AIM", names, wanted)
 
-        def assign() -> frozenset[str]:
-            aims, on = self._aims(rows), np.ones(len(rows), dtype=np.bool_)
-            if wrong := self._movements.refused(names, rows, aims, wanted, on):
+        def store(some: tuple[str, ...], places: FloatArray) -> Storing:
+            return self.holding(self._lent(some, places))
+
+        def check(some: tuple[str, ...]) -> None:
+            rows, on = self._places(some), np.ones(len(some), dtype=np.bool_)
+            if wrong := self._movements.refused(some, rows, self._aims(rows), new.of(some), on):
                 raise BeamError("AIM", wrong)  # aimed elsewhere while the record was written
-            self._movements.take(names, aims, token, self._now())
-            self.assign("AIM", names, wanted)
-            return frozenset(names)
 
-        all_names, note = (*names, *out), f"{len(names)} coded movements"
-        store = self._ways.points.holding(self._movements.record(names, aims, wanted))
-        accept = self._permission.accept
-        ticket = accept(person, token, "AIM", (), all_names, note, store, out)
-        self.when_recorded(ticket, names, wanted, token, assign)
-        return ticket
+        def note(some: tuple[str, ...], places: FloatArray) -> None:
+            del places
+            self._movements.take(some, self._aims(self._places(some)), token, self._now())
 
-    def storing(self, name: str, names: Sequence[str], wanted: FloatArray) -> tuple[Work, Work]:
-        """Return work that stores points (K, 3) before they are assigned, and its reverse."""
-        return self._ways.points.storing(name, self._places(names), wanted)
+        def accept(store: tuple[Work, Work] | None) -> Ticket:
+            each = person, token, "AIM", (), (*names, *out), f"{len(names)} coded movements"
+            return self._permission.accept(*each, store, out)
+
+        every = frozenset(names)
+        new = NewPoints("AIM", names, wanted, token, store, note, check, lambda: every)
+        return self.give_points(new, accept)
+
+    @property
+    def aimed(self) -> frozenset[str]:
+        """The heliostats with a new aim that waits for the disk or for its turn."""
+        return self._joining.waiting("AIM") | self._orders.unstored("AIM")
 
     def holding(self, held: Held) -> tuple[Work, Work]:
         """Return work that stores what a visit takes, and its reverse; see `Points.holding`."""
         return self._ways.points.holding(held)
-
-    def assign(self, name: str, names: Sequence[str], wanted: FloatArray) -> None:
-        """Assign points (K, 3) to heliostats, before they are sent."""
-        self._ways.points.assign(name, self._places(names), wanted)
 
     def _places(self, names: Sequence[str]) -> npt.NDArray[np.intp]:
         return np.array([self._field.place(name) for name in names], dtype=np.intp)
@@ -281,25 +330,100 @@ class Commands:
         rows = self._places(tuple(points))
         return tuple(points), rows, points_of(name, points), out
 
-    def when_recorded(
-        self,
-        ticket: Ticket,
-        names: tuple[str, ...],
-        wanted: FloatArray,
-        token: int,
-        assign: Callable[[], frozenset[str]],
-    ) -> None:
-        """Assign and send points once they are recorded; ``assign`` returns who needs no turn."""
+    def storing(
+        self, name: str, names: tuple[str, ...], places: FloatArray, held: Held = NOTHING
+    ) -> Storing:
+        """Return work that stores points (K, 3) and what visits hold then, and its reverse."""
+        return self._ways.points.storing(name, self._places(names), places, held)
+
+    def _lent(self, names: tuple[str, ...], places: FloatArray) -> Held:
+        """Return what is to be stored before a visit sends beams to points (K, 3)."""
+        return self._movements.record(names, self._aims(self._places(names)), places)
+
+    def give_points(
+        self, new: NewPoints, accept: Callable[[tuple[Work, Work] | None], Ticket]
+    ) -> Ticket:
+        """Give points that are proven; each is stored and assigned when it is sent.
+
+        Parameters
+        ----------
+        new
+            The points.
+        accept
+            Returns their ticket; it is given work that stores those that need no turn, with the
+            record of the ticket.
+        """
+        waiting = self._joins(new)
+        early = tuple(n for n in new.names if n not in waiting)
+        store = new.store(early, new.of(early)) if early else None
+        ticket = accept(store)
 
         def send(again: bool) -> None:
             if again:
-                self._permission.refuse_now(ticket.name, names)
-                self.prove_points(ticket.name, names, wanted)
-            stays = assign()
-            self._given.sent(ticket, names)
-            self._send_points(ticket, ticket.name, grouped(names, wanted), token, stays)
+                self._permission.refuse_now(new.name, new.names)
+                self.prove_points(new.name, new.names, new.wanted)
+            new.check(new.names)
+            self._joining.drop(f"superseded by another {new.name}", frozenset(new.names), new.name)
+            joins = waiting | self._joins(new)
+            if store is not None and (late := joins - waiting):
+                self._orders.owe(partial(store[1], late))
+            still = tuple(n for n in new.names if n not in joins)
+            self._assign(new, ticket, still)
+            for point, members in new.grouped(still).items():
+                self._orders.command(ticket, new.name, point, members, new.token)
+            for point, members in new.grouped(n for n in new.names if n in joins).items():
+                part = replace(new, names=tuple(members), wanted=new.of(members))
+                assign = partial(self._assign_in_turn, part, ticket)
+                self._join(ticket, new.name, point, members, new.token, assign)
 
         self._orders.when_recorded(ticket, send)
+        return ticket
+
+    def _assign_in_turn(
+        self,
+        new: NewPoints,
+        ticket: Ticket,
+        names: tuple[str, ...],
+        clear: Clear,
+        send: Callable[[tuple[str, ...]], None],
+    ) -> None:
+        """Store and assign the points of heliostats whose turn has come, then send them."""
+        store = new.store(names, new.of(names))
+
+        def stored(again: bool) -> None:
+            new.check(names)
+            left = names
+            if again:
+                self._permission.refuse_now(new.name, names)
+                left = clear(names)
+            if gone := set(names).difference(left):
+                self._orders.owe(partial(store[1], gone))
+            self._assign(new, ticket, left)
+            send(left)
+
+        self._orders.when_stored(ticket, names, store, stored)
+
+    def _assign(self, new: NewPoints, ticket: Ticket, names: tuple[str, ...]) -> None:
+        """Assign the points of some heliostats, which are sent now."""
+        places = new.of(names)
+        new.note(names, places)
+        self._ways.points.assign(new.name, self._places(names), places)
+        self._given.sent(ticket, names)
+
+    def _joins(self, new: NewPoints) -> frozenset[str]:
+        """Return the heliostats that track, and need a turn to join their new aims.
+
+        Those that bring no light to a receiver need none: see `_stays`.
+        """
+        if new.name != "AIM":
+            return frozenset()
+        rows = self._places(new.names)
+        moves = self._field.among(_ON_AIM, self._now())[rows]
+        if new.free is not None:
+            return frozenset(new.names[i] for i in np.flatnonzero(moves)) - new.free()
+        return frozenset(
+            new.names[i] for i in np.flatnonzero(moves & ~self._stays(rows, new.wanted))
+        )
 
     def prove_points(self, name: str, names: tuple[str, ...], wanted: FloatArray) -> None:
         """Prove that heliostats (K,) may be given points (K, 3) now.
@@ -316,31 +440,6 @@ class Commands:
         if wrong := self._permission.unready(name, moved, wanted[moves]):
             raise BeamError(name, wrong)
         self._ways.check_points(name, rows, wanted, tracking)
-
-    def _send_points(
-        self,
-        ticket: Ticket,
-        name: str,
-        groups: Mapping[tuple[float, ...], Sequence[str]],
-        token: int,
-        stays: frozenset[str],
-    ) -> None:
-        """Send points that are stored; heliostats that track join their new aim.
-
-        Those that bring no light to a receiver need no turn to join: see `_stays`.
-        """
-        names = [n for members in groups.values() for n in members]
-        rows = self._places(names)
-        tracking = self._field.among(_ON_AIM, self._now())[rows]
-        self._joining.drop(f"superseded by another {name}", frozenset(names), name)
-        joins = {names[i] for i in np.flatnonzero(tracking)} - stays
-        moving = joins if name == "AIM" else set()
-        for point, members in groups.items():
-            still = [n for n in members if n not in moving]
-            if still:
-                self._orders.command(ticket, name, point, still, token)
-            if len(still) < len(members):
-                self._join(ticket, name, point, [n for n in members if n in moving], token)
 
     def _stays(self, rows: npt.NDArray[np.intp], wanted: FloatArray) -> npt.NDArray[np.bool_]:
         """Return which heliostats bring no light to a receiver by new points (K, 3), (K,).
@@ -365,6 +464,7 @@ class Commands:
         values: tuple[float, ...],
         heliostats: Sequence[str],
         token: int,
+        assign: Assign | None = None,
     ) -> None:
-        until = self._now() + self._patience
-        self._joining.put(JoiningJob(ticket, name, values, token, deque(heliostats), until))
+        until, waiting = self._now() + self._patience, deque(heliostats)
+        self._joining.put(JoiningJob(ticket, name, values, token, waiting, until, assign))

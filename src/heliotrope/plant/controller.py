@@ -328,6 +328,7 @@ class PlantController:
     def _dispatching(self) -> JoinDispatcher:
         """Return what sends heliostats whose turn to join has come."""
         return JoinDispatcher(
+            self.now,
             self._joining,
             self._orders,
             self._ways,
@@ -557,7 +558,8 @@ class PlantController:
         """Return why a heliostat that is LOCKED is so, since when and until when, in words."""
         mandate = self.authority.visited().get(heliostat)
         visit = "" if mandate is None else f"the visit to {mandate.where} of {mandate.person.name}"
-        return self.locks.reason(heliostat, visit)
+        held = self._permission.held("UNLOCK", (heliostat,))
+        return self.locks.reason(heliostat, visit, held.get(heliostat, ""))
 
     def waits_to_stow(self, heliostat: str) -> bool:
         """Return whether a heliostat waits for its turn to go to stow."""

@@ -1,6 +1,6 @@
 """Points that were given to local controllers, and whether they were taken.
 
-The plant proves and records a point before it is sent, and counts on it from then on. A local
+The plant proves and records a point before it is sent, and counts on it once it is sent. A local
 controller that is busy refuses it, and goes on with the one before.
 """
 

@@ -6,15 +6,17 @@ as motions are accepted.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 
 import numpy as np
 
+from heliotrope.files.disk import Work
 from heliotrope.geometry import FloatArray
 from heliotrope.plant.audit import AuditError
 from heliotrope.plant.authority import Authority, RefusedError
 from heliotrope.plant.beam_watch import BeamError
-from heliotrope.plant.commands import Commands
+from heliotrope.plant.commands import Commands, NewPoints
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.locks import Locks
 from heliotrope.plant.movements import Movements
@@ -71,23 +73,45 @@ class GivingBack:
 
     def _ordered(self, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
         """Give an order to heliostats that were left locked; return those that need no other."""
-        try:
-            self._permission.refuse_now(what, names)
-            if what == "STOW":
-                if left := tuple(n for n in names if n not in self._locks.under_way(names)):
-                    self._stow(left)
-                return names
-            if not (token := self._authority.token):
-                return ()
-            able, _ = self._commands.examine(what, (), names)
-            note = "a visit has left it locked"
-            ticket = self._orders.accept((*_PLANT, what), (), able, note)
-        except (RefusedError, AuditError):
+        if what == "STOW":
+            held = self._permission.held(what, names)
+            free = tuple(name for name in names if name not in held)
+            if left := tuple(n for n in free if n not in self._locks.under_way(free)):
+                self._stow(left)
+            return free
+        if not self._authority.token:
             return ()
+        try:
+            _, blocked = self._commands.examine(what, (), names)
+        except RefusedError:
+            return ()
+        return self._give(what, (), names, blocked, "a visit has left it locked")
+
+    def _give(
+        self,
+        what: str,
+        values: tuple[float, ...],
+        names: tuple[str, ...],
+        blocked: Mapping[str, str],
+        note: str,
+        store: tuple[Work, Work] | None = None,
+    ) -> tuple[str, ...]:
+        """Give an order to heliostats and return them, without those that are blocked.
+
+        Its ticket names these; they are due again later.
+        """
+        token = self._authority.token
+        able = tuple(name for name in names if name not in blocked)
+        try:
+            ticket = self._orders.accept((*_PLANT, what), values, names, note, store=store)
+        except AuditError:
+            return ()
+        ticket.block(blocked)
 
         def send(again: bool) -> None:
-            del again
-            self._orders.command(ticket, what, (), ticket.waiting(able), token)
+            if again:
+                ticket.block(self._permission.held(what, ticket.waiting(able)))
+            self._orders.command(ticket, what, values, ticket.waiting(able), token)
 
         self._orders.when_recorded(ticket, send)
         return able
@@ -108,25 +132,28 @@ class GivingBack:
             return
         wanted = np.stack([due[name] for name in names])
 
-        def assign() -> frozenset[str]:
-            aimed = [name for name in names if name not in self._movements.names]
-            if aimed:  # while the record was written
-                raise BeamError("AIM", dict.fromkeys(aimed, "it has another aim now"))
-            self._commands.assign("AIM", names, wanted)
-            return self._movements.small(names)
+        def check(some: tuple[str, ...]) -> None:
+            aimed, moved = self._commands.aimed, self._movements.names
+            # While the record was written.
+            if elsewhere := [n for n in some if n in aimed or n not in moved]:
+                raise BeamError("AIM", dict.fromkeys(elsewhere, "it has another aim now"))
 
-        note = f"{len(names)} beams go back to their aims"
-        try:
-            store = self._commands.storing("AIM", names, wanted)
+        def accept(store: tuple[Work, Work] | None) -> Ticket:
+            note = f"{len(names)} beams go back to their aims"
             ticket = self._orders.accept((*_PLANT, "AIM"), (), names, note, store=store)
-        except AuditError:
-            return
-        self._movements.sent(ticket, now)
-        self._commands.when_recorded(ticket, names, wanted, token, assign)
+            self._movements.sent(ticket, now)
+            return ticket
+
+        free = partial(self._movements.small, names)
+        store = partial(self._commands.storing, "AIM")
+        new = NewPoints("AIM", names, wanted, token, store, check=check, free=free)
+        with suppress(AuditError):
+            self._commands.give_points(new, accept)
 
     def _free_to_return(self, due: Mapping[str, FloatArray]) -> tuple[str, ...]:
         """Return the moved beams that may go back now."""
-        names = tuple(due)
+        aimed = self._commands.aimed  # they go elsewhere when their turn comes
+        names = tuple(name for name in due if name not in aimed)
         while names:
             try:
                 self._permission.refuse_now("AIM", names)
@@ -145,24 +172,10 @@ class GivingBack:
         token = self._authority.token
         for rough, due in self._stepping.due(now, token).items():
             self._stepping.sent(due, now)
-            blocked = self._permission.strange(due)
+            blocked = self._permission.strange(due) | self._permission.held("ROUGH", due)
             names = tuple(name for name in due if name not in blocked)
             if not names:
                 continue
             note = f"{len(names)} step {'roughly again' if rough else 'finely for a visit'}"
-            values = (float(rough),)
-            try:
-                self._permission.refuse_now("ROUGH", names)
-                store = None if rough else self._commands.holding(self._stepping.record(names))
-                ticket = self._orders.accept((*_PLANT, "ROUGH"), values, names, note, store=store)
-            except (RefusedError, AuditError):
-                continue
-            self._orders.when_recorded(ticket, partial(self._send_step, ticket, values, token))
-
-    def _send_step(
-        self, ticket: Ticket, values: tuple[float, ...], token: int, again: bool
-    ) -> None:
-        left = ticket.waiting(ticket.heliostats)
-        if again:
-            self._permission.refuse_now(ticket.name, left)
-        self._orders.command(ticket, ticket.name, values, left, token)
+            store = None if rough else self._commands.holding(self._stepping.record(names))
+            self._give("ROUGH", (float(rough),), due, blocked, note, store)

@@ -23,6 +23,10 @@ Examine = Callable[
     [str, tuple[float, ...], tuple[str, ...]], tuple[tuple[str, ...], dict[str, str]]
 ]
 
+#: Returns which of some heliostats may go now; the ticket ends for the others.
+Clear = Callable[[tuple[str, ...]], tuple[str, ...]]
+#: Assigns the points of some heliostats, as far as they may still go, then sends these.
+Assign = Callable[[tuple[str, ...], Clear, Callable[[tuple[str, ...]], None]], None]
 #: Returns which of some heliostats may no longer be commanded under a token.
 Lost = Callable[[int, Iterable[str]], frozenset[str]]
 
@@ -44,6 +48,9 @@ class JoiningJob:
         Heliostats still to be sent.
     until
         Time at which they are given up, monotonic s.
+    assign
+        Assigns the point of heliostats whose turn has come, and sends them; None: the command
+        assigns none.
     """
 
     ticket: Ticket
@@ -52,6 +59,7 @@ class JoiningJob:
     token: int
     waiting: deque[str]
     until: float
+    assign: Assign | None = None
 
 
 class JoinQueue:
@@ -67,6 +75,10 @@ class JoinQueue:
     def __len__(self) -> int:
         """Return how many wait to join the receiver."""
         return sum(len(job.waiting) for job in self._jobs if job.name != SLICED)
+
+    def waiting(self, name: str) -> frozenset[str]:
+        """Return the heliostats that wait with a command."""
+        return frozenset(n for job in self._jobs if job.name == name for n in job.waiting)
 
     def put(self, job: JoiningJob) -> None:
         """Add a job at the end."""
@@ -125,6 +137,8 @@ class JoinDispatcher:
 
     Parameters
     ----------
+    now
+        Returns the monotonic time, s.
     queue, orders, beams
         Of the plant.
     life
@@ -137,6 +151,7 @@ class JoinDispatcher:
 
     def __init__(
         self,
+        now: Callable[[], float],
         queue: JoinQueue,
         orders: PlantOrders,
         beams: BeamWatch,
@@ -144,33 +159,38 @@ class JoinDispatcher:
         barred: Callable[[str, tuple[str, ...]], dict[str, str]],
         examine: Examine,
     ) -> None:
-        self._queue, self._orders, self._beams, self._life = queue, orders, beams, life
+        self._now, self._queue, self._orders = now, queue, orders
+        self._beams, self._life = beams, life
         self._barred, self._examine = barred, examine
 
     def beat(self, now: float, lost: Lost, *, held: bool) -> None:
         """Send the heliostats whose turn it is, unless no new motion may begin (``held``)."""
         for job, part in self._queue.admit(now, lost, held=held):
-            wrong = self._wrong(job, part, now)
-            job.ticket.block(wrong)
-            clear = [name for name in part if name not in wrong]
-            self._orders.command(
-                job.ticket,
-                job.name,
-                job.values,
-                clear,
-                job.token,
-                self._life,
-                partial(self._wait_again, job),
-            )
+            clear = self._clear(job, part)
+            if job.assign is None or not clear:
+                self._send(job, clear)
+            else:
+                job.assign(clear, partial(self._clear, job), partial(self._send, job))
+
+    def _send(self, job: JoiningJob, heliostats: tuple[str, ...]) -> None:
+        again = partial(self._wait_again, job)
+        values, token = job.values, job.token
+        self._orders.command(job.ticket, job.name, values, heliostats, token, self._life, again)
 
     def _wait_again(self, job: JoiningJob, heliostats: tuple[str, ...]) -> None:
         """Let heliostats whose cluster refused an earlier token wait for another turn."""
         self._queue.put(replace(job, waiting=deque(heliostats)))
 
-    def _wrong(self, job: JoiningJob, part: tuple[str, ...], now: float) -> dict[str, str]:
+    def _clear(self, job: JoiningJob, part: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the heliostats whose turn has come and that may go; end the ticket for others."""
+        wrong = self._wrong(job, part)
+        job.ticket.block(wrong)
+        return tuple(name for name in part if name not in wrong)
+
+    def _wrong(self, job: JoiningJob, part: tuple[str, ...]) -> dict[str, str]:
         """Return which heliostats whose turn has come may not go, and why."""
         if job.name != SLICED:
-            wrong = self._beams.joining(job.name, job.values, part, now)
+            wrong = self._beams.joining(job.name, job.values, part, self._now())
             return wrong | self._barred(job.name, part)
         try:
             return self._examine(job.name, job.values, part)[1]

@@ -86,10 +86,11 @@ class Locks:
         place = (self._utc(), 0.0, 0.0) if visit else None
         return {"LOCKED": dict.fromkeys(heliostats, place)}
 
-    def reason(self, heliostat: str, visit: str) -> str:
+    def reason(self, heliostat: str, visit: str, held: str = "") -> str:
         """Return why a heliostat is LOCKED, since when and until when, in words.
 
-        ``visit`` names the visit that it is in; "" if it is in none.
+        ``visit`` names the visit that it is in; "" if it is in none. ``held`` is why its cluster
+        may begin no motion now; "" if it may.
         """
         lock = self._locked.get(heliostat)
         if lock is None:
@@ -108,6 +109,7 @@ class Locks:
         return (
             f"{left} has left it locked ({since}); the plant unlocks it {there}as soon as motions "
             "are accepted and somebody has the command authority"
+            f"{held and f'; now they are not: {held}'}"
         )
 
     def forget(self, heliostats: Iterable[str]) -> None:

@@ -59,20 +59,24 @@ class _Under:
 
 @dataclass
 class _Recording:
-    """A ticket whose record is on its way to the disk."""
+    """What must be on the disk before some heliostats of a ticket are sent their command."""
 
     ticket: Ticket
-    begin: Work
+    heliostats: tuple[str, ...]
+    #: Writes the record of the ticket; None: it is on the disk already.
+    begin: Work | None
     #: Stores what the command assigns, after its record, and takes that back.
     store: tuple[Work, Work] | None
     until: float
     send: Callable[[bool], None] | None = None
     begun: bool = False
+    waited: bool = False
     error: Exception | None = None
 
     def write(self) -> None:
         """Write the record, then store what the command assigns."""
-        self.begin()
+        if self.begin is not None:
+            self.begin()
         self.begun = True
         if self.store is not None:
             self.store[0]()
@@ -209,27 +213,53 @@ class PlantOrders:
 
     def _record(self, ticket: Ticket, entry: Record, store: tuple[Work, Work] | None) -> None:
         """Give the record of a ticket to the disk."""
-        begin = partial(self._audit.begin, entry)
-        recording = _Recording(ticket, begin, store, self._clock.monotonic() + RECORDING)
-        self._recording[ticket.identity] = recording
+        begin, until = partial(self._audit.begin, entry), self._clock.monotonic() + RECORDING
+        recording = _Recording(ticket, ticket.heliostats, begin, store, until)
         try:
-            self._disk.do(recording.write, partial(self._recorded, recording))
+            self._write(ticket.identity, recording)
         except DiskBusyError as error:
-            del self._recording[ticket.identity]
             raise AuditError(f"audit: {error}") from None
         if recording.error is not None and not recording.begun:
             raise recording.error
 
-    def _recorded(self, recording: _Recording, error: Exception | None) -> None:
+    def when_stored(
+        self,
+        ticket: Ticket,
+        heliostats: tuple[str, ...],
+        store: tuple[Work, Work],
+        send: Callable[[bool], None],
+    ) -> None:
+        """Call ``send`` once what a recorded command assigns to some heliostats is on the disk.
+
+        See `when_recorded`; ``store`` is as in `accept`.
+        """
+        until, self._messages = self._clock.monotonic() + RECORDING, self._messages + 1
+        recording = _Recording(ticket, heliostats, None, store, until, send)
+        try:
+            self._write(f"{ticket.identity}.{self._messages}", recording)
+        except DiskBusyError as error:
+            ticket.advance(heliostats, Stage.FAILED, f"not sent: {error}")
+
+    def _write(self, key: str, recording: _Recording) -> None:
+        """Give the disk what must be on it before a command is sent."""
+        self._recording[key] = recording
+        try:
+            self._disk.do(recording.write, partial(self._recorded, key, recording))
+        except DiskBusyError:
+            del self._recording[key]
+            raise
+        recording.waited = True
+
+    def _recorded(self, key: str, recording: _Recording, error: Exception | None) -> None:
         """Send a command whose record is on the disk, or end it because that failed."""
-        ticket = recording.ticket
+        ticket, heliostats = recording.ticket, recording.heliostats
         self._give_up_late(recording, self._clock.monotonic())
-        del self._recording[ticket.identity]
+        del self._recording[key]
         recording.error = error
         if recording.begun:
             self.confirmed_at = self._clock.monotonic()
         if error is None:
-            if not ticket.finished:
+            if ticket.waiting(heliostats):
                 ticket.record()
                 if recording.send is not None:
                     self._send_recorded(recording, recording.send)
@@ -237,20 +267,19 @@ class PlantOrders:
                 self._owed.append(recording.store[1])
         elif recording.begun:
             text = f"not sent, because it cannot be stored: {error}"
-            ticket.advance(ticket.heliostats, Stage.FAILED, text)
-        elif ticket.identity in self._open:
+            ticket.advance(heliostats, Stage.FAILED, text)
+        elif ticket.identity in self._open and recording.begin is not None:
             text = f"not sent: its record could not be written: {error}"
-            ticket.advance(ticket.heliostats, Stage.FAILED, text)
+            ticket.advance(heliostats, Stage.FAILED, text)
             # It was accepted, so it gets a record as soon as the disk takes one.
             self._owed.append(recording.begin)
 
     def _send_recorded(self, recording: _Recording, send: Callable[[bool], None]) -> None:
         """Send a command that waited for its record, unless it may no longer be sent."""
         try:
-            send(True)
+            send(recording.waited)
         except Exception as error:
-            ticket = recording.ticket
-            ticket.advance(ticket.heliostats, Stage.FAILED, f"not sent: {error}")
+            recording.ticket.advance(recording.heliostats, Stage.FAILED, f"not sent: {error}")
             if recording.store is not None:
                 self._owed.append(recording.store[1])
             if not isinstance(error, RefusedError):
@@ -260,7 +289,7 @@ class PlantOrders:
     def _give_up_late(recording: _Recording, now: float) -> None:
         if now > recording.until:
             text = f"not sent: its record was not on the disk within {RECORDING:g} s"
-            recording.ticket.advance(recording.ticket.heliostats, Stage.FAILED, text)
+            recording.ticket.advance(recording.heliostats, Stage.FAILED, text)
 
     def when_recorded(self, ticket: Ticket, send: Callable[[bool], None]) -> None:
         """Call ``send`` once the ticket's record is on the disk; never, if that takes too long.
@@ -275,6 +304,11 @@ class PlantOrders:
         elif ticket.recorded:
             send(False)
 
+    def unstored(self, name: str) -> frozenset[str]:
+        """Return the heliostats whose command of a name waits for the disk."""
+        waiting = (r for r in self._recording.values() if r.ticket.name == name)
+        return frozenset(each for r in waiting for each in r.heliostats)
+
     def _overtake(self, heliostats: frozenset[str], what: str) -> None:
         """Give up commands that wait for their records or for the line to their cluster.
 
@@ -283,7 +317,7 @@ class PlantOrders:
         for recording in self._recording.values():
             ticket = recording.ticket
             if ticket.name not in _STILL:
-                names = [name for name in ticket.heliostats if name in heliostats]
+                names = [name for name in recording.heliostats if name in heliostats]
                 ticket.advance(names, Stage.FAILED, f"not sent: overtaken by {what}")
         for identity in self._unsent:
             under = self._under.get(identity)
@@ -582,7 +616,7 @@ class PlantOrders:
         until = now + _LAST
         for recording in self._recording.values():
             text = "not sent: the plant was closed"
-            recording.ticket.advance(recording.ticket.heliostats, Stage.FAILED, text)
+            recording.ticket.advance(recording.heliostats, Stage.FAILED, text)
         self.beat(now)
         await self._until(lambda: not self._recording, until)
         for identity, ticket in self._open.items():

@@ -345,6 +345,7 @@ class AutomaticControl:
         rows = [field.place(name) for name in heliostats]
         out = self._plant.lockouts.blocked("TRACK", heliostats, self._plant.aims[rows])
         able, state = self._raising.able(), field.rows["state"]
+        waits = self._raising.waits(heliostats)
         steps = {}
         for name in heliostats:
             if name in out:
@@ -361,11 +362,15 @@ class AutomaticControl:
                 steps[name] = Step("automatic control has it: it is calibrated", Stage.DONE)
             else:
                 row = field.place(name)
-                steps[name] = self._up_step(name, int(state[row]), age, able=bool(able[row]))
+                why, ready = waits.get(name, ""), bool(able[row])
+                steps[name] = self._up_step(name, int(state[row]), age, why, able=ready)
         return steps
 
-    def _up_step(self, name: str, state: int, age: float, *, able: bool) -> Step:
-        """Return the step of a heliostat that automatic control may move."""
+    def _up_step(self, name: str, state: int, age: float, waits: str, *, able: bool) -> Step:
+        """Return the step of a heliostat that automatic control may move.
+
+        ``waits`` is what it waits for beside its turn, "" for nothing.
+        """
         shown = self._plant.field.of(name, self._plant.now())
         if not shown.live:
             return Step(shown.condition, Stage.FAILED if age > _HEARD else None)
@@ -374,8 +379,9 @@ class AutomaticControl:
         if why := self._raising.why_not(name):
             return Step(why, Stage.FAILED)
         if state == states.APPROACHING or (state in _READY and able):
-            return Step(f"automatic control has it: {shown.condition}", Stage.DONE)
-        return Step(f"it waits for its turn: {shown.condition}")
+            text = f"automatic control has it: {shown.condition}"
+            return Step(f"{text}; it waits: {waits}" if waits else text, Stage.DONE)
+        return Step(f"it waits: {waits}" if waits else f"it waits for its turn: {shown.condition}")
 
     def calibrating(self, since: float, heliostats: Sequence[str]) -> Mapping[str, Step]:
         """Return how far calibrations are that persons asked for at a time, POSIX s."""

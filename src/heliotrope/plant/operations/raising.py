@@ -134,6 +134,17 @@ class Raising:
             return f"it was raised in vain too often: {alarms.RAISING_GIVEN_UP.name}"
         return ""
 
+    def waits(self, heliostats: Sequence[str]) -> dict[str, str]:
+        """Return the wanted heliostats that wait for more than their turn, and for what."""
+        plant, found = self._plant, dict(self._plant.held(heliostats))
+        if why := plant.witnesses.refusal:
+            joins = self.able() & plant.field.among((states.IDLE,), plant.now())
+            for name in heliostats:
+                row = plant.field.place(name)
+                if joins[row] and (self._clear[row] or plant.beliefs.record(name) is not None):
+                    found.setdefault(name, why)
+        return found
+
     def give_up(self) -> None:
         """Take all heliostats out of automatic control."""
         self.wanted[:] = False
