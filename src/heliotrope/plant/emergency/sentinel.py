@@ -102,10 +102,10 @@ class Sentinel:
         self._kept = self._recalled = Standing() if record is None else _recall(record)
         self._calls = {call.who: call for call in self._recalled.calls}
         #: Heliostats that an emergency left unproven, and when each was proven, monotonic s.
-        self._unproven: dict[str, float] = {}
-        if not self._recalled.act:
-            left = set(self._recalled.unproven) & set(field.names)
-            self._unproven = dict.fromkeys(sorted(left), math.inf)
+        left = set() if self._recalled.act else set(self._recalled.unproven) & set(field.names)
+        self._unproven = dict.fromkeys(sorted(left), math.inf)
+        #: The order of the program before that these did not prove; reports from now on prove it.
+        self._left = _left_order(self._recalled, tuple(self._unproven), clock)
         known = {"", *field.names, *field.clusters}
         table.recall(row for row in self._recalled.rows if row[1] in known)
         self._clock, self.table, self._field = clock, table, field
@@ -188,8 +188,8 @@ class Sentinel:
                 continue
             self._tries[name] = tries + 1, now + min(OFF_SHOWS * 2**tries, LONGEST_PAUSE)
             best = self._ways.way_out(name, again=tries > 0)
-            if self.order is not None and (self.on or name in self._unproven):
-                best = max(best, self.order.act)
+            if self._proving is not None and (self.on or name in self._unproven):
+                best = max(best, self._proving.act)
             sent.setdefault(max(act, best), {})[name] = text
         for act, texts in sent.items():
             why = "; ".join([*texts.values()][:3])
@@ -217,6 +217,11 @@ class Sentinel:
         self._orders.emergency(ticket, act, names)
         self._joining.drop(f"{act.name} of the field: {reason}")
         return self.order
+
+    @property
+    def _proving(self) -> EmergencyOrder | None:
+        """The order that reports prove now: the last one, or what the program before has left."""
+        return self.order or self._left
 
     @property
     def calls(self) -> tuple[Call, ...]:
@@ -278,7 +283,8 @@ class Sentinel:
         rows = self.table.standing()
         if order is None:
             left = tuple(sorted(name for name, at in self._unproven.items() if math.isinf(at)))
-            return Standing(calls=self.calls, rows=rows, unproven=left)
+            left_by = self._proving.act.name if left and self._proving is not None else ""
+            return Standing(calls=self.calls, rows=rows, unproven=left, left_by=left_by)
         unproven = self._not_done()
         return Standing(order.act.name, order.who, order.reason, self.calls, rows, unproven)
 
@@ -355,7 +361,7 @@ class Sentinel:
 
     def take_rows(self, cluster: str, now: float) -> None:
         """Update the proof of the order from a cluster's new status."""
-        order, names = self.order, self._field.members[cluster]
+        order, names = self._proving, self._field.members[cluster]
         if not self.on:
             names = tuple(name for name in names if name in self._unproven)
         if order is None or not names:
@@ -432,6 +438,17 @@ class Sentinel:
             return f"an emergency holds ({self.order.act.name}: {self.order.reason})"
         texts = (self.table.reasons(Act.REFUSE_NEW, name) for name in sorted(set(clusters)))
         return next((text for text in texts if text), "")
+
+
+def _left_order(before: Standing, unproven: tuple[str, ...], clock: Clock) -> EmergencyOrder | None:
+    """Return the order that heliostats have yet to prove after a restart, None if none has."""
+    if not unproven:
+        return None
+    ticket = Ticket("", before.left_by, unproven, clock, math.inf)
+    now = clock.monotonic()
+    return EmergencyOrder(
+        Act[before.left_by], before.who, before.reason, now, ticket, flux_measured=False
+    )
 
 
 def _recall(record: EmergencyRecord) -> Standing:
