@@ -17,6 +17,7 @@ from heliotrope.links.clock import Clock
 from heliotrope.links.messages import Progress, Stage
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.beam_watch import BeamWatch
+from heliotrope.plant.drive_checks import DriveChecks
 from heliotrope.plant.emergency.order import (
     COUNTS_UNKNOWN,
     ON_BEAM,
@@ -66,6 +67,8 @@ class Sentinel:
         Pause between two repetitions of an order, s.
     identities
         Heliostats that are not what their address says: they must leave, and are never proven.
+    drive_checks
+        Heliostats whose drives stall are never proven; what mirrors were seen to follow is named.
     record
         Store of the emergency that stands: the plant begins in one that held when its last program
         ended. None: it ends with the program.
@@ -93,6 +96,7 @@ class Sentinel:
         drives: Drive,
         repeat: float,
         identities: Identities,
+        drive_checks: DriveChecks,
         record: EmergencyRecord | None = None,
     ) -> None:
         self.order: EmergencyOrder | None = None
@@ -111,6 +115,7 @@ class Sentinel:
         self._clock, self.table, self._field = clock, table, field
         self._orders, self._joining, self._ways = orders, joining, ways
         self._drives, self._repeat, self._identities = drives, repeat, identities
+        self._drive_checks = drive_checks
         #: The strongest act that each cluster was sent as a whole, while it holds.
         self._acts: dict[str, Act] = {}
         self._sent_off: dict[str, float] = {}
@@ -350,10 +355,10 @@ class Sentinel:
             return
         stage = progress.stage
         if stage is Stage.DONE:
-            flags, strange = self._field.rows["flags"], self._identities.strange
+            flags, untrue = self._field.rows["flags"], self._untrue()
             good = (flags & COUNTS_UNKNOWN == 0) & ~switched_off(flags)
             heliostats = tuple(
-                n for n in heliostats if good[self._field.index[n]] and n not in strange
+                n for n in heliostats if good[self._field.index[n]] and n not in untrue
             )
             if self._ways.unsent.watches:
                 stage = Stage.ACKNOWLEDGED
@@ -369,6 +374,7 @@ class Sentinel:
         if self.on:
             self._order_again(order, names)
         rows = [self._field.index[n] for n in names if not order.is_done(n)]
+        untrue = self._untrue()
         if rows:
             index = np.array(rows, dtype=np.intp)
             lit = self._ways.unsent.lit(index)
@@ -379,7 +385,7 @@ class Sentinel:
                 self._field.counted_at[index],
                 Drive(self._drives.table[index]),
                 now,
-                np.array([self._field.names[r] in self._identities.strange for r in rows]),
+                np.array([self._field.names[r] in untrue for r in rows]),
                 lit,
             )
         for row, shines in zip(rows, lit if rows else (), strict=True):
@@ -391,7 +397,7 @@ class Sentinel:
                     f"{name}: its drives are switched off at the mirror, so it is not proven to be "
                     "off; it was not at stow"
                 )
-            elif not order.is_done(name) and (text := self._identities.strange.get(name)):
+            elif not order.is_done(name) and (text := untrue.get(name)):
                 order.unknown[name] = (
                     f"{name}: {text}, so nothing that it reports proves that it is off"
                 )
@@ -406,6 +412,10 @@ class Sentinel:
         for name in () if self.on else names:
             if order.is_done(name):
                 self._unproven[name] = min(self._unproven[name], now)
+
+    def _untrue(self) -> dict[str, str]:
+        """Return the heliostats whose reports prove nothing, and the reasons."""
+        return {**self._drive_checks.stalled, **self._identities.strange}
 
     def _order_again(self, order: EmergencyOrder, names: tuple[str, ...]) -> None:
         """Send heliostats off again that have come back while the emergency holds."""
