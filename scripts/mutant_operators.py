@@ -4,7 +4,7 @@ import ast
 import copy
 import hashlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -172,16 +172,21 @@ def mutated(mutant: Mutant, source: str) -> str:
     return ast.unparse(planted(mutant, source)) + "\n"
 
 
-def sampled(count: int, seed: int) -> list[Mutant]:
-    """Return a seeded sample of the mutants of all packages, in random order.
+def sampled(count: int, seed: int, below: Sequence[str] = PACKAGES) -> list[Mutant]:
+    """Return a seeded sample of the mutants of some packages or files, in random order.
 
     Each mutant is drawn by its own name, so a change of the sources changes the sample no further
-    than it changes mutants: survivors of one tree can be looked for in the next.
+    than it changes mutants: survivors of one tree can be looked for in the next. ``below``
+    are paths below `SOURCE`.
     """
+    paths = {
+        path
+        for each in below
+        for path in ((SOURCE / each).rglob("*.py") if (SOURCE / each).is_dir() else [SOURCE / each])
+    }
     found = [
         mutant
-        for package in PACKAGES
-        for path in sorted((SOURCE / package).rglob("*.py"))
+        for path in sorted(paths)
         for mutant in mutants_of(str(path.relative_to(SOURCE)), path.read_text(encoding="utf-8"))
     ]
     return sorted(found, key=lambda each: _lot(each, seed))[:count]

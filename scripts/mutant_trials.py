@@ -59,7 +59,7 @@ MOST_TESTS, START = 10.0, 10.0
 BESIDE = (
     "console/test_admission.py", "console/test_connections.py", "console/test_marking.py",
     "console/test_outlook_page.py", "console/test_parameters.py", "console/test_zero.py",
-    "store/test_kept_alarms.py", "store/test_kept_audit.py",
+    "optics/test_standing.py", "store/test_kept_alarms.py", "store/test_kept_audit.py",
     "twin/test_live.py", "twin/test_parts.py", "test_limits_page.py",
 )  # fmt: skip
 #: The tests that read every constant and every default.

@@ -41,7 +41,8 @@ def table(lines: Sequence[dict[str, Any]]) -> str:
     heads = ("package", "mutants", "by unit tests", "simulation", "either", "survived",
              "not executed", "not felt")  # fmt: skip
     rows = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-    names = [p for p in PACKAGES if any(line["package"] == p for line in lines)]
+    names = dict.fromkeys([*PACKAGES, *(line["package"] for line in lines)])
+    names = [p for p in names if any(line["package"] == p for line in lines)]
     for name in [*names, "all"]:
         some = [line for line in lines if name in (line["package"], "all")]
         count = _counted(some)
@@ -105,10 +106,13 @@ def main() -> None:
     parser.add_argument("--progress", type=Path, default=ROOT / "out" / "mutants.jsonl")
     parser.add_argument("--reach", type=Path, default=ROOT / "out" / "mutants-reach.json")
     parser.add_argument("--only", choices=("unit", "simulation"), help="one kind of trials")
+    parser.add_argument(
+        "--below", nargs="+", default=PACKAGES, help="packages and files below src/heliotrope"
+    )
     given = parser.parse_args()
     progress: Path = given.progress
     progress.parent.mkdir(parents=True, exist_ok=True)
-    sample, known = sampled(given.sample, given.seed), read(progress)
+    sample, known = sampled(given.sample, given.seed, given.below), read(progress)
     kinds = (given.only,) if given.only else ("unit", "simulation")
     todo = [(kind, m) for m in sample for kind in kinds if (m.key, kind) not in known]
 

@@ -40,6 +40,10 @@ def test_every_order_that_moves_or_locks_has_a_row_of_unsafe_control_actions() -
         row[1] for row in messages.MESSAGES if row[2] in (messages.ANYONE, messages.AUTHORITY)
     }
     assert rows.keys() == orders
+    # A cell names tests, and not a file in which its test might be.
+    assert not [name for name, cells in rows.items() if "tests/" in "".join(cells)]
+    named = {name: re.findall(r"`(test_\w+)`", "".join(cells)) for name, cells in rows.items()}
+    assert not [name for name, tests in named.items() if not tests and name != "GOTO"]
     assert all(len(cells) == 7 and all(cell.strip() for cell in cells) for cells in rows.values())
 
 

@@ -68,6 +68,12 @@ def test_the_same_seed_draws_the_same_mutants(mutants: Any) -> None:
     assert first == mutants.sampled(20, 3)
     assert first != mutants.sampled(20, 4)
     assert {Path(each.file).parts[0] for each in first} <= set(mutants.PACKAGES)
+    some = mutants.sampled(20, 3, ("plant/emergency", "optics/standing.py"))
+    assert len(some) == 20
+    assert {each.file for each in some} <= {
+        "optics/standing.py",
+        *(f"plant/emergency/{name}.py" for name in ("order", "sentinel", "standing", "table")),
+    }
 
 
 def test_a_change_elsewhere_in_a_file_draws_the_same_mutants(mutants: Any) -> None:

@@ -141,6 +141,22 @@ def test_ctl_commands(ctl: Callable[..., Any], console: LiveConsole) -> None:
     assert console.until(lambda: console.live.operations.heliostat(name).state == "STOWED")
 
 
+def test_ctl_says_what_a_proof_has_measured_and_what_it_believes(
+    ctl: Callable[..., Any], console: LiveConsole
+) -> None:
+    try:
+        given = ctl("operator", "emergency")
+        assert given.exit_code == 0, given.output
+        assert console.until(lambda: console.live.operations.emergency_view().measured)
+        shown = ctl("viewer", "status").stdout
+        (line,) = [line for line in shown.splitlines() if line.startswith("EMERGENCY (DEFOCUS): ")]
+        assert "measured: the flux is below its limit" in line
+        assert " by reports alone: " in line
+    finally:
+        ctl("operator", "emergency", "--withdraw")
+        console.calm()
+
+
 @pytest.mark.parametrize(
     ("role", "words", "text"),
     [

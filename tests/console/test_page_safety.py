@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from heliotrope.plant.drive_checks import PHOTOGRAPH
 from support.live_console import LiveConsole
 from support.pages import NEEDS_BROWSER, menu, orders_counted, said
 
@@ -151,6 +152,27 @@ def test_an_emergency_is_withdrawn_after_one_question_and_its_text_ends(
     field.calm()
     page.wait_for_function("!document.querySelector('.hx-alert.on')")
     page.wait_for_selector(".hx-plant p:has-text('ordered by')", state="detached")
+
+
+def test_the_page_says_what_a_proof_has_measured_and_what_it_believes(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    page, name = enter("operator"), field.live.names[3]
+    field.call(lambda: field.live.plant.drive_checks.seen(name, PHOTOGRAPH))
+    page.click("#emergency")
+    page.wait_for_selector(
+        ".hx-alert:has-text('measured: the flux is below its limit (10% of nominal, where single')"
+        ":has-text('1 seen to move today by photograph; 63 by reports alone: ')"
+    )
+    page.wait_for_selector(".hx-plant dd:has-text('the flux, below its limit')")
+    page.wait_for_selector(".hx-plant dd:has-text('1 by photograph')")
+    believed = page.inner_text(".hx-plant dt:has-text('Believed by reports alone') + dd")
+    assert believed.startswith(", ".join(field.live.names[:3] + field.live.names[4:6]))
+    assert believed.endswith(", … (63)")
+    assert name not in believed.split(", ")
+    page.click(".hx-alert button >> text=Withdraw")
+    page.click("dialog >> text='Withdraw'")
+    field.calm()
 
 
 def test_a_refused_acknowledgement_is_not_shown_as_done(enter: Callable[..., Any]) -> None:

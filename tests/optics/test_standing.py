@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from heliotrope.field.layouts import malan_plant
+from heliotrope.field.layouts import PATTERNS, lay_out, malan_plant
 from heliotrope.field.volumes import Sphere, Volume
 from heliotrope.geometry import direction, normalize, reflect
 from heliotrope.optics import MirrorOptics
@@ -152,13 +152,26 @@ def test_a_stow_position_that_lights_something_is_known() -> None:
     design = malan_plant(300)
     group = design.groups["azel"]
     names = design.names
-    assert BeamCheck(design, names).at_stow() == {}
-    strict = replace(
-        group, machines=tuple(replace(one, stow_lights=False) for one in group.machines)
-    )
-    found = BeamCheck(replace(design, groups={"azel": strict}), names).at_stow()
+    flat = max(one.stow[1] for one in group.machines)
+    for allowed in (True, False):
+        up = tuple(replace(one, stow=(0, flat), stow_lights=allowed) for one in group.machines)
+        looking_up = replace(design, groups={"azel": replace(group, machines=up)})
+        found = BeamCheck(looking_up, names).at_stow()
+        assert bool(found) is not allowed
     assert 0 < len(found) < 300
     assert "at some time of the year; choose another stow position" in next(iter(found.values()))
     # A keep-out volume counts wherever it is.
     over = replace(design, keep_outs=(Sphere("corridor", (0.0, -60.0, 60.0), 40.0),))
     assert "corridor" in next(iter(BeamCheck(over, names).at_stow().values()))
+
+
+@pytest.mark.parametrize("kind", PATTERNS)
+@pytest.mark.parametrize("site", [Site(-28.5, 21.2, 830.0), Site(37.1, -2.4, 500.0)])
+def test_no_mirror_of_a_generated_field_lights_anything_from_stow(kind: str, site: Site) -> None:
+    design = lay_out(kind, 400, site=site)
+    machines = design.groups["azel"].machines
+    assert not any(one.stow_lights for one in machines)
+    # The oracle is the proof of the whole beams; the layout reckons with cones of suns.
+    assert BeamCheck(design, design.names).at_stow() == {}
+    up = max(one.stow[1] for one in machines)
+    assert 0 < sum(one.stow[1] < up for one in machines) < 400

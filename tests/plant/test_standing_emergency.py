@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency
 from heliotrope.plant.authority import RefusedError
-from heliotrope.plant.emergency import Call, Standing, read_standing
+from heliotrope.plant.emergency import UNPROVEN, Call, Standing, read_standing
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Act
 from heliotrope.store.keeper import Keeper
@@ -38,7 +39,14 @@ class Record:
         self.document, self.kept = document, self.kept + 1
 
 
-def programs(folder: Path, *scenes: Play, record: object, settings: PlantSettings = FLUX) -> None:
+def programs(
+    folder: Path,
+    *scenes: Play,
+    record: object,
+    settings: PlantSettings = FLUX,
+    deaf: tuple[str, ...] = (),
+    polled_ms: int = 0,
+) -> None:
     """Run one program of a plant after the other; the field is tracking when each begins."""
     for number, scene in enumerate(scenes):
         place = folder / str(number)
@@ -48,6 +56,8 @@ def programs(folder: Path, *scenes: Play, record: object, settings: PlantSetting
             bench = Bench(clock, place, record=record, settings=settings)
             for cluster in bench.clusters.values():
                 cluster.set(states.TRACKING)
+                cluster.polled_ms = polled_ms
+                cluster.deaf.update(deaf)
             async with running(bench):
                 await scene(bench)
 
@@ -197,6 +207,54 @@ def test_rows_of_heliostats_that_the_plant_no_longer_has_are_forgotten(tmp_path:
     programs(tmp_path, scene, record=record)
 
 
+@pytest.mark.parametrize("left_by", ["DEFOCUS", "STOW"])
+def test_what_an_earlier_program_left_unproven_is_proven_by_reports(
+    left_by: str, tmp_path: Path
+) -> None:
+    record = Record(
+        Standing(
+            rows=((UNPROVEN, "P1A"), (UNPROVEN, "P1B")), unproven=("P1A", "P1B"), left_by=left_by
+        ).document
+    )
+
+    async def scene(bench: Bench) -> None:
+        plant, cluster = bench.plant, bench.cluster_of("P1A")
+        await bench.wait(15.0)
+        assert read_standing(record.document).left_by == left_by
+        # P1A carries out the order that it did not prove, P1B the weaker one of the two.
+        cluster.set(states.STOWED, "P1A")
+        cluster.set(states.DEFOCUSED, "P1B")
+        await bench.wait(40.0)
+        left = {a.subject for a in plant.alarms if a.condition == UNPROVEN and a.active}
+        over = {a.subject for a in plant.alarms if a.condition == UNPROVEN and not a.active}
+        assert left == {"P1A", "P1B"}
+        assert over == ({"P1A", "P1B"} if left_by == "DEFOCUS" else {"P1A"})
+        assert plant.emergency is None
+        expected = () if left_by == "DEFOCUS" else ("P1B",)
+        assert read_standing(record.document).unproven == expected
+
+    programs(tmp_path, scene, record=record, settings=PlantSettings(), deaf=("P1A", "P1B"))
+
+
+def test_reports_from_before_the_program_began_prove_nothing(tmp_path: Path) -> None:
+    record = Record(
+        Standing(rows=((UNPROVEN, "P1A"),), unproven=("P1A",), left_by="DEFOCUS").document
+    )
+
+    async def scene(bench: Bench) -> None:
+        cluster = bench.cluster_of("P1A")
+        cluster.set(states.STOWED, "P1A")
+        await bench.wait(40.0)
+        assert read_standing(record.document).unproven == ("P1A",)
+        cluster.polled_ms = 0
+        await bench.wait(40.0)
+        assert record.document == ""
+
+    programs(
+        tmp_path, scene, record=record, settings=PlantSettings(), deaf=("P1A",), polled_ms=60_000
+    )
+
+
 CALLS = (Call("Olga", "smoke", "STOW", 12.0), Call("Vera", "a person on the tower", "DEFOCUS", 9.5))
 
 
@@ -204,5 +262,10 @@ def test_a_standing_emergency_reads_as_it_was_kept() -> None:
     standing = Standing("STOW", "Olga", "smoke", CALLS, (("a", ""), ("b", "P1A")), ("P1A", "P2A"))
     assert read_standing(standing.document) == standing
     assert read_standing("") == Standing()
+    left = Standing(unproven=("P1A",), left_by="DEFOCUS")
+    assert read_standing(left.document) == left
+    # Records of an edition that did not keep which order: the one that is harder to prove.
+    older = left.document.replace(', "left_by": "DEFOCUS"', "")
+    assert read_standing(older) == replace(left, left_by="STOW")
     many = Standing("STOW", "Olga", "smoke", unproven=tuple(f"H{i}" for i in range(10)))
     assert many.continued.endswith("not proven for H0, H1, H2, H3, H4, H5, H6, H7 and 2 more")

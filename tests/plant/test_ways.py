@@ -74,14 +74,14 @@ def counts(plant: PlantController, name: str, point: tuple[float, float, float])
     return [round(float(x)) for x in found.best_counts]
 
 
-async def stands(bench: Bench, name: str, state: int, at: list[int]) -> None:
+async def stands(bench: Bench, name: str, state: int, at: list[int], seconds: float = 2.0) -> None:
     """Let a heliostat report that it stands at counts."""
     cluster = bench.cluster_of(name)
     cluster.set(state, name)
     row = cluster.names.index(name)
     for end, value in zip(("primary", "secondary"), at, strict=True):
         cluster.rows[end][row] = cluster.rows[f"{end}_goal"][row] = value
-    await bench.wait(2.0)
+    await bench.wait(seconds)
 
 
 def test_a_move_by_counts_through_a_volume_is_refused(tmp_path: Path) -> None:
@@ -291,13 +291,15 @@ def test_a_diagnosis_beside_a_volume_is_refused(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         plant = bench.plant
         token = await bench.commanded(ENGINEER)
-        for east, clear in ((-8.0, True), (-1.9, False)):
-            await stands(bench, "P5A", states.IDLE, counts(plant, "P5A", (east, -12.0, 8.0)))
+        for name, east, clear in (("P5B", -8.0, True), ("P5A", -1.9, False)):
+            # Beside the walkway it is ordered off within two seconds.
+            at = counts(plant, name, (east, -12.0, 8.0))
+            await stands(bench, name, states.IDLE, at, 1.5)
             if clear:
-                assert plant.command(ENGINEER, token, "DIAGNOSE", ("P5A",))
+                assert plant.command(ENGINEER, token, "DIAGNOSE", (name,))
             else:
                 with pytest.raises(RefusedError, match="DIAGNOSE P5A: the beam enters walkway"):
-                    plant.command(ENGINEER, token, "DIAGNOSE", ("P5A",))
+                    plant.command(ENGINEER, token, "DIAGNOSE", (name,))
 
     play(tmp_path, scene)
 

@@ -53,6 +53,7 @@ LEADS = {
     "DEFOCUS": states.DEFOCUSED,
     "STOW": states.STOWED,
     "SEARCH": states.SEARCHING,
+    "DIAGNOSE": states.IDLE,
 }
 
 
@@ -82,6 +83,8 @@ class ScriptedCluster:
         Completes the rows with the step counts of heliostats that track.
     found
         What a search of its bus finds; None: it refuses to search.
+    diagnoses
+        Results of diagnoses by heliostat, as `lcu.diagnosis` has them; none: it knows no question.
     late, site, settings
         Error of its time, s; the site and the checksum of settings that it reports.
     """
@@ -107,6 +110,7 @@ class ScriptedCluster:
         self.site: tuple[float, ...] = ()
         self.settings = ""
         self.found: list[dict[str, Any]] | None = None
+        self.diagnoses: dict[str, int] = {}
 
     def of(self, kind: type[Any] | tuple[type[Any], ...]) -> list[Any]:
         """The messages of a kind, or of some."""
@@ -195,6 +199,8 @@ class ScriptedCluster:
             return Answer(ask.identity, {name: {} for name in self.names})
         if ask.what == "discover" and self.found is not None:
             return Answer(ask.identity, {"found": self.found})
+        if ask.what == "diagnosis" and ask.heliostat in self.diagnoses:
+            return Answer(ask.identity, {"result": self.diagnoses[ask.heliostat]})
         if ask.what == "stored" and ask.heliostat not in self.deaf:
             items = self.stored[ask.heliostat] or {"address": struct.pack("<H", 1)}
             sizes = [len(data) for data in items.values()]

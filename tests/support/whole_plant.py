@@ -73,6 +73,8 @@ class WholePlant:
         clusters: int = 2,
         seed: int = 1,
         target: Target = TARGET,
+        *,
+        tilt_sensors: bool = False,
         **options: Any,
     ) -> None:
         self.clock = clock
@@ -86,7 +88,12 @@ class WholePlant:
             SITE,
             {
                 "all": Heliostats(
-                    names, perfect, np.full(count, 3.0), np.full(count, 2.0), cluster=homes
+                    names,
+                    perfect,
+                    np.full(count, 3.0),
+                    np.full(count, 2.0),
+                    cluster=homes,
+                    machines=(replace(MACHINE, tilt_sensor=True),) * count if tilt_sensors else (),
                 )
             },
             targets=(target,),

@@ -216,6 +216,7 @@ def status(context: typer.Context, as_json: Json = False) -> None:
     """Print a summary of the plant."""
     with _client(context) as client:
         found = client.get("summary")
+        order = client.get("emergency") if found["emergency"] else {}
     if as_json:
         print_json(found)
         return
@@ -225,7 +226,7 @@ def status(context: typer.Context, as_json: Json = False) -> None:
     print(f"{found['alarms']} alarms active or not acknowledged")
     print(f"{found['holder'] or 'nobody'} has the command authority")
     if found["emergency"]:
-        print("EMERGENCY")
+        print(f"EMERGENCY ({order['act']}): {order['text']}")
     if found["resume"]:
         print(f"automatic control waits for Resume: {found['resume']}")
 

@@ -1,4 +1,4 @@
-"""Questions of the plant: checksums, stored items, statistics, discovery, frames of the bus."""
+"""Questions of the plant: checksums, stored items, diagnoses, counts, discovery, frames."""
 
 from collections import deque
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from heliotrope.cluster._bus_log import RecordedBus
 from heliotrope.cluster._discovery import Discovery
 from heliotrope.cluster._exchange import Exchange
 from heliotrope.cluster._nodes import ClusterNode, Nodes, OrderRefusedError
-from heliotrope.cluster._orders import stored
+from heliotrope.cluster._orders import TRIES, stored
 from heliotrope.cluster._reports import Reports
 from heliotrope.lcu.journal import ITEMS
 from heliotrope.links.messages import Answer, Ask
@@ -66,14 +66,14 @@ class Questions:
             self._reports.answer(Answer(ask.identity, data))
         elif ask.what == "statistics":
             self._reports.answer(Answer(ask.identity, self.statistics()))
-        elif ask.what == "stored":
-            self._take_stored(ask)
+        elif ask.what in ("stored", "diagnosis"):
+            self._take_one(ask)
         elif ask.what == "discover":
             self._waiting.append(ask)
         elif ask.what == "frames":
             self._record(ask)
         else:
-            known = "checksums, stored, statistics, discover, frames"
+            known = "checksums, stored, diagnosis, statistics, discover, frames"
             self._error(ask, f"question {ask.what!r} is not known; give one of {known}")
 
     def statistics(self) -> dict[str, Any]:
@@ -108,6 +108,9 @@ class Questions:
         if isinstance(first, _Recall):
             self._waiting.popleft()
             await self._recall(first)
+        elif first.what == "diagnosis":
+            self._waiting.popleft()
+            await self._diagnosis(first)
         else:
             await self._discover(first)
 
@@ -120,13 +123,28 @@ class Questions:
             self._reports.answer(Answer(ask.identity, self._discovery.result()))
             self._discovery = None
 
-    def _take_stored(self, ask: Ask) -> None:
+    def _take_one(self, ask: Ask) -> None:
         try:
             node = self._nodes.named(ask.heliostat)
         except OrderRefusedError as refusal:
             self._error(ask, str(refusal))
         else:
-            self._waiting.append(_Recall(ask, node))
+            self._waiting.append(_Recall(ask, node) if ask.what == "stored" else ask)
+
+    async def _diagnosis(self, ask: Ask) -> None:
+        """Answer with the result of a node's last diagnosis of movement."""
+        node = self._nodes.named(ask.heliostat)
+        answer = await self._exchange.ask(
+            node,
+            "QUERY_DIAGNOSIS",
+            expires=self._clock() + _PATIENCE,
+            tries=TRIES,
+            numbers=("DIAGNOSIS",),
+        )
+        if answer is None:
+            self._error(ask, f"{node.name} does not answer")
+        else:
+            self._reports.answer(Answer(ask.identity, {"result": answer.values[0]}))
 
     async def _recall(self, recall: _Recall) -> None:
         """Ask for one item; items already received are not asked for again."""

@@ -12,9 +12,10 @@ ours.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field import layout_tower as tower
@@ -22,7 +23,7 @@ from heliotrope.field.camera import Camera
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
-from heliotrope.geometry import FloatArray, direction
+from heliotrope.geometry import FloatArray, direction, reflect
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive, rotary
@@ -43,8 +44,13 @@ FREE = 6.0
 #: Steps of a turn of a joint; steps/s of its motor.
 _STEPS, _RATE = 400_000, 8000.0
 #: Final approach from below, steps; angles by which both axes turn away at a defocus, rad;
-#: elevation at stow, rad.
+#: elevation at stow, and the lowest at which a mirror is turned away there, rad.
 _BACKLASH, _DEFOCUS, _STOW = 40, (0.1, 0.05), float(np.radians(88.0))
+_LOWEST_STOW, _STOW_STEP = float(np.radians(45.0)), float(np.radians(1.0))
+#: Largest declination of the sun, and its lowest place, refracted, rad; width of a beam with the
+#: errors of a mirror, rad, and room about what it may not light, m.
+_TROPIC, _SUNRISE = float(np.radians(23.45)), float(np.radians(-0.6))
+_SPREAD, _ROOM = float(np.radians(1.5)), 0.5
 #: Distance of the standby point from the receiver: in widths of the receiver, and at least, m.
 _ASIDE, _LEAST_ASIDE = 3.0, 8.0
 _SITE = Site(-28.5, 21.2, 830.0, name="Northern Cape")
@@ -410,8 +416,8 @@ def stepped_machine(mechanism: Mechanism, receiver: Receiver) -> Machine:
 
     Limits are the stops of the drives, the rate is that of the drives, and the acceleration
     reaches it in half a second. At stow the azimuth is in the middle of its stops and the mirror
-    looks up, from where its beam passes the receiver or a target now and then. The standby point is
-    beside the receiver, at the height of its centre.
+    looks up; `unlit_machines` turns those whose beams would pass the receiver or a target. The
+    standby point is beside the receiver, at the height of its centre.
 
     Parameters
     ----------
@@ -433,7 +439,68 @@ def stepped_machine(mechanism: Mechanism, receiver: Receiver) -> Machine:
     east, north, height = (receiver.center + aside).tolist()
     stow = (int(ranges[0].mean()), up)
     standby = (east, north, height)
-    return Machine((axes[0], axes[1]), stow, _DEFOCUS, standby, stow_lights=True)
+    return Machine((axes[0], axes[1]), stow, _DEFOCUS, standby)
+
+
+def unlit_machines(
+    machines: Sequence[Machine],
+    mechanism: Mechanism,
+    things: Sequence[tuple[FloatArray, float]],
+    latitude: float,
+) -> tuple[Machine, ...]:
+    """Return the machines with stow positions from which beams light nothing in a year.
+
+    A mirror that looks up keeps its stow position, unless some sun would send its beam to one of
+    the things. Then it is turned away from them, and tilted no further than that takes: the sun
+    that would do so is below the horizon. Where even 45° do not help, all of the group accept it
+    (`Machine.stow_lights`).
+
+    Parameters
+    ----------
+    machines, mechanism
+        Of azimuth-elevation heliostats, N, whose azimuth is clockwise from north.
+    things
+        Centre, ENU, m, (3,), and radius, m, of each receiver and target.
+    latitude
+        rad, north positive.
+    """
+    drives, armature = Drive(mechanism.drives.table), mechanism.armature
+    stow = np.array([one.stow for one in machines])
+    center = np.mean([place for place, _ in things], axis=0)
+    away = armature.origin_1 - center
+    turned = np.stack([np.arctan2(away[:, 0], away[:, 1]), np.full(len(stow), _STOW)], axis=-1)
+    left = _lights(armature.pose(drives.angles(stow.astype(np.float64))), things, latitude)
+    while left.any() and turned[:, 1].min() >= _LOWEST_STOW:
+        turned[left, 1] -= _STOW_STEP
+        stow[left] = np.round(drives.counts(turned))[left]
+        left &= _lights(armature.pose(turned), things, latitude)
+    return tuple(
+        replace(one, stow=(int(a), int(b)), stow_lights=bool(left.any()))
+        for one, (a, b) in zip(machines, stow.tolist(), strict=True)
+    )
+
+
+def _lights(
+    pose: tuple[FloatArray, FloatArray],
+    things: Sequence[tuple[FloatArray, float]],
+    latitude: float,
+) -> npt.NDArray[np.bool_]:
+    """Return whether some sun of the year sends the beams of standing mirrors to things, (N,).
+
+    All suns from which a beam comes within reach of a thing are in a cone; it may hold a sun if it
+    reaches above the horizon and between the tropics.
+    """
+    normal, vertex = pose
+    pole = np.array([0.0, np.cos(latitude), np.sin(latitude)])
+    found = np.zeros(len(normal), dtype=np.bool_)
+    for center, radius in things:
+        way = center - vertex
+        distance = np.linalg.norm(way, axis=-1)
+        cone = np.arcsin(np.minimum((radius + _ROOM) / distance, 1.0)) + _SPREAD
+        sun = reflect(way / distance[:, None], normal)
+        up = np.arcsin(np.clip(sun[:, 2], -1.0, 1.0)) + cone > _SUNRISE
+        found |= up & (np.abs(np.arcsin(np.clip(sun @ pole, -1.0, 1.0))) - cone < _TROPIC)
+    return found
 
 
 def malan_plant(heliostats: int = 10_000) -> Plant:
@@ -509,7 +576,9 @@ def lay_out(
         )
     count = len(places)
     mechanism = stepped(places.position, size)
-    machine = stepped_machine(mechanism, receiver)
+    machines = spread_machines(stepped_machine(mechanism, receiver), places.names)
+    surfaces = (receiver, *targets)
+    things = [(s.center, 0.5 * float(np.hypot(s.width, s.height) + size.reach)) for s in surfaces]
     return Plant(
         name or kind,
         site,
@@ -520,7 +589,7 @@ def lay_out(
                 np.full(count, size.width),
                 np.full(count, size.height),
                 cluster=clusters(count),
-                machines=spread_machines(machine, places.names),
+                machines=unlit_machines(machines, mechanism, things, np.radians(site.latitude_deg)),
             )
         },
         targets,

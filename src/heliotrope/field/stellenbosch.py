@@ -113,4 +113,4 @@ def _machine(mechanism: Mechanism, receiver: Receiver) -> Machine:
     # Elastic cords and the mirror's weight keep the gears on one flank (5.1.3).
     first, second = (replace(axis, backlash=0) for axis in made.axes)
     stepping = Stepping((MICROSTEPS, MICROSTEPS), rests=True)
-    return replace(made, axes=(first, second), stow=(0, 0), stepping=stepping)
+    return replace(made, axes=(first, second), stow=(0, 0), stepping=stepping, stow_lights=True)

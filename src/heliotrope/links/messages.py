@@ -167,7 +167,9 @@ class Parameters:
 class Ask:
     """A question.
 
-    ``what``: ``checksums``, ``stored`` (of a heliostat), ``statistics``, ``discover``, ``frames``.
+    ``what``: ``checksums``, ``stored`` and ``diagnosis`` (of a heliostat), ``statistics``,
+    ``discover``, ``frames``. The answer to ``diagnosis`` is the ``result`` of the last diagnosis of
+    movement (`lcu.diagnosis`).
     The answer to ``statistics`` names all heliostats in the order of the rows of `ClusterStatus`.
     The answer to ``frames``, what went over the bus, comes when its time or number is reached; its
     block holds a `BUS_ENTRY` and the bytes for each.

@@ -128,6 +128,8 @@ class Machine:
     stow_lights
         Whether the beam may pass a receiver or a target at some hours of the year while the mirror
         is at stow: it is one sun. Keep-out volumes are never passed.
+    tilt_sensor
+        Whether the mirror carries a sensor of its tilt, by which a diagnosis sees it follow.
 
     Raises
     ------
@@ -144,6 +146,7 @@ class Machine:
     way: tuple[tuple[float, float, float], ...] = ()
     stepping: Stepping | None = None
     stow_lights: bool = False
+    tilt_sensor: bool = False
 
     @property
     def rests(self) -> bool:

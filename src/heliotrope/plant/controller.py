@@ -55,6 +55,7 @@ from heliotrope.plant.cluster_settings import ClusterSettings
 from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
 from heliotrope.plant.commands import Commands
 from heliotrope.plant.doubts import Doubts
+from heliotrope.plant.drive_checks import DriveChecks
 from heliotrope.plant.emergency import (
     Call,
     EmergencyOrder,
@@ -128,7 +129,7 @@ class PlantController:
 
     Attributes
     ----------
-    design, settings, field, authority, wanted, counters, beliefs, doubts, witnesses
+    design, settings, field, authority, wanted, counters, beliefs, doubts, witnesses, drive_checks
         See their classes.
     beams
         Mirrors and keep-out volumes; see `BeamCheck`.
@@ -203,8 +204,21 @@ class PlantController:
         self.witnesses = Witnesses(
             self.settings.witnesses, design.site, lambda: clock.utc().timestamp(), self._tell
         )
+        self.drive_checks = DriveChecks(
+            self.field,
+            self._clusters,
+            (name for name, each in self.beams.machines.items() if each.tilt_sensor),
+            design.site,
+            clock,
+            self._tell,
+        )
         self.doubts = Doubts(
-            self.field, design, self.aims, self._tell, lambda: self.witnesses.refusal
+            self.field,
+            design,
+            self.aims,
+            self._tell,
+            lambda: self.witnesses.refusal,
+            self.drive_checks.stalled,
         )
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
         self._rivals, self._told_alarms = Rivals(self.name, self._tell), ToldAlarms()
@@ -277,6 +291,7 @@ class PlantController:
             self.beams.drives,
             self.settings.repeat,
             self._identities,
+            self.drive_checks,
             record,
         )
 
@@ -414,6 +429,8 @@ class PlantController:
 
     def _obeyed(self, ticket: Ticket, part: Sequence[str], stage: Stage, now: float) -> None:
         """Note what some heliostats of a ticket have acknowledged or done."""
+        if stage is Stage.DONE and ticket.name == "DIAGNOSE":
+            self.drive_checks.ask(part)
         if stage is Stage.ACKNOWLEDGED:
             self._agreement.obeyed(ticket.name, ticket.accepted_at, part, now)
             self._ways.ordered.taken(ticket.name, part, now)
@@ -434,6 +451,7 @@ class PlantController:
             self._tell(alarm)
         self._give_up(self._identities.look(end.name))
         self.doubts.look(end.name)
+        self.drive_checks.look(end.name)
         if not self.field.knows_order(end.name) and now - self._named_at[end.name] >= _ASK_NAMES:
             # The message that names the rows was lost; the statistics come in the same order.
             self._named_at[end.name] = now
@@ -672,7 +690,8 @@ class PlantController:
         condition, subject
             As the alarm names them. A row that a cluster watches has the cluster as subject; the
             cluster decides, and ends the alarm if it agrees. For `counts_doubtful` it confirms that
-            the person has seen the heliostat where it should be.
+            the person has seen the heliostat where it should be; for `drive_stalled`, that its
+            mirror follows its drives.
 
         Raises
         ------
@@ -683,6 +702,8 @@ class PlantController:
         role = person.role.acknowledges_as
         if condition == alarms.COUNTS_DOUBTFUL.name:
             self.doubts.confirm(subject)
+        elif condition == alarms.DRIVE_STALLED.name:
+            self.drive_checks.confirm(subject)
         elif condition in self._sentinel.table.rows or subject not in self._clusters.ends:
             refusal = self._sentinel.acknowledge(condition, person.name, role, subject)
             if refusal:

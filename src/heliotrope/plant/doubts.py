@@ -5,11 +5,12 @@ which it reports as COUNTS_DOUBTFUL until ZERO. Its beam may then stand beside i
 any other sign. Such a heliostat is named, and kept off the receiver until a photograph on a target
 or a person has confirmed its place. A confirmation holds for one boot: it says nothing of the next
 cut. One that stores new parameters which a calibration has yet to verify stays off in the same way,
-one whose parameters a flight of a drone contradicts, and all while no witness confirms the sun.
+one whose parameters a flight of a drone contradicts, one whose drives stall, and all while no
+witness confirms the sun.
 """
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 
 import numpy as np
 
@@ -40,6 +41,8 @@ class Doubts:
         Called with each alarm.
     unwitnessed
         Returns why no heliostat may join a receiver, "" if heliostats may; see `witnesses`.
+    stalled
+        Heliostats whose drives stall; see `drive_checks`.
 
     Attributes
     ----------
@@ -54,8 +57,9 @@ class Doubts:
         aims: FloatArray,
         tell: Callable[[Alarm], None],
         unwitnessed: Callable[[], str],
+        stalled: Collection[str],
     ) -> None:
-        self._unwitnessed = unwitnessed
+        self._unwitnessed, self._stalled = unwitnessed, stalled
         self._field, self._aims, self._tell = field, aims, tell
         self._receivers = np.array([each.center for each in design.receivers]).reshape(-1, 3)
         self._targets = np.array([each.center for each in design.targets]).reshape(-1, 3)
@@ -124,7 +128,8 @@ class Doubts:
         rows = [self._field.place(name) for name in names]
         unverified, astray = (np.isin(rows, list(s)) for s in (self._unverified, self._astray))
         blocked = self._unwitnessed()
-        doubted = self.standing[rows] | unverified | astray | bool(blocked)
+        stalled = np.array([name in self._stalled for name in names], dtype=np.bool_)
+        doubted = self.standing[rows] | unverified | astray | stalled | bool(blocked)
         if not doubted.any():
             return {}
         on_target = self._on_target(self._aims[rows] if points is None else points)
@@ -135,6 +140,8 @@ class Doubts:
                 found[names[i]] = refusals.COUNTS_DOUBTFUL.text
             if astray[i]:
                 found[names[i]] = refusals.SEEN_ASTRAY.text
+            if stalled[i]:
+                found[names[i]] = refusals.DRIVE_STALLED.text
             if unverified[i]:
                 found[names[i]] = refusals.NOT_VERIFIED.text
         return found

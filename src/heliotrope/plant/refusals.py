@@ -218,6 +218,13 @@ COUNTS_DOUBTFUL = Refusal(
     "its step counts may be wrong since a power cut in motion, and nobody has confirmed them",
     "Look where its mirror stands, then acknowledge the alarm `counts_doubtful`; or calibrate it.",
 )
+DRIVE_STALLED = Refusal(
+    "drive stalled",
+    "A heliostat whose mirror did not follow its drives is sent to the receiver.",
+    "its drives made steps, and its mirror did not follow, so its step counts are wrong",
+    "Look for ice, a loose coupling or a driver without current; then give Diagnose again, or "
+    "acknowledge the alarm `drive_stalled` once you have seen the mirror follow, and give ZERO.",
+)
 NOT_VERIFIED = Refusal(
     "not verified",
     "A heliostat is sent to the receiver while a calibration verifies its new parameters.",

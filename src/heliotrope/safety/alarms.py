@@ -233,6 +233,43 @@ COUNTS_DOUBTFUL = AlarmKind(
     "gives its step counts (ZERO). A calibration visit confirms it too.",
     over="{subject}: its step counts are confirmed, or have been given again",
 )
+DRIVE_STALLED = AlarmKind(
+    "drive_stalled",
+    _PLANT,
+    Severity.ALARM,
+    "The drives of a heliostat made steps, and its mirror did not follow: ice, a loose coupling, "
+    "or a driver without current.",
+    "{subject}: {drives} made steps, and its mirror did not follow",
+    "It joins no receiver, automatic control leaves it at stow, and nothing that it reports proves "
+    "an emergency: its beam may be anywhere that its drives have been since.",
+    "Look where its beam is from a safe place. Remove the cause, clear the fault, and give "
+    "Diagnose again; or acknowledge once you have seen the mirror follow. Its step counts need "
+    "ZERO.",
+    over="{subject}: its mirror follows its drives",
+)
+DIAGNOSIS_FAILS = AlarmKind(
+    "diagnosis_fails",
+    _PLANT,
+    Severity.WARNING,
+    "Diagnoses of a heliostat's movement did not come to their end five times in a row.",
+    "{subject}: {count} diagnoses of its movement in a row failed; the last time {reason}",
+    "It stays at stow, and is diagnosed again after an hour.",
+    "Find the cause (tab Logs): its cluster, its supply, or orders that interrupt it; then give "
+    "Diagnose by hand. If it has no tilt sensor, correct tilt_sensor in the plant file.",
+    over="{subject}: a diagnosis of its movement has come to its end",
+)
+TILT_SENSOR_SILENT = AlarmKind(
+    "tilt_sensor_silent",
+    _PLANT,
+    Severity.WARNING,
+    "A heliostat has a tilt sensor by the plant file, and its board gets no reading from it.",
+    "{subject}: its tilt sensor gives no reading, so a drive that stalls is not seen",
+    "It goes on as a heliostat without such a sensor; a photograph on a target still shows whether "
+    "its mirror follows.",
+    "Check the sensor's wires and its pins in the settings of the board; or correct tilt_sensor in "
+    "the plant file.",
+    over="{subject}: its tilt sensor gives readings",
+)
 RECORDS = AlarmKind(
     "records",
     _PLANT,

@@ -1,10 +1,12 @@
 """The proof that an emergency order was carried out.
 
-It is a proof of reports: of states and step counts. Only the flux on the receiver is measured,
-where a sensor feeds it.
+It is a proof of reports: of states and step counts. Only the flux on the receiver is measured after
+the order, where a sensor feeds it, and that shows the field, not a single mirror. What has shown
+earlier that mirrors follow their drives is said beside it.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -31,7 +33,10 @@ class FluxProof(Enum):
     #: There is still time for a reading.
     AWAITED = "flux not proven yet"
     #: A fresh reading, taken after the order, shows it below its limit.
-    BELOW = "measured: the flux is below its limit"
+    BELOW = (
+        "measured: the flux is below its limit "
+        f"({FLUX_LIMIT:.0%} of nominal, where single beams do not show)"
+    )
     #: No such reading came in time.
     NOT_BELOW = f"flux not proven to be below {FLUX_LIMIT:.0%}"
 
@@ -53,6 +58,11 @@ class ProofReport:
         measured.
     unknown
         What is known of each heliostat of which nothing can show that it is done.
+    followed
+        Number of the heliostats that are done whose mirrors were seen to follow their drives
+        earlier today, by what showed it.
+    believed
+        Those that are done by their reports alone, sorted.
     """
 
     unacknowledged: tuple[str, ...]
@@ -61,26 +71,49 @@ class ProofReport:
     flux: FluxProof
     complete: bool
     unknown: tuple[str, ...] = ()
+    followed: Mapping[str, int] = field(default_factory=dict)
+    believed: tuple[str, ...] = ()
 
     @property
     def text(self) -> str:
         """One line for the operator."""
         if self.complete:
-            measured = self.flux is FluxProof.BELOW
-            believed = "" if measured else ", so this is believed: a stalled drive reports the same"
-            return (
-                "every heliostat has acknowledged and is done, as it reports; "
-                f"{self.flux.value}{believed}"
-            )
+            return f"every heliostat has acknowledged and is done, as it reports; {self.basis}"
         parts = []
         for names, what in ((self.unacknowledged, "not acknowledged"), (self.not_done, "not done")):
             if names:
-                shown = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
-                parts.append(f"{len(names)} {what}: {shown}")
-        parts += self.unknown[:8]
-        if self.flux is not FluxProof.BELOW:
-            parts.append(self.flux.value)
+                parts.append(f"{len(names)} {what}: {_first(names)}")
+        return "; ".join([*parts, *self.unknown[:8], self.basis])
+
+    @property
+    def basis(self) -> str:
+        """What of the proof is measured and what is believed, in one line."""
+        parts = [self.flux.value]
+        if self.flux is not FluxProof.BELOW and (self.complete or self.believed or self.followed):
+            parts[0] += ", so this is believed: a stalled drive reports the same"
+        parts += [
+            f"{count} seen to move today by {by}" for by, count in sorted(self.followed.items())
+        ]
+        if self.believed:
+            parts.append(f"{len(self.believed)} by reports alone: {_first(self.believed)}")
         return "; ".join(parts)
+
+    def with_evidence(self, done: Iterable[str], shown: Mapping[str, str]) -> "ProofReport":
+        """Return the report with what showed today that mirrors follow, by heliostat.
+
+        ``done`` are the heliostats that have carried out the order.
+        """
+        names = sorted(done)
+        followed = Counter(shown[name] for name in names if name in shown)
+        return replace(
+            self,
+            followed=dict(followed),
+            believed=tuple(name for name in names if name not in shown),
+        )
+
+
+def _first(names: tuple[str, ...]) -> str:
+    return ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
 
 
 @dataclass(frozen=True)

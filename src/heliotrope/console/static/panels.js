@@ -30,7 +30,10 @@ export function plant(box) {
     light.replaceChildren(facts([["Azimuth", `${degrees(head.sun.azimuth, 1)}°`], ["Elevation", `${degrees(head.sun.elevation, 1)}°`],
       ["Shadow of the tower", head.sun.elevation > 0.02 ? `${number(store.field.tower[2] / Math.tan(head.sun.elevation), 0)} m to ${degrees((head.sun.azimuth + Math.PI) % (2 * Math.PI), 0)}°` : "none: the sun is down"]]));
     proof.replaceChildren(...(head.order.on ? [h("p", { className: "hx-said bad" },
-      `${head.order.act} of the field, ordered by ${head.order.who}: ${head.order.acknowledged} of ${head.order.heliostats} acknowledged, ${head.order.done} done. ${head.order.text}`)] : []));
+      `${head.order.act} of the field, ordered by ${head.order.who}: ${head.order.acknowledged} of ${head.order.heliostats} acknowledged, ${head.order.done} done. ${head.order.text}`), facts([
+      ["Measured", head.order.measured ? "the flux, below its limit" : "nothing since the order"],
+      ["Seen to move today", Object.entries(head.order.followed).map(([by, n]) => `${count(n)} by ${by}`).join(", ") || "none"],
+      ["Believed by reports alone", head.order.believed.join(", ") + (head.order.believed_count > head.order.believed.length ? `, … (${count(head.order.believed_count)})` : "") || "none"]])] : []));
   };
   const draw = () => { if (seen) drawFlux(flux, seen); };
   const off = [store.on("frame", show), store.on("theme", () => { show(); draw(); })];

@@ -321,7 +321,13 @@ class _Reader:
             if numbers not in made:
                 limits = (AxisLimits(*numbers[0]), AxisLimits(*numbers[1]))
                 made[numbers] = Machine(
-                    limits, *numbers[2:], joints.index(first), way, stepping, table.stow_lights
+                    limits,
+                    *numbers[2:],
+                    joints.index(first),
+                    way,
+                    stepping,
+                    table.stow_lights,
+                    table.tilt_sensor,
                 )
             found.append(made[numbers])
         return tuple(found)
@@ -494,4 +500,6 @@ def _machine_document(
         }
     if machines[0].stow_lights:
         document["stow_lights"] = True
+    if machines[0].tilt_sensor:
+        document["tilt_sensor"] = True
     return {**document, "axes": axes}

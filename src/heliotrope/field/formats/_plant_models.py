@@ -286,6 +286,11 @@ class MachineTable(StrictTable):
         description="Whether beams may pass a receiver or a target at some hours of the year while "
         "the mirrors are at stow.",
     )
+    tilt_sensor: bool = Field(
+        False,
+        description="Whether each mirror carries a sensor of its tilt: automatic control then lets "
+        "each be diagnosed at stow, on each day before it is raised.",
+    )
     standby_m: Vector | None = Field(
         None, description="ENU; without: the local controller keeps the point it has."
     )

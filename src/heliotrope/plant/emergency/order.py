@@ -8,7 +8,9 @@ its beam onto one. A heliostat with unknown step counts is never done: the repor
 beam was last.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -108,9 +110,13 @@ class EmergencyOrder:
             self._proof = self._proof.without(back)
         return back
 
-    def report(self, now: float) -> ProofReport:
-        """Return how far the order has been carried out."""
-        return replace(self.proof.report(now), unknown=tuple(self.unknown.values()))
+    def report(self, now: float, shown: Mapping[str, str] = MappingProxyType({})) -> ProofReport:
+        """Return how far the order has been carried out.
+
+        ``shown`` is what has shown today that mirrors follow their drives, by heliostat.
+        """
+        report = replace(self.proof.report(now), unknown=tuple(self.unknown.values()))
+        return report.with_evidence(self.proof.done, shown)
 
     def unacknowledged(self, heliostats: tuple[str, ...]) -> tuple[str, ...]:
         """Return which of some heliostats have not acknowledged the order."""

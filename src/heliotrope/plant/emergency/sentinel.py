@@ -17,6 +17,7 @@ from heliotrope.links.clock import Clock
 from heliotrope.links.messages import Progress, Stage
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.beam_watch import BeamWatch
+from heliotrope.plant.drive_checks import DriveChecks
 from heliotrope.plant.emergency.order import (
     COUNTS_UNKNOWN,
     ON_BEAM,
@@ -66,6 +67,8 @@ class Sentinel:
         Pause between two repetitions of an order, s.
     identities
         Heliostats that are not what their address says: they must leave, and are never proven.
+    drive_checks
+        Heliostats whose drives stall are never proven; what mirrors were seen to follow is named.
     record
         Store of the emergency that stands: the plant begins in one that held when its last program
         ended. None: it ends with the program.
@@ -93,6 +96,7 @@ class Sentinel:
         drives: Drive,
         repeat: float,
         identities: Identities,
+        drive_checks: DriveChecks,
         record: EmergencyRecord | None = None,
     ) -> None:
         self.order: EmergencyOrder | None = None
@@ -102,15 +106,16 @@ class Sentinel:
         self._kept = self._recalled = Standing() if record is None else _recall(record)
         self._calls = {call.who: call for call in self._recalled.calls}
         #: Heliostats that an emergency left unproven, and when each was proven, monotonic s.
-        self._unproven: dict[str, float] = {}
-        if not self._recalled.act:
-            left = set(self._recalled.unproven) & set(field.names)
-            self._unproven = dict.fromkeys(sorted(left), math.inf)
+        left = set() if self._recalled.act else set(self._recalled.unproven) & set(field.names)
+        self._unproven = dict.fromkeys(sorted(left), math.inf)
+        #: The order of the program before that these did not prove; reports from now on prove it.
+        self._left = _left_order(self._recalled, tuple(self._unproven), clock)
         known = {"", *field.names, *field.clusters}
         table.recall(row for row in self._recalled.rows if row[1] in known)
         self._clock, self.table, self._field = clock, table, field
         self._orders, self._joining, self._ways = orders, joining, ways
         self._drives, self._repeat, self._identities = drives, repeat, identities
+        self._drive_checks = drive_checks
         #: The strongest act that each cluster was sent as a whole, while it holds.
         self._acts: dict[str, Act] = {}
         self._sent_off: dict[str, float] = {}
@@ -188,8 +193,8 @@ class Sentinel:
                 continue
             self._tries[name] = tries + 1, now + min(OFF_SHOWS * 2**tries, LONGEST_PAUSE)
             best = self._ways.way_out(name, again=tries > 0)
-            if self.order is not None and (self.on or name in self._unproven):
-                best = max(best, self.order.act)
+            if self._proving is not None and (self.on or name in self._unproven):
+                best = max(best, self._proving.act)
             sent.setdefault(max(act, best), {})[name] = text
         for act, texts in sent.items():
             why = "; ".join([*texts.values()][:3])
@@ -217,6 +222,11 @@ class Sentinel:
         self._orders.emergency(ticket, act, names)
         self._joining.drop(f"{act.name} of the field: {reason}")
         return self.order
+
+    @property
+    def _proving(self) -> EmergencyOrder | None:
+        """The order that reports prove now: the last one, or what the program before has left."""
+        return self.order or self._left
 
     @property
     def calls(self) -> tuple[Call, ...]:
@@ -278,7 +288,8 @@ class Sentinel:
         rows = self.table.standing()
         if order is None:
             left = tuple(sorted(name for name, at in self._unproven.items() if math.isinf(at)))
-            return Standing(calls=self.calls, rows=rows, unproven=left)
+            left_by = self._proving.act.name if left and self._proving is not None else ""
+            return Standing(calls=self.calls, rows=rows, unproven=left, left_by=left_by)
         unproven = self._not_done()
         return Standing(order.act.name, order.who, order.reason, self.calls, rows, unproven)
 
@@ -344,10 +355,10 @@ class Sentinel:
             return
         stage = progress.stage
         if stage is Stage.DONE:
-            flags, strange = self._field.rows["flags"], self._identities.strange
+            flags, untrue = self._field.rows["flags"], self._untrue()
             good = (flags & COUNTS_UNKNOWN == 0) & ~switched_off(flags)
             heliostats = tuple(
-                n for n in heliostats if good[self._field.index[n]] and n not in strange
+                n for n in heliostats if good[self._field.index[n]] and n not in untrue
             )
             if self._ways.unsent.watches:
                 stage = Stage.ACKNOWLEDGED
@@ -355,7 +366,7 @@ class Sentinel:
 
     def take_rows(self, cluster: str, now: float) -> None:
         """Update the proof of the order from a cluster's new status."""
-        order, names = self.order, self._field.members[cluster]
+        order, names = self._proving, self._field.members[cluster]
         if not self.on:
             names = tuple(name for name in names if name in self._unproven)
         if order is None or not names:
@@ -363,6 +374,7 @@ class Sentinel:
         if self.on:
             self._order_again(order, names)
         rows = [self._field.index[n] for n in names if not order.is_done(n)]
+        untrue = self._untrue()
         if rows:
             index = np.array(rows, dtype=np.intp)
             lit = self._ways.unsent.lit(index)
@@ -373,7 +385,7 @@ class Sentinel:
                 self._field.counted_at[index],
                 Drive(self._drives.table[index]),
                 now,
-                np.array([self._field.names[r] in self._identities.strange for r in rows]),
+                np.array([self._field.names[r] in untrue for r in rows]),
                 lit,
             )
         for row, shines in zip(rows, lit if rows else (), strict=True):
@@ -385,7 +397,7 @@ class Sentinel:
                     f"{name}: its drives are switched off at the mirror, so it is not proven to be "
                     "off; it was not at stow"
                 )
-            elif not order.is_done(name) and (text := self._identities.strange.get(name)):
+            elif not order.is_done(name) and (text := untrue.get(name)):
                 order.unknown[name] = (
                     f"{name}: {text}, so nothing that it reports proves that it is off"
                 )
@@ -400,6 +412,10 @@ class Sentinel:
         for name in () if self.on else names:
             if order.is_done(name):
                 self._unproven[name] = min(self._unproven[name], now)
+
+    def _untrue(self) -> dict[str, str]:
+        """Return the heliostats whose reports prove nothing, and the reasons."""
+        return {**self._drive_checks.stalled, **self._identities.strange}
 
     def _order_again(self, order: EmergencyOrder, names: tuple[str, ...]) -> None:
         """Send heliostats off again that have come back while the emergency holds."""
@@ -432,6 +448,17 @@ class Sentinel:
             return f"an emergency holds ({self.order.act.name}: {self.order.reason})"
         texts = (self.table.reasons(Act.REFUSE_NEW, name) for name in sorted(set(clusters)))
         return next((text for text in texts if text), "")
+
+
+def _left_order(before: Standing, unproven: tuple[str, ...], clock: Clock) -> EmergencyOrder | None:
+    """Return the order that heliostats have yet to prove after a restart, None if none has."""
+    if not unproven:
+        return None
+    ticket = Ticket("", before.left_by, unproven, clock, math.inf)
+    now = clock.monotonic()
+    return EmergencyOrder(
+        Act[before.left_by], before.who, before.reason, now, ticket, flux_measured=False
+    )
 
 
 def _recall(record: EmergencyRecord) -> Standing:

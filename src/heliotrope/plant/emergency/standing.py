@@ -73,6 +73,8 @@ class Standing:
         cluster or heliostat, "" for the field.
     unproven
         Heliostats that the proof did not show to be done.
+    left_by
+        Name of the order of which ``unproven`` heliostats are left, where no emergency holds.
     """
 
     act: str = ""
@@ -81,6 +83,7 @@ class Standing:
     calls: tuple[Call, ...] = ()
     rows: tuple[tuple[str, str], ...] = ()
     unproven: tuple[str, ...] = ()
+    left_by: str = ""
 
     @property
     def document(self) -> str:
@@ -106,13 +109,16 @@ def read_standing(document: str) -> Standing:
         rows = tuple((str(row), str(subject)) for row, subject in found["rows"])
         unproven = _names(found["unproven"])
         act, who, reason = (str(found[key]) for key in ("act", "who", "reason"))
-        if act and Act[act] not in (Act.DEFOCUS, Act.STOW):
-            raise ValueError(act)
+        # A record of an older edition does not say which order: STOW is harder to prove.
+        left_by = str(found.get("left_by", "STOW" if unproven and not act else ""))
+        for name in filter(None, (act, left_by)):
+            if Act[name] not in (Act.DEFOCUS, Act.STOW):
+                raise ValueError(name)
         calls = tuple(
             Call(str(c["who"]), str(c["reason"]), str(c["act"]), float(c["at"]))
             for c in found["calls"]
         )
-        return Standing(act, who, reason, calls, rows, unproven)
+        return Standing(act, who, reason, calls, rows, unproven, left_by)
     except (ValueError, KeyError, TypeError):
         call = Call("plant", _UNREADABLE, "DEFOCUS", 0.0)
         return Standing(call.act, call.who, call.reason, (call,))

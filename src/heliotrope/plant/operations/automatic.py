@@ -35,6 +35,7 @@ from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.learning import Learner, Learning
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.losses import Losses
+from heliotrope.plant.operations.movement_checks import MovementChecks
 from heliotrope.plant.operations.parties import Parties
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.production import ProductionVisits
@@ -208,6 +209,7 @@ class AutomaticControl:
             clearance=settings.margin * self.installed,
             wanted=settings.wanted,
         )
+        self._checks = MovementChecks(plant, AUTOMATIC, logbook.take_alarm)
         most = min(settings.losses, math.floor(settings.losses_share * len(plant.field)))
         self._losses = Losses(plant, logbook, most, records, self._wait)
         visits = CycleSettings() if cycle is None else cycle.settings
@@ -421,6 +423,7 @@ class AutomaticControl:
         return (
             *(() if visits is None else visits.retries()),
             *self._raising.attempts.shown(now),
+            *self._checks.attempts.shown(now),
             *self.service.attempts.shown(now),
             *self._parts.shown(now),
         )
@@ -494,7 +497,7 @@ class AutomaticControl:
     async def run(self) -> None:
         """Work until cancelled."""
         async with asyncio.TaskGroup() as group:
-            for part in (self._govern, self._raise, self._look, self._learn):
+            for part in (self._govern, self._raise, self._diagnose, self._look, self._learn):
                 name = part.__name__.strip("_")
                 group.create_task(self._again(name, part, self._settings.beat))
             if self._calibrating is not None:
@@ -611,11 +614,21 @@ class AutomaticControl:
         self.service.park()
         if self._plant.emergency_on:
             self._raising.give_up()
-        self._raising.lose(self._losses.look(self._raising.wanted))
+        self._raising.lose(self._losses.look(self._raising.wanted, self._checks.moved))
         if not self._why_idle():
-            resting = self._losses.settling() | self.service.rows() | self._raising.given_up()
+            resting = self._left_alone() | self._checks.resting
             self._start_again(self._raising.stuck(self._visiting(), resting))
             await self._raising.step(self._token, self._visiting, resting)
+
+    def _left_alone(self) -> npt.NDArray[np.bool_]:
+        """Return which heliostats automatic control leaves where they are, (N,)."""
+        return self._losses.settling() | self.service.rows() | self._raising.given_up()
+
+    async def _diagnose(self) -> None:
+        """Let drives show that they turn their mirrors, on each day before these are raised."""
+        if not self._why_idle():
+            free = self._raising.wanted & ~self._left_alone()
+            await self._checks.step(self._token, free)
 
     def _start_again(self, rows: npt.NDArray[np.intp]) -> None:
         """Send heliostats to stow that cannot go on from where they are; they are raised again."""

@@ -24,7 +24,7 @@ _LONGEST = 240
 #: Alarms that the evaluation of the table raises and ends itself: nothing to acknowledge.
 _UNACKNOWLEDGED = (alarms.TIME_WENT_BACK.name, alarms.UNKNOWN_READING.name)
 #: Alarms whose acknowledgement the plant takes, beside the rows of the table.
-_CONFIRMED = (alarms.COUNTS_DOUBTFUL.name,)
+_CONFIRMED = (alarms.COUNTS_DOUBTFUL.name, alarms.DRIVE_STALLED.name)
 #: An alarm that is raised once and put right by the plant itself.
 _PASSING = (alarms.PARAMETERS_DIFFER.name,)
 

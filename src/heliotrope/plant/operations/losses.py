@@ -28,6 +28,7 @@ _UP = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)
 _LEAVING = (states.DEFOCUSED, states.STOWING)
 
 Mask = npt.NDArray[np.bool_]
+_NONE: Mask = np.zeros(1, dtype=np.bool_)
 
 
 class Losses:
@@ -71,10 +72,13 @@ class Losses:
         for alarm in _standing(records):
             self._wait(alarm)
 
-    def look(self, wanted: Mask) -> Mask:
-        """Return which of the wanted heliostats (N,) were lost since the last look, (N,)."""
+    def look(self, wanted: Mask, at_stow: Mask = _NONE) -> Mask:
+        """Return which of the wanted heliostats (N,) were lost since the last look, (N,).
+
+        Those that are diagnosed ``at_stow`` (N,) are IDLE there, and no loss.
+        """
         field, now = self._plant.field, self._plant.now()
-        live, up = field.live(now), field.among(_UP, now)
+        live, up = field.live(now), field.among(_UP, now) & ~at_stow
         # Only an order locks a heliostat: a person's, or a visit's that writes parameters.
         held = field.among((states.LOCKED,), now)
         lost = live & ~up & ~held & self._up

@@ -128,6 +128,8 @@ class Raising:
 
     def why_not(self, heliostat: str) -> str:
         """Return why a wanted heliostat is not raised, "" if it is or waits for its turn."""
+        if why := self._plant.drive_checks.stalled.get(heliostat):
+            return f"{why}: see the alarm {alarms.DRIVE_STALLED.name}"
         if heliostat in self._blocked:
             return f"its beam has no free path: {self._blocked[heliostat]}"
         if not self.attempts.due(heliostat, self._plant.now()):

@@ -20,6 +20,7 @@ from heliotrope.plant.operations.views import (
     HeliostatView,
     ParameterView,
 )
+from heliotrope.safety import FluxProof
 
 #: Life of a frame, s of the plant's clock.
 _EVERY = 1.0
@@ -202,7 +203,8 @@ class Viewer:
             return EmergencyView(
                 False, order.act.name, order.who, order.reason, ago, 0, 0, 0, (), over
             )
-        report, count = order.report(plant.now()), len(order.ticket.heliostats)
+        report = order.report(plant.now(), plant.drive_checks.shown)
+        count = len(order.ticket.heliostats)
         return EmergencyView(
             True,
             order.act.name,
@@ -215,6 +217,11 @@ class Viewer:
             report.not_done[:_SOME],
             report.text,
             plant.calls,
+            report.flux is FluxProof.BELOW,
+            report.followed,
+            report.believed[:_SOME],
+            len(report.believed),
+            report.basis,
         )
 
 

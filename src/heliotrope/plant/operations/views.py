@@ -1,7 +1,7 @@
 """The views that `Operations` gives of a plant at work: plain values that never change."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
@@ -646,6 +646,15 @@ class EmergencyView:
         The same for people.
     calls
         The orders of persons that have not been withdrawn, one for each person.
+    measured
+        Whether a sensor shows since the order that the flux on the receiver is below its limit.
+    followed
+        Number of the heliostats done whose mirrors were seen to follow their drives earlier today,
+        by what showed it.
+    believed, believed_count
+        Names of the first heliostats done by their reports alone, and the number of all of them.
+    basis
+        What is measured and what is believed, for people.
     """
 
     on: bool
@@ -659,6 +668,11 @@ class EmergencyView:
     not_done: tuple[str, ...]
     text: str
     calls: tuple[Call, ...] = ()
+    measured: bool = False
+    followed: Mapping[str, int] = field(default_factory=dict)
+    believed: tuple[str, ...] = ()
+    believed_count: int = 0
+    basis: str = ""
 
 
 @dataclass(frozen=True)

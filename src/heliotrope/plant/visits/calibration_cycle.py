@@ -33,6 +33,7 @@ from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.authority import Mandate, Person, RefusedError
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.drive_checks import PHOTOGRAPH
 from heliotrope.plant.visits.fitting import (
     Believed,
     JudgedFit,
@@ -334,6 +335,7 @@ class CalibrationCycle:
             result = result.then(await self._again(visit, proof, say, fewest))
         if taken.used and self._missed(visit.heliostat, taken) <= PLACED:
             self._plant.doubts.confirm(visit.heliostat, visit.boots)
+            self._plant.drive_checks.seen(visit.heliostat, PHOTOGRAPH)
         return result
 
     async def _again(self, visit: Visit, proof: Photographs, tell: Tell, least: int) -> CycleResult:
