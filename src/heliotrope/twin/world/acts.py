@@ -112,7 +112,7 @@ class Acts:
         if back := sorted(out.keys() - self._left):
             for name in back:
                 operations.unhold(ENGINEER, [name], owner=out[name], reason="the day ends")
-            self.acted("back in service")
+                self.acted(f"{name} back in service")
             self._watch.held(back, self.now(), out=False)
         operations.give_back(ENGINEER, names)
         self.acted(f"{len(names)} heliostats given")
