@@ -120,17 +120,15 @@ def compare(
     mine = found.reflections
     key = number[mine.photo] * len(rows) + rows[mine.heliostat]
     true = exact.photo * len(rows) + exact.heliostat
-    right = 0
+    right, explained = 0, set[int]()
     for place, k in zip(mine.xy, key.tolist(), strict=True):
-        there = exact.xy[true == k]
-        right += bool(len(there) and np.linalg.norm(there - place, axis=-1).min() < _SAME)
-    shown, kinds = visible_reflections(flight, exact)
-    missed = dict.fromkeys(KINDS, 0)
-    known = shown.photo * len(rows) + shown.heliostat
-    for place, k, kind in zip(shown.xy, known.tolist(), kinds, strict=True):
-        there = mine.xy[key == k]
-        if not (len(there) and np.linalg.norm(there - place, axis=-1).min() < _SAME):
-            missed[kind] += 1
+        there = np.flatnonzero(true == k)
+        apart = np.linalg.norm(exact.xy[there] - place, axis=-1)
+        if apart.min(initial=np.inf) < _SAME:
+            right += 1
+            explained.add(int(there[np.argmin(apart)]))
+    shown = visible_reflections(flight, exact)
+    lost = [kind for i, kind in shown.items() if i not in explained]
     kept = [o for o in result.flights[0].measured.found.found if o.count >= fewest]
     return Compared(
         len(flight.taken),
@@ -138,7 +136,7 @@ def compare(
         len(shown),
         len(mine),
         right,
-        missed,
+        {kind: lost.count(kind) for kind in KINDS},
         as_float([o.count for o in kept]),
         as_float(
             [
@@ -150,14 +148,13 @@ def compare(
     )
 
 
-def visible_reflections(flight: Flight, exact: Reflections) -> tuple[Reflections, list[str]]:
-    """Return the reflections that no nearer mirror hides, within the frame, and where each is.
+def visible_reflections(flight: Flight, exact: Reflections) -> dict[int, str]:
+    """Return the rows of reflections that no nearer mirror hides, within the frame.
 
-    The places are `KINDS`: the first that applies.
+    Each has its place: the first of `KINDS` that applies.
     """
     stand, camera = flight.truth, flight.camera
-    kept: list[int] = []
-    kinds: list[str] = []
+    kinds: dict[int, str] = {}
     for k, photo in enumerate(flight.taken):
         away = np.linalg.norm(stand.vertex - photo.position, axis=-1)
         labels = draw_labels(photo.pixels(camera, stand.corners), away, camera.size)
@@ -171,9 +168,8 @@ def visible_reflections(flight: Flight, exact: Reflections) -> tuple[Reflections
                 inside = 0 <= x < camera.size[0] and 0 <= y < camera.size[1]
                 if inside and labels[y, x] == row + 1:
                     seen[i] = pixel
-        kept += seen
-        kinds += [_kind(i, seen, labels) for i in seen]
-    return exact.take(np.array(kept, dtype=np.intp)), kinds
+        kinds |= {i: _kind(i, seen, labels) for i in seen}
+    return kinds
 
 
 def _kind(i: int, seen: dict[int, FloatArray], labels: Labels) -> str:
