@@ -15,7 +15,7 @@ from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.photo import LedCamera
 from heliotrope.airborne.simulate.rendering import Conditions, render_flight
 from heliotrope.airborne.simulate.simulation import Errors, Flight, fly, hover_grid, look_counts
-from heliotrope.airborne.visibility import draw_labels
+from heliotrope.airborne.visibility import MARGIN, Labels, draw_labels
 from heliotrope.field.camera import look_at
 from heliotrope.field.example import azimuth_elevation
 from heliotrope.field.heliostats import Facets, Heliostats
@@ -25,6 +25,11 @@ from heliotrope.sun import Site
 
 #: A found reflection is the true one if it is this close on the same mirror, m.
 _SAME = 0.25
+#: Two reflections closer than this in the photograph are one spot, px.
+_MERGED = 5.0
+#: What is beside a reflection: another one, another mirror within the margin and the outline's own
+#: error, the ground within the margin; or nothing of these.
+KINDS = ("beside another reflection", "at another mirror", "at the mirror's edge", "clear")
 #: 90 % of a bivariate normal distribution lie within this many variances.
 _ELLIPSE = 4.605170185988091
 
@@ -39,6 +44,8 @@ class Compared:
         Rendered, and evaluated.
     shown, found, right
         True reflections on visible parts of mirrors; those found; of them, those on the right one.
+    missed
+        Reflections shown and not found, by `KINDS`.
     count
         Reflections of each of K measured mirrors, (K,).
     error, sigma
@@ -50,6 +57,7 @@ class Compared:
     shown: int
     found: int
     right: int
+    missed: dict[str, int]
     count: FloatArray
     error: FloatArray
     sigma: FloatArray
@@ -112,17 +120,23 @@ def compare(
     mine = found.reflections
     key = number[mine.photo] * len(rows) + rows[mine.heliostat]
     true = exact.photo * len(rows) + exact.heliostat
-    right = 0
+    right, explained = 0, set[int]()
     for place, k in zip(mine.xy, key.tolist(), strict=True):
-        there = exact.xy[true == k]
-        right += bool(len(there) and np.linalg.norm(there - place, axis=-1).min() < _SAME)
+        there = np.flatnonzero(true == k)
+        apart = np.linalg.norm(exact.xy[there] - place, axis=-1)
+        if apart.min(initial=np.inf) < _SAME:
+            right += 1
+            explained.add(int(there[np.argmin(apart)]))
+    shown = visible_reflections(flight, exact)
+    lost = [kind for i, kind in shown.items() if i not in explained]
     kept = [o for o in result.flights[0].measured.found.found if o.count >= fewest]
     return Compared(
         len(flight.taken),
         len(found.photos),
-        len(visible_reflections(flight, exact)),
+        len(shown),
         len(mine),
         right,
+        {kind: lost.count(kind) for kind in KINDS},
         as_float([o.count for o in kept]),
         as_float(
             [
@@ -134,22 +148,44 @@ def compare(
     )
 
 
-def visible_reflections(flight: Flight, exact: Reflections) -> Reflections:
-    """Return the reflections that no nearer mirror hides, within the frame."""
-    stand, camera, kept = flight.truth, flight.camera, []
+def visible_reflections(flight: Flight, exact: Reflections) -> dict[int, str]:
+    """Return the rows of reflections that no nearer mirror hides, within the frame.
+
+    Each has its place: the first of `KINDS` that applies.
+    """
+    stand, camera = flight.truth, flight.camera
+    kinds: dict[int, str] = {}
     for k, photo in enumerate(flight.taken):
         away = np.linalg.norm(stand.vertex - photo.position, axis=-1)
         labels = draw_labels(photo.pixels(camera, stand.corners), away, camera.size)
+        seen: dict[int, FloatArray] = {}
         for i in np.flatnonzero(exact.photo == k).tolist():
             row = int(exact.heliostat[i])
             point = flight.shapes[row].point_at(exact.facet[i : i + 1], exact.xy[i : i + 1])[0]
-            seen = photo.pixels(camera, stand.vertex[row] + stand.rotation[row] @ point)
-            if np.isfinite(seen).all():
-                x, y = np.round(seen).astype(int).tolist()
+            pixel = photo.pixels(camera, stand.vertex[row] + stand.rotation[row] @ point)
+            if np.isfinite(pixel).all():
+                x, y = np.round(pixel).astype(int).tolist()
                 inside = 0 <= x < camera.size[0] and 0 <= y < camera.size[1]
                 if inside and labels[y, x] == row + 1:
-                    kept.append(i)
-    return exact.take(np.array(kept, dtype=np.intp))
+                    seen[i] = pixel
+        kinds |= {i: _kind(i, seen, labels) for i in seen}
+    return kinds
+
+
+def _kind(i: int, seen: dict[int, FloatArray], labels: Labels) -> str:
+    """Return what is beside reflection ``i`` of those ``seen`` in a photograph."""
+    merged, mirror, edge, clear = KINDS
+    if any(np.linalg.norm(seen[i] - pixel) < _MERGED for k, pixel in seen.items() if k != i):
+        return merged
+    x, y = np.round(seen[i]).astype(int).tolist()
+    low_x, low_y = max(x - 3, 0), max(y - 3, 0)
+    around = labels[low_y : y + 4, low_x : x + 4]
+    rows, columns = np.indices(around.shape)
+    apart = np.hypot(columns + low_x - seen[i][0], rows + low_y - seen[i][1])
+    other = around != labels[y, x]
+    if (other & (around > 0) & (apart < MARGIN + 1)).any():
+        return mirror
+    return edge if (other & (apart < MARGIN)).any() else clear
 
 
 def paper_field(rows: int = 6, columns: int = 8) -> Heliostats:
