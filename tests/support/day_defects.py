@@ -120,6 +120,8 @@ def _when(moment: str, what: str, after: float = 0.0) -> tuple[CrewAct, ...]:
 
 #: A mirror goes out of service, and the plant's program ends a moment later.
 RESTART = (Fault("plant_crash", 23.3, 5.0, 0, 0.5),)
+#: The plant's program ends while three mirrors are locked for their first parameters.
+IN_A_LOCK = (Fault("plant_crash", 72.0, 5.0, 0, 0.5),)
 #: Invariants that may find it, name, defect, the acts of persons, the faults, the length of the
 #: day, s, whether it is slow, and the seed that found it.
 ROWS: tuple[
@@ -134,7 +136,7 @@ ROWS: tuple[
     ((L1,), "a visit's lock is not given back", locks_kept,
      _when(LOCKED, "emergency"), (), 420.0, False, 1),
     ((L1,), "a restart forgets a visit's lock", locks_forgotten_by_a_restart,
-     None, None, 840.0, True, 20),
+     (), IN_A_LOCK, 240.0, False, 4),
     ((16,), "movements below the resolution", movements_below_the_resolution,
      (), (), 420.0, True, 8),
     ((L2,), "retries without an end", endless_retries, (), (), 840.0, True, 14),
