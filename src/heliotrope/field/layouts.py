@@ -537,7 +537,7 @@ def lay_out(
     count = len(places)
     mechanism = stepped(places.position, size)
     machines = spread_machines(stepped_machine(mechanism, receiver), places.names)
-    surfaces = (receiver, *targets)
+    surfaces: tuple[Receiver | Target, ...] = (receiver, *targets)
     things = [(s.center, 0.5 * float(np.hypot(s.width, s.height) + size.reach)) for s in surfaces]
     return Plant(
         name or kind,
