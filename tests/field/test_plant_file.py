@@ -388,6 +388,18 @@ def test_machine_of_a_group(tmp_path: Path) -> None:
     assert plant_file.read_plant(tmp_path / "again.toml").machine("A1") == machine
 
 
+def test_a_defocus_that_takes_too_long_is_refused(tmp_path: Path) -> None:
+    slow = MACHINE.replace("rate_steps_per_s = 8000", "rate_steps_per_s = 600")
+    assert slow != MACHINE
+    plant_file.read_plant(with_machine(tmp_path, slow))
+    with pytest.raises(
+        FormatError, match=r"of heliostat A\d needs \d\d s to turn away by \d+\.\d°, and has 20 s"
+    ):
+        plant_file.read_plant(
+            with_machine(tmp_path, slow.replace("defocus_spread = 0", "defocus_spread = 4"))
+        )
+
+
 @pytest.mark.parametrize(("key", "most"), [("", 2.0), ("defocus_spread = 2.5", 3.5)])
 def test_mirrors_turn_away_by_angles_of_their_own(key: str, most: float, tmp_path: Path) -> None:
     text = MACHINE.replace("defocus_spread = 0", f"{key}\nstow_lights = true")

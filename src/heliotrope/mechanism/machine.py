@@ -27,6 +27,9 @@ WAY_POINTS = MOST_POINTS
 #: Highest rate that a local controller emits, steps/s.
 MOST_RATE = 1000 * Config().stride // Config().ahead_ms
 _NAMES = ("primary", "secondary")
+#: Longest turn of a DEFOCUS, s: a beam must be off 30 s after the loss of what leads it, which is
+#: noticed by the end of a lease, 6 s, and the first order may be lost.
+LONGEST_DEFOCUS = 20.0
 #: Steps in which `spread_defocus` spreads each axis: their product is the number of machines.
 _SPREADS = 8
 

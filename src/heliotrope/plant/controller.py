@@ -204,22 +204,7 @@ class PlantController:
         self.witnesses = Witnesses(
             self.settings.witnesses, design.site, lambda: clock.utc().timestamp(), self._tell
         )
-        self.drive_checks = DriveChecks(
-            self.field,
-            self._clusters,
-            (name for name, each in self.beams.machines.items() if each.tilt_sensor),
-            design.site,
-            clock,
-            self._tell,
-        )
-        self.doubts = Doubts(
-            self.field,
-            design,
-            self.aims,
-            self._tell,
-            lambda: self.witnesses.refusal,
-            self.drive_checks.stalled,
-        )
+        self.drive_checks, self.doubts = self._doubting()
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
         self._rivals, self._told_alarms = Rivals(self.name, self._tell), ToldAlarms()
         self._cluster_settings = ClusterSettings(self._tell, _expected(self.settings))
@@ -245,6 +230,21 @@ class PlantController:
         self._named_at, self._slow_at = dict.fromkeys(members, -math.inf), -math.inf
         self._closing = asyncio.Event()
         self._last_safe: tuple[tuple[str, Act, tuple[str, ...]], Ticket] | None = None
+
+    def _doubting(self) -> tuple[DriveChecks, Doubts]:
+        """Return what is known of drives, and what keeps heliostats in doubt off the receiver."""
+        sensed = (name for name, each in self.beams.machines.items() if each.tilt_sensor)
+        checks = DriveChecks(
+            self.field, self._clusters, sensed, self.design.site, self.clock, self._tell
+        )
+        return checks, Doubts(
+            self.field,
+            self.design,
+            self.aims,
+            self._tell,
+            lambda: self.witnesses.refusal,
+            checks.stalled,
+        )
 
     def _ordering(self, clock: Clock, audit: Audit, disk: Disk) -> PlantOrders:
         """Return what follows accepted commands to their ends."""

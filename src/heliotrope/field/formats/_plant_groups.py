@@ -1,6 +1,6 @@
 """Groups of a plant file: from tables to mechanisms and machines, and back number by number."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,13 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS, Drive
 from heliotrope.mechanism.kernels import slots as slot
-from heliotrope.mechanism.machine import AxisLimits, Machine, Stepping, spread_defocus
+from heliotrope.mechanism.machine import (
+    LONGEST_DEFOCUS,
+    AxisLimits,
+    Machine,
+    Stepping,
+    spread_defocus,
+)
 from heliotrope.sun import Site
 
 # Numbers of a drive as the writer names them; names such as "rate" have no unit because it
@@ -330,6 +336,7 @@ class _Reader:
                     table.tilt_sensor,
                 )
             found.append(made[numbers])
+        self.check_defocus(drives, axes, defocus, joints)
         return tuple(found)
 
     def axis(self, drive: Drive, where: str, table: AxisTable) -> npt.NDArray[np.int64]:
@@ -378,6 +385,27 @@ class _Reader:
         else:
             steps = drives.counts(np.radians(self.array("machine.stow_deg", table.stow_deg)))
         return np.round(steps).astype(np.int64)
+
+    def check_defocus(
+        self,
+        drives: Drive,
+        axes: Sequence[npt.NDArray[np.int64]],
+        defocus: FloatArray,
+        joints: Sequence[str],
+    ) -> None:
+        """Check that the largest turn of a DEFOCUS ends in time, spread as it is."""
+        low, high, rate, ramp, _ = np.stack(axes, axis=1).transpose(2, 0, 1).astype(np.float64)
+        steps = np.abs(defocus / drives.radians_per_count(0.5 * (low + high)))
+        time = steps / rate + rate / ramp
+        row, axis = divmod(int(time.argmax()), 2)
+        if time[row, axis] > LONGEST_DEFOCUS:
+            raise self.fail(
+                f"the {joints[axis]} of heliostat {self.table.name[self.rows[row]]} needs "
+                f"{time[row, axis]:.0f} s to turn away by {np.degrees(defocus[row, axis]):.1f}°, "
+                f"and has {LONGEST_DEFOCUS:.0f} s after the loss of its cluster has been noticed; "
+                "lower defocus_spread or the angles, or raise the rate",
+                "machine",
+            )
 
     def defocus(self, table: MachineTable) -> FloatArray:
         units = [u for u in ANGLE_UNITS if getattr(table, f"defocus_{u}") is not None]
