@@ -15,7 +15,7 @@ OPTIONS ?=
 BOARD ?= rp2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test soak mutants lint docs bench house firmware clean
+.PHONY: help setup run notebook test soak mutants lint docs bench house firmware clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | sort | expand -t 12
@@ -28,6 +28,9 @@ $(STAMP): pyproject.toml constraints.txt requirements.lock scripts/setup.sh
 
 run: $(STAMP)  ## run a plant of 10,000 heliostats in simulation until Ctrl-C: OPTIONS="--speed 2"
 	@$(BIN)/heliotrope run $(OPTIONS)
+
+notebook: $(STAMP)  ## open the notebooks of examples/ in the browser
+	@$(BIN)/jupyter lab --notebook-dir=examples
 
 test: $(STAMP)  ## run the tests in parallel
 	@bash scripts/packages.sh & $(BIN)/python -m heliotrope.warm && $(BIN)/python -m heliotrope.twin.warm; warm=$$?; wait; exit $$warm

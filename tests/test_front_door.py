@@ -20,7 +20,7 @@ def test_readme_names_both_commands() -> None:
 
 
 @pytest.mark.parametrize(
-    "target", ["setup", "run", "test", "soak", "lint", "docs", "bench", "clean"]
+    "target", ["setup", "run", "notebook", "test", "soak", "lint", "docs", "bench", "clean"]
 )
 def test_make_knows_its_targets(target: str) -> None:
     done = subprocess.run(

@@ -7,6 +7,7 @@ import sys
 from typing import Annotated
 
 import typer
+from typer.exceptions import TyperException
 
 from heliotrope import __version__
 from heliotrope.cli._ctl import app as ctl_app
@@ -14,6 +15,7 @@ from heliotrope.cli._extras import missing
 from heliotrope.cli._field_layout import layout
 from heliotrope.cli._keys import app as keys_app
 from heliotrope.cli._store import app as store_app
+from heliotrope.cli._usage import refusal
 from heliotrope.cli.calibrate import calibrate
 from heliotrope.cli.camera import app as camera_app
 from heliotrope.cli.cluster import cluster
@@ -86,16 +88,23 @@ app.command()(demo)
 def main() -> None:
     """Run the command line; bad input ends with one line on standard error and exit code 2."""
     try:
-        app()
+        sys.exit(app(standalone_mode=False))
+    except TyperException as error:
+        line = refusal(error)
+        print(error.message if line is None else f"heliotrope: {line}", file=sys.stderr)
+        sys.exit(2)
+    except typer.Abort:
+        print("heliotrope: ended at a question", file=sys.stderr)
+        sys.exit(1)
     except HeliotropeError as error:
         print(f"heliotrope: {error}", file=sys.stderr)
         sys.exit(2)
     except ModuleNotFoundError as error:
         words = [word for word in sys.argv[1:] if not word.startswith("-")]
-        refusal = missing(error, words[0] if words else "")
-        if refusal is None:
+        absent = missing(error, words[0] if words else "")
+        if absent is None:
             raise
-        print(f"heliotrope: {refusal}", file=sys.stderr)
+        print(f"heliotrope: {absent}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("heliotrope: interrupted", file=sys.stderr)

@@ -1,6 +1,5 @@
 """Options and progress bars that the commands of calibration share."""
 
-import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -10,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from heliotrope.errors import InputError
+from heliotrope.cli._common import parse_numbers
+from heliotrope.errors import shown
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -50,7 +50,7 @@ SplitOption = Annotated[
         "latest, each predicted from all before it; or one of PAINT's four splits."
     ),
 ]
-SeedOption = Annotated[int, typer.Option(help="Seed of the random choice.")]
+SeedOption = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of the random choice.")]
 SchedulerOption = Annotated[
     str | None, typer.Option(help="Address of a dask scheduler, or local:N.")
 ]
@@ -61,15 +61,11 @@ def parse_priors(given: list[str]) -> dict[str, float]:
     found = {}
     for text in given:
         name, _, value = text.partition("=")
-        try:
-            found[name.strip()] = float(value)
-        except ValueError:
-            found[name.strip()] = math.nan
-        if not (math.isfinite(found[name.strip()]) and found[name.strip()] > 0):
-            raise InputError(
-                f"--prior {text!r}: write NAME=VALUE with a value above 0 in rad, m or 1, for "
-                "example tilt_north=0.005"
-            )
+        refusal = (
+            f"--prior {shown(text)}: write NAME=VALUE with a value above 0 in rad, m or 1, for "
+            "example tilt_north=0.005"
+        )
+        (found[name.strip()],) = parse_numbers(value, refusal, least=1e-9)
     return found
 
 

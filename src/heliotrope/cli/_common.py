@@ -8,7 +8,7 @@ from datetime import date, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from heliotrope.errors import InputError, TimeError
+from heliotrope.errors import InputError, TimeError, shown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,18 +43,18 @@ def day_of(time: datetime, site: "Site") -> date:
     return time.date() if time.utcoffset() else solar_day(time, site)
 
 
-def sunlit(time: datetime, site: "Site", every: str) -> "pd.DatetimeIndex":
-    """Return the times of a day with sunlight, at an interval such as "10min".
+def sunlit(time: datetime, site: "Site", every: str, least: float = 1.0) -> "pd.DatetimeIndex":
+    """Return the times of a day with sunlight, at an interval such as "10min", ``least`` s or more.
 
     Raises
     ------
     InputError
-        If the sun does not rise on that day, or the interval is none.
+        If the sun does not rise on that day, or the interval is none or too short.
     """
     from heliotrope.sun import daylight
 
     day = day_of(time, site)
-    times = daylight(day, site, every=parse_duration(every))
+    times = daylight(day, site, every=parse_duration(every, least))
     if not len(times):
         raise InputError(
             f"{site.label}: the sun does not rise on {day} at a multiple of {every}; choose "
@@ -63,25 +63,47 @@ def sunlit(time: datetime, site: "Site", every: str) -> "pd.DatetimeIndex":
     return times
 
 
-def parse_duration(text: str) -> timedelta:
-    """Return a duration from "30s", "5min", "1h"."""
-    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(s|min|m|h)\s*", text)
-    seconds = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
-    if not match or float(match[1]) <= 0:
-        raise InputError(f"duration {text!r}: write it as 30s, 5min or 1h, above 0")
-    return timedelta(seconds=float(match[1]) * seconds[match[2]])
+def parse_duration(text: str, least: float = 1e-3) -> timedelta:
+    """Return a duration from "30s", "5min", "1h", of ``least`` s to 1000 h."""
+    refusal = f"duration {shown(text)}: write it as 30s, 5min or 1h, from {least:g} s to 1000 h"
+    match = re.fullmatch(r"\s*(\d[\d.]*)\s*(s|min|m|h)\s*", text, re.ASCII)
+    if match is None:
+        raise InputError(refusal)
+    (number,) = parse_numbers(match[1], refusal)
+    length = number * {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}[match[2]]
+    if not least <= length <= 3.6e6:
+        raise InputError(refusal)
+    return timedelta(seconds=length)
+
+
+def parse_numbers(
+    text: str, refusal: str, *, count: int | None = 1, least: float = -1e6, most: float = 1e6
+) -> tuple[float, ...]:
+    """Return the numbers of "A,B,C".
+
+    Raises
+    ------
+    InputError
+        With the line ``refusal``, if there are not ``count`` (None: one or more) numbers from
+        ``least`` to ``most``.
+    """
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    # A nan is within no limits.
+    if len(values) not in ({count} if count else range(1, 1000)) or not all(
+        least <= value <= most for value in values
+    ):
+        raise InputError(refusal)
+    return values
 
 
 def parse_point(text: str, what: str) -> tuple[float, float, float]:
-    """Return three finite numbers from "E,N,U"."""
-    parts = text.split(",")
-    try:
-        values = [float(part) for part in parts]
-    except ValueError:
-        values = []
-    if len(values) != 3 or not all(math.isfinite(v) for v in values):
-        raise InputError(f"{what} {text!r}: give three numbers in metres, east,north,up")
-    return values[0], values[1], values[2]
+    """Return three numbers within ± 1e6 from "E,N,U"."""
+    refusal = f"{what} {shown(text)}: give three numbers in metres, east,north,up"
+    east, north, up = parse_numbers(text, refusal, count=3)
+    return east, north, up
 
 
 def open_plant(path: Path, site: "Site | None" = None) -> "Plant":
@@ -95,14 +117,11 @@ def parse_site(text: str) -> "Site":
     """Return a site from "LATITUDE,LONGITUDE,HEIGHT", degrees and m."""
     from heliotrope.sun import Site
 
-    parts = text.split(",")
-    try:
-        latitude, longitude, height = (float(part) for part in parts)
-    except ValueError:
-        raise InputError(
-            f"site {text!r}: give three numbers, latitude and longitude in degrees and the height "
-            "in m, as in 50.913,6.388,87"
-        ) from None
+    refusal = (
+        f"site {shown(text)}: give three numbers, latitude and longitude in degrees and the height "
+        "in m, as in 50.913,6.388,87"
+    )
+    latitude, longitude, height = parse_numbers(text, refusal, count=3)
     return Site(latitude, longitude, height)
 
 

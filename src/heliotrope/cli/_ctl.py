@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from heliotrope.cli._common import parse_duration, parse_point, print_json, print_table
+from heliotrope.cli._common import (
+    parse_duration,
+    parse_numbers,
+    parse_point,
+    print_json,
+    print_table,
+)
 from heliotrope.errors import InputError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -29,7 +35,9 @@ LockedReceivers = Annotated[
 LockedTower = Annotated[bool, typer.Option("--tower", help="The tower: all heliostats.")]
 #: Status of an answer that asks for the code of a second factor.
 _NEEDS_CODE = 428
-Wait = Annotated[float, typer.Option("--wait", help="Longest wait for the end, s; 0: none.")]
+Wait = Annotated[
+    float, typer.Option("--wait", min=0, max=86_400, help="Longest wait for the end, s; 0: none.")
+]
 
 
 @app.callback()
@@ -106,7 +114,10 @@ def token(
     name: Annotated[str, typer.Option(help="Name of your account.")] = "engineer",
     role: Annotated[str, typer.Option(help="viewer, operator or engineer.")] = "operator",
     days: Annotated[
-        float, typer.Option(help="Validity in days: at most 365 for a viewer, 90 above.")
+        float,
+        typer.Option(
+            min=0.001, max=365, help="Validity in days: at most 365 for a viewer, 90 above."
+        ),
     ] = 30.0,
     password: Annotated[
         str,
@@ -293,7 +304,9 @@ def command(
     everybody: All = False,
     value: Annotated[
         list[float] | None,
-        typer.Option(help="Values of the command, in order.", show_default=False),
+        typer.Option(
+            min=-1e9, max=1e9, help="Values of the command, in order.", show_default=False
+        ),
     ] = None,
     wait: Wait = 60.0,
 ) -> None:
@@ -412,7 +425,9 @@ def error_parameters(
         ),
     ] = None,
     reason: Annotated[str, typer.Option(help="Reason, kept with the values.")] = "",
-    version: Annotated[int, typer.Option(help="Bring back this earlier version.")] = 0,
+    version: Annotated[
+        int, typer.Option(min=0, max=1_000_000_000, help="Bring back this earlier version.")
+    ] = 0,
     wait: Wait = 60.0,
     as_json: Json = False,
 ) -> None:
@@ -455,11 +470,8 @@ def _parameter(text: str, units: dict[str, str]) -> tuple[str, float]:
     if name not in units:
         raise UnknownNameError("parameter", name, units)
     size = 0.017453292519943295 if given.endswith("_deg") else _SHOWN[units[name]][1]
-    try:
-        return name, float(number) * size
-    except ValueError:
-        shown = _SHOWN[units[name]][0]
-        raise InputError(f"{text!r}: give NAME=VALUE with a number, {shown}") from None
+    refusal = f"{text!r}: give NAME=VALUE with a number, {_SHOWN[units[name]][0]}"
+    return name, parse_numbers(number, refusal)[0] * size
 
 
 def _show_parameters(found: dict[str, Any], as_json: bool) -> None:
@@ -502,7 +514,9 @@ def photographs(
     heliostat: Annotated[
         str, typer.Argument(help="Heliostat; those that persons asked for if left out.")
     ] = "",
-    limit: Annotated[int, typer.Option(help="Newest ones, at most this many.")] = 50,
+    limit: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Newest ones, at most this many.")
+    ] = 50,
     as_json: Json = False,
 ) -> None:
     """List the kept photographs of a heliostat, each with the result of its visit."""
@@ -660,7 +674,9 @@ def _entries(found: list[dict[str, Any]], name: str, remove: bool) -> list[dict[
 def reading(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Reading of the safety table.")],
-    value: Annotated[float, typer.Argument(help="Value, made now, in the unit of its row.")],
+    value: Annotated[
+        float, typer.Argument(min=-1e9, max=1e9, help="Value, made now, in the unit of its row.")
+    ],
 ) -> None:
     """Give a reading of a sensor to the safety table, where the links file says "api"."""
     from urllib.parse import quote
@@ -679,7 +695,10 @@ def out_of_service(
     receivers: LockedReceivers = None,
     tower: LockedTower = False,
     hours: Annotated[
-        float | None, typer.Option(help="Hours until they are expected back.", show_default=False)
+        float | None,
+        typer.Option(
+            min=0.01, max=87_600, help="Hours until they are expected back.", show_default=False
+        ),
     ] = None,
     wait: Wait = 600.0,
 ) -> None:

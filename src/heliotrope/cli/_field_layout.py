@@ -15,20 +15,37 @@ if TYPE_CHECKING:
 def layout(
     kind: Annotated[str, typer.Argument(help="six-packs, twin-field, radial or rows.")],
     out: Annotated[Path, typer.Option("--out", help="Plant file to write (TOML).")],
-    heliostats: Annotated[int, typer.Option(help="Number of heliostats.")] = 10_000,
-    width: Annotated[float, typer.Option(help="Width of a mirror, m.")] = 2.5,
-    height: Annotated[float, typer.Option(help="Height of a mirror, m.")] = 2.0,
+    heliostats: Annotated[
+        int, typer.Option(min=1, max=1_000_000, help="Number of heliostats.")
+    ] = 10_000,
+    width: Annotated[float, typer.Option(min=0.05, max=50, help="Width of a mirror, m.")] = 2.5,
+    height: Annotated[float, typer.Option(min=0.05, max=50, help="Height of a mirror, m.")] = 2.0,
     pivot: Annotated[
-        float | None, typer.Option(help="Height of the pivots, m; default 0.7 above half a mirror.")
+        float | None,
+        typer.Option(
+            min=0.01, max=50, help="Height of the pivots, m; default 0.7 above half a mirror."
+        ),
     ] = None,
-    clearance: Annotated[float, typer.Option(help="Gap between two mirrors in any pose, m.")] = 0.3,
+    clearance: Annotated[
+        float, typer.Option(min=0, max=50, help="Gap between two mirrors in any pose, m.")
+    ] = 0.3,
     tower: Annotated[
         float | None,
-        typer.Option(help="Receiver above the pivots, m; default in proportion to the field."),
+        typer.Option(
+            min=1,
+            max=1000,
+            help="Receiver above the pivots, m; default in proportion to the field.",
+        ),
     ] = None,
-    latitude: Annotated[float, typer.Option(help="Latitude, degrees north.")] = -28.5,
-    longitude: Annotated[float, typer.Option(help="Longitude, degrees east.")] = 21.2,
-    altitude: Annotated[float, typer.Option(help="Altitude of the site, m.")] = 830.0,
+    latitude: Annotated[
+        float, typer.Option(min=-90, max=90, help="Latitude, degrees north.")
+    ] = -28.5,
+    longitude: Annotated[
+        float, typer.Option(min=-180, max=180, help="Longitude, degrees east.")
+    ] = 21.2,
+    altitude: Annotated[
+        float, typer.Option(min=-500, max=9000, help="Altitude of the site, m.")
+    ] = 830.0,
     name: Annotated[str, typer.Option(help="Name of the plant; default the kind.")] = "",
     table: Annotated[str, typer.Option(help="Table of heliostats: csv or parquet.")] = "csv",
     picture: Annotated[
@@ -82,11 +99,12 @@ def _report(plant: "Plant", mirror: "HeliostatSize", out: Path, as_json: bool) -
     if as_json:
         print_json(facts)
         return
+    gap = f"; mirrors keep {facts['nearest_gap_m']:.2f} m apart in any pose"
+    apart = gap if len(plant) > 1 else ""
     print(
         f"{out}: {facts['heliostats']:,} heliostats of {area:g} m² in "
         f"{facts['clusters']:,} clusters, receiver at {facts['receiver_height_m']:.0f} m, the "
-        f"farthest {facts['farthest_m']:.0f} m away; mirrors keep {facts['nearest_gap_m']:.2f} m "
-        "apart in any pose"
+        f"farthest {facts['farthest_m']:.0f} m away{apart}"
     )
 
 

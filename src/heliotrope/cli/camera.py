@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from heliotrope.cli._common import open_plant, print_json, print_table
+from heliotrope.cli._common import open_plant, parse_numbers, print_json, print_table
 from heliotrope.errors import FormatError, InputError
 
 if TYPE_CHECKING:
@@ -42,7 +42,9 @@ def calibrate(
     chessboard: Annotated[
         str | None, typer.Option(help="Inner corners of a chessboard, COLUMNSxROWS, e.g. 9x6.")
     ] = None,
-    square: Annotated[float | None, typer.Option(help="Side of its squares, m.")] = None,
+    square: Annotated[
+        float | None, typer.Option(min=0.001, max=100, help="Side of its squares, m.")
+    ] = None,
     anew: Annotated[
         bool, typer.Option("--anew", help="From marks: solve for a known lens again.")
     ] = False,
@@ -219,7 +221,9 @@ def teach(
         typer.Option(help="Stroke width of corners and tees, m; NAME=WIDTH for one."),
     ] = None,
     camera: Annotated[str, typer.Option("--camera", help="Name of the camera.")] = "camera",
-    sigma_px: Annotated[float, typer.Option(help="Error of the given points, px.")] = 1.0,
+    sigma_px: Annotated[
+        float, typer.Option(min=0.001, max=1000, help="Error of the given points, px.")
+    ] = 1.0,
     anew: Annotated[bool, typer.Option("--anew", help="Solve for a known lens again.")] = False,
     out: OutOption = None,
     as_json: JsonOption = False,
@@ -264,13 +268,11 @@ def _announcer(quiet: bool) -> Callable[[str], None]:
 
 def _at(text: str) -> tuple[str, tuple[float, float]]:
     name, found, pair = text.rpartition("=")
-    parts = pair.split(",")
-    if found and name and len(parts) == 2:
-        try:
-            return name, (float(parts[0]), float(parts[1]))
-        except ValueError:
-            pass
-    raise InputError(f"--at {text!r}: write NAME=X,Y in pixels, as upper_left=812.5,304")
+    refusal = f"--at {text!r}: write NAME=X,Y in pixels, as upper_left=812.5,304"
+    if not found or not name:
+        raise InputError(refusal)
+    x, y = parse_numbers(pair, refusal, count=2)
+    return name, (x, y)
 
 
 def _wishes(
@@ -279,10 +281,7 @@ def _wishes(
     from heliotrope.imaging.targets.teaching import Wish
 
     def metres(text: str) -> float:
-        try:
-            return float(text)
-        except ValueError:
-            raise InputError(f"{text!r} is not a number of metres") from None
+        return parse_numbers(text, f"{text!r} is not a number of metres")[0]
 
     kind = _split(kinds, str)
     size, stroke = _split(sizes, metres), _split(strokes, metres)
@@ -389,7 +388,9 @@ def receiver(
             "default: by the camera's position."
         ),
     ] = None,
-    gamma: Annotated[float, typer.Option(help="Of the camera's response; 1: linear.")] = 1.0,
+    gamma: Annotated[
+        float, typer.Option(min=0.1, max=10, help="Of the camera's response; 1: linear.")
+    ] = 1.0,
     as_json: JsonOption = False,
 ) -> None:
     """Take the reference by which a camera measures the flux on the receiver."""
@@ -454,12 +455,10 @@ def _outline(texts: Sequence[str], camera: "Camera", receiver: "Receiver") -> An
 
 def _lit(text: str) -> "tuple[Frame, float]":
     name, found, share = text.rpartition("=")
-    try:
-        value = float(share)
-    except ValueError:
-        found, value = "", 0.0
+    refusal = f"--lit {text!r}: write FILE=SHARE, as lit.png=0.1"
     if not found or not name:
-        raise InputError(f"--lit {text!r}: write FILE=SHARE, as lit.png=0.1")
+        raise InputError(refusal)
+    (value,) = parse_numbers(share, refusal)
     return _read(Path(name)), value
 
 

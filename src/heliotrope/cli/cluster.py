@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 def cluster(
     config: Annotated[Path, typer.Argument(help="Cluster file (TOML).")],
     check: Annotated[bool, typer.Option("--check", help="Only read the file.")] = False,
-    every: Annotated[float, typer.Option(help="Seconds between lines of the log.")] = 10.0,
+    every: Annotated[
+        float, typer.Option(min=1, max=86_400, help="Seconds between lines of the log.")
+    ] = 10.0,
 ) -> None:
     """Run a cluster of heliostats until SIGTERM or Ctrl-C; it then defocuses them."""
     from heliotrope.errors import InputError
 
-    if not 1.0 <= every <= 86400.0:
-        raise InputError(f"--every {every:g} s is not within 1 to 86400 s")
     try:
         from heliotrope.cluster.config_file import read_cluster
         from heliotrope.links.clock import SystemClock

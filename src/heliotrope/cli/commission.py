@@ -9,7 +9,7 @@ import typer
 
 from heliotrope.cli._calibration import progress
 from heliotrope.cli._common import open_plant, parse_duration, print_json, print_table
-from heliotrope.cli.plan import above, check_outputs, made_so_far, span_of, targets_of
+from heliotrope.cli.plan import check_outputs, made_so_far, span_of, targets_of
 
 if TYPE_CHECKING:
     from heliotrope.calibration.plan.commission import CommissionPlan, CommissionTerms
@@ -26,49 +26,77 @@ def commission(
     begin: Annotated[
         str, typer.Option("--from", help="ISO 8601 with a time zone, or now.")
     ] = "now",
-    days: Annotated[float, typer.Option(help="Length of the span.")] = 3.0,
+    days: Annotated[float, typer.Option(min=0.01, max=3660, help="Length of the span.")] = 3.0,
     goal_mrad: Annotated[
-        float, typer.Option(help="Beam error that 90 % of the mirrors shall not exceed, mrad.")
+        float,
+        typer.Option(
+            min=0.001, max=1000, help="Beam error that 90 % of the mirrors shall not exceed, mrad."
+        ),
     ] = 0.6,
     installed_mrad: Annotated[
-        float, typer.Option(help="Expected beam error before any measurement, mrad RMS.")
+        float,
+        typer.Option(
+            min=0.001, max=1000, help="Expected beam error before any measurement, mrad RMS."
+        ),
     ] = 15.0,
     target: Annotated[
         list[str] | None, typer.Option(help="Target with a camera; may be repeated. Default: all.")
     ] = None,
     together: Annotated[
         int | None,
-        typer.Option(help="Mirrors of a later joint visit. Default: the plant file's; 1: none."),
+        typer.Option(
+            min=1,
+            max=1000,
+            help="Mirrors of a later joint visit. Default: the plant file's; 1: none.",
+        ),
     ] = None,
     first: Annotated[
         int | None,
-        typer.Option(help="Mirrors of a joint first visit. Default: the plant file's; 0: alone."),
+        typer.Option(
+            min=0,
+            max=1000,
+            help="Mirrors of a joint first visit. Default: the plant file's; 0: alone.",
+        ),
     ] = None,
     step: Annotated[str, typer.Option(help="Time of each photograph of a joint visit.")] = "2.2s",
-    shots: Annotated[int, typer.Option(help="Photographs of a visit of one mirror.")] = 3,
+    shots: Annotated[
+        int, typer.Option(min=1, max=1000, help="Photographs of a visit of one mirror.")
+    ] = 3,
     interval: Annotated[str, typer.Option(help="Time of each.")] = "20s",
     settle: Annotated[str, typer.Option(help="Time of a visit beside the photographs.")] = "20s",
     look: Annotated[str, typer.Option(help="Time of a further look for a lost beam.")] = "20s",
     sigma_mrad: Annotated[
-        float, typer.Option(help="Accuracy of a photograph in each direction, mrad.")
+        float,
+        typer.Option(min=0.001, max=1000, help="Accuracy of a photograph in each direction, mrad."),
     ] = 0.5,
     sigma_together_mrad: Annotated[
-        float, typer.Option(help="Accuracy of visits of several in each direction, mrad.")
+        float,
+        typer.Option(
+            min=0.001, max=1000, help="Accuracy of visits of several in each direction, mrad."
+        ),
     ] = 0.22,
     repeat_mrad: Annotated[
-        float, typer.Option(help="What a visit does not repeat, in each direction, mrad.")
+        float,
+        typer.Option(
+            min=0, max=1000, help="What a visit does not repeat, in each direction, mrad."
+        ),
     ] = 0.0,
     drone: Annotated[
-        int, typer.Option(help="Fly a drone first, with this many poses of each mirror.")
+        int,
+        typer.Option(
+            min=0, max=1000, help="Fly a drone first, with this many poses of each mirror."
+        ),
     ] = 0,
-    drones: Annotated[int, typer.Option(help="Drones that fly at once.")] = 1,
+    drones: Annotated[int, typer.Option(min=1, max=50, help="Drones that fly at once.")] = 1,
     model: Annotated[
         str, typer.Option(help="auto, jacks, malan8, guo6, khalsa8 or full.")
     ] = "auto",
     sightings: Annotated[
         Path | None, typer.Option(help="Table of the sightings made so far.")
     ] = None,
-    clear: Annotated[float, typer.Option(help="Share of the time without clouds.")] = 1.0,
+    clear: Annotated[
+        float, typer.Option(min=0.01, max=1, help="Share of the time without clouds.")
+    ] = 1.0,
     every: Annotated[str, typer.Option(help="Interval at which gains are computed.")] = "30m",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     csv: Annotated[Path | None, typer.Option("--csv", help="File for the visits.")] = None,
@@ -84,19 +112,19 @@ def commission(
     plant = open_plant(field)
     check_outputs((csv, page, picture), field, sightings)
     terms = CommissionTerms(
-        goal=_MRAD * above(goal_mrad, "--goal-mrad"),
+        goal=_MRAD * goal_mrad,
         settle=parse_duration(settle).total_seconds(),
         shots=shots,
         interval=parse_duration(interval).total_seconds(),
         look=parse_duration(look).total_seconds(),
-        sigma=_MRAD * above(sigma_mrad, "--sigma-mrad"),
+        sigma=_MRAD * sigma_mrad,
         joint=_joint(plant, together, first, step, sigma_together_mrad),
         receiver=_receiver(plant, sigma_together_mrad),
         repeat=_MRAD * repeat_mrad,
         clear=clear,
         every=parse_duration(every).total_seconds(),
     )
-    installed = _MRAD * above(installed_mrad, "--installed-mrad")
+    installed = _MRAD * installed_mrad
     start, stop = span_of(begin, None, days)
     fleets, measured, flight = _fleets(
         plant, start.year, model, sightings, terms, installed, (drone, drones), as_json
@@ -131,7 +159,7 @@ def _joint(
         least=min(settings.least, most),
         first=alike if first is None else first,
         step=parse_duration(step).total_seconds(),
-        sigma=_MRAD * above(sigma_mrad, "--sigma-together-mrad"),
+        sigma=_MRAD * sigma_mrad,
     )
 
 

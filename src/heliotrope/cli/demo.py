@@ -23,7 +23,9 @@ MODEL = (
 
 def demo(
     into: Annotated[Path, typer.Option(help="Folder for plant and report.")] = Path("out/demo"),
-    seed: Annotated[int, typer.Option(help="Seed of the imperfections and the noise.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**63 - 1, help="Seed of the imperfections and the noise.")
+    ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Make an example plant, measure it, calibrate it, track a day, and write a report."""

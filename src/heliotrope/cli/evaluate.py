@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 def evaluate(
     place: shared.Place,
     split: shared.SplitOption = "random",
-    fraction: Annotated[float, typer.Option(help="Share of the sightings to learn from.")] = 0.7,
+    fraction: Annotated[
+        float, typer.Option(min=0.01, max=0.999, help="Share of the sightings to learn from.")
+    ] = 0.7,
     seed: shared.SeedOption = 0,
     model: shared.ModelOption = "auto",
     sightings: shared.TableOption = None,

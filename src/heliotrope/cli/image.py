@@ -63,7 +63,7 @@ def image(
     ] = None,
     heliostat: Annotated[str, typer.Option(help="Heliostat of the beam, without a log.")] = "",
     processes: Annotated[
-        int, typer.Option(min=0, help="Processes on this machine; 0: one per core.")
+        int, typer.Option(min=0, max=1024, help="Processes on this machine; 0: one per core.")
     ] = 0,
     scheduler: shared.SchedulerOption = None,
     live: Annotated[
@@ -71,9 +71,12 @@ def image(
         typer.Option("--live", help="Follow a watched folder, video, rtsp://, http://, usb:0."),
     ] = False,
     limit: Annotated[
-        int | None, typer.Option(min=1, help="With --live: stop after this many frames.")
+        int | None,
+        typer.Option(min=1, max=1_000_000_000, help="With --live: stop after this many frames."),
     ] = None,
-    burst: Annotated[int, typer.Option(min=1, help="With --live: frames to average.")] = 1,
+    burst: Annotated[
+        int, typer.Option(min=1, max=1000, help="With --live: frames to average.")
+    ] = 1,
     archive: Annotated[
         Path | None, typer.Option("--keep", help="With --live: folder for frames and results.")
     ] = None,

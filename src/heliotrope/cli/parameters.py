@@ -1,12 +1,11 @@
 """``heliotrope parameters``: one machine in the parameters of Guo, of Malan and of this program."""
 
-import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from heliotrope.cli._common import print_json, print_table
-from heliotrope.errors import InputError
+from heliotrope.cli._common import parse_numbers, print_json, print_table
+from heliotrope.errors import InputError, shown
 
 if TYPE_CHECKING:
     from heliotrope.mechanism.guo import GuoParameters
@@ -47,12 +46,8 @@ def _parsed(values: list[str]) -> dict[str, float]:
     found = {}
     for text in values:
         name, _, value = text.partition("=")
-        try:
-            found[name.strip()] = float(value)
-        except ValueError:
-            found[name.strip()] = math.nan
-        if not math.isfinite(found[name.strip()]):
-            raise InputError(f"{text!r}: write NAME=VALUE with a number, for example psi_t=1.854")
+        refusal = f"{shown(text)}: write NAME=VALUE with a number, for example psi_t=1.854"
+        (found[name.strip()],) = parse_numbers(value, refusal)
     return found
 
 

@@ -1,6 +1,5 @@
 """``heliotrope plan``: the measurements to make next, of some heliostats or of a whole field."""
 
-import math
 import sys
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -40,11 +39,15 @@ def plan(
         str, typer.Option("--from", help="ISO 8601 with a time zone, or now.")
     ] = "now",
     end: Annotated[str | None, typer.Option("--to", help="ISO 8601 with a time zone.")] = None,
-    days: Annotated[float | None, typer.Option(help="Instead of --to; default 7.")] = None,
+    days: Annotated[
+        float | None, typer.Option(min=0.01, max=3660, help="Instead of --to; default 7.")
+    ] = None,
     count: Annotated[
         int | None,
         typer.Option(
-            help="Measurements of each heliostat (default 10), or of the campaign (no limit)."
+            min=1,
+            max=100_000,
+            help="Measurements of each heliostat (default 10), or of the campaign (no limit).",
         ),
     ] = None,
     target: Annotated[
@@ -65,7 +68,12 @@ def plan(
     ] = False,
     every: Annotated[str, typer.Option(help="Step of the times considered.")] = "30m",
     sigma_mrad: Annotated[
-        float, typer.Option(help="Standard deviation of a measured beam in each direction, mrad.")
+        float,
+        typer.Option(
+            min=0.001,
+            max=1000,
+            help="Standard deviation of a measured beam in each direction, mrad.",
+        ),
     ] = 0.5,
     settle: Annotated[str, typer.Option(help="Time to come to rest on the target.")] = "5s",
     exposure: Annotated[str, typer.Option(help="Exposure time of the camera.")] = "2s",
@@ -77,8 +85,10 @@ def plan(
     worth: Annotated[
         float,
         typer.Option(
+            min=0,
+            max=1,
             help="Campaign: least share by which a measurement lowers the squared error of its "
-            "heliostat."
+            "heliostat.",
         ),
     ] = 0.05,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
@@ -104,7 +114,7 @@ def plan(
         picture=picture,
         as_json=as_json,
     )
-    sigma = 1e-3 * above(sigma_mrad, "--sigma-mrad")
+    sigma = 1e-3 * sigma_mrad
     made = made_so_far(plant, sightings)
     with progress("computing the errors over the year", as_json) as step:
         fleets = fleets_of(
@@ -179,23 +189,13 @@ def span_of(begin: str, end: str | None, days: float | None) -> tuple[datetime, 
     if end is not None:
         stop = parse_time(end)
     else:
-        length = 7.0 if days is None else above(days, "--days")
-        if length > 3660.0:
-            raise InputError(f"--days {length:g}: give at most 3660")
         try:
-            stop = start + timedelta(days=length)
+            stop = start + timedelta(days=7.0 if days is None else days)
         except OverflowError:
             raise TimeError(f"--from {begin}: the span runs beyond the year 9999") from None
     if stop <= start:
         raise TimeError(f"--to {stop.isoformat()} is not after --from {start.isoformat()}")
     return start, stop
-
-
-def above(value: float, what: str) -> float:
-    """Return a number of the command line that must be above 0."""
-    if not (math.isfinite(value) and value > 0.0):
-        raise InputError(f"{what} {value:g}: give a number above 0")
-    return value
 
 
 def targets_of(plant: "Plant", wanted: list[str] | None) -> "tuple[Target, ...]":

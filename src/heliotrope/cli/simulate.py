@@ -9,13 +9,22 @@ from heliotrope.cli._common import print_json, print_table
 
 
 def simulate(
-    seed: Annotated[int, typer.Option(help="Seed of everything random; the first of --runs.")] = 0,
+    seed: Annotated[
+        int,
+        typer.Option(min=0, max=2**63 - 1, help="Seed of everything random; the first of --runs."),
+    ] = 0,
     hours: Annotated[
         float | None,
-        typer.Option(help="Simulated time of each run; by default 0.1, for a day 14 minutes."),
+        typer.Option(
+            min=0.001,
+            max=8760,
+            help="Simulated time of each run; by default 0.1, for a day 14 minutes.",
+        ),
     ] = None,
-    heliostats: Annotated[int, typer.Option(help="Number on the bus, 1 to 32.")] = 4,
-    pause: Annotated[float, typer.Option(help="Mean time between two faults, s.")] = 12.0,
+    heliostats: Annotated[int, typer.Option(min=1, max=32, help="Number on the bus, 1 to 32.")] = 4,
+    pause: Annotated[
+        float, typer.Option(min=0.01, max=1e6, help="Mean time between two faults, s.")
+    ] = 12.0,
     only: Annotated[
         list[str] | None, typer.Option(help="Only faults of this kind; may be repeated.")
     ] = None,
@@ -23,10 +32,13 @@ def simulate(
         list[str] | None,
         typer.Option(help="Add a harder world; may be repeated. any: each run draws its own."),
     ] = None,
-    runs: Annotated[int, typer.Option(help="Number of runs, with consecutive seeds.")] = 1,
-    processes: Annotated[int, typer.Option(help="Runs in parallel.")] = 1,
+    runs: Annotated[
+        int, typer.Option(min=1, max=1_000_000, help="Number of runs, with consecutive seeds.")
+    ] = 1,
+    processes: Annotated[int, typer.Option(min=1, max=1024, help="Runs in parallel.")] = 1,
     minutes: Annotated[
-        float | None, typer.Option(help="Time after which no further run begins.")
+        float | None,
+        typer.Option(min=0.001, max=1e6, help="Time after which no further run begins."),
     ] = None,
     progress: Annotated[
         Path | None, typer.Option(help="File that records finished runs; continue from it.")
@@ -40,13 +52,10 @@ def simulate(
 
     Sixteen safety invariants and four of liveness are checked; the exit code is 1 if one is broken.
     """
-    from heliotrope.errors import InputError
     from heliotrope.twin.world.simulation import RunPlan
     from heliotrope.twin.world.soak import run_many
     from heliotrope.twin.world.worlds import ANY, length_of, mixed
 
-    if runs < 1 or (minutes is not None and not minutes > 0.0):
-        raise InputError(f"{runs} runs in {minutes} minutes; give at least 1, and above 0")
     plans = []
     for number in range(seed, seed + runs):
         worlds = mixed(number) if world == [ANY] else tuple(world or ())

@@ -5,18 +5,28 @@ from typing import Annotated, Literal
 import typer
 
 from heliotrope.cli._common import day_of, parse_duration, parse_time, print_json, print_table
-from heliotrope.errors import InputError
 
 
 def sun(
-    latitude: Annotated[float, typer.Option(help="Degrees, north positive.")] = -33.93,
-    longitude: Annotated[float, typer.Option(help="Degrees, east positive.")] = 18.87,
-    height: Annotated[float, typer.Option(help="Metres above the ellipsoid.")] = 120.0,
+    latitude: Annotated[
+        float, typer.Option(min=-90, max=90, help="Degrees, north positive.")
+    ] = -33.93,
+    longitude: Annotated[
+        float, typer.Option(min=-180, max=180, help="Degrees, east positive.")
+    ] = 18.87,
+    height: Annotated[
+        float, typer.Option(min=-500, max=9000, help="Metres above the ellipsoid.")
+    ] = 120.0,
     time: Annotated[str, typer.Option(help="ISO 8601 with a zone, or now.")] = "now",
     pressure: Annotated[
-        float | None, typer.Option(help="Air pressure at the site, hPa; default from the height.")
+        float | None,
+        typer.Option(
+            min=300, max=1200, help="Air pressure at the site, hPa; default from the height."
+        ),
     ] = None,
-    temperature: Annotated[float, typer.Option(help="Air temperature, °C.")] = 12.0,
+    temperature: Annotated[
+        float, typer.Option(min=-90, max=60, help="Air temperature, °C.")
+    ] = 12.0,
     every: Annotated[
         str | None,
         typer.Option(help="Print the whole day of TIME at this interval: 30s, 10min."),
@@ -33,11 +43,12 @@ def sun(
     from heliotrope import sun as solar
 
     moment = parse_time(time)
-    site = solar.Site(latitude, longitude, height, _pascal(pressure), temperature)
+    pascal = None if pressure is None else 100.0 * pressure
+    site = solar.Site(latitude, longitude, height, pascal, temperature)
     day = day_of(moment, site)
     events = solar.events(day, site)
     if every is not None:
-        moments = solar.daylight(day, site, every=parse_duration(every))
+        moments = solar.daylight(day, site, every=parse_duration(every, 1.0))
     else:
         import pandas as pd
 
@@ -81,12 +92,3 @@ def sun(
     ):
         shown = event.strftime("%Y-%m-%d %H:%M:%S UTC") if event else f"none ({events.kind})"
         print(f"{name:12}{shown}")
-
-
-def _pascal(pressure: float | None) -> float | None:
-    """Return hPa of the option in Pa; refuse what no site has."""
-    if pressure is not None and not 300.0 <= pressure <= 1200.0:
-        raise InputError(
-            f"pressure {pressure:g} hPa is not within 300 to 1200 hPa; give hPa (1013 at sea level)"
-        )
-    return None if pressure is None else 100.0 * pressure

@@ -19,6 +19,9 @@ from heliotrope.errors import InputError
 #: Simulated time that passes in a second of the animation, s.
 _PACE = 3600.0
 
+#: Shortest time between two poses, s: a page of 30 s holds 2,000, and 10 MB.
+_LEAST = 30.0
+
 
 def view(
     field: FieldArgument,
@@ -44,7 +47,7 @@ def view(
     one = plant[heliostat]
     mechanism, width, height = one.calibrated, one.width, one.height
     goal = np.array(aim_of(plant, heliostat, aim, target))
-    times = sunlit(parse_time(time), plant.site, every)
+    times = sunlit(parse_time(time), plant.site, every, _LEAST)
     light = np.asarray(solar.vector(times, plant.site))
     found = tracking.track(mechanism, light, goal)
     good = found.reachable

@@ -61,7 +61,7 @@ def fly_dome(
     for k, (place, wanted) in enumerate(zip(dome.position, dome.rotation, strict=True)):
         told = place + rng.normal(0.0, 1.0, 3) * wrong.hover
         true = told - np.asarray(wrong.rtk_offset) + rng.normal(0.0, 1.0, 3) * wrong.rtk
-        lean = rng.normal(0.0, wrong.gimbal, 3)
+        lean = wrong.gimbal * rng.normal(0.0, 1.0, 3)
         turned = rotation(lean, float(np.linalg.norm(lean))) @ wanted
         name, time = f"DJI_{k + 1:04d}.JPG", _START + timedelta(seconds=5 * k)
         taken.append(Photo(name, time, true, turned))

@@ -249,7 +249,7 @@ def fly(
     # Drawn last, so that a flight without these errors is the same as before they were thought of.
     stand = standing(really, counts)
     if wrong.kinematics > 0.0:
-        off = rng.normal(0.0, wrong.kinematics, stand.vertex.shape)
+        off = wrong.kinematics * rng.normal(0.0, 1.0, stand.vertex.shape)
         stand = replace(stand, vertex=stand.vertex + off)
     own = np.random.default_rng([seed, 1])
     return Flight(
@@ -325,7 +325,7 @@ def _shape(
         slope = smooth_slopes(shape, rng, wrong.slope, length=wrong.slope_length)
     if wrong.canting > 0.0:
         # As a slope of the whole facet, so that a map shows it like deflectometry does.
-        turn = rng.normal(0.0, wrong.canting, (len(shape), 2))
+        turn = wrong.canting * rng.normal(0.0, 1.0, (len(shape), 2))
         area = np.prod(shape.half_size, axis=-1)
         slope = slope + (turn - (area / area.sum()) @ turn)[:, None, None, :]
     return shape.with_slopes(slope)
@@ -337,7 +337,7 @@ def _installed(heliostats: Heliostats, wrong: Errors, rng: np.random.Generator) 
     sizes = {f"position_{axis}": wrong.survey for axis in ("east", "north", "up")}
     moved = dict(heliostats.parameters)
     for name, sigma in {**sizes, **wrong.mechanism}.items():
-        moved[name] = moved.get(name, 0.0) + rng.normal(0.0, sigma, count)
+        moved[name] = moved.get(name, 0.0) + sigma * rng.normal(0.0, 1.0, count)
     return heliostats.with_parameters(moved)
 
 
@@ -351,11 +351,11 @@ def _photograph(
 ) -> tuple[Photo, Photo]:
     """Return a photograph with its true orientation, and as the drone records it."""
     if wrong.hover > 0.0:
-        place = place + rng.normal(0.0, wrong.hover, 3)
+        place = place + wrong.hover * rng.normal(0.0, 1.0, 3)
     # The drone steers by its own RTK, so it records the position that it was sent to.
     true = place - np.asarray(wrong.rtk_offset) + rng.normal(0.0, 1.0, 3) * wrong.rtk
     wanted = look_at(place, focus)
-    lean = rng.normal(0.0, wrong.gimbal, 3)
+    lean = wrong.gimbal * rng.normal(0.0, 1.0, 3)
     turned = rotation(lean, np.linalg.norm(lean)) @ wanted
     return (
         Photo(name, time, true, turned),
@@ -411,7 +411,7 @@ def reflections_of(
     wrong = errors or Errors()
     exact = exact_reflections(flight)
     rng = np.random.default_rng(seed)
-    noisy = exact.xy + rng.normal(0.0, wrong.reflection, (len(exact), 2))
+    noisy = exact.xy + wrong.reflection * rng.normal(0.0, 1.0, (len(exact), 2))
     recorded = as_float([p.position for p in flight.recorded]).reshape(-1, 3)
     true = as_float([p.position for p in flight.taken]).reshape(-1, 3)
     off = (recorded - true).mean(axis=0) if corrected and len(recorded) else np.zeros(3)

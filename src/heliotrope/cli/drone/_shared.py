@@ -35,22 +35,28 @@ CommandsOption = Annotated[
 ClusterOption = Annotated[str, typer.Option(help="Cluster of the commands that was measured.")]
 PointOption = Annotated[str, typer.Option(help="Calibration point of the commands.")]
 SurveyOption = Annotated[
-    float, typer.Option(min=0.1, help="Standard deviation of surveyed positions, mm.")
+    float, typer.Option(min=0.1, max=100_000, help="Standard deviation of surveyed positions, mm.")
 ]
 KinematicsOption = Annotated[
     float,
     typer.Option(
-        min=0.0, help="Standard deviation of mirror vertices from their kinematic model, mm."
+        min=0,
+        max=100_000,
+        help="Standard deviation of mirror vertices from their kinematic model, mm.",
     ),
 ]
 RtkOption = Annotated[
-    float, typer.Option(min=0.1, help="Standard deviation of RTK's common offset (its base), mm.")
+    float,
+    typer.Option(
+        min=0.1, max=100_000, help="Standard deviation of RTK's common offset (its base), mm."
+    ),
 ]
 ProcessesOption = Annotated[
-    int, typer.Option(min=0, help="Processes on this machine; 0: one for each core.")
+    int, typer.Option(min=0, max=1024, help="Processes on this machine; 0: one for each core.")
 ]
 FocalOption = Annotated[
-    float | None, typer.Option(min=1.0, help="Focal length of the facets, m; default: flat.")
+    float | None,
+    typer.Option(min=1, max=100_000, help="Focal length of the facets, m; default: flat."),
 ]
 OutOption = Annotated[Path, typer.Option(help="Folder for the results.")]
 

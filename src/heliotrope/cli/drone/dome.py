@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from heliotrope.cli import _calibration as calibration
-from heliotrope.cli._common import open_plant, parse_point
+from heliotrope.cli._common import open_plant, parse_numbers, parse_point
 from heliotrope.cli.drone import _shared as shared
 
 if TYPE_CHECKING:
@@ -23,14 +23,20 @@ def dome(
     home: Annotated[
         str, typer.Option(help="Take-off, E,N,U in m; default: the middle of the targets.")
     ] = "",
-    radius: Annotated[float, typer.Option(help="Distance of the photographs, m.")] = 15.0,
+    radius: Annotated[
+        float, typer.Option(min=1, max=1000, help="Distance of the photographs, m.")
+    ] = 15.0,
     elevations: Annotated[
         str, typer.Option(help="Elevations of the rings, degrees.")
     ] = "35,50,65,80",
-    photographs: Annotated[int, typer.Option(help="Photographs in all.")] = 48,
-    targets: Annotated[int, typer.Option(help="Coded targets, laid out in a square.")] = 25,
-    spacing: Annotated[float, typer.Option(help="Between targets, m.")] = 2.5,
-    target_mm: Annotated[float, typer.Option(help="Side of a target's black square.")] = 400.0,
+    photographs: Annotated[int, typer.Option(min=1, max=10_000, help="Photographs in all.")] = 48,
+    targets: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Coded targets, laid out in a square.")
+    ] = 25,
+    spacing: Annotated[float, typer.Option(min=0.01, max=1000, help="Between targets, m.")] = 2.5,
+    target_mm: Annotated[
+        float, typer.Option(min=1, max=100_000, help="Side of a target's black square.")
+    ] = 400.0,
     formats: Annotated[
         str, typer.Option(help="Formats of waypoint files: some of dji,qgc,litchi, or none.")
     ] = "dji,qgc,litchi",
@@ -44,7 +50,7 @@ def dome(
     rtk_mm: Annotated[
         str, typer.Option(help="RTK error of each rendered position, E,N,U in mm.")
     ] = "6,6,8",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all randomness.")] = 0,
 ) -> None:
     """Plan a dome flight over coded targets; `drone rtk --targets` evaluates its photographs."""
     import numpy as np
@@ -77,14 +83,8 @@ def dome(
 
 
 def _degrees(text: str) -> list[float]:
-    from heliotrope.errors import InputError
-
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise InputError(
-            f"--elevations {text!r}: give degrees separated by commas, such as 35,50,65,80"
-        ) from None
+    refusal = f"--elevations {text!r}: give degrees from 0 to 90, such as 35,50,65,80"
+    return list(parse_numbers(text, refusal, count=None, least=0.0, most=90.0))
 
 
 def _simulate(

@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from heliotrope.cli._calibration import progress
-from heliotrope.cli._common import open_plant, parse_duration, parse_point, print_json, print_table
+from heliotrope.cli._common import (
+    open_plant,
+    parse_duration,
+    parse_numbers,
+    parse_point,
+    print_json,
+    print_table,
+)
 from heliotrope.cli.drone import _shared as shared
 
 if TYPE_CHECKING:
@@ -19,7 +26,9 @@ if TYPE_CHECKING:
 def plan(
     field: Annotated[Path, typer.Argument(metavar="PLANT", help="Plant file or PAINT folder.")],
     into: Annotated[Path, typer.Option(help="Folder for the plan.")] = Path("flight"),
-    points: Annotated[int, typer.Option(help="Calibration points of each heliostat.")] = 20,
+    points: Annotated[
+        int, typer.Option(min=1, max=1000, help="Calibration points of each heliostat.")
+    ] = 20,
     model: Annotated[
         str, typer.Option(help="auto, or jacks, malan8, guo6, khalsa8, full.")
     ] = "auto",
@@ -27,33 +36,53 @@ def plan(
         Literal["d", "v"], typer.Option(help="d: most information; v: smallest beam error.")
     ] = "d",
     distance: Annotated[
-        float, typer.Option(help="Distance of the drone from a cluster, m.")
+        float, typer.Option(min=1, max=10_000, help="Distance of the drone from a cluster, m.")
     ] = 150.0,
-    size: Annotated[float, typer.Option(help="Diameter of a cluster, m.")] = 100.0,
+    size: Annotated[
+        float, typer.Option(min=1, max=10_000, help="Diameter of a cluster, m.")
+    ] = 100.0,
     spread_deg: Annotated[
-        float, typer.Option(help="Largest angle of an optical axis from its cluster's mean.")
+        float,
+        typer.Option(
+            min=0.1, max=180, help="Largest angle of an optical axis from its cluster's mean."
+        ),
     ] = 25.0,
     view_deg: Annotated[
-        float, typer.Option(help="Angle of view across the shorter side of a photograph.")
+        float,
+        typer.Option(min=1, max=179, help="Angle of view across the shorter side of a photograph."),
     ] = 56.0,
     pointing_mrad: Annotated[
-        float, typer.Option(help="Pointing error of mirrors that patterns must cover.")
+        float,
+        typer.Option(min=0, max=1000, help="Pointing error of mirrors that patterns must cover."),
     ] = 5.0,
-    samples: Annotated[float, typer.Option(help="Reflections on each facet.")] = 9.0,
+    samples: Annotated[
+        float, typer.Option(min=1, max=1e6, help="Reflections on each facet.")
+    ] = 9.0,
     facet_focal: Annotated[
-        float | None, typer.Option(help="Focal length of the facets, m; default: flat.")
+        float | None,
+        typer.Option(min=1, max=100_000, help="Focal length of the facets, m; default: flat."),
     ] = None,
-    least_spacing: Annotated[float, typer.Option(help="Least distance of hover points, m.")] = 0.6,
+    least_spacing: Annotated[
+        float, typer.Option(min=0.01, max=1000, help="Least distance of hover points, m.")
+    ] = 0.6,
     led: Annotated[
         str, typer.Option(help="Lamp from the camera: right,down,forward in m.")
     ] = "0,0,0",
     sigma_mrad: Annotated[
-        float, typer.Option(help="Standard deviation that all reflections of a mirror share.")
+        float,
+        typer.Option(
+            min=0.001, max=1000, help="Standard deviation that all reflections of a mirror share."
+        ),
     ] = 0.2,
     scatter_mrad: Annotated[
-        float, typer.Option(help="Standard deviation of the normal that one reflection shows.")
+        float,
+        typer.Option(
+            min=0.001, max=1000, help="Standard deviation of the normal that one reflection shows."
+        ),
     ] = 0.8,
-    focal_px: Annotated[float, typer.Option(help="Focal length of the camera, pixels.")] = 3000.0,
+    focal_px: Annotated[
+        float, typer.Option(min=1, max=1e6, help="Focal length of the camera, pixels.")
+    ] = 3000.0,
     elevations: Annotated[
         str, typer.Option(help="Lowest,highest elevation of the drone from the mirrors, degrees.")
     ] = "20,85",
@@ -63,19 +92,26 @@ def plan(
     tower: Annotated[
         bool, typer.Option("--tower/--no-tower", help="Keep away from receivers and targets.")
     ] = True,
-    min_height: Annotated[float, typer.Option(help="Lower limit above ground, m.")] = 15.0,
-    max_height: Annotated[float, typer.Option(help="Upper limit above ground, m.")] = 120.0,
+    min_height: Annotated[
+        float, typer.Option(min=0, max=10_000, help="Lower limit above ground, m.")
+    ] = 15.0,
+    max_height: Annotated[
+        float, typer.Option(min=0, max=10_000, help="Upper limit above ground, m.")
+    ] = 120.0,
     home: Annotated[str | None, typer.Option(help="Take-off: east,north,up in m.")] = None,
-    drones: Annotated[int, typer.Option(help="Drones flying at the same time.")] = 1,
-    speed: Annotated[float, typer.Option(help="Between stations, m/s.")] = 8.0,
+    drones: Annotated[int, typer.Option(min=1, max=50, help="Drones flying at the same time.")] = 1,
+    speed: Annotated[float, typer.Option(min=0.01, max=15, help="Between stations, m/s.")] = 8.0,
     photo: Annotated[
         str, typer.Option(help="Time to come to rest and take a photograph.")
     ] = "2.5s",
     endurance: Annotated[str, typer.Option(help="Flying time on one battery.")] = "25min",
     change: Annotated[str, typer.Option(help="Time to change the battery.")] = "5min",
-    hours_a_day: Annotated[float, typer.Option(help="Flying hours a day.")] = 8.0,
+    hours_a_day: Annotated[float, typer.Option(min=0.01, max=24, help="Flying hours a day.")] = 8.0,
     target_minutes: Annotated[
-        float, typer.Option(help="Camera and target, for comparison: time between photographs.")
+        float,
+        typer.Option(
+            min=0.001, max=1e6, help="Camera and target, for comparison: time between photographs."
+        ),
     ] = 2.0,
     formats: Annotated[
         str, typer.Option(help="Formats of waypoint files: some of dji,qgc,litchi, or none.")
@@ -150,7 +186,9 @@ def _selection(
 
     from heliotrope.airborne.plan.calibration_points import PointSelection
 
-    low, high = np.radians(_numbers(elevations, 2, "--elevations")).tolist()
+    refusal = f"--elevations {elevations!r}: give two numbers of degrees from 0 to 90"
+    asked = parse_numbers(elevations, refusal, count=2, least=0.0, most=90.0)
+    low, high = np.radians(asked).tolist()
     return PointSelection(
         points, criterion, 1e-3 * sigma_mrad, low, high, scatter=1e-3 * scatter_mrad
     )
@@ -162,20 +200,6 @@ def _check_aircraft(aircraft: str) -> None:
 
     if aircraft not in AIRCRAFT:
         raise UnknownNameError("aircraft", aircraft, AIRCRAFT)
-
-
-def _numbers(text: str, count: int, what: str) -> tuple[float, ...]:
-    import math
-
-    from heliotrope.errors import InputError
-
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != count or not all(math.isfinite(v) for v in values):
-        raise InputError(f"{what} {text!r}: give {count} numbers separated by commas")
-    return values
 
 
 def _airspace(

@@ -83,9 +83,6 @@ class Shown:
     photographs: PictureSettings = field(default_factory=PictureSettings)
 
     def __post_init__(self) -> None:
-        for name, value in (("minutes", self.minutes), ("every", self.every)):
-            if value is not None and not 0.0 < value < 1e6:
-                raise InputError(f"run: --{name} {value:g}; give above 0")
         if self.database is not None and not self.database.startswith("postgresql://"):
             raise InputError(
                 "run: --database must be postgresql://user@host/name; for SQLite give --data alone"

@@ -43,7 +43,12 @@ def run(
     ] = None,
     heliostats: Annotated[
         int | None,
-        typer.Option(help="Number in the default plant, instead of 10,000.", rich_help_panel=_TWIN),
+        typer.Option(
+            min=1,
+            max=1_000_000,
+            help="Number in the default plant, instead of 10,000.",
+            rich_help_panel=_TWIN,
+        ),
     ] = None,
     prototype: Annotated[
         bool,
@@ -54,7 +59,10 @@ def run(
         ),
     ] = False,
     speed: Annotated[
-        float, typer.Option(help="Simulated seconds per second.", rich_help_panel=_TWIN)
+        float,
+        typer.Option(
+            min=0.001, max=1000, help="Simulated seconds per second.", rich_help_panel=_TWIN
+        ),
     ] = 1.0,
     start: Annotated[
         str,
@@ -65,7 +73,13 @@ def run(
         ),
     ] = "morning",
     seed: Annotated[
-        int, typer.Option(help="Seed of how the mirrors really stand.", rich_help_panel=_TWIN)
+        int,
+        typer.Option(
+            min=0,
+            max=2**63 - 1,
+            help="Seed of how the mirrors really stand.",
+            rich_help_panel=_TWIN,
+        ),
     ] = 0,
     exact: Annotated[
         bool,
@@ -104,14 +118,24 @@ def run(
     ] = None,
     minutes: Annotated[
         float | None,
-        typer.Option(help="Time after which to end; default: at Ctrl-C.", rich_help_panel=_WORK),
+        typer.Option(
+            min=0.001,
+            max=1e6,
+            help="Time after which to end; default: at Ctrl-C.",
+            rich_help_panel=_WORK,
+        ),
     ] = None,
     every: Annotated[
-        float, typer.Option(help="Seconds between printed lines.", rich_help_panel=_WORK)
+        float,
+        typer.Option(
+            min=0.1, max=86_400, help="Seconds between printed lines.", rich_help_panel=_WORK
+        ),
     ] = 10.0,
     stow_rate: Annotated[
         float,
         typer.Option(
+            min=0,
+            max=1e6,
             help="Heliostats a second that an ordinary STOW of many sends to stow; 0: all at once. "
             "Emergencies always send all at once.",
             rich_help_panel=_WORK,
@@ -124,7 +148,9 @@ def run(
             rich_help_panel=_CONSOLE,
         ),
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="0: a free one.", rich_help_panel=_CONSOLE)] = 8080,
+    port: Annotated[
+        int, typer.Option(min=0, max=65_535, help="0: a free one.", rich_help_panel=_CONSOLE)
+    ] = 8080,
     name: Annotated[
         list[str] | None,
         typer.Option(
@@ -171,6 +197,8 @@ def run(
     emergency_port: Annotated[
         int | None,
         typer.Option(
+            min=0,
+            max=65_535,
             help="Port that serves EMERGENCY alone; default: the one after --port.",
             rich_help_panel=_CONSOLE,
         ),
@@ -219,12 +247,17 @@ def run(
     heads_every: Annotated[
         float,
         typer.Option(
-            help="Hours between heads, in that folder and to syslog.", rich_help_panel=_KEPT
+            min=0.001,
+            max=8760,
+            help="Hours between heads, in that folder and to syslog.",
+            rich_help_panel=_KEPT,
         ),
     ] = 1.0,
     photographs_days: Annotated[
         float,
         typer.Option(
+            min=1,
+            max=36_500,
             help="Days for which photographs of calibrations are kept: all for 30 of them, then "
             "one a day of each heliostat.",
             rich_help_panel=_KEPT,
@@ -232,7 +265,9 @@ def run(
     ] = 400.0,
     photographs_gb: Annotated[
         float,
-        typer.Option(help="Size of all kept photographs, GB.", rich_help_panel=_KEPT),
+        typer.Option(
+            min=0.001, max=1e6, help="Size of all kept photographs, GB.", rich_help_panel=_KEPT
+        ),
     ] = 4.0,
 ) -> None:
     """Run a plant: it tracks, photographs, learns and corrects; by default in simulation.
@@ -247,7 +282,7 @@ def run(
     from heliotrope.plant.operations.pictures import PictureSettings
     from heliotrope.plant.settings import PlantSettings
 
-    _one_plant(field, heliostats, speed, prototype=prototype)
+    _one_plant(field, heliostats, prototype=prototype)
     shown = Shown(
         host=host,
         port=port,
@@ -298,14 +333,10 @@ def run(
     run_real(design, real, shown)
 
 
-def _one_plant(
-    field: Path | None, heliostats: int | None, speed: float, *, prototype: bool
-) -> None:
-    """Refuse several plants at once, and a speed without sense."""
+def _one_plant(field: Path | None, heliostats: int | None, *, prototype: bool) -> None:
+    """Refuse several plants at once."""
     from heliotrope.errors import InputError
 
-    if not 0.0 < speed <= 1000.0:
-        raise InputError(f"run: --speed {speed:g}; give above 0 to 1000")
     if prototype and (field is not None or heliostats is not None):
         raise InputError(
             "run: --prototype is a plant of its own; leave out the field and --heliostats"

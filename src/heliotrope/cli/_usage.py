@@ -1,0 +1,37 @@
+"""One line for a command line that cannot be used: the option, its value, the limits."""
+
+import typer
+from typer.exceptions import TyperException
+
+from heliotrope.errors import shown
+
+
+def refusal(error: TyperException) -> str | None:
+    """Return the line of an error, None if it only asks for help: a group without a command."""
+    context = getattr(error, "ctx", None)
+    if context is not None and error.message == context.get_help():
+        return None
+    text = _number(error) or " ".join(error.format_message().split())
+    return text if context is None else f"{text}; see {context.command_path} -h"
+
+
+def _number(error: TyperException) -> str | None:
+    """Return what a number has to be; None for other errors.
+
+    Each numeric option of the command line declares its limits, ``min`` and ``max``.
+    """
+    cause = error.__cause__
+    if not isinstance(error, typer.BadParameter) or error.param is None or cause is None:
+        return None
+    low, high = getattr(error.param, "min", None), getattr(error.param, "max", None)
+    if low is None or high is None:
+        return None
+    value = getattr(cause, "errors", list)()[0]["input"]
+    name = error.param.opts[0] if error.param.param_type_name == "option" else error.param.name
+    kind = "a whole number" if "int" in str(error.param.type_descriptor.annotation) else "a number"
+    comma = " with a point, not a comma" if "," in str(value) else ""
+    limits = " to ".join(
+        f"{end:,}" if isinstance(end, int) else f"{end:,.10g}" for end in (low, high)
+    )
+    about = getattr(error.param, "help", "").rstrip(".")
+    return f"{name} {shown(value)}: give {kind} from {limits}{comma} ({about})"
