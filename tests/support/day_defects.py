@@ -138,7 +138,7 @@ ROWS: tuple[
     ((L1,), "a restart forgets a visit's lock", locks_forgotten_by_a_restart,
      (), IN_A_LOCK, 240.0, False, 4),
     ((16,), "movements below the resolution", movements_below_the_resolution,
-     (), (), 420.0, True, 8),
+     (), (), 420.0, True, 6),
     ((L2,), "retries without an end", endless_retries, (), (), 840.0, True, 14),
     ((16,), "ROUGH to all reaches a visit", rough_in_a_visit,
      _when("photograph", "rough", 1.0), (), 420.0, True, 8),

@@ -338,13 +338,16 @@ def test_an_emergency_has_a_person_who_has_called_it() -> None:
             alarmed("operator_emergency", rest=-inf, calls=calls, over=over)
 
 
-def visited(count: int, *, asks: int = 0, outcome: str = "not_proven", names: int = 1) -> None:
-    """Observe visits, each of which brings nothing."""
+def visited(
+    count: int, *, asks: int = 0, outcome: str = "not_proven", names: int = 1, every: float = 10.0
+) -> None:
+    """Observe visits, each of which brings nothing; nearer than 5 s they are one visit."""
     observer = ResultObserver.__new__(ResultObserver)
     accounts: dict[str, Any] = {}
     observer.__dict__.update(
         checks=dict.fromkeys(TITLES, 0), _start=0.0, _zero=0.0, _accounts=accounts,
-        _boards={f"H{i}": None for i in range(names)}, _dark=frozenset(), _barren=0, _together=True,
+        _boards={f"H{i}": None for i in range(names)}, _dark=frozenset(), _barren=[],
+        _together=True,
     )  # fmt: skip
     observer.__dict__["_noted"] = lambda *_: None
     for i in range(names):
@@ -357,15 +360,16 @@ def visited(count: int, *, asks: int = 0, outcome: str = "not_proven", names: in
         if asks and k % asks == 0:
             observer.asked(("H0",))
         entry: Any = SimpleNamespace(
-            heliostat=f"H{k % names}", at=float(k), target="left", new=0, sightings=0, good=False,
+            heliostat=f"H{k % names}", at=every * k, target="left", new=0, sightings=0, good=False,
             outcome=CalibrationOutcome[outcome.upper()], version=0, text="no light follows",
         )  # fmt: skip
-        observer._concluded(operations, entry, float(k))
+        observer._concluded(operations, entry, every * k)
 
 
 def test_visits_that_bring_nothing_end(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InvariantError, match=rf"invariant 16 .* {BARREN} results in a row"):
         visited(BARREN, names=3)
+    visited(3 * BARREN, names=3, every=1.0)  # one visit of all
     visited(3 * BARREN, names=3, outcome="refused")
     monkeypatch.setattr("heliotrope.twin.invariants.results.BARREN", 10**6)
     visited(RETRIES)

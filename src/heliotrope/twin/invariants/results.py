@@ -11,7 +11,7 @@ without end (L2).
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
-from math import isfinite, nan
+from math import inf, isfinite, nan
 
 import numpy as np
 
@@ -43,8 +43,10 @@ RETRIES = 14
 #: the plant's program rests for longer than a day of `days` after each.
 SEARCHES = 3
 #: Results in a row, of mirrors that photographs show, that do not all bring nothing though no
-#: visit broke off: so many, or all of the field but one.
-BARREN = 5
+#: visit broke off: so many, or all of the field but one, of so many visits.
+BARREN, BARREN_VISITS = 5, 4
+#: Results at one target within this time are of one visit, s.
+_ONE_VISIT = 5.0
 #: Results of visits that broke off: what they brought is not counted.
 _BROKEN = (
     CalibrationOutcome.REFUSED,
@@ -120,7 +122,8 @@ class ResultObserver:
         self._start, self._records, self._sun, self._zero = start, records, sun, zero
         self._boards = {board.outfit.name: board for board in boards}
         self._accounts = {name: _Account() for name in self._boards}
-        self._dark, self._barren, self._together = frozenset(dark), 0, together
+        self._dark, self._together = frozenset(dark), together
+        self._barren: list[CalibrationEntry] = []  # results in a row
         self._results: set[tuple[str, float]] = set()
         self._program: Operations | None = None
         self._looked = start
@@ -240,9 +243,11 @@ class ResultObserver:
         saw = f"its beam was searched for in vain {account.searched} times in a row"
         self._check(account.searched <= SEARCHES, now, name, saw, L2)
         if name not in self._dark:
-            self._barren = 0 if entry.new else self._barren + 1
-            saw = f"{self._barren} results in a row have brought nothing, the last: {entry.text}"
-            few = self._barren < max(BARREN, len(self._boards) - 1)
+            self._barren = [] if entry.new else [*self._barren, entry]
+            count = len(self._barren)
+            saw = f"{count} results in a row have brought nothing, the last: {entry.text}"
+            few = count < max(BARREN, len(self._boards) - 1)
+            few |= _visits(self._barren) < BARREN_VISITS
             self._check(few or not self._together, now, name, saw)
         saw = f"a result counts {entry.new} new sightings; {brought} came"
         self._check(entry.new == brought, now, name, saw)
@@ -301,6 +306,16 @@ class ResultObserver:
         known = self._accounts[name].kept
         saw = f"the store has {count} sightings; the plant knows {known}"
         self._check(count >= known, now, name, saw)
+
+
+def _visits(results: Sequence[CalibrationEntry]) -> int:
+    """Return of how many visits some results are, in the order of their times."""
+    last: dict[str, float] = {}
+    count = 0
+    for entry in results:
+        count += entry.at - last.get(entry.target, -inf) > _ONE_VISIT
+        last[entry.target] = entry.at
+    return count
 
 
 def _of_all(event: EventRow, entry: CalibrationEntry) -> bool:
