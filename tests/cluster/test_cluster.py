@@ -654,3 +654,17 @@ def test_no_order_of_callbacks_and_no_damage_keeps_a_mirror_on_the_receiver(seed
             )
 
     run(main, "TRACKING", seed=seed)
+
+
+def test_without_a_known_time_a_second_lasts_a_second() -> None:
+    async def main(field: Field) -> None:
+        known = field.time.time()
+        unknown = dataclasses.replace(known, quality="none")
+        assert field.cluster._next_due(5.0, unknown) == 6.0
+        phase = field.cluster.config.phase
+        for ahead, due in ((-0.01, 6.01), (0.01, 5.99)):
+            present = dataclasses.replace(known, gps_s=known.gps_s // 1.0 + phase + ahead)
+            assert present.usable
+            assert field.cluster._next_due(5.0, present) == pytest.approx(due, abs=1e-6)
+
+    run(main)

@@ -653,6 +653,22 @@ def test_what_was_at_work_when_an_emergency_came_is_not_sent_again() -> None:
     run(main, "IDLE", bus=interrupted)
 
 
+def test_an_emergency_that_was_given_up_is_given_to_who_answers() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        field.bus.lose("DEFOCUS", 100_000)
+        await field.emergency("stop", "DEFOCUS")
+        await field.until(lambda: Stage.FAILED in field.plant.stages("stop", "A1"), 60.0)
+        asked = len(field.bus.lost)
+        await asyncio.sleep(10.0)
+        assert len(field.bus.lost) > asked, "those that answer polls are asked on"
+        field.bus.lose("DEFOCUS", 0)
+        await asyncio.sleep(10.0)
+        assert not field.plant.alarms("order_unacknowledged")[-1].active
+
+    run(main, "TRACKING", bus=interrupted)
+
+
 def test_many_emergencies_on_a_silent_bus_keep_nobody_from_the_sun() -> None:
     async def main(field: Field) -> None:
         await field.until(field.sun_is_fresh)

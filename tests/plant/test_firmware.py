@@ -49,6 +49,8 @@ def test_boards_with_another_version_are_named_until_they_have_the_expected_one(
             assert named(bench).keys() == set()
             await bench.wait(600.0)
             assert named(bench).keys() == {"pod-3"}, "it was asked again"
+            # A bus that was searched is not searched again before its cluster connects.
+            assert [ask.what for ask in odd.of(Ask)].count("discover") == 2
 
     run_virtual(main)
 

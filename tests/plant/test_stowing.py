@@ -61,6 +61,16 @@ def test_they_go_one_after_the_other_in_their_order(tmp_path: Path) -> None:
     play(tmp_path, scene)
 
 
+def test_the_lowest_rate_is_one_a_second(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        ticket = bench.plant.stow("anybody", ("P1A", "P1B", "P1C"))
+        assert await ticket.end(20.0), ticket.text
+        (first, _), *_, (last, _) = sent(bench, "STOW")
+        assert last - first >= 1.5
+
+    play(tmp_path, scene, rate=1.0)
+
+
 def test_at_once_where_the_setting_says_so_and_for_a_few(tmp_path: Path) -> None:
     async def all_at_once(bench: Bench) -> None:
         ticket = bench.plant.stow("anybody")

@@ -91,6 +91,19 @@ def test_a_beam_left_on_the_receiver_is_sent_off_in_every_state(state: int, tmp_
     assert sent[-1].name == "STOW"
 
 
+def test_each_mirror_that_stands_is_looked_at_in_turn(tmp_path: Path) -> None:
+    names = ("P5A", "P5B", "P5C")
+
+    async def scene(bench: Bench) -> None:
+        for name in names:
+            bench.cluster_of(name).deaf.add(name)
+            put(bench, name, states.LOCKED, ON)
+        await bench.wait(12.0)
+        assert alarmed(bench.plant) == set(names)
+
+    play(tmp_path, scene)
+
+
 @pytest.mark.parametrize("way", [-1.0, 1.0], ids=["west", "east"])
 def test_a_beam_that_was_sent_there_or_comes_off_is_left_in_peace(
     way: float, tmp_path: Path
