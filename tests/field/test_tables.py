@@ -4,6 +4,7 @@ import csv
 import errno
 import io
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -555,6 +556,14 @@ def test_a_full_disk_is_called_full(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
     with pytest.raises(InputError, match="give a folder that exists"):
         write_file(tmp_path / "none" / "a.csv", lambda stream: stream.write(b""))
+
+
+def test_a_device_or_a_pipe_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(pipe := tmp_path / "pipe")
+    with pytest.raises(InputError, match="this is a device or a pipe, not a file; give a file"):
+        write_file(pipe, lambda stream: stream.write(b"a"))
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]
 
 
 def test_messages_do_not_begin_with_an_empty_name() -> None:
