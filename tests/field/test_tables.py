@@ -525,10 +525,12 @@ def test_a_plant_refuses_alike_names_over_groups_and_surfaces() -> None:
 
 def test_the_folders_of_artist_open_as_they_are(tmp_path: Path) -> None:
     (tmp_path / "tower-measurements.json").write_text(json.dumps(TOWER), encoding="utf-8")
-    for name in ("AA31", "AA39"):
+    latitude, *rest = PAINT["heliostat_position"]
+    for k, name in enumerate(("AA31", "AA39")):
         (tmp_path / name).mkdir()
         file = tmp_path / name / "heliostat-properties.json"
-        file.write_text(json.dumps(PAINT), encoding="utf-8")
+        place = {"heliostat_position": [latitude + 1e-4 * k, *rest]}
+        file.write_text(json.dumps(PAINT | place), encoding="utf-8")
     seen = {
         "motor_position": {"axis_1_motor_position": 20000, "axis_2_motor_position": 30000},
         "target_name": "target",
