@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 from heliotrope.calibration.sighting_table import read_sightings
 from heliotrope.cli import main
 from heliotrope.field.example import azimuth_elevation
-from heliotrope.field.formats.plant_file import write_plant
+from heliotrope.field.formats.plant_file import read_plant, write_plant
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import enu_to_geodetic
@@ -313,6 +314,35 @@ def test_crops_need_their_target(folder: Path, call: Any) -> None:
     assert code == 2
     assert "a crop shows one target; name it by --target (one of target)" in err
     assert call(*common, "--target", "target")[0] == 0
+
+
+@pytest.mark.parametrize("record", ["log", "json"])
+def test_two_targets_for_one_photograph_are_refused(record: str, folder: Path, call: Any) -> None:
+    plant = read_plant(folder / "plant.toml")
+    other = replace(TARGET, name="other", corners=TARGET.corners + [0.0, 0.0, 30.0])
+    write_plant(replace(plant, targets=(TARGET, other)), folder / "plant.toml")
+    photograph = folder / "photographs" / "7-raw.png"
+    (folder / "photographs" / "p0.png").rename(photograph)
+    words = [photograph, "--plant", folder / "plant.toml", "--no-pictures", "--target", TARGET.name]
+    if record == "log":
+        text = (folder / "log.csv").read_text(encoding="utf-8")
+        text = text.replace("p0.png", "7-raw.png").replace("Z,target,100", "Z,other,100")
+        (folder / "two.csv").write_text(text, encoding="utf-8")
+        words += ["--log", folder / "two.csv"]
+    else:
+        facts = {
+            "motor_position": {"axis_1_motor_position": 1, "axis_2_motor_position": 2},
+            "target_name": "other",
+            "sun_elevation": 30.0,
+            "sun_azimuth": 10.0,
+            "focal_spot": {"UTIS": [50.9, 6.39, 130.0]},
+        }
+        file = folder / "photographs" / "7-calibration-properties.json"
+        file.write_text(json.dumps(facts), encoding="utf-8")
+    code, _, err = call(*words, "--heliostat", "H0", "--to-sightings", folder / "s.csv")
+    assert code == 2
+    assert "its record names target other, and --target target; give the true one alone" in err
+    assert not (folder / "s.csv").exists()
 
 
 BAD: list[tuple[str, list[str], str]] = [

@@ -202,3 +202,25 @@ def test_a_plant_table_given_to_the_check_is_named(tmp_path: Path, run: Any) -> 
     code, out, _ = run("field", "check", tmp_path / "field.csv")
     assert code == 2
     assert "this is a table, not a plant file; `heliotrope track TABLE.csv` reads a layout" in out
+
+
+COPIES = {
+    "plant.toml": "name,group,east_m,north_m,up_m\nA1,azel,0,-30,0\nA2,azel,0.001,-30.0,0\n",
+    "solarpilot.csv": "id,x,y,z\nA1,0,-30,0\nA3,5,-30,0\nA2,0,-30.001,0\n",
+}
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_two_heliostats_at_one_place_are_refused(name: str, tmp_path: Path, run: Any) -> None:
+    plant = _plant(tmp_path, table=COPIES["plant.toml"])
+    file = plant if name == "plant.toml" else tmp_path / name
+    if file != plant:
+        file.write_text(COPIES[name], encoding="utf-8")
+    words = ("--heliostat", "A1", "--aim", "0,0,13", "--site", "37,-5,100", *NOON)
+    code, out, err = run("track", file, *(words if file != plant else words[:2]))
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "heliostats A1 and A2 stand at one place: 0.00 m east, -30.00 m north" in err
+    # One above the other is another place.
+    apart = COPIES[name].replace("30.0,0", "30.0,4").replace("30.001,0", "30.001,4")
+    (tmp_path / "field.csv" if file == plant else file).write_text(apart, encoding="utf-8")
+    assert run("track", file, *(words if file != plant else (*words[:4], *NOON)))[0] == 0

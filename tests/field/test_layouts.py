@@ -335,7 +335,6 @@ def test_the_command_tells_json(tmp_path: Path) -> None:
         (("rings",), "there is no layout 'rings'"),
         (("rows", "--table", "xls"), "table 'xls': give csv or parquet"),
         (("rows", "--picture", "p.bmp"), "give a file that ends in .png, .svg or .pdf"),
-        (("rows", "--latitude", "95"), "latitude"),
     ],
 )
 def test_the_command_refuses_and_leaves_nothing(

@@ -72,6 +72,7 @@ def test_every_kind_survives(table: str, tmp_path: Path) -> None:
     groups = {}
     for kind, one in every_kind().items():
         field = imperfect(_spread(one, 3), seed=1)
+        field = replace(field, position=field.position + [0.0, 10.0 * len(groups), 0.0])
         rng = np.random.default_rng(2)
         groups[kind] = Heliostats(
             tuple(f"{kind}-{i}" for i in range(3)),
@@ -132,7 +133,12 @@ def _spread(one: Mechanism, count: int) -> Mechanism:
 
 
 @given(
-    st.lists(st.tuples(*[st.floats(-900, 900)] * 3), min_size=1, max_size=5),
+    st.lists(
+        st.tuples(*[st.floats(-900, 900)] * 3),
+        min_size=1,
+        max_size=5,
+        unique_by=lambda place: tuple(np.round(np.array(place) / 0.01)),
+    ),
     st.floats(-89, 89),
     st.floats(-0.2, 0.2),
     st.floats(-0.05, 0.05),

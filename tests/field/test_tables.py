@@ -4,6 +4,7 @@ import csv
 import errno
 import io
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -524,10 +525,12 @@ def test_a_plant_refuses_alike_names_over_groups_and_surfaces() -> None:
 
 def test_the_folders_of_artist_open_as_they_are(tmp_path: Path) -> None:
     (tmp_path / "tower-measurements.json").write_text(json.dumps(TOWER), encoding="utf-8")
-    for name in ("AA31", "AA39"):
+    latitude, *rest = PAINT["heliostat_position"]
+    for k, name in enumerate(("AA31", "AA39")):
         (tmp_path / name).mkdir()
         file = tmp_path / name / "heliostat-properties.json"
-        file.write_text(json.dumps(PAINT), encoding="utf-8")
+        place = {"heliostat_position": [latitude + 1e-4 * k, *rest]}
+        file.write_text(json.dumps(PAINT | place), encoding="utf-8")
     seen = {
         "motor_position": {"axis_1_motor_position": 20000, "axis_2_motor_position": 30000},
         "target_name": "target",
@@ -555,6 +558,14 @@ def test_a_full_disk_is_called_full(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
     with pytest.raises(InputError, match="give a folder that exists"):
         write_file(tmp_path / "none" / "a.csv", lambda stream: stream.write(b""))
+
+
+def test_a_device_or_a_pipe_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(pipe := tmp_path / "pipe")
+    with pytest.raises(InputError, match="this is a device or a pipe, not a file; give a file"):
+        write_file(pipe, lambda stream: stream.write(b"a"))
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]
 
 
 def test_messages_do_not_begin_with_an_empty_name() -> None:

@@ -28,6 +28,8 @@ from heliotrope.sun import Site, check_site
 from heliotrope.values import Card, Value, amount, dots
 
 Surface = TypeVar("Surface", Target, Receiver, Camera)
+#: Positions are one place if they are alike when rounded to this, m.
+_ONE_PLACE = 0.01
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -83,6 +85,7 @@ class Plant(Value, Framed):
         limited(CONDITIONS, self.safety)
         groups = self.groups.values()
         check_names("heliostat", (name for group in groups for name in group.names))
+        self._check_places()
         surfaces = [*(t.name for t in self.targets), *(r.name for r in self.receivers)]
         check_names("target or receiver", surfaces)
         check_names("camera", (camera.name for camera in self.cameras))
@@ -97,6 +100,20 @@ class Plant(Value, Framed):
             _ = self.camera(self.receiver_visits.camera).pose
         if self.timetable:
             check_timetable(self.timetable, self.names, (t.name for t in self.targets))
+
+    def _check_places(self) -> None:
+        """Refuse two heliostats at one place: a row that was copied, or a wrong position."""
+        cells = np.round(self.position / _ONE_PLACE)
+        order = np.lexsort(cells.T)
+        same = (np.diff(cells[order], axis=0) == 0.0).all(axis=1)
+        if same.any():
+            k = int(np.flatnonzero(same)[0])
+            one, other = (self.names[i] for i in sorted(order[k : k + 2].tolist()))
+            east, north, up = self.position[order[k]]
+            raise InputError(
+                f"heliostats {one} and {other} stand at one place: {east:.2f} m east, "
+                f"{north:.2f} m north, {up:.2f} m up; correct one, or leave it out"
+            )
 
     def _card(self) -> Card:
         s = self.site

@@ -87,9 +87,12 @@ def write_file(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
     Raises
     ------
     InputError
-        If the folder does not exist or is not writable.
+        If the folder does not exist or is not writable, or a device or a pipe has that name.
     """
     file = Path(path)
+    if file.exists() and not (file.is_file() or file.is_dir()):
+        # To replace it would take it from every program, as root even /dev/null.
+        raise InputError(f"{file}: this is a device or a pipe, not a file; give a file")
     beside = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         with beside.open("wb") as stream:

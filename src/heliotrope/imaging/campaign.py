@@ -170,9 +170,16 @@ def look(
     Raises
     ------
     InputError
-        If its target is needed and not known, or the annotated picture cannot be written.
+        If its target is needed and not known, or two are named, or the annotated picture cannot be
+        written.
     """
-    name = entry.target if entry is not None and entry.target else job.target
+    recorded = "" if entry is None else entry.target
+    if recorded and job.target and recorded != job.target:
+        raise InputError(
+            f"{path}: its record names target {recorded}, and --target {job.target}; give the true "
+            "one alone"
+        )
+    name = recorded or job.target
     if job.crop:
         photograph = read_crop(frame, _target(job, name, path), job.settings)
     else:
