@@ -96,12 +96,7 @@ def track(
     from heliotrope.mechanism import track_path, tracking
 
     # With a given sun the place on Earth does not matter.
-    place = site or ("0,0,0" if sun is not None else "")
-    plant = open_plant(field, parse_site(place) if place else None)
-    if calibration is not None:
-        from heliotrope.calibration.report.results import read_json
-
-        plant = plant.with_calibration(read_json(calibration))
+    plant = _opened(field, site or ("0,0,0" if sun is not None else ""), calibration)
     mechanism = plant[heliostat].calibrated
     _check(every, law, local, trace, target)
     goal = np.array(
@@ -153,6 +148,16 @@ def track(
         _print_branches(document, heliostat)
     if not result.reachable:
         raise typer.Exit(1)
+
+
+def _opened(field: Path, place: str, calibration: Path | None) -> "Plant":
+    """Open a field at a place, "" for its own, with a calibration."""
+    plant = open_plant(field, parse_site(place) if place else None)
+    if calibration is None:
+        return plant
+    from heliotrope.calibration.report.results import read_json
+
+    return plant.with_calibration(read_json(calibration))
 
 
 def _check(every: str | None, law: str, local: bool, trace: bool, target: str | None) -> None:
