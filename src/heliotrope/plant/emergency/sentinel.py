@@ -45,6 +45,8 @@ _PROVEN_SHOWS = 5.0
 _KEEP_PERIOD = 1.0
 #: Name and role of the safety table in a record.
 _TABLE = ("safety table", "plant")
+#: Name and role in the record of an emergency that a new program continues: nobody orders it then.
+_AGAIN = ("plant", "plant")
 #: Name and role of the night in a record.
 _NIGHT = ("the sun is down", "plant")
 
@@ -202,16 +204,22 @@ class Sentinel:
         """Order what the table demands, or go on with the emergency of the program before."""
         before, self._recalled = self._recalled, Standing()
         if before.act:
-            self._begin(max(act, Act[before.act]), (before.who, "anybody"), before.continued)
+            self._begin(max(act, Act[before.act]), _AGAIN, before.continued, before.who)
         else:
             self._begin(act, _TABLE, self.table.reasons(Act.DEFOCUS))
 
-    def _begin(self, act: Act, giver: tuple[str, str], reason: str) -> EmergencyOrder:
-        """Order DEFOCUS or STOW of the whole field."""
+    def _begin(
+        self, act: Act, giver: tuple[str, str], reason: str, who: str = ""
+    ) -> EmergencyOrder:
+        """Order DEFOCUS or STOW of the whole field; ``giver`` is a name and a role in the record.
+
+        ``who`` gave the order that this one continues, "" if it continues none.
+        """
         now, names = self._clock.monotonic(), self._field.names
         ticket = self._orders.accept((*giver, act.name), (), names, reason, late=True)
         measured = self.table.flux_measured
-        self.order = EmergencyOrder(act, giver[0], reason, now, ticket, flux_measured=measured)
+        first = who or giver[0]
+        self.order = EmergencyOrder(act, first, reason, now, ticket, flux_measured=measured)
         self.on, self._repeated_at = True, now
         self._unproven = {}
         self._orders.emergency(ticket, act, names)

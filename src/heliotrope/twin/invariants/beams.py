@@ -18,6 +18,7 @@ from heliotrope.lcu.node import Node
 from heliotrope.links.messages import ClusterStatus, Command, Progress, Stage
 from heliotrope.mechanism.tracking import TrackingStatus, track
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.emergency import EmergencyOrder
 from heliotrope.safety import Act, Alarm, alarms
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, STANDBY, Ball
@@ -101,6 +102,8 @@ class _Mirror:
         has seen it up since the plant last took it off.
     called_at, uncalled
         When the plant last sent its beam to a point, s; whether it went there without that.
+    shines_since
+        Since when its beam is on the receiver while an emergency holds, s.
     """
 
     board: Board
@@ -129,6 +132,7 @@ class _Mirror:
     seen_up: bool = False
     called_at: float = float("-inf")
     uncalled: bool = False
+    shines_since: float | None = None
 
     @property
     def name(self) -> str:
@@ -487,6 +491,7 @@ class BeamObserver:
         order = plant.emergency
         if order is None:
             return
+        self._complete(order, sun, now, holds=plant.emergency_on)
         for mirror in self._mirrors.values():
             key = (order.ticket.identity, mirror.name)
             if key not in self._proved:
@@ -508,3 +513,16 @@ class BeamObserver:
                 good = True
             saw = f"{order.act.name} is proven for it, and its beam or mirror is {saw}"
             self._check(15, good or now - begin <= DONE_WITHIN, now, mirror.name, saw)
+
+    def _complete(self, order: EmergencyOrder, sun: FloatArray, now: float, *, holds: bool) -> None:
+        """Check that no beam is on the receiver while every heliostat is said to be done."""
+        complete = holds and order.report(now).complete
+        for mirror in self._mirrors.values():
+            lit = holds and mirror.state >= 0 and mirror.board.miss(sun, RECEIVER) <= OFF
+            mirror.shines_since = _since(lit, mirror.shines_since, now)
+            if not complete:
+                continue
+            passed = 0.0 if mirror.shines_since is None else now - mirror.shines_since
+            saw = f"every heliostat is said to have done {order.act.name}, and its beam has been on"
+            saw += f" the receiver for {passed:.1f} s"
+            self._check(15, passed <= DONE_WITHIN, now, mirror.name, saw)

@@ -1,4 +1,4 @@
-"""The sixteen safety invariants, and an independent observer of the first eleven.
+"""The seventeen safety invariants, and an independent observer of the first eleven.
 
 The observer sees the frames on the bus, the actions of each board, and the messages to and from the
 plant. It keeps its own accounts in true time and trusts no report: the age of a sun counts from
@@ -36,6 +36,8 @@ number    check
 16        In quiet stretches what was ordered is done; a kept sighting is the mirror's own; while
           the sun is low, what automatic control was given is at stow. Alarms have causes, and
           causes have alarms; each command ends, and says why it failed.
+17        What a person has ordered or locked stands until its owner, or an engineer by name, has
+          ended it: the emergency holds, and the locked mirror stands still.
 ========  ============================================================================
 
 Besides being safe, life must go on:
@@ -51,7 +53,7 @@ L4        What holds for safety outlives a restart of the plant's program.
 ========  ============================================================================
 
 `twin.invariants.beams` checks 12 to 15, `twin.invariants.quiet`, `.visits`, `.day`, `.alarms` and
-`.tickets` 16, and `twin.invariants.answers` 11.
+`.tickets` 16, `twin.invariants.persons` 17, and `twin.invariants.answers` 11.
 """
 
 from collections import Counter, deque
@@ -90,17 +92,20 @@ TITLES = {
     14: "only a person resumes the field",
     15: "a proof counts only what is known",
     16: "work that is possible is done, and what is shown is true",
-    17: "what was taken is given back",
-    18: "each ticket and each retry ends, truthfully",
-    19: "every healthy mirror tracks again",
-    20: "what holds for safety outlives a restart",
+    17: "what a person has ordered or locked stands",
+    18: "what was taken is given back",
+    19: "each ticket and each retry ends, truthfully",
+    20: "every healthy mirror tracks again",
+    21: "what holds for safety outlives a restart",
 }
-#: Numbers of the invariants of liveness, which people call by name.
-L1, L2, L3, L4 = 17, 18, 19, 20
+#: Number of the invariant of persons' orders and locks; numbers of those of liveness, which people
+#: call by name.
+WORDS = 17
+L1, L2, L3, L4 = 18, 19, 20, 21
 
 
 def named(number: int) -> str:
-    """Return what people call an invariant: 1 to 16, L1 to L4."""
+    """Return what people call an invariant: 1 to 17, L1 to L4."""
     return str(number) if number < L1 else f"L{number - L1 + 1}"
 
 
@@ -192,7 +197,7 @@ class Violation:
     Attributes
     ----------
     number
-        Of `TITLES`: 1 to 16, or `L1` to `L4`.
+        Of `TITLES`: 1 to 17, or `L1` to `L4`.
     at
         Time since the start, s.
     subject

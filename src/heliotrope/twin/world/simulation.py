@@ -43,6 +43,7 @@ from heliotrope.twin.invariants.alarms import AlarmObserver
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
+from heliotrope.twin.invariants.persons import PersonsObserver
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.progress import ProgressObserver
 from heliotrope.twin.invariants.quiet import NEAR, QuietObserver
@@ -321,6 +322,8 @@ class Simulation:
         self.observer = PlantObserver(
             self.begin, self.disk, SETTINGS, observers, automatic=works(plan.worlds)
         )
+        alone = "twice" not in plan.worlds
+        self.persons = PersonsObserver(self.begin, self.boards, alone=alone)
         self.operator = self._new_operator(fits, scene.keep_outs[0][0])
         self.operator.quiet, self.operator.tickets = self.quiet, self.tickets
         self.operator.alarms = self.alarms
@@ -347,6 +350,7 @@ class Simulation:
             Habits.of(self.plan.worlds, self.plan.seed),
             self.observer,
             self.beams,
+            self.persons,
             fits,
             self.pods,
             keep_out,
@@ -466,7 +470,7 @@ class Simulation:
     @property
     def checks(self) -> Counter[int]:
         """Number of checks of each invariant by the observers of work, alarms and tickets."""
-        found = self.alarms.checks + self.tickets.checks
+        found = self.alarms.checks + self.tickets.checks + self.persons.checks
         if self._work is not None:
             found += self._work.watch.checks
         return found if self.quiet is None else found + self.quiet.checks
@@ -659,6 +663,7 @@ class Simulation:
                     self.alarms.look(
                         damage.rest, carried, now, runs=going is not None, writes=writes
                     )
+                self.persons.look(self.plant, now)
                 going_on = self.plant is not None and not self.operator.waits
                 self.tickets.look(now, runs=going_on and writes)
                 if self._work is not None:
