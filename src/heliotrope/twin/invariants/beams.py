@@ -218,6 +218,7 @@ class BeamObserver:
         self._left: deque[tuple[float, str]] = deque(maxlen=64)
         self._lost_at = self._lost_known_at = self._released_at = float("-inf")
         self._proved: dict[tuple[str, str], float] = {}
+        self._misled: set[str] = set()
 
     def _check(self, number: int, good: bool, now: float, subject: str, saw: str) -> None:
         self.checks[number] += 1
@@ -285,7 +286,9 @@ class BeamObserver:
         What is lost is told by the true states; the report only tells since when that is known.
         """
         for name, row in zip(names, status.nodes(), strict=True):
-            mirror, age = self._mirrors[name], 1e-3 * int(row["heard_ms"])
+            mirror, age = self._mirrors.get(name), 1e-3 * int(row["heard_ms"])
+            if mirror is None:
+                continue  # the cluster's file names none like it
             if age <= _HEARD and now - age >= mirror.changed_at:
                 mirror.reports += 1
                 if mirror.reports == REPORTS:
@@ -318,6 +321,14 @@ class BeamObserver:
     def alarmed(self, alarm: Alarm, now: float) -> None:
         """Note an alarm of the plant."""
         self._alarms[alarm.condition, alarm.subject] = (now, alarm.active)
+
+    def mislead(self, heliostat: str) -> None:
+        """Note that the motors of a mirror no longer stand where its board counts.
+
+        A drive that stalls and a board of another mirror are seen by nothing that this plant has,
+        but by the flux; so its beam is judged with the others' only (15).
+        """
+        self._misled.add(heliostat)
 
     def ended(self) -> None:
         """Note that the plant's program has ended, and its alarms with it.
@@ -364,6 +375,9 @@ class BeamObserver:
             if mirror.state < 0:
                 mirror.astray_since = mirror.lit_since = mirror.inside_since = None
                 continue
+            if mirror.name in self._misled:
+                self._stays_off(mirror, now)
+                continue
             self._placed(mirror, sun, now)
             self._dark(mirror, sun, now)
         if self._most is None:
@@ -374,6 +388,13 @@ class BeamObserver:
             if plant.emergency_on:  # automatic control has given up the field
                 self.taken(self._mirrors)
             self._proofs(plant, sun, now)
+
+    def _stays_off(self, mirror: _Mirror, now: float) -> None:
+        """Check that a board with another mirror's parameters does not bring a beam up."""
+        node, own = mirror.node, mirror.board.outfit.items["armature"]
+        strange = node is not None and node.journal.items.get("armature") != own
+        saw = f"{states.STATES[mirror.state]}, with the parameters of another mirror"
+        self._check(12, not strange or mirror.state not in _ON, now, mirror.name, saw)
 
     def _enters(self, mirror: _Mirror, state: int, now: float) -> None:
         """Note a new state."""
@@ -501,7 +522,11 @@ class BeamObserver:
             begin, board = self._proved[key], mirror.board
             if begin == float("inf"):
                 continue
-            away = mirror.state < 0 or mirror.ordered_at > order.at + 1.0
+            away = (
+                mirror.state < 0
+                or mirror.name in self._misled
+                or mirror.ordered_at > order.at + 1.0
+            )
             if order.act is Act.STOW:
                 off = steps_from_stow(board)
                 saw, good = f"{off} steps from stow", off <= NEAR_STOW

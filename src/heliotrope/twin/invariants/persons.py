@@ -114,6 +114,11 @@ class PersonsObserver:
                 self._locks.pop(name, None)
 
     @property
+    def sure(self) -> bool:
+        """Whether the plant's store has the locks of now."""
+        return self._confirmed
+
+    @property
     def locks(self) -> dict[str, tuple[str, ...]]:
         """Owners of the locks on each heliostat."""
         return {name: tuple(lock.owners) for name, lock in self._locks.items()}
@@ -124,12 +129,13 @@ class PersonsObserver:
         """Return what stands now: a backup of the plant's store that is made now has it."""
         return Words(dict(self.orders), self.locks)
 
-    def restored(self, words: Words) -> None:
+    def restored(self, words: Words, now: float) -> None:
         """Note that the plant's store is a backup: it has the orders of that time.
 
         The locks of now go on, until persons have confirmed what the store has (`confirmed`).
         """
-        self.orders, self._confirmed = dict(words.orders), False
+        self.orders = {owner: (act, now) for owner, (act, _) in words.orders.items()}
+        self._confirmed = False
 
     def confirmed(self) -> None:
         """Note that persons have put their locks again, and returned old ones."""

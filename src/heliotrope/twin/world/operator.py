@@ -13,6 +13,7 @@ import random
 import struct
 from collections import Counter
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
 
@@ -51,6 +52,19 @@ LATCHING = frozenset(
     {"operator_emergency", "nodes_unacknowledged", "flux_after_emergency", "clock_jump"}
 )
 Point = tuple[float, ...]
+
+
+class Maintenance(Protocol):
+    """The persons who work at the mirrors; see `world.maintenance`."""
+
+    def acts(self, plant: PlantController) -> None:
+        """Do one thing."""
+        ...
+
+    def confirms(self, plant: PlantController) -> None:
+        """Do what a restored store asks for."""
+        ...
+
 
 #: Share of the emergencies that a second person orders too.
 _SECOND = 0.3
@@ -94,8 +108,12 @@ class Operator:
         Why the plant refused last.
     quiet, tickets, alarms
         Observers of reasons, tickets and alarms; None: these are not judged. Set by the owner.
+    maintenance
+        The persons who work at the mirrors; None: there are none. Set by the owner.
     points
         Points last accepted, ENU, m, by command (AIM, STANDBY) and heliostat.
+    persons
+        As given.
     """
 
     def __init__(
@@ -119,9 +137,10 @@ class Operator:
         self.quiet: QuietObserver | None = None
         self.tickets: TicketObserver | None = None
         self.alarms: AlarmObserver | None = None
+        self.maintenance: Maintenance | None = None
         self.points: dict[tuple[str, str], Point] = {}
         self._clock, self._observer, self._flux = clock, observer, flux
-        self._beams, self._persons, self._habits = beams, persons, habits
+        self._beams, self.persons, self._habits = beams, persons, habits
         self._chance = random.Random(f"operator {seed}")
         self._others = random.Random(f"others {seed}")
         self._fits, self._names = {fit.name: fit for fit in fits}, sorted(fit.name for fit in fits)
@@ -220,6 +239,8 @@ class Operator:
                 ],
                 self._habits.weights,
             )[0]
+            if self.maintenance is not None and self._others.random() < self._habits.locks:
+                does = self.maintenance.acts
             if self._chance.random() < self._habits.calibrates:
                 does = self._calibrate
             does(plant)
@@ -375,6 +396,16 @@ class Operator:
             return None
         return self._accepted(who, token, ticket, "PARAMETERS")
 
+    def zero(self, plant: PlantController, name: str, counts: Sequence[int]) -> Ticket | None:
+        """Declare the step counts of one heliostat; see `give`."""
+        who, token = self._duty, self._tokens.get(self._duty.name, 0)
+        try:
+            ticket = plant.zero(who, token, name, counts)
+        except RefusedError as error:
+            self._refused(error, who, token, "ZERO", (name,))
+            return None
+        return self._accepted(who, token, ticket, "ZERO")
+
     def _calibrate(self, plant: PlantController) -> None:
         """Change parameters of one heliostat: rightly, slightly wrongly, or much, unconfirmed."""
         chance, name = self._chance, self._safe(plant)
@@ -426,7 +457,7 @@ class Operator:
         self._beams.taken(self._names)  # after it none is automatic control's
         now = self._clock.monotonic()
         self._observer.obeyed(who.name, act.name, now)
-        self._persons.ordered(who.name, act, now)
+        self.persons.ordered(who.name, act, now)
         if self.alarms is not None:
             self.alarms.called()
 
@@ -445,8 +476,10 @@ class Operator:
 
         Another person's order stands on until the next time.
         """
-        if self._persons.orders:
-            self.withdraws(plant, next(iter(self._persons.orders)))
+        if self.maintenance is not None:
+            self.maintenance.confirms(plant)
+        if self.persons.orders:
+            self.withdraws(plant, next(iter(self.persons.orders)))
         return self._acknowledge(plant)
 
     def withdraws(self, plant: PlantController, owner: str) -> None:
@@ -456,9 +489,9 @@ class Operator:
         try:
             plant.withdraw_emergency(who, owner)
         except RefusedError as error:
-            self._persons.withdrawal_refused(owner, str(error), now)
+            self.persons.withdrawal_refused(owner, str(error), now)
         self._observer.obeyed(who.name, "WITHDRAW", now)
-        self._persons.withdrew(owner)
+        self.persons.withdrew(owner)
 
     def _acknowledge(self, plant: PlantController) -> set[str]:
         """Acknowledge every latched condition; return those for which the plant takes it.

@@ -4,6 +4,7 @@ import asyncio
 import random
 import struct
 from collections import Counter
+from collections.abc import Mapping
 from datetime import datetime
 
 from heliotrope.cluster.config import ClusterConfig, Member
@@ -89,6 +90,9 @@ class Pod:
         Messages to the plant, by kind.
     freezes
         Whether its program can be frozen.
+    file
+        What is wrong in the cluster's file: the name that a heliostat has in it, "" if it is
+        missing there.
     """
 
     def __init__(
@@ -103,7 +107,7 @@ class Pod:
         errors: PodErrors,
     ) -> None:
         self.name, self.boards, self.observer = name, boards, observer
-        self.freezes = errors.freezes
+        self.freezes, self.file = errors.freezes, dict[str, str]()
         self.intruder = Intruder(observer.frames, [b.outfit.address for b in boards])
         self._true, self._site, self._chance = clock, errors.site(site), chance
         drift = chance.choice([0.0, 50e-6, -50e-6, 200e-6])
@@ -146,8 +150,11 @@ class Pod:
         link = self.link = self.line.end(1, "plant", self.clock, seed=seed)
         heard = TappedLink(link, self._true, _ClusterEar(self.observer))
         keeper = self.time or SystemTime(self.clock)
-        fits = [board.outfit for board in self.boards]
-        members = tuple(Member(o.name, self.addresses[o.name], o.serial, o.key) for o in fits)
+        fits = [board.outfit for board in self.boards if self.file.get(board.outfit.name) != ""]
+        members = tuple(
+            Member(self.file.get(o.name, o.name), self.addresses[o.name], o.serial, o.key)
+            for o in fits
+        )
         config = ClusterConfig(self.name, self._site, members)
         cluster = Cluster(config, self.bus, heard, self.clock, keeper, self._kept)
         context = context_of(self.name) if self.freezes else None
@@ -166,6 +173,18 @@ class Pod:
         loop = asyncio.get_running_loop()
         if self.freezes and isinstance(loop, VirtualLoop):
             loop.kill(self.name)
+
+    def edit(self, file: Mapping[str, str], group: asyncio.TaskGroup) -> None:
+        """Restart the program with another file, if it is another one; see ``file``."""
+        if file == self.file:
+            return
+        self.file = dict(file)
+        now = self._true.monotonic()
+        self.observer.unlist([name for name, written in file.items() if not written], now)
+        if self.runs:
+            self.crash()
+            self.observer.disturbed(now, crashed=True)
+            self.start(group)
 
     def freeze(self, *, on: bool) -> None:
         """Freeze the program, or let it go on."""
@@ -310,7 +329,10 @@ class PlantEar:
                 self._quiet.leased(message.token, now)
         elif isinstance(message, Emergency):
             whom = message.heliostats or tuple(self._addresses)
-            observer.emergency(message.name, now, carried=self._pod.carried(now), heliostats=whom)
+            there = tuple(name for name in whom if name not in self._pod.file)
+            carried = self._pod.carried(now)
+            if there:
+                observer.emergency(message.name, now, carried=carried, heliostats=there)
             self._beams.ordered_off(whom, now)
             if self._quiet is not None:
                 self._quiet.ordered_off(message.name, whom, now)

@@ -12,6 +12,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.links.clock import VirtualClock
 from heliotrope.links.tapped import TappedLink
 from heliotrope.mechanism.board_items import Wanted
+from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Alarm, Condition
@@ -65,7 +66,7 @@ class SecondPlant:
         settings: PlantSettings,
         table: tuple[Condition, ...],
         wanted: Wanted,
-        assigned: AssignedDisk,
+        assigned: Assigned,
         pods: Sequence[Pod],
         fits: Sequence[Outfit],
         keep_out: Ball,
