@@ -28,7 +28,14 @@ from heliotrope.twin.boards import outfit
 from heliotrope.twin.world.crew import CrewAct
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.simulation import RunPlan
-from support import day_defects, plant_defects, quiet_defects, report_defects, work_defects
+from support import (
+    day_defects,
+    plant_defects,
+    quiet_defects,
+    report_defects,
+    review_defects,
+    work_defects,
+)
 
 #: The plant stands still for a minute when mirrors track.
 STILL = (Fault("plant_silent", 110.0, 60.0, 0, 0.5),)
@@ -418,6 +425,8 @@ DEFECTS = (
     *(Defect(numbers, name, defect, faults=faults, seconds=seconds, worlds=("days",), acts=acts,
              slow=slow, first=first)
       for numbers, name, defect, acts, faults, seconds, slow, first in day_defects.ROWS),
+    *(Defect(numbers, name, defect, only, worlds=worlds, slow=slow, first=first)
+      for numbers, name, defect, only, worlds, slow, first in review_defects.ROWS),
     *(Defect((16,), name, defect, faults=(), worlds=worlds, slow=slow)
       for name, defect, worlds, slow in quiet_defects.ROWS),
     *(Defect((16,), name, defect, seconds=180.0, worlds=worlds, slow=slow,

@@ -352,11 +352,9 @@ class Sentinel:
             return
         stage = progress.stage
         if stage is Stage.DONE:
-            flags, strange = self._field.rows["flags"], self._identities.strange
+            flags, doubt = self._field.rows["flags"], self._identities.untrusted
             good = (flags & COUNTS_UNKNOWN == 0) & ~switched_off(flags)
-            heliostats = tuple(
-                n for n in heliostats if good[self._field.index[n]] and n not in strange
-            )
+            heliostats = tuple(n for n in heliostats if good[self._field.index[n]] and not doubt(n))
             if self._ways.unsent.watches:
                 stage = Stage.ACKNOWLEDGED
         order.take_stage(heliostats, stage, self._clock.monotonic())
@@ -381,7 +379,7 @@ class Sentinel:
                 self._field.counted_at[index],
                 Drive(self._drives.table[index]),
                 now,
-                np.array([self._field.names[r] in self._identities.strange for r in rows]),
+                np.array([bool(self._identities.untrusted(self._field.names[r])) for r in rows]),
                 lit,
             )
         for row, shines in zip(rows, lit if rows else (), strict=True):
@@ -393,7 +391,7 @@ class Sentinel:
                     f"{name}: its drives are switched off at the mirror, so it is not proven to be "
                     "off; it was not at stow"
                 )
-            elif not order.is_done(name) and (text := self._identities.strange.get(name)):
+            elif not order.is_done(name) and (text := self._identities.untrusted(name)):
                 order.unknown[name] = (
                     f"{name}: {text}, so nothing that it reports proves that it is off"
                 )

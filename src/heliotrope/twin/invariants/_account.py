@@ -96,10 +96,11 @@ class HeliostatAccount:
         When its timers were last given steps, s.
     ticks_jumped, misled
         Whether its counter has jumped since it booted; whether it has heard a stranger's frame.
-    exchanged
-        Whether a board is or was there that is another mirror's: its counts may be wrong.
-    unlisted_at
-        Since when it is missing in its cluster's file, s; None: it is not.
+    unsure
+        Whether a board of another mirror is or was there, or a drive has stalled: its motors may
+        stand elsewhere than counted.
+    written, unlisted_at
+        Name that it has in its cluster's file; since when it is missing there, s, None: it is not.
     foot
         Nearest that its beam came to the foot of the way in this approach, m; 0 if that is unknown.
     """
@@ -124,7 +125,8 @@ class HeliostatAccount:
         self.booted_at, self.boots, self.cuts = now, 0, 0
         self.stepped_at = float("-inf")
         self._slot_ends, self._slot_steps = [float("-inf")] * 2, [0, 0]
-        self.ticks_jumped = self.misled = self.exchanged = False
+        self.ticks_jumped = self.misled = self.unsure = False
+        self.written = self.name
         self.unlisted_at: float | None = None
         self._history: deque[tuple[float, int]] = deque([(now, self.state)], maxlen=64)
         self._items = board.node.journal.items if board.node is not None else board.outfit.items

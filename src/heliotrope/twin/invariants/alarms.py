@@ -116,7 +116,6 @@ class AlarmObserver:
         self._off: dict[str, float] = {}
         self._faulty: dict[str, float] = {}
         self._unlisted: dict[str, float] = {}
-        self._common = "common" in worlds
         self._called = False
 
     def _check(self, good: bool, now: float, subject: str, saw: str, number: int = 16) -> None:
@@ -210,11 +209,14 @@ class AlarmObserver:
             self._well[cluster] = min(self._well[cluster], now) if there else inf
             for name in some:
                 self._named(name, max(self._well[cluster], self._runs_since), now, files)
-        if self._common:
-            named = any(kind == "sun_contradicted" for kind, _ in self._active)
-            passed = now - self._runs_since
-            saw = f"its time has been wrong for {passed:.0f} s, and no sun_contradicted says so"
-            self._check(named or passed <= CONTRADICTED_WITHIN, now, "plant", saw)
+
+    def contradicted(self, now: float, *, runs: bool) -> None:
+        """Check that a time which is wrong in plant and clusters alike is named."""
+        self._runs_since = min(self._runs_since, now) if runs else inf
+        named = any(kind == "sun_contradicted" for kind, _ in self._active)
+        passed = now - self._runs_since
+        saw = f"its time has been wrong for {passed:.0f} s, and no sun_contradicted says so"
+        self._check(named or passed <= CONTRADICTED_WITHIN, now, "plant", saw)
 
     def _caused(
         self, alarm: Alarm, rests: Mapping[str, float], now: float, *, called: bool

@@ -192,6 +192,11 @@ class BeamObserver:
         Number of checks of each invariant.
     losses
         Number of losses after which the field waits for a person.
+    proofs
+        Number of emergency orders of which every heliostat was said to be done.
+    contradicted
+        Whether a witness contradicts the time that plant and clusters share: then no mirror may
+        join the receiver, and where beams rest is nobody's to know. Set by the owner.
     """
 
     def __init__(
@@ -218,7 +223,8 @@ class BeamObserver:
         self._left: deque[tuple[float, str]] = deque(maxlen=64)
         self._lost_at = self._lost_known_at = self._released_at = float("-inf")
         self._proved: dict[tuple[str, str], float] = {}
-        self._misled: set[str] = set()
+        self._stalled, self._exchanged = set[str](), set[str]()
+        self.proofs, self._complete_order, self.contradicted = 0, "", False
 
     def _check(self, number: int, good: bool, now: float, subject: str, saw: str) -> None:
         self.checks[number] += 1
@@ -322,13 +328,13 @@ class BeamObserver:
         """Note an alarm of the plant."""
         self._alarms[alarm.condition, alarm.subject] = (now, alarm.active)
 
-    def mislead(self, heliostat: str) -> None:
-        """Note that the motors of a mirror no longer stand where its board counts.
+    def stalled(self, heliostat: str) -> None:
+        """Note that a drive has stalled, which only the flux sees: the whole proof is judged."""
+        self._stalled.add(heliostat)
 
-        A drive that stalls and a board of another mirror are seen by nothing that this plant has,
-        but by the flux; so its beam is judged with the others' only (15).
-        """
-        self._misled.add(heliostat)
+    def exchanged(self, heliostat: str) -> None:
+        """Note that another mirror's board is at a mirror: its beam is where nobody can know."""
+        self._exchanged.add(heliostat)
 
     def ended(self) -> None:
         """Note that the plant's program has ended, and its alarms with it.
@@ -375,11 +381,11 @@ class BeamObserver:
             if mirror.state < 0:
                 mirror.astray_since = mirror.lit_since = mirror.inside_since = None
                 continue
-            if mirror.name in self._misled:
+            if self.contradicted or mirror.name in self._exchanged:
                 self._stays_off(mirror, now)
-                continue
-            self._placed(mirror, sun, now)
-            self._dark(mirror, sun, now)
+            elif mirror.name not in self._stalled:
+                self._placed(mirror, sun, now)
+                self._dark(mirror, sun, now)
         if self._most is None:
             self._loss(on, now)
         if plant is not None:
@@ -390,11 +396,12 @@ class BeamObserver:
             self._proofs(plant, sun, now)
 
     def _stays_off(self, mirror: _Mirror, now: float) -> None:
-        """Check that a board with another mirror's parameters does not bring a beam up."""
+        """Check that neither a wrong sun nor another mirror's parameters bring a beam up."""
         node, own = mirror.node, mirror.board.outfit.items["armature"]
         strange = node is not None and node.journal.items.get("armature") != own
-        saw = f"{states.STATES[mirror.state]}, with the parameters of another mirror"
-        self._check(12, not strange or mirror.state not in _ON, now, mirror.name, saw)
+        by = "a sun that is contradicted" if self.contradicted else "another mirror's parameters"
+        good = mirror.state not in _ON or not (strange or self.contradicted)
+        self._check(12, good, now, mirror.name, f"{states.STATES[mirror.state]}, by {by}")
 
     def _enters(self, mirror: _Mirror, state: int, now: float) -> None:
         """Note a new state."""
@@ -524,7 +531,7 @@ class BeamObserver:
                 continue
             away = (
                 mirror.state < 0
-                or mirror.name in self._misled
+                or mirror.name in self._stalled | self._exchanged
                 or mirror.ordered_at > order.at + 1.0
             )
             if order.act is Act.STOW:
@@ -540,14 +547,19 @@ class BeamObserver:
             self._check(15, good or now - begin <= DONE_WITHIN, now, mirror.name, saw)
 
     def _complete(self, order: EmergencyOrder, sun: FloatArray, now: float, *, holds: bool) -> None:
-        """Check that no beam is on the receiver while every heliostat is said to be done."""
+        """Check that no beam is on the receiver that the proof calls done, alone or with all."""
         complete = holds and order.report(now).complete
+        if complete and order.ticket.identity != self._complete_order:
+            self.proofs, self._complete_order = self.proofs + 1, order.ticket.identity
+        done = {name for name in self._mirrors if name not in self._stalled and order.is_done(name)}
         for mirror in self._mirrors.values():
             lit = holds and mirror.state >= 0 and mirror.board.miss(sun, RECEIVER) <= OFF
             mirror.shines_since = _since(lit, mirror.shines_since, now)
-            if not complete:
-                continue
             passed = 0.0 if mirror.shines_since is None else now - mirror.shines_since
-            saw = f"every heliostat is said to have done {order.act.name}, and its beam has been on"
-            saw += f" the receiver for {passed:.1f} s"
-            self._check(15, passed <= DONE_WITHIN, now, mirror.name, saw)
+            shines = f"and its beam has been on the receiver for {passed:.1f} s"
+            if complete:
+                saw = f"every heliostat is said to have done {order.act.name}, {shines}"
+                self._check(15, passed <= DONE_WITHIN, now, mirror.name, saw)
+            if holds and mirror.name in done:
+                saw = f"{order.act.name} is proven for it, {shines}"
+                self._check(15, passed <= DONE_WITHIN, now, mirror.name, saw)

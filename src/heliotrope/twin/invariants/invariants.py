@@ -277,20 +277,23 @@ class Observer:
     def call(self, names: Mapping[int, str]) -> None:
         """Call each heliostat by the name that the cluster has for its address."""
         for account in self.accounts:
-            account.name = names[account.address]
+            account.name = account.written = names[account.address]
 
-    def exchanged(self, board: Board) -> None:
-        """Note that another board is at a mirror: what it stores is not what was stored before."""
-        self._by_address[board.outfit.address].exchanged = True
+    def doubt(self, board: Board) -> None:
+        """Note that another board is at a mirror, or that a drive has stalled.
 
-    def unlist(self, heliostats: Iterable[str], now: float) -> None:
-        """Note the heliostats that are missing in the cluster's file, which it now begins with.
-
-        It addresses them no more, so they count as cut off.
+        What it stores is not what was stored before, and where its beam is nobody can know.
         """
-        missing = set(heliostats)
+        self._by_address[board.outfit.address].unsure = True
+
+    def edited(self, file: Mapping[str, str], now: float) -> None:
+        """Note what is wrong in the file that the cluster now begins with; see `Pod.file`.
+
+        A heliostat that is missing there is addressed no more, so it counts as cut off.
+        """
         for account in self.accounts:
-            account.unlisted_at = now if account.name in missing else None
+            account.written = file.get(account.name, account.name)
+            account.unlisted_at = None if account.written else now
 
     # -- verdicts --------------------------------------------------------------------------
 
@@ -423,7 +426,7 @@ class Observer:
         if heard:
             self._took(account, now)
         if account.state == states.APPROACHING and account.foot > NEAR_FOOT:
-            miss = board.miss(self._sun(now), FOOT, believed=True)
+            miss = 0.0 if account.unsure else board.miss(self._sun(now), FOOT, believed=True)
             account.foot = min(account.foot, miss)
         if account.board.state != account.state:
             self._changed(account, now, heard)
@@ -515,14 +518,14 @@ class Observer:
         state, name = states.STATES[board.state], account.name
         self.check(7, board.state in AFTER_BOOT, now, name, f"{state} after a boot")
         held = dict(node.journal.items)
-        wrong = "" if account.exchanged else account.mixture(held)
+        wrong = "" if account.unsure else account.mixture(held)
         self.check(7, not wrong, now, name, f"after a boot its journal holds {wrong}")
         doubt = node.journal.doubt
         slip = max(abs(s) for s in board.slip)
         saw = (
             f"step counts are {slip} steps wrong after a boot, with a stated uncertainty of {doubt}"
         )
-        good = account.exchanged or doubt < 0 or slip <= doubt
+        good = account.unsure or doubt < 0 or slip <= doubt
         self.check(7, good, now, name, saw)
         account.booted(now)
 
@@ -667,7 +670,7 @@ class Observer:
             at, where, addresses, orders = self._unreported.popleft()
             if min(order.at for order in orders) <= self.disturbed_at:
                 continue
-            names = {self._by_address[address].name for address in addresses}
+            names = {self._by_address[address].written for address in addresses} - {""}
             told = any(names <= set(order.accepted) for order in orders)
             saw = f"{where} went out {now - at:.1f} s ago and was never reported as accepted"
             self.check(11, told, now, "cluster", saw)
@@ -693,7 +696,8 @@ class Observer:
         # Unknown counts tell nothing of the pose: there the true beam counts, with its error.
         known = board.node.controller.motion.known
         on_way = board.state in (states.APPROACHING, states.IDLE) and account.from_stow
-        if known and board.state == states.DEFOCUSED:
+        sure = not account.unsure
+        if sure and known and board.state == states.DEFOCUSED:
             stays = account.stays(board.miss(sun, RECEIVER, believed=True) <= OFF, now)
             saw = f"DEFOCUSED, its beam within {OFF:g} m of the receiver's middle for {stays:.1f} s"
             self.check(2, stays <= TURNED_WITHIN, now, name, saw)
@@ -704,7 +708,7 @@ class Observer:
                 saw = f"{state} {passed:.1f} s after {why}, limit {DEFOCUS_WITHIN:g} s"
                 self.check(2, board.state not in NEED_SUN, now, name, saw)
                 miss = board.miss(sun, RECEIVER, believed=known)
-                crossing = account.crosses(miss <= OFF, now)
+                crossing = account.crosses(sure and miss <= OFF, now)
                 saw = (
                     f"{state} {passed:.1f} s after {why}, its beam within {OFF:g} m of the "
                     f"receiver's middle for {crossing:.1f} s, limit {CROSSING:g} s"
@@ -714,7 +718,7 @@ class Observer:
                 stow = sorted(account.stows)
                 saw = f"{state} at {account.place()} {passed:.1f} s after {why}, stow is {stow}"
                 self.check(2, account.place() in account.stows, now, name, saw)
-        if board.state in ON_THE_WAY:
+        if sure and board.state in ON_THE_WAY:
             for middle, radius in self._keep_outs:
                 miss = board.miss(sun, middle, believed=True)
                 saw = (
@@ -722,7 +726,7 @@ class Observer:
                     f"keep-out volume of {radius:.1f} m"
                 )
                 self.check(10, miss > radius, now, name, saw)
-        if on_way:
+        if sure and on_way:
             miss = board.miss(sun, RECEIVER, believed=True)
             saw = f"{states.STATES[board.state]}, its beam passes the receiver at {miss:.1f} m"
             self.check(10, miss > OFF, now, name, saw)

@@ -14,7 +14,6 @@ from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.bus import BusFaults
 from heliotrope.twin.boards.flash import NorFlash
 from heliotrope.twin.boards.outfit import outfits, own_items
-from heliotrope.twin.invariants.alarms import AlarmObserver
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.records import RecordsDisk
 from heliotrope.twin.world import faults as kinds
@@ -48,7 +47,6 @@ class SimulatedPlant(Protocol):
     operator: Operator
     instruments: Instruments
     beams: BeamObserver
-    alarms: AlarmObserver
     faults: Counter[str]
 
     def pod_of(self, fault: Fault) -> Pod:
@@ -196,7 +194,8 @@ class Damage:
         elif fault.kind == "board_exchanged":
             self._exchanges(fault, now)
         elif fault.kind == "stall":
-            of.beams.mislead(board.outfit.name)
+            of.beams.stalled(board.outfit.name)
+            pod.observer.doubt(board)
             for axis in board.axes:
                 axis.stalled = True
         elif fault.kind == "gust":
@@ -218,8 +217,8 @@ class Damage:
         spare = {**other.items, **own_items(board.outfit.address)}
         self._own[target] = board.exchange(other.serial, spare)
         self._off[target] = now + _EXCHANGE
-        pod.observer.exchanged(board)
-        of.beams.mislead(board.outfit.name)
+        pod.observer.doubt(board)
+        of.beams.exchanged(board.outfit.name)
 
     def _ends(self, fault: Fault, now: float) -> None:
         board = self._of.boards[fault.target]
@@ -230,7 +229,7 @@ class Damage:
             board.power_off(now)
             board.exchange(board.outfit.serial, self._own.pop(fault.target))
             self._off[fault.target] = now + _EXCHANGE
-            self._of.pod_of(fault).observer.exchanged(board)
+            self._of.pod_of(fault).observer.doubt(board)
 
     def _apply(self, group: asyncio.TaskGroup, now: float) -> None:
         """Apply every lasting fault that is active now."""

@@ -22,7 +22,7 @@ from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import MACHINE
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.plant_observer import PlantObserver
-from heliotrope.twin.world.operator import ENGINEER, OPERATOR, Operator
+from heliotrope.twin.world.operator import ENGINEER, OPERATOR, VIEWER, Operator
 
 #: Share of the locks that are put on a mirror which somebody has locked already.
 _AGAIN = 0.6
@@ -74,9 +74,11 @@ class Maintenance:
         """Do one thing."""
         if self.service is None:
             return
-        does = self._chance.choice(["lock", "lock", "return", "write", "mend", "mend"])
+        does = self._chance.choice(["lock", "lock", "return", "write", "write", "mend", "two off"])
         if does == "lock":
             self._locks(self.service)
+        elif does == "two off":
+            self._takes_off(plant)
         elif does == "return":
             self._returns(self.service)
         elif does == "write":
@@ -118,7 +120,8 @@ class Maintenance:
         The last one is that on the tower; then the standby points are given again.
         """
         service = self.service
-        if service is None or self._persons.sure or self._chance.random() < _LATER:
+        asks = service is not None and any(lock.who == OWNER for lock in service.out)
+        if service is None or not asks or self._chance.random() < _LATER:
             return
         there = {(lock.name, lock.who) for lock in service.out if lock.who != OWNER}
         here = {(name, owner) for name, some in self._persons.locks.items() for owner in some}
@@ -126,8 +129,7 @@ class Maintenance:
             self._puts(service, ENGINEER if owner == ENGINEER.name else OPERATOR, name)
         for name, owner in sorted(there - here):
             self._gives_back(service, Kind.HELIOSTAT, name, owner)
-        if any(lock.who == OWNER for lock in service.out):
-            self._gives_back(service, Kind.TOWER, TOWER, OWNER)
+        self._gives_back(service, Kind.TOWER, TOWER, OWNER)
         self._persons.confirmed()
         self._operator.give(plant, "STANDBY")
 
@@ -147,6 +149,12 @@ class Maintenance:
             counts = plant.field.counts(np.array([plant.field.place(name)]))[0] + steps
             self._operator.zero(plant, name, [int(each) for each in counts])
         self._operator.safe(plant, "STOW", name)
+
+    def _takes_off(self, plant: PlantController) -> None:
+        """Take two mirrors off by one order, of which a cluster may know one only."""
+        names = self._chance.sample(self._names, min(2, len(self._names)))
+        ticket = plant.stow(VIEWER.name, names)
+        self._observer.obeyed(VIEWER.name, "STOW", self._clock.monotonic(), ticket.identity)
 
     def _mends(self, plant: PlantController) -> None:
         """Declare the true step counts of a mirror that does not know them."""

@@ -180,7 +180,7 @@ class Pod:
             return
         self.file = dict(file)
         now = self._true.monotonic()
-        self.observer.unlist([name for name, written in file.items() if not written], now)
+        self.observer.edited(file, now)
         if self.runs:
             self.crash()
             self.observer.disturbed(now, crashed=True)

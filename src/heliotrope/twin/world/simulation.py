@@ -24,7 +24,7 @@ from heliotrope.lcu import ticks
 from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of
 from heliotrope.links.common_settings import CommonSettings
 from heliotrope.links.tapped import TappedLink
-from heliotrope.mechanism.board_items import Wanted, items_of
+from heliotrope.mechanism.board_items import Wanted, packed
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.controller import PlantController
@@ -316,6 +316,7 @@ class Simulation:
         boards = {pod.name: pod.boards for pod in self.pods}
         most = LOSSES if works(plan.worlds) else None
         self.beams = BeamObserver(self.begin, boards, self.sun, scene.keep_outs, most, self._astray)
+        self.beams.contradicted = COMMON in plan.worlds
         self.readings = SensorObserver(self.begin, boards)
         self.alarms = AlarmObserver(self.begin, boards, plan.worlds)
         accounts = {each.name: each for pod in self.pods for each in pod.observer.accounts}
@@ -334,6 +335,7 @@ class Simulation:
         self._wanted = wanted_of(known) if knows_boards(plan.worlds) else Wanted()
         self._exits = contextlib.ExitStack()
         self._store: PlantStore | None = None
+        self._stows: dict[str, bytes] = {}
         self._emergency: EmergencyRecord = EmergencyDisk()
         self._assigned: Assigned = AssignedDisk()
         if REPAIRS in plan.worlds:
@@ -516,6 +518,8 @@ class Simulation:
             self._wanted = wanted_of(self._fits)  # the store knows better; see `Work.begins`
             noted = self.alarms.alarmed
             self._work.control.opens(lambda alarm: noted(alarm, self._clock.monotonic()))
+        if self._store is not None:
+            self._read_plant_file()
         context = context_of(_PLANT)
         plant = self.plant = PlantController(
             self._design,
@@ -577,8 +581,13 @@ class Simulation:
             sun = self.sun(self._clock.monotonic())
             best = track(fit.mechanism, sun, np.array(RECEIVER), current=here).best_counts
             stow = np.rint(best).astype(int)
-        machine = replace(fit.machine, stow=(int(stow[0]), int(stow[1])))
-        self._wanted.set(fit.name, items_of(fit.mechanism, machine))
+        self._stows = {fit.name: packed("stow", (int(stow[0]), int(stow[1])))}
+
+    def _read_plant_file(self) -> None:
+        """Want the stow positions of the plant file; the next program finds it corrected."""
+        for fit in self._fits:
+            self._wanted.set(fit.name, {"stow": self._stows.get(fit.name, fit.items["stow"])})
+        self._stows = {}
 
     def restore_store(self) -> None:
         """Put a backup in the place of the plant's store."""
@@ -744,6 +753,8 @@ class Simulation:
                     )
                 self.persons.look(self.plant, now)
                 going_on = self.plant is not None and not self.operator.waits
+                if COMMON in self.plan.worlds:
+                    self.alarms.contradicted(now, runs=going_on)
                 self.tickets.look(now, runs=going_on and writes)
                 if self._work is not None:
                     calm = None if self.quiet is None else self.quiet.stretches
@@ -792,6 +803,7 @@ def run(plan: RunPlan) -> RunResult:
     outcome.checks += simulation.checks
     outcome.faults = simulation.faults
     outcome.counts = sum((pod.counts for pod in simulation.pods), simulation.operator.counts)
+    outcome.counts["proofs"] = simulation.beams.proofs
     outcome.states = sum((pod.observer.entered for pod in simulation.pods), Counter())
     return outcome
 

@@ -131,7 +131,7 @@ class Habits:
     def of(cls, worlds: Sequence[str], seed: int) -> "Habits":
         """Return the habits of a run."""
         if REPAIRS in worlds:
-            return cls(2.0, _REPAIRING, locks=0.25)
+            return cls(2.0, _REPAIRING, locks=0.02 if "calm" in worlds else 0.35)
         calibrates = 0.15 if "calibrations" in worlds else 0.0
         habits = cls(calibrates=calibrates)
         if "calm" in worlds:
