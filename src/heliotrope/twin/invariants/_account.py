@@ -21,7 +21,7 @@ SERVED = 2.0
 BRAKING = 1.0
 #: Why a heliostat must leave that its cluster's file does not name: it still hears SUN and stays
 #: DEFOCUSED.
-_UNLISTED = "it is missing in the cluster's file"
+UNLISTED = "it is missing in the cluster's file"
 #: True position of a mirror at stow, to within this many steps.
 NEAR_STOW = 5000
 
@@ -335,9 +335,9 @@ class HeliostatAccount:
         if now - self._served_at > SERVED:
             found.append(("it was cut off", self._served_at))
         if self.unlisted_at is not None:
-            found.append((_UNLISTED, self.unlisted_at))
+            found.append((UNLISTED, self.unlisted_at))
         return found
 
     def must_stow(self, why: str) -> bool:
         """Whether the cause requires stow, not only defocus."""
-        return why not in ("DEFOCUS", _UNLISTED)
+        return why not in ("DEFOCUS", UNLISTED)

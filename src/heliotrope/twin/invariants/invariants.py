@@ -67,7 +67,7 @@ from heliotrope.lcu import messages, states, wire
 from heliotrope.links.messages import NEVER, ClusterStatus, Progress, Stage
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, STANDBY, Ball
-from heliotrope.twin.invariants._account import HeliostatAccount, fingerprint
+from heliotrope.twin.invariants._account import UNLISTED, HeliostatAccount, fingerprint
 from heliotrope.twin.invariants.ledger import FrameLedger, OrderLedger, PlantCommand, Sent
 from heliotrope.twin.invariants.runs import RunAccount
 
@@ -706,7 +706,9 @@ class Observer:
             state = states.STATES[board.state]
             if passed > DEFOCUS_WITHIN:
                 saw = f"{state} {passed:.1f} s after {why}, limit {DEFOCUS_WITHIN:g} s"
-                self.check(2, board.state not in NEED_SUN, now, name, saw)
+                # What no file names must not stay at standby either: nobody can take it from there.
+                up = ON_THE_WAY if why == UNLISTED else NEED_SUN
+                self.check(2, board.state not in up, now, name, saw)
                 miss = board.miss(sun, RECEIVER, believed=known)
                 crossing = account.crosses(sure and miss <= OFF, now)
                 saw = (

@@ -123,6 +123,11 @@ class PersonsObserver:
         """Owners of the locks on each heliostat."""
         return {name: tuple(lock.owners) for name, lock in self._locks.items()}
 
+    @property
+    def parked(self) -> tuple[str, ...]:
+        """Heliostats that are locked and stand still at stow, so that somebody may be at them."""
+        return tuple(name for name, lock in self._locks.items() if lock.place is not None)
+
     # -- the plant's store ---------------------------------------------------------------------
 
     def words(self) -> Words:

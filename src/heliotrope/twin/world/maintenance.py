@@ -21,7 +21,7 @@ from heliotrope.store.backup import OWNER
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import MACHINE
 from heliotrope.twin.invariants.beams import BeamObserver
-from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.invariants.plant_observer import MOMENT, PlantObserver
 from heliotrope.twin.world.operator import ENGINEER, OPERATOR, VIEWER, Operator
 
 #: Share of the locks that are put on a mirror which somebody has locked already.
@@ -69,6 +69,7 @@ class Maintenance:
         self._names = tuple(board.outfit.name for board in boards)
         self._chance = random.Random(f"maintenance {seed}")
         self._persons = operator.persons
+        self._put_at = -math.inf
 
     def acts(self, plant: PlantController) -> None:
         """Do one thing."""
@@ -81,8 +82,10 @@ class Maintenance:
             self._takes_off(plant)
         elif does == "return":
             self._returns(self.service)
+        elif does == "write" and self._persons.parked:
+            self._writes(plant, self._chance.choice(self._persons.parked))
         elif does == "write":
-            self._writes(plant)
+            self._locks(self.service)
         else:
             self._mends(plant)
 
@@ -94,6 +97,9 @@ class Maintenance:
         self._puts(service, self._chance.choice([OPERATOR, ENGINEER]), name)
 
     def _puts(self, service: Service, person: Person, name: str) -> None:
+        if self._clock.monotonic() - self._put_at < MOMENT:
+            return  # the plant takes the same order of a moment for one
+        self._put_at = self._clock.monotonic()
         concerned = service.take(person, [(Kind.HELIOSTAT, name)], "washing", math.nan)
         now = self._clock.monotonic()
         self._persons.locked(person.name, (name,), now)
@@ -125,22 +131,21 @@ class Maintenance:
             return
         there = {(lock.name, lock.who) for lock in service.out if lock.who != OWNER}
         here = {(name, owner) for name, some in self._persons.locks.items() for owner in some}
-        for name, owner in sorted(here - there):
+        if missing := sorted(here - there):
+            name, owner = missing[0]
             self._puts(service, ENGINEER if owner == ENGINEER.name else OPERATOR, name)
+            return
         for name, owner in sorted(there - here):
             self._gives_back(service, Kind.HELIOSTAT, name, owner)
         self._gives_back(service, Kind.TOWER, TOWER, OWNER)
         self._persons.confirmed()
         self._operator.give(plant, "STANDBY")
 
-    def _writes(self, plant: PlantController) -> None:
+    def _writes(self, plant: PlantController, name: str) -> None:
         """Write another stow position, or other counts, to a locked mirror; then send it to stow.
 
         The plant must refuse both: the mirror would turn under the hands of whoever is at it.
         """
-        if not (locked := sorted(self._persons.locks)):
-            return
-        name = self._chance.choice(locked)
         steps = [self._chance.choice([-_OTHER, _OTHER]) for _ in range(2)]
         if self._chance.random() < 0.5:
             stow = (MACHINE.stow[0] + steps[0], MACHINE.stow[1] + steps[1])

@@ -96,8 +96,10 @@ def mixed(seed: int) -> tuple[str, ...]:
     return tuple(name for name in found if name != "twice" or not works(found))
 
 
-#: Weights of the actions of persons while much is repaired: emergencies are frequent.
+#: Weights of the actions of persons while much is repaired: emergencies are frequent; and of those
+#: who leave mirrors up for a while.
 _REPAIRING = (60, 14, 2, 6, 2, 2, 2, 3, 1)
+_REPAIRING_CALMLY = (60, 10, 1, 1.5, 0.3, 0.3, 2, 2, 1)
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,8 @@ class Habits:
     def of(cls, worlds: Sequence[str], seed: int) -> "Habits":
         """Return the habits of a run."""
         if REPAIRS in worlds:
-            return cls(2.0, _REPAIRING, locks=0.02 if "calm" in worlds else 0.35)
+            calm = "calm" in worlds
+            return cls(2.0, _REPAIRING_CALMLY if calm else _REPAIRING, locks=0.02 if calm else 0.5)
         calibrates = 0.15 if "calibrations" in worlds else 0.0
         habits = cls(calibrates=calibrates)
         if "calm" in worlds:
