@@ -337,7 +337,8 @@ class Observer:
 
     def _authorised(self, sent: Sent, now: float) -> None:
         """Check a command on the bus: ordered with authority, in time, and reported."""
-        name = "PARAMETERS" if sent.who == messages.KEY else sent.name
+        pushed = sent.who == messages.KEY and sent.name != "ZERO"  # a person declares counts
+        name = "PARAMETERS" if pushed else sent.name
         addresses = [a.address for a in self.accounts if sent.addresses(a.address)]
         orders = self.orders.covering(name, addresses, now)
         if name == "STANDBY":  # a pushed standby point goes out as the command does

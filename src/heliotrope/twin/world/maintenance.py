@@ -28,6 +28,8 @@ from heliotrope.twin.world.operator import ENGINEER, OPERATOR, VIEWER, Operator
 _AGAIN = 0.6
 #: Chance that persons wait once more before they confirm what a restored store has.
 _LATER = 0.5
+#: Share of these writes that are stow positions; a board at stow refuses other counts itself.
+_STOWS = 0.8
 #: A stow position, or counts, that persons write to a locked mirror differ by this, steps.
 _OTHER = 2500
 
@@ -69,11 +71,15 @@ class Maintenance:
         self._names = tuple(board.outfit.name for board in boards)
         self._chance = random.Random(f"maintenance {seed}")
         self._persons = operator.persons
-        self._put_at = -math.inf
+        self._put_at, self._written = -math.inf, ""
 
     def acts(self, plant: PlantController) -> None:
         """Do one thing."""
         if self.service is None:
+            return
+        if self._written:
+            self._operator.safe(plant, "STOW", self._written)
+            self._written = ""
             return
         does = self._chance.choice(["lock", "lock", "return", "write", "write", "mend", "two off"])
         if does == "lock":
@@ -142,18 +148,18 @@ class Maintenance:
         self._operator.give(plant, "STANDBY")
 
     def _writes(self, plant: PlantController, name: str) -> None:
-        """Write another stow position, or other counts, to a locked mirror; then send it to stow.
+        """Write another stow position, or other counts, to a locked mirror; later it goes to stow.
 
         The plant must refuse both: the mirror would turn under the hands of whoever is at it.
         """
         steps = [self._chance.choice([-_OTHER, _OTHER]) for _ in range(2)]
-        if self._chance.random() < 0.5:
+        if self._chance.random() < _STOWS:
             stow = (MACHINE.stow[0] + steps[0], MACHINE.stow[1] + steps[1])
             self._operator.push(plant, name, {"stow": packed("stow", stow)})
         else:
             counts = plant.field.counts(np.array([plant.field.place(name)]))[0] + steps
             self._operator.zero(plant, name, [int(each) for each in counts])
-        self._operator.safe(plant, "STOW", name)
+        self._written = name
 
     def _takes_off(self, plant: PlantController) -> None:
         """Take two mirrors off by one order, of which a cluster may know one only."""
