@@ -83,8 +83,11 @@ def test_a_locked_mirror_stands_still_until_the_last_lock_is_returned() -> None:
     one.axes[1].turned = 66
     with pytest.raises(InvariantError, match="33 steps"):
         looks(observer, None, 24.0)
+    with pytest.raises(InvariantError, match=r"H1: ZERO is sent to it 24\.0 s after it was locked"):
+        observer.written("H1", "ZERO", 25.0)
     observer.returned("Ben", ["H1"])
     looks(observer, None, 25.0)
+    observer.written("H1", "ZERO", 25.0)
 
 
 def test_the_plant_has_the_locks_of_each_person_once_a_restored_store_is_confirmed() -> None:

@@ -4,7 +4,8 @@ It keeps a ledger of its own, from the calls of persons and not from the plant: 
 emergency, by which act, and who has withdrawn it; who has locked a heliostat, and has returned the
 lock. While an order stands, the plant shows it under its owner's name, an emergency of at least
 that act holds, and no mirror is up once it has had the time to turn away. A heliostat that a person
-has locked stands still at stow until the last lock on it is returned, whatever is ordered.
+has locked stands still at stow until the last lock on it is returned, whatever is ordered, and
+nothing is written to it.
 
 A board that starts anew is left out until it stands still again: what it does at a start no lock
 can prevent, which is why a person at a mirror uses its switch.
@@ -104,6 +105,13 @@ class PersonsObserver:
         """Note that a person has locked heliostats."""
         for name in heliostats:
             self._locks.setdefault(name, _Lock()).owners[owner] = now
+
+    def written(self, heliostat: str, what: str, now: float) -> None:
+        """Check that nothing is written to a locked heliostat: its next STOW would move it."""
+        lock = self._locks.get(heliostat)
+        since = now - min(lock.owners.values()) if lock is not None else 0.0
+        saw = f"{what} is sent to it {since:.1f} s after it was locked"
+        self._check(since <= UNDER_WAY, now, heliostat, saw)
 
     def returned(self, owner: str, heliostats: Sequence[str]) -> None:
         """Note that a person's locks are returned, by that person or by an engineer."""

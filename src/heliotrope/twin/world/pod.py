@@ -39,6 +39,7 @@ from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.invariants import Observer
 from heliotrope.twin.invariants.ledger import PlantCommand
 from heliotrope.twin.invariants.lines import LineObserver
+from heliotrope.twin.invariants.persons import PersonsObserver
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.quiet import QuietObserver
 from heliotrope.twin.world.intruder import Intruder
@@ -276,8 +277,8 @@ class PlantEar:
         Observer of the plant.
     beams
         Observer of the beams.
-    quiet, alarms
-        Observers of what is done, and of alarms; None: it is not judged.
+    quiet, alarms, persons
+        Observers of what is done, of alarms, and of locks; None: it is not judged.
     """
 
     def __init__(
@@ -287,9 +288,10 @@ class PlantEar:
         beams: BeamObserver,
         quiet: QuietObserver | None = None,
         alarms: AlarmObserver | None = None,
+        persons: PersonsObserver | None = None,
     ) -> None:
         self._pod, self._plant, self._beams, self._quiet = pod, plant, beams, quiet
-        self._alarms = alarms
+        self._alarms, self._persons = alarms, persons
         self._addresses = pod.addresses
         self._names: tuple[str, ...] = ()
         self._goes = asyncio.Event()
@@ -340,6 +342,7 @@ class PlantEar:
             observer.time_acknowledged()
         elif isinstance(message, Command | Parameters):
             observer.ordered(self.order(message, now, known=self._plant.known(message.token)))
+            self._writes(message, now)
             if isinstance(message, Parameters) and (stow := message.items().get("stow")):
                 one, two = struct.unpack(CODES_OF["stow"], stow)
                 observer.given_stow(message.heliostat, (one, two))
@@ -348,6 +351,16 @@ class PlantEar:
                 self._beams.sent(message, whom, now)
                 if self._quiet is not None:
                     self._quiet.sent(message, whom, now)
+
+    def _writes(self, message: Command | Parameters, now: float) -> None:
+        """Judge what is written to heliostats."""
+        if self._persons is None:
+            return
+        if isinstance(message, Parameters):
+            self._persons.written(message.heliostat, "PARAMETERS", now)
+        elif message.name == "ZERO":
+            for name in message.heliostats or tuple(self._addresses):
+                self._persons.written(name, message.name, now)
 
     def order(self, message: Command | Parameters, now: float, *, known: bool) -> PlantCommand:
         """Return an order for the ledger; ``known``: its token was once issued."""

@@ -510,7 +510,9 @@ class Simulation:
         for pod in self.pods:
             seed = self._chance.getrandbits(31)
             link = pod.line.end(0, pod.name, self._clock, seed=seed)
-            pod.ear = PlantEar(pod, self.observer, self.beams, self.quiet, self.alarms)
+            pod.ear = PlantEar(
+                pod, self.observer, self.beams, self.quiet, self.alarms, self.persons
+            )
             pod.tap = TappedLink(link, self._clock, pod.ear)
             links[pod.name] = pod.tap
         audit = self._audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
