@@ -164,8 +164,8 @@ class Maintenance:
     def _takes_off(self, plant: PlantController) -> None:
         """Take two mirrors off by one order, of which a cluster may know one only."""
         names = self._chance.sample(self._names, min(2, len(self._names)))
-        ticket = plant.stow(VIEWER.name, names)
-        self._observer.obeyed(VIEWER.name, "STOW", self._clock.monotonic(), ticket.identity)
+        ticket = plant.defocus(VIEWER.name, names)
+        self._observer.obeyed(VIEWER.name, "DEFOCUS", self._clock.monotonic(), ticket.identity)
 
     def _mends(self, plant: PlantController) -> None:
         """Declare the true step counts of a mirror that does not know them."""
