@@ -323,6 +323,21 @@ def test_an_emergency_with_an_unknown_name_reaches_those_that_are_there(name: st
     run(main, "TRACKING")
 
 
+def test_what_was_made_without_a_line_names_its_rows() -> None:
+    """After a restart with another file of as many mirrors, rows counted as other mirrors'."""
+
+    async def scene(field: Field) -> None:
+        field.line.cut(first_to_second=True, second_to_first=True)
+        await field.until(lambda: not field.link.connected, 30.0)
+        await asyncio.sleep(3.0)
+        before = len(field.plant.all(ClusterStatus))
+        field.line.cut(first_to_second=False, second_to_first=False)
+        await field.until(lambda: len(field.plant.all(ClusterStatus)) > before, 30.0)
+        assert field.plant.all(ClusterStatus)[before].names == ("A1", "A2")
+
+    run(scene)
+
+
 def test_a_cluster_begins_with_a_defocus_of_whatever_is_up() -> None:
     """A mirror that was missing in an older file tracked on for 391 s, and nobody saw it."""
     boards, start = boards_in("TRACKING")

@@ -203,6 +203,28 @@ def test_an_emergency_is_never_proven_for_boards_of_other_mirrors(tmp_path: Path
     run_virtual(main)
 
 
+def test_a_board_with_an_armature_that_nobody_knows_proves_nothing(tmp_path: Path) -> None:
+    """A spare board of another plant says STOWED wherever its mirror stands."""
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path, wanted=wanted_of("P5A"))
+        correct(bench)
+        stores(bench, "P5A", 12345)
+        stores(bench, "P5C", 54321)  # of this one the plant wants nothing
+        async with running(bench):
+            plant = bench.plant
+            await bench.wait(2.0)
+            for cluster in bench.clusters.values():
+                cluster.set(states.DEFOCUSED)
+            order = plant.raise_emergency("Vera")
+            await bench.wait(5.0)
+            report = order.report(plant.now())
+            assert set(report.not_done) == {"P5A"}
+            assert "P5A: its local controller stores parameters that this" in report.unknown[0]
+
+    run_virtual(main)
+
+
 def test_an_armature_that_is_nobodys_is_no_exchange(tmp_path: Path) -> None:
     async def main(clock: VirtualClock) -> None:
         bench = Bench(clock, tmp_path)

@@ -259,6 +259,33 @@ def test_nothing_moves_before_its_parameters_have_been_compared(tmp_path: Path) 
     assert made[0].cluster_of(OTHER).commands("APPROACH")
 
 
+def test_a_board_that_has_started_anew_is_compared_before_its_mirror_moves(tmp_path: Path) -> None:
+    """A spare board with other parameters was led through its approach, and tracked."""
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path, wanted=Wanted({NAME: items(NAME)}))
+        plant, cluster = bench.plant, bench.cluster_of(NAME)
+        cluster.stored[NAME] = items(NAME)
+        row = cluster.names.index(NAME)
+        async with running(bench):
+            token = await bench.commanded(ENGINEER)
+            await bench.wait(3.0)
+            assert plant.command(ENGINEER, token, "APPROACH", (NAME,))
+            for column in ("boots", "armature_crc"):
+                cluster.deaf.add(NAME)
+                cluster.rows[column][row] += 1
+                await bench.wait(2.0)
+                with pytest.raises(RefusedError, match="have not been compared with the wanted"):
+                    plant.command(ENGINEER, token, "IDLE", (NAME,))
+                cluster.deaf.clear()
+                plant.authority.keep(ENGINEER, token)
+                plant._sync.compare(NAME)
+                await bench.wait(3.0)
+                assert not plant._sync.differing((NAME,))
+
+    run_virtual(main)
+
+
 def stows(bench: Bench) -> tuple[tuple[int, int], tuple[int, int]]:
     """A stow position from which the beam of `NAME` lights the receiver now, and a good one."""
     rows, beams = np.array([bench.plant.field.place(NAME)]), bench.plant.beams

@@ -28,7 +28,14 @@ from heliotrope.twin.boards import outfit
 from heliotrope.twin.world.crew import CrewAct
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.simulation import RunPlan
-from support import day_defects, plant_defects, quiet_defects, report_defects, work_defects
+from support import (
+    day_defects,
+    plant_defects,
+    quiet_defects,
+    report_defects,
+    review_defects,
+    work_defects,
+)
 
 #: The plant stands still for a minute when mirrors track.
 STILL = (Fault("plant_silent", 110.0, 60.0, 0, 0.5),)
@@ -333,6 +340,16 @@ def _silence_unseen(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(evaluation, "_advance", patient)
 
 
+def kinds_of(some: tuple[str, ...] | tuple[Fault, ...]) -> tuple[str, ...]:
+    """Return the kinds among kinds or faults."""
+    return tuple(each for each in some if isinstance(each, str))
+
+
+def faults_of(some: tuple[str, ...] | tuple[Fault, ...]) -> tuple[Fault, ...] | None:
+    """Return the faults among kinds or faults, None if they are drawn."""
+    return tuple(each for each in some if isinstance(each, Fault)) or None
+
+
 DEFECTS = (
     Defect((1, 4, 5), "lease renewed by any frame", _lease_by_any_frame,
            ("cluster_crash", "replay", "stranger_safe", "forgery"), 1.5),
@@ -418,6 +435,9 @@ DEFECTS = (
     *(Defect(numbers, name, defect, faults=faults, seconds=seconds, worlds=("days",), acts=acts,
              slow=slow, first=first)
       for numbers, name, defect, acts, faults, seconds, slow, first in day_defects.ROWS),
+    *(Defect(numbers, name, defect, kinds_of(some), faults=faults_of(some), worlds=worlds,
+             slow=slow, first=first)
+      for numbers, name, defect, some, worlds, slow, first in review_defects.ROWS),
     *(Defect((16,), name, defect, faults=(), worlds=worlds, slow=slow)
       for name, defect, worlds, slow in quiet_defects.ROWS),
     *(Defect((16,), name, defect, seconds=180.0, worlds=worlds, slow=slow,

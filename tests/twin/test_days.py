@@ -36,7 +36,7 @@ from heliotrope.twin.world.acts import Acts
 from heliotrope.twin.world.operator import ENGINEER
 from heliotrope.twin.world.scene import TARGETS, scene_of
 from heliotrope.twin.world.simulation import SETTINGS, RunPlan, run
-from heliotrope.twin.world.worlds import DAY, DAYS, DAYS_SHARE, covered_by, length_of, mixed
+from heliotrope.twin.world.worlds import ALONE_SHARE, DAY, DAYS, covered_by, length_of, mixed
 
 #: High enough for every day, above no limit.
 ZENITH = np.array([0.0, 0.0, 1.0])
@@ -61,7 +61,7 @@ def test_a_day_is_some_of_any_and_has_its_own_length() -> None:
     drawn = [mixed(seed) for seed in range(400)]
     days = [worlds for worlds in drawn if DAYS in worlds]
     assert all(worlds == (DAYS,) for worlds in days)
-    assert 0.5 * DAYS_SHARE < len(days) / 400 < 1.5 * DAYS_SHARE
+    assert 0.5 * ALONE_SHARE < len(days) / 400 < 1.5 * ALONE_SHARE
     assert length_of((DAYS,), None) == DAY
     assert length_of((DAYS,), 0.5) == 1800.0
     assert length_of(("visits",), None) == 360.0
@@ -77,7 +77,7 @@ def test_on_some_days_a_mirror_is_covered() -> None:
 
 def test_people_call_invariants_of_liveness_by_their_names() -> None:
     assert [named(number) for number in TITLES] == [
-        *map(str, range(1, 17)), "L1", "L2", "L3", "L4"
+        *map(str, range(1, 18)), "L1", "L2", "L3", "L4"
     ]  # fmt: skip
     assert str(Violation(L2, 3.0, "H1", "so")).startswith("invariant L2 (each ticket")
 

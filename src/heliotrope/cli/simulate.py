@@ -1,5 +1,8 @@
 """``heliotrope simulate``: plant and clusters in virtual time, with faults and invariants."""
 
+import json
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,6 +46,10 @@ def simulate(
     progress: Annotated[
         Path | None, typer.Option(help="File that records finished runs; continue from it.")
     ] = None,
+    results: Annotated[
+        Path | None,
+        typer.Option(help="JSON file for the result: commit, worlds, seeds, checks, breaks."),
+    ] = None,
     shrink: Annotated[
         bool, typer.Option(help="Reduce the faults of a failed run to those that still break it.")
     ] = False,
@@ -50,8 +57,9 @@ def simulate(
 ) -> None:
     """Run the real plant, clusters and local controllers in virtual time, with random faults.
 
-    Sixteen safety invariants and four of liveness are checked; the exit code is 1 if one is broken.
+    Seventeen safety invariants and four of liveness are checked; the exit code is 1 if one breaks.
     """
+    from heliotrope.files.text import write_text
     from heliotrope.twin.world.simulation import RunPlan
     from heliotrope.twin.world.soak import run_many
     from heliotrope.twin.world.worlds import ANY, length_of, mixed
@@ -68,6 +76,9 @@ def simulate(
         progress=progress,
     )
     document = _document(found)
+    if results is not None:
+        about = {"commit": _commit(), "worlds": world or [], "seeds": [seed, seed + runs - 1]}
+        write_text(results, json.dumps(about | document, indent=1) + "\n")
     if shrink and found.broken:
         document["shrunk"] = _shrunk(plans, found)
     if as_json:
@@ -78,6 +89,18 @@ def simulate(
         raise typer.Exit(1)
 
 
+def _commit() -> str:
+    """Return the commit of the program, "" if it does not run from a repository."""
+    git = shutil.which("git")
+    if git is None:
+        return ""
+    command = [git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    done = subprocess.run(  # noqa: S603 - every word is our own
+        command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False
+    )
+    return done.stdout.strip()
+
+
 def _document(found: Any) -> dict[str, Any]:
     from heliotrope.lcu import states
     from heliotrope.twin.invariants.invariants import TITLES, named
@@ -86,6 +109,8 @@ def _document(found: Any) -> dict[str, Any]:
         "runs": found.runs,
         "hours": found.seconds / 3600.0,
         "faults": dict(sorted(found.faults.items())),
+        "emergencies": found.counts["emergencies"],
+        "proofs": found.counts["proofs"],
         "states": {states.STATES[k]: v for k, v in sorted(found.states.items())},
         "checks": [
             {"number": n, "name": named(n), "invariant": title, "checks": found.checks[n]}

@@ -143,7 +143,8 @@ class PlantLink:
         if told:
             self._reports.repeat()
         # Alarms are not repeated at once: on a slow line they may be what kept the status back.
-        told, self._names_lost = told or self._names_lost, False
+        # What is made before the line is there may be the first that the plant gets of this file.
+        told, self._names_lost = told or self._names_lost or not connected, False
         self._reports.status(
             ClusterStatus(
                 cluster=self._cluster,

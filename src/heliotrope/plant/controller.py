@@ -444,6 +444,7 @@ class PlantController:
     def _take_status(self, end: ClusterEnd, status: ClusterStatus, now: float) -> None:
         self.counters.statuses += 1
         self.counters.problems.extend(self.field.take(end.name, status, now))
+        self._sync.greet(self.field.restarted)
         self._agreement.take(end.name, status)
         self._cluster_settings.take(end.name, status, now)
         self._rivals.take(end.name, status)

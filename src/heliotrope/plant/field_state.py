@@ -104,6 +104,9 @@ class FieldState:
         controller that has lost its counts goes on reporting numbers, which mean nothing.
     unlisted
         Heliostats for which their clusters report no row.
+    restarted
+        Heliostats whose boards had started anew, or stored another armature, by the last status:
+        other boards may be there.
     turned
         Whether one that is locked or in FAULT has moved since: it has turned away, and turns no
         further, (N,). One that was locked anew would, which no status shows.
@@ -139,6 +142,7 @@ class FieldState:
         self.turned = np.zeros(len(pairs), dtype=bool)
         self.status_at = dict.fromkeys(self.clusters, -math.inf)
         self.unlisted: set[str] = set()
+        self.restarted: tuple[str, ...] = ()
         self._places: dict[str, tuple[tuple[str, ...], npt.NDArray[np.intp]]] = {}
 
     def __len__(self) -> int:
@@ -152,7 +156,7 @@ class FieldState:
         ProtocolError
             If its block is not a whole number of rows.
         """
-        nodes = status.nodes()
+        nodes, self.restarted = status.nodes(), ()
         if status.names:
             self.learn_order(cluster, status.names)
         known = self._places.get(cluster)
@@ -170,6 +174,10 @@ class FieldState:
         good = (places >= 0) & (nodes["heard_ms"] != NEVER) & (nodes["state"] < len(states.STATES))
         mine, new = places[good], nodes[good]
         self._note_failures(mine, new, at)
+        anew = self.rows["boots"][mine] != new["boots"]
+        anew |= self.rows["armature_crc"][mine] != new["armature_crc"]
+        anew &= np.isfinite(self.heard[mine])
+        self.restarted = tuple(self.names[row] for row in mine[anew])
         before, goals = self.rows["state"][mine], self.goals(mine)
         self.rows[mine] = new
         stays = np.isin(before, _HELD) & (before == new["state"])

@@ -22,6 +22,8 @@ from heliotrope.safety import Act, Alarm, alarms
 #: States in which a heliostat is safe whoever's board it has, or on its way there. DEFOCUSED is not
 #: among them: a defocus is relative to goals, which may belong to the other mirror.
 _OFF = (states.STOWED, states.STOWING)
+#: Why a board proves nothing that stores an armature which the plant has never known.
+_UNKNOWN = "its local controller stores parameters that this plant does not know"
 _AT_STOW = 1 << meanings.FLAGS.index("AT_STOW")
 
 
@@ -56,6 +58,7 @@ class Identities:
         tell: Callable[[Alarm], None],
     ) -> None:
         self._field, self._connections, self._tell = field, connections, tell
+        self._wanted = wanted
         self.strange: dict[str, str] = {}
         #: Rows of the heliostats that have ever had an armature, by its checksum.
         self._owners: defaultdict[int, set[int]] = defaultdict(set)
@@ -134,6 +137,16 @@ class Identities:
     def _of(self, row: int) -> set[int]:
         """Return the rows of the heliostats that have ever had the armature of a row."""
         return self._owners.get(int(self._stored[row]), set())
+
+    def untrusted(self, heliostat: str) -> str:
+        """Return why nothing that a heliostat reports proves where its beam is, "" if it may.
+
+        It is strange, or its board stores an armature that the plant has never known: its step
+        counts are those of the mirror that it was at before.
+        """
+        row = self._field.index[heliostat]
+        unknown = self._stored[row] != 0 and not self._own[row] and heliostat in self._wanted
+        return self.strange.get(heliostat) or (_UNKNOWN if unknown else "")
 
     def barred(self, heliostats: Iterable[str]) -> dict[str, str]:
         """Return which heliostats may be neither moved nor written, and why."""

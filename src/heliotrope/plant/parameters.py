@@ -137,7 +137,7 @@ class ParameterSync:
         self._stow_proof, self._barred = stow_proof, barred
         #: Heliostats to be compared, each with its time, monotonic s.
         self._due = dict.fromkeys(wanted.items, -math.inf)
-        #: Those not compared since their cluster connected: any board may answer there.
+        #: Those not compared since their cluster connected, or their board started.
         self._strange = set(self._due)
         self._tickets: dict[str, Ticket] = {}
         self._tried: dict[str, float] = {}
@@ -148,7 +148,10 @@ class ParameterSync:
             self._due[heliostat] = -math.inf
 
     def greet(self, heliostats: Sequence[str]) -> None:
-        """Compare the heliostats of a cluster that has connected, before they may move."""
+        """Compare heliostats before they may move, since any boards may answer there.
+
+        Their cluster has connected, or their boards have started anew.
+        """
         for name in heliostats:
             self.compare(name)
         self._strange.update(name for name in heliostats if name in self._wanted.items)
@@ -156,7 +159,8 @@ class ParameterSync:
     def differing(self, heliostats: Sequence[str]) -> dict[str, str]:
         """Return which heliostats may not move, because their parameters differ, and why.
 
-        Those that have not been compared since their cluster connected may differ.
+        Those that have not been compared since their cluster connected, or their board started,
+        may differ.
         """
         found = {}
         for name in heliostats:

@@ -46,6 +46,8 @@ _PROVEN_SHOWS = 5.0
 _KEEP_PERIOD = 1.0
 #: Name and role of the safety table in a record.
 _TABLE = ("safety table", "plant")
+#: Name and role in the record of an emergency that a new program continues: nobody orders it then.
+_AGAIN = ("plant", "plant")
 #: Name and role of the night in a record.
 _NIGHT = ("the sun is down", "plant")
 
@@ -207,16 +209,22 @@ class Sentinel:
         """Order what the table demands, or go on with the emergency of the program before."""
         before, self._recalled = self._recalled, Standing()
         if before.act:
-            self._begin(max(act, Act[before.act]), (before.who, "anybody"), before.continued)
+            self._begin(max(act, Act[before.act]), _AGAIN, before.continued, before.who)
         else:
             self._begin(act, _TABLE, self.table.reasons(Act.DEFOCUS))
 
-    def _begin(self, act: Act, giver: tuple[str, str], reason: str) -> EmergencyOrder:
-        """Order DEFOCUS or STOW of the whole field."""
+    def _begin(
+        self, act: Act, giver: tuple[str, str], reason: str, who: str = ""
+    ) -> EmergencyOrder:
+        """Order DEFOCUS or STOW of the whole field; ``giver`` is a name and a role in the record.
+
+        ``who`` gave the order that this one continues, "" if it continues none.
+        """
         now, names = self._clock.monotonic(), self._field.names
         ticket = self._orders.accept((*giver, act.name), (), names, reason, late=True)
         measured = self.table.flux_measured
-        self.order = EmergencyOrder(act, giver[0], reason, now, ticket, flux_measured=measured)
+        first = who or giver[0]
+        self.order = EmergencyOrder(act, first, reason, now, ticket, flux_measured=measured)
         self.on, self._repeated_at = True, now
         self._unproven = {}
         self._orders.emergency(ticket, act, names)
@@ -355,10 +363,10 @@ class Sentinel:
             return
         stage = progress.stage
         if stage is Stage.DONE:
-            flags, untrue = self._field.rows["flags"], self._untrue()
+            flags = self._field.rows["flags"]
             good = (flags & COUNTS_UNKNOWN == 0) & ~switched_off(flags)
             heliostats = tuple(
-                n for n in heliostats if good[self._field.index[n]] and n not in untrue
+                n for n in heliostats if good[self._field.index[n]] and not self._doubted(n)
             )
             if self._ways.unsent.watches:
                 stage = Stage.ACKNOWLEDGED
@@ -374,7 +382,6 @@ class Sentinel:
         if self.on:
             self._order_again(order, names)
         rows = [self._field.index[n] for n in names if not order.is_done(n)]
-        untrue = self._untrue()
         if rows:
             index = np.array(rows, dtype=np.intp)
             lit = self._ways.unsent.lit(index)
@@ -385,7 +392,7 @@ class Sentinel:
                 self._field.counted_at[index],
                 Drive(self._drives.table[index]),
                 now,
-                np.array([self._field.names[r] in untrue for r in rows]),
+                np.array([bool(self._doubted(self._field.names[r])) for r in rows]),
                 lit,
             )
         for row, shines in zip(rows, lit if rows else (), strict=True):
@@ -397,7 +404,7 @@ class Sentinel:
                     f"{name}: its drives are switched off at the mirror, so it is not proven to be "
                     "off; it was not at stow"
                 )
-            elif not order.is_done(name) and (text := untrue.get(name)):
+            elif not order.is_done(name) and (text := self._doubted(name)):
                 order.unknown[name] = (
                     f"{name}: {text}, so nothing that it reports proves that it is off"
                 )
@@ -413,9 +420,10 @@ class Sentinel:
             if order.is_done(name):
                 self._unproven[name] = min(self._unproven[name], now)
 
-    def _untrue(self) -> dict[str, str]:
-        """Return the heliostats whose reports prove nothing, and the reasons."""
-        return {**self._drive_checks.stalled, **self._identities.strange}
+    def _doubted(self, heliostat: str) -> str:
+        """Return why nothing that a heliostat reports proves where its beam is, "" if it may."""
+        untrusted = self._identities.untrusted(heliostat)
+        return untrusted or self._drive_checks.stalled.get(heliostat, "")
 
     def _order_again(self, order: EmergencyOrder, names: tuple[str, ...]) -> None:
         """Send heliostats off again that have come back while the emergency holds."""

@@ -8,6 +8,8 @@ its time. A `Witness` sees all its actions without affecting them.
 import contextlib
 import math
 import random
+import struct
+from collections.abc import Mapping
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +17,7 @@ import numpy as np
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.lcu.controller import SWITCH, Controller
-from heliotrope.lcu.journal import Journal
+from heliotrope.lcu.journal import CODES_OF, Journal
 from heliotrope.lcu.node import Node
 from heliotrope.twin.boards.clocks import TickCounter
 from heliotrope.twin.boards.flash import NorFlash, PowerCutError
@@ -67,7 +69,8 @@ class Board:
     Parameters
     ----------
     outfit
-        The heliostat: name, addresses, mechanism, journal.
+        The heliostat: name, addresses, mechanism, journal. The board may be another mirror's; see
+        `exchange`.
     seed
         Seed of flash, motors and random choices.
     ticks
@@ -84,7 +87,7 @@ class Board:
     axes
         Motors.
     slip
-        Position of the motors beyond the node's counts, steps: set at each boot.
+        Position of the motors beyond the node's counts, steps: set at each boot, and by ZERO.
     now
         True time of the last event, in s.
     tilt
@@ -109,6 +112,7 @@ class Board:
         self.outfit, self.wind = outfit, wind
         self.ticks = ticks or TickCounter()
         self.flash = NorFlash(chance.getrandbits(32))
+        self._serial = outfit.serial
         self.axes = [
             MotorAxis(count, play, miss, random.Random(chance.random())) for count in outfit.stow
         ]
@@ -149,7 +153,7 @@ class Board:
                 _Timer(self),
                 self._out.extend,
                 self.ticks.at(now),
-                serial=self.outfit.serial,
+                serial=self._serial,
                 sha256=sha256,
                 key=self.outfit.key,
                 sensor=lambda: self.tilt,
@@ -161,6 +165,12 @@ class Board:
             return
         self._tell("boot")
 
+    def zeroed(self) -> None:
+        """Note that its step counts were declared: how far the motors are from them."""
+        if self.node is not None:
+            counted = [self.node.controller.motion.place(axis) for axis in (0, 1)]
+            self.slip = [axis.turned - n for axis, n in zip(self.axes, counted, strict=True)]
+
     def power_off(self, now: float, *, warned: bool = False) -> None:
         """Cut the supply; ``warned``: the brown-out detector notices in time."""
         self._to(now)
@@ -170,6 +180,29 @@ class Board:
             with contextlib.suppress(PowerCutError):
                 self.node.on_supply_failing(self.ticks.at(now))
         self._die()
+
+    def exchange(self, serial: int, items: Mapping[str, bytes] | NorFlash) -> NorFlash:
+        """Put another board at the mirror, while there is no supply; return the flash of this one.
+
+        Parameters
+        ----------
+        serial
+            Serial number of the other board.
+        items
+            What it stores: it was last at stow, by these items; or the flash of a board that was
+            here before.
+        """
+        assert self.node is None
+        before, self._serial = self.flash, serial
+        if isinstance(items, NorFlash):
+            self.flash = items
+            return before
+        self.flash = NorFlash(serial)
+        journal = Journal(self.flash)
+        journal.load()
+        journal.store(dict(items))
+        journal.zero(*struct.unpack(CODES_OF["stow"], items["stow"]))
+        return before
 
     def switch(self, now: float, *, off: bool) -> None:
         """Switch the drives off, or on again, with the switch at the mirror."""

@@ -37,6 +37,8 @@ class MotorAxis:
         Steps missed so far.
     fastest
         Least interval of a segment since the start, µs.
+    stalled
+        Whether the motor stands still, by ice or a broken coupling, whatever is ordered of it.
     """
 
     def __init__(
@@ -46,7 +48,7 @@ class MotorAxis:
         self.joint = float(count)
         self.play, self.miss = play, miss
         self.missed = 0
-        self.fastest = 1 << 30
+        self.fastest, self.stalled = 1 << 30, False
         self._chance = chance or random.Random(0)
         self._queue: deque[tuple[int, int, int]] = deque()  # direction, count, interval
         self._free_at = 0.0  # when the timer takes the next segment, s
@@ -77,6 +79,9 @@ class MotorAxis:
 
     def _turn(self, direction: int, steps: int) -> None:
         if steps <= 0:
+            return
+        if self.stalled:
+            self.missed += steps
             return
         if self.miss > 0.0 and self._chance.random() < self.miss:
             self.missed += 1

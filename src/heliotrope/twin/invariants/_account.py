@@ -19,6 +19,9 @@ SLOT, PAUSE = 0.05, 0.5
 SERVED = 2.0
 #: Braking takes half a second at most; after this only the axis whose turn it is may move, s.
 BRAKING = 1.0
+#: Why a heliostat must leave that its cluster's file does not name: it still hears SUN and stays
+#: DEFOCUSED.
+UNLISTED = "it is missing in the cluster's file"
 #: True position of a mirror at stow, to within this many steps.
 NEAR_STOW = 5000
 
@@ -93,6 +96,11 @@ class HeliostatAccount:
         When its timers were last given steps, s.
     ticks_jumped, misled
         Whether its counter has jumped since it booted; whether it has heard a stranger's frame.
+    unsure
+        Whether a board of another mirror is or was there, or a drive has stalled: its motors may
+        stand elsewhere than counted.
+    written, unlisted_at
+        Name that it has in its cluster's file; since when it is missing there, s, None: it is not.
     foot
         Nearest that its beam came to the foot of the way in this approach, m; 0 if that is unknown.
     """
@@ -117,7 +125,9 @@ class HeliostatAccount:
         self.booted_at, self.boots, self.cuts = now, 0, 0
         self.stepped_at = float("-inf")
         self._slot_ends, self._slot_steps = [float("-inf")] * 2, [0, 0]
-        self.ticks_jumped = self.misled = False
+        self.ticks_jumped = self.misled = self.unsure = False
+        self.written = self.name
+        self.unlisted_at: float | None = None
         self._history: deque[tuple[float, int]] = deque([(now, self.state)], maxlen=64)
         self._items = board.node.journal.items if board.node is not None else board.outfit.items
         self._pending: dict[str, bytes] = {}
@@ -324,8 +334,10 @@ class HeliostatAccount:
         found = list(self._ordered.items())
         if now - self._served_at > SERVED:
             found.append(("it was cut off", self._served_at))
+        if self.unlisted_at is not None:
+            found.append((UNLISTED, self.unlisted_at))
         return found
 
     def must_stow(self, why: str) -> bool:
         """Whether the cause requires stow, not only defocus."""
-        return why != "DEFOCUS"
+        return why not in ("DEFOCUS", UNLISTED)

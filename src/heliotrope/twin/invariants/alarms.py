@@ -20,6 +20,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Mapping
 from math import inf
+from types import MappingProxyType
 
 from heliotrope.lcu import states
 from heliotrope.safety import Alarm
@@ -37,7 +38,8 @@ BY_FAULTS = {
 }  # fmt: skip
 #: Alarms that persons, weather, wrong parameters and automatic control cause.
 BY_OTHERS = frozenset({
-    "authority_lost", "beam_blocked", "beam_disproved", "beam_unsent", "counts_doubtful",
+    "authority_lost", "firmware_differs", "heliostat_unlisted", "not_parked", "sun_contradicted",
+    "unwitnessed", "beam_blocked", "beam_disproved", "beam_unsent", "counts_doubtful",
     "flux_after_emergency",
     "identity", "keep_out_predicted", "nodes_unacknowledged", "operator_emergency",
     "parameters_differ", "pointing_disagrees", "receiver_flux_high", "resume_needed",
@@ -47,9 +49,9 @@ BY_OTHERS = frozenset({
 })  # fmt: skip
 #: Alarms of mirrors that point elsewhere, and the worlds in which they come without a fault.
 MISLED = {
-    "identity": frozenset({"addresses", "parameters", "calibrations"}),
+    "identity": frozenset({"addresses", "parameters", "calibrations", "repairs"}),
     "pointing_disagrees": frozenset({
-        "clock", "site", "calibrations", "visits", "day", "lights", "parties", "days",
+        "clock", "site", "calibrations", "repairs", "visits", "day", "lights", "parties", "days",
     }),
 }  # fmt: skip
 #: Alarms that say that mirrors did what nobody ordered, or not what was: their only cause is
@@ -68,6 +70,9 @@ RAISED_WITHIN = 30.0
 #: A board without power is named after this: silence for 10 s, asked each fifth second, and the way
 #: to the plant. A fault, and a cluster that is not heard, are named after these. s.
 SILENT_WITHIN, FAULT_WITHIN, UNHEARD_WITHIN = 18.0, 10.0, 8.0
+#: A heliostat that no cluster's file names is named after this, and a wrong time that plant and
+#: clusters share after that, s: a cluster says its names with its first status.
+UNLISTED_WITHIN, CONTRADICTED_WITHIN = 10.0, 10.0
 #: What no text for a person holds.
 _NONSENSE = re.compile(r"[{}]|\bnan\b|\bNone\b|\binf\b|<[a-z_.]+ ")
 
@@ -110,6 +115,7 @@ class AlarmObserver:
         self._well = dict.fromkeys(boards, inf)
         self._off: dict[str, float] = {}
         self._faulty: dict[str, float] = {}
+        self._unlisted: dict[str, float] = {}
         self._called = False
 
     def _check(self, good: bool, now: float, subject: str, saw: str, number: int = 16) -> None:
@@ -158,6 +164,7 @@ class AlarmObserver:
         *,
         runs: bool,
         writes: bool,
+        files: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Judge all alarms.
 
@@ -173,10 +180,13 @@ class AlarmObserver:
             Whether the plant's program runs.
         writes
             Whether the disk of its records writes in time: works of a slow one end one by one.
+        files
+            What is wrong in the clusters' files; see `Pod.file`.
         """
         self._wrote_at = self._wrote_at if writes else now
         rests = dict(rest)
         rests |= {name: max(rest[each] for each in some) for name, some in self._clusters.items()}
+        rests |= {written: rest[name] for name, written in files.items() if written}
         rests[""] = max(rest.values())
         new, self._new = self._new, []
         if runs:
@@ -198,7 +208,15 @@ class AlarmObserver:
             there = cluster in carried
             self._well[cluster] = min(self._well[cluster], now) if there else inf
             for name in some:
-                self._named(name, max(self._well[cluster], self._runs_since), now)
+                self._named(name, max(self._well[cluster], self._runs_since), now, files)
+
+    def contradicted(self, now: float, *, runs: bool) -> None:
+        """Check that a time which is wrong in plant and clusters alike is named."""
+        self._runs_since = min(self._runs_since, now) if runs else inf
+        named = any(kind == "sun_contradicted" for kind, _ in self._active)
+        passed = now - self._runs_since
+        saw = f"its time has been wrong for {passed:.0f} s, and no sun_contradicted says so"
+        self._check(named or passed <= CONTRADICTED_WITHIN, now, "plant", saw)
 
     def _caused(
         self, alarm: Alarm, rests: Mapping[str, float], now: float, *, called: bool
@@ -231,18 +249,18 @@ class AlarmObserver:
         saw = f"the plant has heard nothing of it for {silent:.1f} s, and no alarm says so"
         self._check(named or silent <= UNHEARD_WITHIN, now, cluster, saw)
 
-    def _named(self, name: str, well: float, now: float) -> None:
-        """Check that a board without power, and one in FAULT, are named."""
-        state = self._boards[name].state
-        for since, holds, alarm, within in (
-            (self._off, state < 0, "node_silent", SILENT_WITHIN),
-            (self._faulty, state == states.FAULT, "node_fault", FAULT_WITHIN),
+    def _named(self, name: str, well: float, now: float, files: Mapping[str, str]) -> None:
+        """Check that a board without power, one in FAULT, and one without a row are named."""
+        state, heard = self._boards[name].state, name not in files
+        for since, holds, alarm, within, what in (
+            (self._off, heard and state < 0, "node_silent", SILENT_WITHIN, "without power"),
+            (self._faulty, heard and state == states.FAULT, "node_fault", FAULT_WITHIN, "in FAULT"),
+            (self._unlisted, not heard, "heliostat_unlisted", UNLISTED_WITHIN, "in no file"),
         ):
             if not holds:
                 since.pop(name, None)
                 continue
             passed = now - max(since.setdefault(name, now), well)
             named = (alarm, name) in self._active
-            what = "without power" if state < 0 else "in FAULT"
             saw = f"it is {what} for {passed:.1f} s, and no {alarm} names it"
             self._check(named or passed <= within, now, name, saw)

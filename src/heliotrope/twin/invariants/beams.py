@@ -18,6 +18,7 @@ from heliotrope.lcu.node import Node
 from heliotrope.links.messages import ClusterStatus, Command, Progress, Stage
 from heliotrope.mechanism.tracking import TrackingStatus, track
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.emergency import EmergencyOrder
 from heliotrope.safety import Act, Alarm, alarms
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, STANDBY, Ball
@@ -101,6 +102,8 @@ class _Mirror:
         has seen it up since the plant last took it off.
     called_at, uncalled
         When the plant last sent its beam to a point, s; whether it went there without that.
+    shines_since
+        Since when its beam is on the receiver while an emergency holds, s.
     """
 
     board: Board
@@ -129,6 +132,7 @@ class _Mirror:
     seen_up: bool = False
     called_at: float = float("-inf")
     uncalled: bool = False
+    shines_since: float | None = None
 
     @property
     def name(self) -> str:
@@ -188,6 +192,11 @@ class BeamObserver:
         Number of checks of each invariant.
     losses
         Number of losses after which the field waits for a person.
+    proofs
+        Number of emergency orders of which every heliostat was said to be done.
+    contradicted
+        Whether a witness contradicts the time that plant and clusters share: then no mirror may
+        join the receiver, and where beams rest is nobody's to know. Set by the owner.
     """
 
     def __init__(
@@ -214,6 +223,8 @@ class BeamObserver:
         self._left: deque[tuple[float, str]] = deque(maxlen=64)
         self._lost_at = self._lost_known_at = self._released_at = float("-inf")
         self._proved: dict[tuple[str, str], float] = {}
+        self._stalled, self._exchanged = set[str](), set[str]()
+        self.proofs, self._complete_order, self.contradicted = 0, "", False
 
     def _check(self, number: int, good: bool, now: float, subject: str, saw: str) -> None:
         self.checks[number] += 1
@@ -281,7 +292,9 @@ class BeamObserver:
         What is lost is told by the true states; the report only tells since when that is known.
         """
         for name, row in zip(names, status.nodes(), strict=True):
-            mirror, age = self._mirrors[name], 1e-3 * int(row["heard_ms"])
+            mirror, age = self._mirrors.get(name), 1e-3 * int(row["heard_ms"])
+            if mirror is None:
+                continue  # the cluster's file names none like it
             if age <= _HEARD and now - age >= mirror.changed_at:
                 mirror.reports += 1
                 if mirror.reports == REPORTS:
@@ -314,6 +327,14 @@ class BeamObserver:
     def alarmed(self, alarm: Alarm, now: float) -> None:
         """Note an alarm of the plant."""
         self._alarms[alarm.condition, alarm.subject] = (now, alarm.active)
+
+    def stalled(self, heliostat: str) -> None:
+        """Note that a drive has stalled, which only the flux sees: the whole proof is judged."""
+        self._stalled.add(heliostat)
+
+    def exchanged(self, heliostat: str) -> None:
+        """Note that another mirror's board is at a mirror: its beam is where nobody can know."""
+        self._exchanged.add(heliostat)
 
     def ended(self) -> None:
         """Note that the plant's program has ended, and its alarms with it.
@@ -360,8 +381,11 @@ class BeamObserver:
             if mirror.state < 0:
                 mirror.astray_since = mirror.lit_since = mirror.inside_since = None
                 continue
-            self._placed(mirror, sun, now)
-            self._dark(mirror, sun, now)
+            if self.contradicted or mirror.name in self._exchanged:
+                self._stays_off(mirror, now)
+            elif mirror.name not in self._stalled:
+                self._placed(mirror, sun, now)
+                self._dark(mirror, sun, now)
         if self._most is None:
             self._loss(on, now)
         if plant is not None:
@@ -370,6 +394,14 @@ class BeamObserver:
             if plant.emergency_on:  # automatic control has given up the field
                 self.taken(self._mirrors)
             self._proofs(plant, sun, now)
+
+    def _stays_off(self, mirror: _Mirror, now: float) -> None:
+        """Check that neither a wrong sun nor another mirror's parameters bring a beam up."""
+        node, own = mirror.node, mirror.board.outfit.items["armature"]
+        strange = node is not None and node.journal.items.get("armature") != own
+        by = "a sun that is contradicted" if self.contradicted else "another mirror's parameters"
+        good = mirror.state not in _ON or not (strange or self.contradicted)
+        self._check(12, good, now, mirror.name, f"{states.STATES[mirror.state]}, by {by}")
 
     def _enters(self, mirror: _Mirror, state: int, now: float) -> None:
         """Note a new state."""
@@ -487,6 +519,7 @@ class BeamObserver:
         order = plant.emergency
         if order is None:
             return
+        self._complete(order, sun, now, holds=plant.emergency_on)
         for mirror in self._mirrors.values():
             key = (order.ticket.identity, mirror.name)
             if key not in self._proved:
@@ -496,7 +529,11 @@ class BeamObserver:
             begin, board = self._proved[key], mirror.board
             if begin == float("inf"):
                 continue
-            away = mirror.state < 0 or mirror.ordered_at > order.at + 1.0
+            away = (
+                mirror.state < 0
+                or mirror.name in self._stalled | self._exchanged
+                or mirror.ordered_at > order.at + 1.0
+            )
             if order.act is Act.STOW:
                 off = steps_from_stow(board)
                 saw, good = f"{off} steps from stow", off <= NEAR_STOW
@@ -508,3 +545,21 @@ class BeamObserver:
                 good = True
             saw = f"{order.act.name} is proven for it, and its beam or mirror is {saw}"
             self._check(15, good or now - begin <= DONE_WITHIN, now, mirror.name, saw)
+
+    def _complete(self, order: EmergencyOrder, sun: FloatArray, now: float, *, holds: bool) -> None:
+        """Check that no beam is on the receiver that the proof calls done, alone or with all."""
+        complete = holds and order.report(now).complete
+        if complete and order.ticket.identity != self._complete_order:
+            self.proofs, self._complete_order = self.proofs + 1, order.ticket.identity
+        done = {name for name in self._mirrors if name not in self._stalled and order.is_done(name)}
+        for mirror in self._mirrors.values():
+            lit = holds and mirror.state >= 0 and mirror.board.miss(sun, RECEIVER) <= OFF
+            mirror.shines_since = _since(lit, mirror.shines_since, now)
+            passed = 0.0 if mirror.shines_since is None else now - mirror.shines_since
+            shines = f"and its beam has been on the receiver for {passed:.1f} s"
+            if complete:
+                saw = f"every heliostat is said to have done {order.act.name}, {shines}"
+                self._check(15, passed <= DONE_WITHIN, now, mirror.name, saw)
+            if holds and mirror.name in done:
+                saw = f"{order.act.name} is proven for it, {shines}"
+                self._check(15, passed <= DONE_WITHIN, now, mirror.name, saw)

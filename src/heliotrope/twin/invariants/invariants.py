@@ -1,4 +1,4 @@
-"""The sixteen safety invariants, and an independent observer of the first eleven.
+"""The seventeen safety invariants, and an independent observer of the first eleven.
 
 The observer sees the frames on the bus, the actions of each board, and the messages to and from the
 plant. It keeps its own accounts in true time and trusts no report: the age of a sun counts from
@@ -36,6 +36,8 @@ number    check
 16        In quiet stretches what was ordered is done; a kept sighting is the mirror's own; while
           the sun is low, what automatic control was given is at stow. Alarms have causes, and
           causes have alarms; each command ends, and says why it failed.
+17        What a person has ordered or locked stands until its owner, or an engineer by name, has
+          ended it: the emergency holds, and the locked mirror stands still.
 ========  ============================================================================
 
 Besides being safe, life must go on:
@@ -51,7 +53,7 @@ L4        What holds for safety outlives a restart of the plant's program.
 ========  ============================================================================
 
 `twin.invariants.beams` checks 12 to 15, `twin.invariants.quiet`, `.visits`, `.day`, `.alarms` and
-`.tickets` 16, and `twin.invariants.answers` 11.
+`.tickets` 16, `twin.invariants.persons` 17, and `twin.invariants.answers` 11.
 """
 
 from collections import Counter, deque
@@ -65,7 +67,7 @@ from heliotrope.lcu import messages, states, wire
 from heliotrope.links.messages import NEVER, ClusterStatus, Progress, Stage
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, STANDBY, Ball
-from heliotrope.twin.invariants._account import HeliostatAccount, fingerprint
+from heliotrope.twin.invariants._account import UNLISTED, HeliostatAccount, fingerprint
 from heliotrope.twin.invariants.ledger import FrameLedger, OrderLedger, PlantCommand, Sent
 from heliotrope.twin.invariants.runs import RunAccount
 
@@ -90,17 +92,20 @@ TITLES = {
     14: "only a person resumes the field",
     15: "a proof counts only what is known",
     16: "work that is possible is done, and what is shown is true",
-    17: "what was taken is given back",
-    18: "each ticket and each retry ends, truthfully",
-    19: "every healthy mirror tracks again",
-    20: "what holds for safety outlives a restart",
+    17: "what a person has ordered or locked stands",
+    18: "what was taken is given back",
+    19: "each ticket and each retry ends, truthfully",
+    20: "every healthy mirror tracks again",
+    21: "what holds for safety outlives a restart",
 }
-#: Numbers of the invariants of liveness, which people call by name.
-L1, L2, L3, L4 = 17, 18, 19, 20
+#: Number of the invariant of persons' orders and locks; numbers of those of liveness, which people
+#: call by name.
+WORDS = 17
+L1, L2, L3, L4 = 18, 19, 20, 21
 
 
 def named(number: int) -> str:
-    """Return what people call an invariant: 1 to 16, L1 to L4."""
+    """Return what people call an invariant: 1 to 17, L1 to L4."""
     return str(number) if number < L1 else f"L{number - L1 + 1}"
 
 
@@ -192,7 +197,7 @@ class Violation:
     Attributes
     ----------
     number
-        Of `TITLES`: 1 to 16, or `L1` to `L4`.
+        Of `TITLES`: 1 to 17, or `L1` to `L4`.
     at
         Time since the start, s.
     subject
@@ -272,7 +277,23 @@ class Observer:
     def call(self, names: Mapping[int, str]) -> None:
         """Call each heliostat by the name that the cluster has for its address."""
         for account in self.accounts:
-            account.name = names[account.address]
+            account.name = account.written = names[account.address]
+
+    def doubt(self, board: Board) -> None:
+        """Note that another board is at a mirror, or that a drive has stalled.
+
+        What it stores is not what was stored before, and where its beam is nobody can know.
+        """
+        self._by_address[board.outfit.address].unsure = True
+
+    def edited(self, file: Mapping[str, str], now: float) -> None:
+        """Note what is wrong in the file that the cluster now begins with; see `Pod.file`.
+
+        A heliostat that is missing there is addressed no more, so it counts as cut off.
+        """
+        for account in self.accounts:
+            account.written = file.get(account.name, account.name)
+            account.unlisted_at = None if account.written else now
 
     # -- verdicts --------------------------------------------------------------------------
 
@@ -310,11 +331,14 @@ class Observer:
         elif sent.who in (messages.AUTHORITY, messages.KEY):
             self._authorised(sent, now)
         elif sent.who == messages.ANYONE:
-            self._emergencies = [(name, at) for name, at in self._emergencies if name != sent.name]
+            # Who is to stow need not defocus first.
+            over = ("DEFOCUS", "STOW") if sent.name == "STOW" else (sent.name,)
+            self._emergencies = [each for each in self._emergencies if each[0] not in over]
 
     def _authorised(self, sent: Sent, now: float) -> None:
         """Check a command on the bus: ordered with authority, in time, and reported."""
-        name = "PARAMETERS" if sent.who == messages.KEY else sent.name
+        pushed = sent.who == messages.KEY and sent.name != "ZERO"  # a person declares counts
+        name = "PARAMETERS" if pushed else sent.name
         addresses = [a.address for a in self.accounts if sent.addresses(a.address)]
         orders = self.orders.covering(name, addresses, now)
         if name == "STANDBY":  # a pushed standby point goes out as the command does
@@ -403,7 +427,7 @@ class Observer:
         if heard:
             self._took(account, now)
         if account.state == states.APPROACHING and account.foot > NEAR_FOOT:
-            miss = board.miss(self._sun(now), FOOT, believed=True)
+            miss = 0.0 if account.unsure else board.miss(self._sun(now), FOOT, believed=True)
             account.foot = min(account.foot, miss)
         if account.board.state != account.state:
             self._changed(account, now, heard)
@@ -442,6 +466,8 @@ class Observer:
         elif sent is not None and sent.addresses(account.address) and good:
             if sent.who not in (messages.ANYONE, messages.ASK):
                 account.taken = max(account.taken, sent.index)
+            if sent.name == "ZERO":
+                board.zeroed()
             if sent.name == "SUN":
                 account.sun_at = max(account.sun_at, sent.at)
             elif sent.who == messages.ANYONE:
@@ -493,14 +519,15 @@ class Observer:
         state, name = states.STATES[board.state], account.name
         self.check(7, board.state in AFTER_BOOT, now, name, f"{state} after a boot")
         held = dict(node.journal.items)
-        wrong = account.mixture(held)
+        wrong = "" if account.unsure else account.mixture(held)
         self.check(7, not wrong, now, name, f"after a boot its journal holds {wrong}")
         doubt = node.journal.doubt
         slip = max(abs(s) for s in board.slip)
         saw = (
             f"step counts are {slip} steps wrong after a boot, with a stated uncertainty of {doubt}"
         )
-        self.check(7, doubt < 0 or slip <= doubt, now, name, saw)
+        good = account.unsure or doubt < 0 or slip <= doubt
+        self.check(7, good, now, name, saw)
         account.booted(now)
 
     def stepped(
@@ -644,7 +671,7 @@ class Observer:
             at, where, addresses, orders = self._unreported.popleft()
             if min(order.at for order in orders) <= self.disturbed_at:
                 continue
-            names = {self._by_address[address].name for address in addresses}
+            names = {self._by_address[address].written for address in addresses} - {""}
             told = any(names <= set(order.accepted) for order in orders)
             saw = f"{where} went out {now - at:.1f} s ago and was never reported as accepted"
             self.check(11, told, now, "cluster", saw)
@@ -670,7 +697,8 @@ class Observer:
         # Unknown counts tell nothing of the pose: there the true beam counts, with its error.
         known = board.node.controller.motion.known
         on_way = board.state in (states.APPROACHING, states.IDLE) and account.from_stow
-        if known and board.state == states.DEFOCUSED:
+        sure = not account.unsure
+        if sure and known and board.state == states.DEFOCUSED:
             stays = account.stays(board.miss(sun, RECEIVER, believed=True) <= OFF, now)
             saw = f"DEFOCUSED, its beam within {OFF:g} m of the receiver's middle for {stays:.1f} s"
             self.check(2, stays <= TURNED_WITHIN, now, name, saw)
@@ -679,9 +707,11 @@ class Observer:
             state = states.STATES[board.state]
             if passed > DEFOCUS_WITHIN:
                 saw = f"{state} {passed:.1f} s after {why}, limit {DEFOCUS_WITHIN:g} s"
-                self.check(2, board.state not in NEED_SUN, now, name, saw)
+                # What no file names must not stay at standby either: nobody can take it from there.
+                up = ON_THE_WAY if why == UNLISTED else NEED_SUN
+                self.check(2, board.state not in up, now, name, saw)
                 miss = board.miss(sun, RECEIVER, believed=known)
-                crossing = account.crosses(miss <= OFF, now)
+                crossing = account.crosses(sure and miss <= OFF, now)
                 saw = (
                     f"{state} {passed:.1f} s after {why}, its beam within {OFF:g} m of the "
                     f"receiver's middle for {crossing:.1f} s, limit {CROSSING:g} s"
@@ -691,7 +721,7 @@ class Observer:
                 stow = sorted(account.stows)
                 saw = f"{state} at {account.place()} {passed:.1f} s after {why}, stow is {stow}"
                 self.check(2, account.place() in account.stows, now, name, saw)
-        if board.state in ON_THE_WAY:
+        if sure and board.state in ON_THE_WAY:
             for middle, radius in self._keep_outs:
                 miss = board.miss(sun, middle, believed=True)
                 saw = (
@@ -699,7 +729,7 @@ class Observer:
                     f"keep-out volume of {radius:.1f} m"
                 )
                 self.check(10, miss > radius, now, name, saw)
-        if on_way:
+        if sure and on_way:
             miss = board.miss(sun, RECEIVER, believed=True)
             saw = f"{states.STATES[board.state]}, its beam passes the receiver at {miss:.1f} m"
             self.check(10, miss > OFF, now, name, saw)

@@ -456,7 +456,7 @@ class PlantObserver:
         """Check that each record belongs to one command, and that no command has two."""
         records = self._disk.records
         for record in islice(records.values(), self._looked, None):
-            if self._automatic and record.who.endswith(_UNTOLD):
+            if record.who.endswith(_UNTOLD):
                 continue  # it tells nobody; `posted` wants a record of all that it sends
             if record.who in _OWN:
                 if record.identity not in self._sent:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
-from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations import Operations
 from heliotrope.plant.operations.automatic import AUTOMATIC
 from heliotrope.plant.tickets import Ticket
@@ -75,7 +75,9 @@ class Acts:
         self._work, self._operator = work, operator
         self._observer, self._beams, self._watch = observer, beams, watch
         self.names, self._truth, self._clock = tuple(truth), truth, clock
+        self._persons = operator.persons
         self.chance = random.Random(f"shift {seed}")
+        self._others = random.Random(f"locks {seed}")
         self._left: set[str] = set()  # what a person keeps from automatic control
         self._locked: dict[str, str] = {}  # who has locked each heliostat
         operator.commands = False
@@ -108,17 +110,28 @@ class Acts:
             operations.resume(ENGINEER)
             self.acted("resumed")
         names = tuple(name for name in self.names if name not in self._left)
-        out = {lock.name: lock.who for lock in operations.holds() if lock.name in self.names}
-        if back := sorted(out.keys() - self._left):
-            for name in back:
-                operations.unhold(ENGINEER, [name], owner=out[name], reason="the day ends")
-                self.acted(f"{name} back in service")
-            self._watch.held(back, self.now(), out=False)
+        for name, owners in self._persons.locks.items():
+            if name not in self._left:
+                self._returns(operations, name, owners)
         operations.give_back(ENGINEER, names)
         self.acted(f"{len(names)} heliostats given")
         self._beams.given(names, self.now())
         self._watch.given(names, self.now())
         self._left.clear()
+
+    def _returns(self, operations: Operations, name: str, owners: Sequence[str]) -> None:
+        """Return one of the locks on a heliostat: its owner does, or an engineer by name."""
+        owner = owners[0]
+        who = ENGINEER
+        if owner != ENGINEER.name and self._others.random() < 0.5:
+            who = Person(owner, Role.OPERATOR)
+        operations.unhold(who, [name], owner=owner, reason="the day ends")
+        if who.name != owner:
+            self.acted(f"removed {owner}'s lock", who)
+        self.acted("back in service" if len(owners) == 1 else "it stays locked", who)
+        self._persons.returned(owner, [name])
+        if len(owners) == 1:
+            self._watch.held([name], self.now(), out=False)
 
     # -- command authority -------------------------------------------------------------------
 
@@ -286,15 +299,18 @@ class Acts:
             self._operator.tickets.accepted(ticket, self.now())
         self._left.add(name)
 
-    async def holds(self, operations: Operations) -> None:
-        """Take a mirror out of service: it goes to stow."""
+    async def holds(self, operations: Operations, person: Person = ENGINEER) -> None:
+        """Take a mirror out of service, perhaps one that others have locked: it goes to stow."""
         name = self.chance.choice(self.names)
+        if self._persons.locks and self._others.random() < 0.5:
+            name = self._others.choice(sorted(self._persons.locks))
         self._watch.taken((name,))
         self._beams.taken((name,))
-        operations.hold(ENGINEER, (name,), "washing")
-        self.acted(f"{name} out of service")
+        operations.hold(person, (name,), "washing")
+        self.acted(f"{name} out of service", person)
+        self._persons.locked(person.name, (name,), self.now())
         self._watch.held((name,), self.now(), out=True)
-        self._observer.obeyed(ENGINEER.name, "STOW", self.now())
+        self._observer.obeyed(person.name, "STOW", self.now())
         self._left.add(name)
 
     def emergency(self, operations: Operations, person: Person, act: Act) -> None:

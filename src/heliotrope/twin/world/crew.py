@@ -181,7 +181,7 @@ class Crew:
         if what == "off":
             await acts.takes_off(operations)
         elif what == "hold":
-            await acts.holds(operations)
+            await acts.holds(operations, person)
         elif what == "emergency":
             self._ends_at = acts.now() + chance.uniform(2.0, _EMERGENCY)
             act = chance.choice([Act.DEFOCUS, Act.DEFOCUS, Act.STOW])

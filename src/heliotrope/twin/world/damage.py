@@ -12,6 +12,9 @@ from heliotrope.links.in_process import Faults
 from heliotrope.plant.controller import PlantController
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.bus import BusFaults
+from heliotrope.twin.boards.flash import NorFlash
+from heliotrope.twin.boards.outfit import outfits, own_items
+from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.records import RecordsDisk
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.faults import Fault
@@ -21,9 +24,14 @@ from heliotrope.twin.world.pod import Pod
 
 #: Faults of one heliostat, and of one cluster; every other one concerns them all. A cluster belongs
 #: to another run of a plant some time after it has begun, s.
-_OF_BOARD = ("power_cut", "brown_out", "flash_cut", "tick_jump")
-_NEW_RUN, _RUN_WITHIN = ("plant_crash", "plant_twice"), 15.0
+_OF_BOARD = ("power_cut", "brown_out", "flash_cut", "tick_jump", "board_exchanged", "stall")
+#: After these nothing tells where the mirror stands.
+_MISLEAD = ("board_exchanged", "stall")
+_DOWN = ("plant_crash", "plant_file", "plant_restored")
+_NEW_RUN, _RUN_WITHIN = (*_DOWN, "plant_twice"), 15.0
 _OF_CLUSTER = ("line", "bus", "cluster", "time", "replay", "forgery", "stranger_safe", "noise")
+#: Time for which a mirror has no supply while its board is exchanged, s.
+_EXCHANGE = 5.0
 #: An order need not be carried out while a fault of these kinds lasts.
 _HINDERS = ("line", "bus", "plant", "cluster_frozen")
 
@@ -38,6 +46,7 @@ class SimulatedPlant(Protocol):
     disk: RecordsDisk
     operator: Operator
     instruments: Instruments
+    beams: BeamObserver
     faults: Counter[str]
 
     def pod_of(self, fault: Fault) -> Pod:
@@ -50,6 +59,14 @@ class SimulatedPlant(Protocol):
 
     def crash_plant(self, now: float) -> None:
         """End the plant's program at once."""
+        ...
+
+    def edit_plant_file(self, fault: Fault) -> None:
+        """Write another stow position of a heliostat into the plant file."""
+        ...
+
+    def restore_store(self) -> None:
+        """Put a backup in the place of the plant's store."""
         ...
 
     def run_twice(self, group: asyncio.TaskGroup, *, on: bool) -> None:
@@ -83,6 +100,7 @@ class Damage:
         self._left = deque(sorted(faults, key=lambda fault: fault.at))
         self._active: list[tuple[float, Fault]] = []
         self._off: dict[int, float] = {}  # boards without power, and when it returns
+        self._own: dict[int, NorFlash] = {}  # flash of the boards that were exchanged
         #: When the last fault of a heliostat, of a cluster, or of all ended, s.
         self._rest: dict[str, float] = {}
         self._pause = 1.0  # until a board that died during a write restarts
@@ -115,7 +133,7 @@ class Damage:
         elif fault.kind.startswith(_OF_CLUSTER):
             key = self._of.pod_of(fault).name
         until = now + fault.lasts
-        if fault.kind == "time_jump":
+        if fault.kind == "time_jump" or fault.kind in _MISLEAD:
             until = math.inf
         elif fault.kind in _NEW_RUN:
             until += _RUN_WITHIN
@@ -133,6 +151,8 @@ class Damage:
         if over:
             self._active = [(until, fault) for until, fault in self._active if until > now]
             changed = True
+        for fault in over:
+            self._ends(fault, now)
         if changed:
             self._apply(group, now)
         self._supply(now)
@@ -165,12 +185,51 @@ class Damage:
         elif fault.kind == "cluster_crash":
             pod.crash()
             pod.observer.disturbed(now, crashed=True)
-        elif fault.kind == "plant_crash":
+        elif fault.kind in _DOWN:
             of.crash_plant(now)
+            if fault.kind == "plant_file":
+                of.edit_plant_file(fault)
+            elif fault.kind == "plant_restored":
+                of.restore_store()
+        elif fault.kind == "board_exchanged":
+            self._exchanges(fault, now)
+        elif fault.kind == "stall":
+            of.beams.stalled(board.outfit.name)
+            pod.observer.doubt(board)
+            for axis in board.axes:
+                axis.stalled = True
         elif fault.kind == "gust":
             of.instruments.gust(fault.size)
         else:
             _strangers(pod, pod.boards.index(board), fault)
+
+    def _exchanges(self, fault: Fault, now: float) -> None:
+        """Put a spare board in, which was another mirror's and was at stow there."""
+        of, target = self._of, fault.target
+        board, pod = of.boards[target], of.pod_of(fault)
+        if target in self._own:
+            return
+        others = [each.outfit for each in of.boards if each is not board]
+        if fault.size < 0.5 or not others:  # of another field, which this plant does not know
+            others = outfits(1, seed=int(1e6 * fault.size))
+        other = others[int(1e3 * fault.size) % len(others)]
+        board.power_off(now)
+        spare = {**other.items, **own_items(board.outfit.address)}
+        self._own[target] = board.exchange(other.serial, spare)
+        self._off[target] = now + _EXCHANGE
+        pod.observer.doubt(board)
+        of.beams.exchanged(board.outfit.name)
+
+    def _ends(self, fault: Fault, now: float) -> None:
+        board = self._of.boards[fault.target]
+        if fault.kind == "stall":
+            for axis in board.axes:
+                axis.stalled = False
+        elif fault.kind == "board_exchanged" and fault.target in self._own:
+            board.power_off(now)
+            board.exchange(board.outfit.serial, self._own.pop(fault.target))
+            self._off[fault.target] = now + _EXCHANGE
+            self._of.pod_of(fault).observer.doubt(board)
 
     def _apply(self, group: asyncio.TaskGroup, now: float) -> None:
         """Apply every lasting fault that is active now."""
@@ -187,16 +246,25 @@ class Damage:
         of.disk.set_slow(now, max(map(kinds.disk_delay, slow), default=0.0))
         for pod in of.pods:
             active = {fault.kind: fault for _, fault in self._active if of.pod_of(fault) is pod}
+            pod.edit(self._file(active.get("cluster_file"), pod), group)
             if "cluster_crash" not in active and not pod.runs:
                 pod.start(group)
             pod.freeze(on="cluster_frozen" in active and pod.runs)
             _apply_to(pod, active)
         # The plant does not start without room for its records.
-        if "plant_crash" not in everywhere and not of.disk.full and of.plant is None:
+        if everywhere.isdisjoint(_DOWN) and not of.disk.full and of.plant is None:
             of.start_plant(group)
         of.run_twice(group, on="plant_twice" in everywhere)
         frozen, silent = "plant_frozen" in everywhere, "plant_silent" in everywhere
         of.hang_plant(now, silent=silent, frozen=frozen)
+
+    def _file(self, fault: Fault | None, pod: Pod) -> dict[str, str]:
+        """Return what is wrong in the file of a cluster; see `Pod`."""
+        if fault is None:
+            return {}
+        name = self._of.boards[fault.target].outfit.name
+        missing = fault.size < 0.6 and len(pod.boards) > 1
+        return {name: "" if missing else f"{name}x"}
 
     def _supply(self, now: float) -> None:
         """Restore power to boards, including those that died during a flash write."""

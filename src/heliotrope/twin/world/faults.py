@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from heliotrope.errors import InputError
 from heliotrope.lcu import ticks
-from heliotrope.twin.world.worlds import pause_of, weights_of
+from heliotrope.twin.world.worlds import OWN_FAULTS, pause_of, weights_of
 
 #: Everything that can go wrong: kind, weight in the draw, meaning.
 KINDS = {
@@ -52,6 +52,20 @@ KINDS_OF_WORLDS = {
         "sensor_silent": (2, "a sensor shows nothing"),
         "sensor_jumps": (1, "a sensor jumps"),
     },
+    "repairs": {
+        "board_exchanged": (6, "a spare board with another mirror's parameters is put in"),
+        "cluster_file": (
+            4,
+            "a cluster restarts with a file in which a mirror is missing or named otherwise",
+        ),
+        "plant_file": (2, "the plant restarts with another stow position in its file"),
+        "plant_restored": (3, "the plant restarts with a backup of its store"),
+        "stall": (3, "the motors of a mirror stand still"),
+        "plant_crash": (5, "the plant crashes and restarts later"),
+        "cluster_crash": (2, "the cluster crashes and restarts later"),
+        "line_cut": (1, "plant and cluster do not hear each other"),
+        "power_cut": (2, "a board loses its supply at any instant"),
+    },
     "sensors": {
         "sensor_stuck": (3, "a sensor shows its last value for ever"),
         "sensor_jumps": (2, "a sensor jumps"),
@@ -69,6 +83,8 @@ _LONGEST = {
     "sensor_stuck": 60.0, "sensor_jumps": 30.0, "sensor_silent": 60.0, "sensor_nan": 60.0,
     "cluster_frozen": 90.0, "plant_frozen": 90.0, "disk_slow": 60.0,
     "plant_twice": 60.0,
+    "board_exchanged": 120.0, "cluster_file": 90.0, "plant_file": 20.0, "plant_restored": 20.0,
+    "stall": 60.0,
 }  # fmt: skip
 #: A heliostat that is cut off for this long must be at stow, s.
 _LONG = 330.0
@@ -141,7 +157,7 @@ def drawn(
     if not pause > 0.0:
         raise InputError(f"a pause of {pause} s between faults; it must be above 0")
     chance = random.Random(f"faults {seed}")
-    here = {} if "days" in worlds else dict(KINDS)
+    here = {} if not OWN_FAULTS.isdisjoint(worlds) else dict(KINDS)
     for world in worlds:
         here |= KINDS_OF_WORLDS.get(world, {})
     kinds = list(only) or list(here)

@@ -13,6 +13,7 @@ import random
 import struct
 from collections import Counter
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from heliotrope.safety import FLUX_READING, Act, alarms
 from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STANDBY, Outfit
 from heliotrope.twin.invariants.alarms import AlarmObserver
 from heliotrope.twin.invariants.beams import BeamObserver
+from heliotrope.twin.invariants.persons import PersonsObserver
 from heliotrope.twin.invariants.plant_observer import VOID_WITHIN, PlantObserver
 from heliotrope.twin.invariants.quiet import QuietObserver
 from heliotrope.twin.invariants.tickets import TicketObserver
@@ -51,6 +53,21 @@ LATCHING = frozenset(
 )
 Point = tuple[float, ...]
 
+
+class Maintenance(Protocol):
+    """The persons who work at the mirrors; see `world.maintenance`."""
+
+    def acts(self, plant: PlantController) -> None:
+        """Do one thing."""
+        ...
+
+    def confirms(self, plant: PlantController) -> None:
+        """Do what a restored store asks for."""
+        ...
+
+
+#: Share of the emergencies that a second person orders too.
+_SECOND = 0.3
 #: Somebody who looks at a mirror sees from this many steps on that it stands wrong.
 _SEEN_WRONG = 300
 
@@ -64,8 +81,8 @@ class Operator:
         True time.
     seed, habits
         Seed of their actions, and how often they take each.
-    observer, beams
-        Told of each accepted command.
+    observer, beams, persons
+        Told of each accepted command, and of what persons order and withdraw.
     fits
         The heliostats.
     pods
@@ -91,8 +108,12 @@ class Operator:
         Why the plant refused last.
     quiet, tickets, alarms
         Observers of reasons, tickets and alarms; None: these are not judged. Set by the owner.
+    maintenance
+        The persons who work at the mirrors; None: there are none. Set by the owner.
     points
         Points last accepted, ENU, m, by command (AIM, STANDBY) and heliostat.
+    persons
+        As given.
     """
 
     def __init__(
@@ -102,6 +123,7 @@ class Operator:
         habits: Habits,
         observer: PlantObserver,
         beams: BeamObserver,
+        persons: PersonsObserver,
         fits: Sequence[Outfit],
         pods: Sequence[Pod],
         keep_out: tuple[float, float, float],
@@ -115,22 +137,22 @@ class Operator:
         self.quiet: QuietObserver | None = None
         self.tickets: TicketObserver | None = None
         self.alarms: AlarmObserver | None = None
+        self.maintenance: Maintenance | None = None
         self.points: dict[tuple[str, str], Point] = {}
         self._clock, self._observer, self._flux = clock, observer, flux
-        self._beams, self._habits = beams, habits
+        self._beams, self.persons, self._habits = beams, persons, habits
         self._chance = random.Random(f"operator {seed}")
+        self._others = random.Random(f"others {seed}")
         self._fits, self._names = {fit.name: fit for fit in fits}, sorted(fit.name for fit in fits)
         self._pods, self._keep_out = pods, keep_out
         self._duty = ENGINEER
         self._tokens: dict[str, int] = {}
         self._rest_until = 0.0
-        self._called = False
         self._number = 0
 
     def begins(self, plant: PlantController | None) -> None:
-        """Note that the plant has started or (None) ended, which also ends a called emergency."""
+        """Note that the plant has started or (None) ended."""
         self.plant = plant
-        self._called = False
 
     # -- authority -------------------------------------------------------------------------
 
@@ -217,6 +239,8 @@ class Operator:
                 ],
                 self._habits.weights,
             )[0]
+            if self.maintenance is not None and self._others.random() < self._habits.locks:
+                does = self.maintenance.acts
             if self._chance.random() < self._habits.calibrates:
                 does = self._calibrate
             does(plant)
@@ -372,6 +396,16 @@ class Operator:
             return None
         return self._accepted(who, token, ticket, "PARAMETERS")
 
+    def zero(self, plant: PlantController, name: str, counts: Sequence[int]) -> Ticket | None:
+        """Declare the step counts of one heliostat; see `give`."""
+        who, token = self._duty, self._tokens.get(self._duty.name, 0)
+        try:
+            ticket = plant.zero(who, token, name, counts)
+        except RefusedError as error:
+            self._refused(error, who, token, "ZERO", (name,))
+            return None
+        return self._accepted(who, token, ticket, "ZERO")
+
     def _calibrate(self, plant: PlantController) -> None:
         """Change parameters of one heliostat: rightly, slightly wrongly, or much, unconfirmed."""
         chance, name = self._chance, self._safe(plant)
@@ -404,7 +438,12 @@ class Operator:
         # Wait until the order is done or overdue.
         pause = self._chance.choice([2.0, 33.0, 33.0, 310.0])
         self._rest_until = self._clock.monotonic() + pause
-        self.raises(plant, self._chance.choice([VIEWER, self._duty]), act)
+        who = self._chance.choice([VIEWER, self._duty])
+        self.raises(plant, who, act)
+        if self._others.random() < _SECOND:  # another person has a reason of their own
+            others = [each for each in (OPERATOR, ENGINEER, VIEWER) if each is not who]
+            act = self._others.choice([Act.DEFOCUS, Act.STOW])
+            self.raises(plant, self._others.choice(others), act)
 
     def raises(self, plant: PlantController, who: Person, act: Act) -> EmergencyOrder:
         """Raise an emergency, which anybody may do."""
@@ -416,10 +455,11 @@ class Operator:
         """Note an emergency that a person has raised."""
         self.counts["emergencies"] += 1
         self._beams.taken(self._names)  # after it none is automatic control's
-        self._observer.obeyed(who.name, act.name, self._clock.monotonic())
+        now = self._clock.monotonic()
+        self._observer.obeyed(who.name, act.name, now)
+        self.persons.ordered(who.name, act, now)
         if self.alarms is not None:
             self.alarms.called()
-        self._called = True
 
     def _one_safe(self, plant: PlantController) -> None:
         what = self._chance.choice(["DEFOCUS", "STOW"])
@@ -432,18 +472,26 @@ class Operator:
         return ticket
 
     def clear(self, plant: PlantController) -> set[str]:
-        """Withdraw an emergency, and acknowledge all that waits for it; return what was taken."""
-        self._end_emergency(plant)
+        """Withdraw one emergency order, acknowledge all that waits for it; return what was taken.
+
+        Another person's order stands on until the next time.
+        """
+        if self.maintenance is not None:
+            self.maintenance.confirms(plant)
+        if self.persons.orders:
+            self.withdraws(plant, next(iter(self.persons.orders)))
         return self._acknowledge(plant)
 
-    def _end_emergency(self, plant: PlantController) -> None:
-        if self._called:
-            for call in plant.calls:
-                # Others' orders are withdrawn by an engineer, by the owner's name.
-                who = self._duty if call.who == self._duty.name else ENGINEER
-                plant.withdraw_emergency(who, call.who)
-                self._observer.obeyed(who.name, "WITHDRAW", self._clock.monotonic())
-            self._called = False
+    def withdraws(self, plant: PlantController, owner: str) -> None:
+        """Withdraw a person's order: that person does, or an engineer by name for a viewer."""
+        who = OPERATOR if owner == OPERATOR.name else ENGINEER
+        now = self._clock.monotonic()
+        try:
+            plant.withdraw_emergency(who, owner)
+        except RefusedError as error:
+            self.persons.withdrawal_refused(owner, str(error), now)
+        self._observer.obeyed(who.name, "WITHDRAW", now)
+        self.persons.withdrew(owner)
 
     def _acknowledge(self, plant: PlantController) -> set[str]:
         """Acknowledge every latched condition; return those for which the plant takes it.

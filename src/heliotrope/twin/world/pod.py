@@ -4,6 +4,7 @@ import asyncio
 import random
 import struct
 from collections import Counter
+from collections.abc import Mapping
 from datetime import datetime
 
 from heliotrope.cluster.config import ClusterConfig, Member
@@ -38,6 +39,7 @@ from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.invariants import Observer
 from heliotrope.twin.invariants.ledger import PlantCommand
 from heliotrope.twin.invariants.lines import LineObserver
+from heliotrope.twin.invariants.persons import PersonsObserver
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.quiet import QuietObserver
 from heliotrope.twin.world.intruder import Intruder
@@ -89,6 +91,9 @@ class Pod:
         Messages to the plant, by kind.
     freezes
         Whether its program can be frozen.
+    file
+        What is wrong in the cluster's file: the name that a heliostat has in it, "" if it is
+        missing there.
     """
 
     def __init__(
@@ -103,7 +108,7 @@ class Pod:
         errors: PodErrors,
     ) -> None:
         self.name, self.boards, self.observer = name, boards, observer
-        self.freezes = errors.freezes
+        self.freezes, self.file = errors.freezes, dict[str, str]()
         self.intruder = Intruder(observer.frames, [b.outfit.address for b in boards])
         self._true, self._site, self._chance = clock, errors.site(site), chance
         drift = chance.choice([0.0, 50e-6, -50e-6, 200e-6])
@@ -146,8 +151,11 @@ class Pod:
         link = self.link = self.line.end(1, "plant", self.clock, seed=seed)
         heard = TappedLink(link, self._true, _ClusterEar(self.observer))
         keeper = self.time or SystemTime(self.clock)
-        fits = [board.outfit for board in self.boards]
-        members = tuple(Member(o.name, self.addresses[o.name], o.serial, o.key) for o in fits)
+        fits = [board.outfit for board in self.boards if self.file.get(board.outfit.name) != ""]
+        members = tuple(
+            Member(self.file.get(o.name, o.name), self.addresses[o.name], o.serial, o.key)
+            for o in fits
+        )
         config = ClusterConfig(self.name, self._site, members)
         cluster = Cluster(config, self.bus, heard, self.clock, keeper, self._kept)
         context = context_of(self.name) if self.freezes else None
@@ -166,6 +174,18 @@ class Pod:
         loop = asyncio.get_running_loop()
         if self.freezes and isinstance(loop, VirtualLoop):
             loop.kill(self.name)
+
+    def edit(self, file: Mapping[str, str], group: asyncio.TaskGroup) -> None:
+        """Restart the program with another file, if it is another one; see ``file``."""
+        if file == self.file:
+            return
+        self.file = dict(file)
+        now = self._true.monotonic()
+        self.observer.edited(file, now)
+        if self.runs:
+            self.crash()
+            self.observer.disturbed(now, crashed=True)
+            self.start(group)
 
     def freeze(self, *, on: bool) -> None:
         """Freeze the program, or let it go on."""
@@ -257,8 +277,8 @@ class PlantEar:
         Observer of the plant.
     beams
         Observer of the beams.
-    quiet, alarms
-        Observers of what is done, and of alarms; None: it is not judged.
+    quiet, alarms, persons
+        Observers of what is done, of alarms, and of locks; None: it is not judged.
     """
 
     def __init__(
@@ -268,9 +288,10 @@ class PlantEar:
         beams: BeamObserver,
         quiet: QuietObserver | None = None,
         alarms: AlarmObserver | None = None,
+        persons: PersonsObserver | None = None,
     ) -> None:
         self._pod, self._plant, self._beams, self._quiet = pod, plant, beams, quiet
-        self._alarms = alarms
+        self._alarms, self._persons = alarms, persons
         self._addresses = pod.addresses
         self._names: tuple[str, ...] = ()
         self._goes = asyncio.Event()
@@ -310,7 +331,10 @@ class PlantEar:
                 self._quiet.leased(message.token, now)
         elif isinstance(message, Emergency):
             whom = message.heliostats or tuple(self._addresses)
-            observer.emergency(message.name, now, carried=self._pod.carried(now), heliostats=whom)
+            there = tuple(name for name in whom if name not in self._pod.file)
+            carried = self._pod.carried(now)
+            if there:
+                observer.emergency(message.name, now, carried=carried, heliostats=there)
             self._beams.ordered_off(whom, now)
             if self._quiet is not None:
                 self._quiet.ordered_off(message.name, whom, now)
@@ -318,6 +342,7 @@ class PlantEar:
             observer.time_acknowledged()
         elif isinstance(message, Command | Parameters):
             observer.ordered(self.order(message, now, known=self._plant.known(message.token)))
+            self._writes(message, now)
             if isinstance(message, Parameters) and (stow := message.items().get("stow")):
                 one, two = struct.unpack(CODES_OF["stow"], stow)
                 observer.given_stow(message.heliostat, (one, two))
@@ -326,6 +351,16 @@ class PlantEar:
                 self._beams.sent(message, whom, now)
                 if self._quiet is not None:
                     self._quiet.sent(message, whom, now)
+
+    def _writes(self, message: Command | Parameters, now: float) -> None:
+        """Judge what is written to heliostats."""
+        if self._persons is None:
+            return
+        if isinstance(message, Parameters):
+            self._persons.written(message.heliostat, "PARAMETERS", now)
+        elif message.name == "ZERO":
+            for name in message.heliostats or tuple(self._addresses):
+                self._persons.written(name, message.name, now)
 
     def order(self, message: Command | Parameters, now: float, *, known: bool) -> PlantCommand:
         """Return an order for the ledger; ``known``: its token was once issued."""

@@ -24,15 +24,21 @@ from heliotrope.lcu import ticks
 from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of
 from heliotrope.links.common_settings import CommonSettings
 from heliotrope.links.tapped import TappedLink
-from heliotrope.mechanism.board_items import Wanted
+from heliotrope.mechanism.board_items import Wanted, packed
+from heliotrope.mechanism.tracking import track
+from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.emergency import EmergencyRecord
+from heliotrope.plant.operations.service import Service
 from heliotrope.plant.settings import PlantSettings
+from heliotrope.plant.witnesses import SENSOR_ERROR
 from heliotrope.safety import FLUX_READING, Alarm, conditions
 from heliotrope.sun import vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.clocks import TickCounter
 from heliotrope.twin.boards.outfit import (
     COARSE,
+    MACHINE,
     RECEIVER,
     STANDBY,
     Outfit,
@@ -43,6 +49,7 @@ from heliotrope.twin.invariants.alarms import AlarmObserver
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
+from heliotrope.twin.invariants.persons import PersonsObserver
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.progress import ProgressObserver
 from heliotrope.twin.invariants.quiet import NEAR, QuietObserver
@@ -61,19 +68,24 @@ from heliotrope.twin.world.damage import Damage
 from heliotrope.twin.world.design import MIRROR, design_of, wanted_of
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.instruments import READINGS, Instruments
+from heliotrope.twin.world.maintenance import Maintenance
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
 from heliotrope.twin.world.scene import scene_of
 from heliotrope.twin.world.shift import Shift, Working
+from heliotrope.twin.world.store import PlantStore
 from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
 from heliotrope.twin.world.twice import SecondPlant
 from heliotrope.twin.world.work import DAY_WORK, LIT_WORK, LOSSES, USUAL_WORK, Work
 from heliotrope.twin.world.worlds import (
+    COMMON,
     DAYS,
     PARTY,
+    REPAIRS,
     Habits,
     PodErrors,
     checked,
+    common_error,
     covered_by,
     drawn,
     knows_boards,
@@ -93,7 +105,11 @@ _SUN_EVERY = 30.0
 #: The plant's program, for freezing it.
 _PLANT = "plant"
 #: Worlds in which a cluster is wrong from the start, so that its mirrors may do nothing.
-_WRONG = ("addresses", "clock", "site")
+_WRONG = ("addresses", "clock", "site", COMMON)
+#: The witness in the world "common".
+WITNESSES = frozenset({"sun sensor"})
+#: Plant files are edited so that stow is on the receiver beyond this size of the fault.
+_ON_RECEIVER = 0.7
 #: Longest run: the sun must stay up.
 MOST_HOURS = 8.0
 #: Mean time between two interruptions by persons, s: a joint visit takes two minutes.
@@ -281,7 +297,8 @@ class Simulation:
         self.faults: Counter[str] = Counter()
         self._chance = random.Random(f"simulation {plan.seed}")
         scene = self._scene = scene_of(plan.worlds, plan.seed, plan.seconds, plan.size)
-        self._loop, self._clock = loop, VirtualClock(loop.time, scene.start)
+        error = common_error(plan.worlds, plan.seed)
+        self._loop, self._clock = loop, VirtualClock(loop.time, scene.start + error)
         self.begin = loop.time()
         self._suns: dict[int, FloatArray] = {}
         fits = motors_of(outfits(plan.size, plan.seed, scene.places), plan.worlds, plan.seed)
@@ -294,9 +311,12 @@ class Simulation:
         ]
         self.boards = [self._board(each) for each in stored]
         self.pods = self._new_pods()
+        alone = "twice" not in plan.worlds
+        self.persons = PersonsObserver(self.begin, self.boards, alone=alone)
         boards = {pod.name: pod.boards for pod in self.pods}
         most = LOSSES if works(plan.worlds) else None
         self.beams = BeamObserver(self.begin, boards, self.sun, scene.keep_outs, most, self._astray)
+        self.beams.contradicted = COMMON in plan.worlds
         self.readings = SensorObserver(self.begin, boards)
         self.alarms = AlarmObserver(self.begin, boards, plan.worlds)
         accounts = {each.name: each for pod in self.pods for each in pod.observer.accounts}
@@ -313,8 +333,14 @@ class Simulation:
         # The boards' wanted items and assigned points survive the plant's program.
         self._fits = known
         self._wanted = wanted_of(known) if knows_boards(plan.worlds) else Wanted()
-        self._emergency = EmergencyDisk()
-        self._assigned = AssignedDisk()
+        self._exits = contextlib.ExitStack()
+        self._store: PlantStore | None = None
+        self._stows: dict[str, bytes] = {}
+        self._emergency: EmergencyRecord = EmergencyDisk()
+        self._assigned: Assigned = AssignedDisk()
+        if REPAIRS in plan.worlds:
+            self._store = PlantStore(self._clock, self.persons, self._exits)
+            self._assigned, self._emergency = self._store.points, self._store.keeper
         self._assigned.keep({"STANDBY": {each.name: STANDBY for each in fits}})
         self.disk = RecordsDisk()
         observers = [pod.observer for pod in self.pods]
@@ -324,7 +350,11 @@ class Simulation:
         self.operator = self._new_operator(fits, scene.keep_outs[0][0])
         self.operator.quiet, self.operator.tickets = self.quiet, self.tickets
         self.operator.alarms = self.alarms
-        self._exits = contextlib.ExitStack()
+        self._maintenance: Maintenance | None = None
+        if self._store is not None:
+            self._maintenance = self.operator.maintenance = Maintenance(
+                self.operator, self.observer, self.beams, self.boards, self._clock, plan.seed
+            )
         self._work = self._new_work() if works(plan.worlds) else None
         self._tour: Tour | None = None
         if TOUR in plan.worlds:
@@ -347,6 +377,7 @@ class Simulation:
             Habits.of(self.plan.worlds, self.plan.seed),
             self.observer,
             self.beams,
+            self.persons,
             fits,
             self.pods,
             keep_out,
@@ -434,7 +465,7 @@ class Simulation:
         for i in range(count):
             part = self.boards[i * cut : (i + 1) * cut]
             observer = Observer(part, self.begin, self.sun, self._scene.keep_outs)
-            site, start = self._scene.site, self._scene.start
+            site, start = self._scene.site, self._clock.utc()
             name, errors = f"C{i + 1}", PodErrors(self.plan.worlds, self.plan.seed, i)
             pods.append(Pod(name, part, observer, self._clock, start, site, self._chance, errors))
         return pods
@@ -466,7 +497,7 @@ class Simulation:
     @property
     def checks(self) -> Counter[int]:
         """Number of checks of each invariant by the observers of work, alarms and tickets."""
-        found = self.alarms.checks + self.tickets.checks
+        found = self.alarms.checks + self.tickets.checks + self.persons.checks
         if self._work is not None:
             found += self._work.watch.checks
         return found if self.quiet is None else found + self.quiet.checks
@@ -479,7 +510,9 @@ class Simulation:
         for pod in self.pods:
             seed = self._chance.getrandbits(31)
             link = pod.line.end(0, pod.name, self._clock, seed=seed)
-            pod.ear = PlantEar(pod, self.observer, self.beams, self.quiet, self.alarms)
+            pod.ear = PlantEar(
+                pod, self.observer, self.beams, self.quiet, self.alarms, self.persons
+            )
             pod.tap = TappedLink(link, self._clock, pod.ear)
             links[pod.name] = pod.tap
         audit = self._audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
@@ -487,6 +520,8 @@ class Simulation:
             self._wanted = wanted_of(self._fits)  # the store knows better; see `Work.begins`
             noted = self.alarms.alarmed
             self._work.control.opens(lambda alarm: noted(alarm, self._clock.monotonic()))
+        if self._store is not None:
+            self._read_plant_file()
         context = context_of(_PLANT)
         plant = self.plant = PlantController(
             self._design,
@@ -494,7 +529,7 @@ class Simulation:
             self._clock,
             audit,
             clusters=self._homes,
-            settings=MEASURED if self._measured else SETTINGS,
+            settings=self._settings(),
             wanted=self._wanted,
             assigned=self._assigned,
             table=TABLE,
@@ -506,9 +541,61 @@ class Simulation:
         self.operator.begins(plant)
         self.instruments.plant = plant
         parts = [*(link.run() for link in links.values()), plant.run()]
+        if self._store is not None:
+            parts.append(self._parks(self._store.service(plant, self._alarmed), self._store))
+        if COMMON in self.plan.worlds:
+            parts.append(self._sees(plant))
         if self._work is not None:
             parts.append(self._work.control.begins(plant).run())
         self._program = [group.create_task(each, context=context) for each in parts]
+
+    def _settings(self) -> PlantSettings:
+        """Return the settings of the plant."""
+        settings = MEASURED if self._measured else SETTINGS
+        return replace(settings, witnesses=WITNESSES) if COMMON in self.plan.worlds else settings
+
+    async def _parks(self, service: Service, store: PlantStore) -> None:
+        """Send locked heliostats to stow, as automatic control does, and make backups."""
+        assert self._maintenance is not None
+        self._maintenance.service = service
+        while True:
+            service.park()
+            store.look()
+            await asyncio.sleep(1.0)
+
+    async def _sees(self, plant: PlantController) -> None:
+        """Let a sun sensor see the true sun."""
+        (name,) = WITNESSES
+        while True:
+            plant.witnesses.take(name, self.sun(self._clock.monotonic()), SENSOR_ERROR)
+            await asyncio.sleep(2.0)
+
+    def edit_plant_file(self, fault: Fault) -> None:
+        """Write another stow position of a heliostat into the plant file: near, or on the receiver.
+
+        The plant must not write the latter: the beam of a mirror at stow would be on the receiver.
+        """
+        fit = self._fits[fault.target]
+        steps = np.array([2000, -2000]) if fault.size < 0.5 else np.array([-1500, 1000])
+        stow = np.array(MACHINE.stow) + steps
+        if fault.size > _ON_RECEIVER:
+            here = np.array(MACHINE.stow, dtype=np.float64)
+            sun = self.sun(self._clock.monotonic())
+            best = track(fit.mechanism, sun, np.array(RECEIVER), current=here).best_counts
+            stow = np.rint(best).astype(int)
+        self._stows = {fit.name: packed("stow", (int(stow[0]), int(stow[1])))}
+
+    def _read_plant_file(self) -> None:
+        """Want the stow positions of the plant file; the next program finds it corrected."""
+        for fit in self._fits:
+            self._wanted.set(fit.name, {"stow": self._stows.get(fit.name, fit.items["stow"])})
+        self._stows = {}
+
+    def restore_store(self) -> None:
+        """Put a backup in the place of the plant's store."""
+        if self._store is not None:
+            self._store.restore()
+            self._assigned, self._emergency = self._store.points, self._store.keeper
 
     def _second_plant(self, fits: Sequence[Outfit]) -> SecondPlant:
         return SecondPlant(
@@ -559,6 +646,8 @@ class Simulation:
         self._loop.kill(_PLANT)
         self.disk.lose()
         self.operator.begins(None)
+        if self._maintenance is not None:
+            self._maintenance.service = None
         self.instruments.plant = None
         self.observer.ended(now)
         self.beams.ended()
@@ -657,9 +746,17 @@ class Simulation:
                     for pod in self.pods:
                         pod.answers.look(now)
                     self.alarms.look(
-                        damage.rest, carried, now, runs=going is not None, writes=writes
+                        damage.rest,
+                        carried,
+                        now,
+                        runs=going is not None,
+                        writes=writes,
+                        files={k: v for pod in self.pods for k, v in pod.file.items()},
                     )
+                self.persons.look(self.plant, now)
                 going_on = self.plant is not None and not self.operator.waits
+                if COMMON in self.plan.worlds:
+                    self.alarms.contradicted(now, runs=going_on)
                 self.tickets.look(now, runs=going_on and writes)
                 if self._work is not None:
                     calm = None if self.quiet is None else self.quiet.stretches
@@ -708,6 +805,7 @@ def run(plan: RunPlan) -> RunResult:
     outcome.checks += simulation.checks
     outcome.faults = simulation.faults
     outcome.counts = sum((pod.counts for pod in simulation.pods), simulation.operator.counts)
+    outcome.counts["proofs"] = simulation.beams.proofs
     outcome.states = sum((pod.observer.entered for pod in simulation.pods), Counter())
     return outcome
 

@@ -23,7 +23,7 @@ class SoakResult:
     ----------
     runs, seconds
         Number of runs and their simulated time.
-    checks, faults, states
+    checks, faults, counts, states
         Sums over all runs; see `twin.world.simulation.RunResult`.
     broken
         One line for each failed run: what broke, and the command that replays it.
@@ -33,6 +33,7 @@ class SoakResult:
     seconds: float = 0.0
     checks: Counter[int] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
+    counts: Counter[str] = field(default_factory=Counter)
     states: Counter[int] = field(default_factory=Counter)
     broken: list[str] = field(default_factory=list)
 
@@ -42,6 +43,7 @@ class SoakResult:
         self.seconds += line["seconds"]
         self.checks.update({int(k): v for k, v in line["checks"].items()})
         self.faults.update(line["faults"])
+        self.counts.update(line["counts"])
         self.states.update({int(k): v for k, v in line["states"].items()})
         if line["broken"]:
             self.broken.append(line["broken"])
@@ -54,6 +56,7 @@ def summary(outcome: RunResult) -> dict[str, Any]:
         "seconds": outcome.seconds,
         "checks": dict(outcome.checks),
         "faults": dict(outcome.faults),
+        "counts": dict(outcome.counts),
         "states": dict(outcome.states),
         "broken": "" if outcome.good else f"{outcome.text}; replay: {outcome.command}",
     }

@@ -12,11 +12,13 @@ from heliotrope.field.plant import Plant
 from heliotrope.links.clock import VirtualClock
 from heliotrope.links.tapped import TappedLink
 from heliotrope.mechanism.board_items import Wanted
+from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Alarm, Condition
 from heliotrope.twin.boards.outfit import Ball, Outfit
 from heliotrope.twin.invariants.beams import BeamObserver
+from heliotrope.twin.invariants.persons import PersonsObserver
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
 from heliotrope.twin.world.operator import Operator
@@ -64,7 +66,7 @@ class SecondPlant:
         settings: PlantSettings,
         table: tuple[Condition, ...],
         wanted: Wanted,
-        assigned: AssignedDisk,
+        assigned: Assigned,
         pods: Sequence[Pod],
         fits: Sequence[Outfit],
         keep_out: Ball,
@@ -81,8 +83,18 @@ class SecondPlant:
         self.observer = PlantObserver(
             clock.monotonic(), self._disk, settings, [pod.observer for pod in pods]
         )
+        self._persons = PersonsObserver(clock.monotonic(), ())
         self.operator = Operator(
-            clock, -1 - seed, Habits(), self.observer, beams, fits, pods, keep_out[0], flux
+            clock,
+            -1 - seed,
+            Habits(),
+            self.observer,
+            beams,
+            self._persons,
+            fits,
+            pods,
+            keep_out[0],
+            flux,
         )
         self._program: list[asyncio.Task[None]] = []
 
@@ -133,4 +145,5 @@ class SecondPlant:
         self._program, self.plant = [], None
         self._disk.lose()
         self.operator.begins(None)
+        self._persons.forget()
         self.observer.ended(self._clock.monotonic())

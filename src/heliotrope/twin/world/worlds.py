@@ -29,10 +29,16 @@ WORLDS = {
     "day": "automatic control meets the morning's or the evening's limit of the sun, at any place",
     "lights": "as visits; lights stand on the targets for minutes, and most visits search no beam",
     "parties": "as visits, by the plant's own schedule: many at once on a target and the receiver",
+    "repairs": "boards, files and stores are exchanged for wrong ones, drives stall, persons lock",
+    "common": "plant and clusters begin with the same wrong time, which a sun sensor contradicts",
     "days": "as parties, from morning to evening stow: several persons act at any stage of a visit",
 }
 #: A short working day, and its length, s.
 DAYS, DAY = "days", 840.0
+#: Boards, files and stores are exchanged; plant and clusters share a wrong time.
+REPAIRS, COMMON = "repairs", "common"
+#: Worlds in which nothing fails but their own faults.
+OWN_FAULTS = frozenset({DAYS, REPAIRS})
 #: Worlds with automatic control.
 WORKING = ("visits", "day", "lights", "parties", DAYS)
 #: Worlds with joint visits and receiver visits, and the least number of their heliostats.
@@ -42,6 +48,8 @@ DRAWN = ("place", "day")
 #: Faults in a run with automatic control come this many times more seldom: a visit takes a minute,
 #: and a person's act is most of what happens on a day.
 _SELDOM, _SELDOM_BY_DAY = 4.0, 50.0
+#: Repairs take their time: faults come this many times more seldom than usual ones.
+_REPAIRED = 2.0
 #: Name that lets each run draw its worlds: see `mixed`.
 ANY = "any"
 #: Worlds that hold, of which `mixed` chooses.
@@ -52,14 +60,14 @@ MIX = (
 )  # fmt: skip
 #: Worlds that `mixed` adds to this share of runs each, beside those that it draws. A cluster that
 #: is wrong from the start is found within seconds, and then keeps its mirrors from all else.
-RARE, RARE_SHARE = ("lights", "clock", "site", "addresses"), 0.04
+RARE, RARE_SHARE = ("lights", "clock", "site", "addresses", COMMON), 0.04
 #: Shares of days with motors that step coarsely, and with heliostats of which the plant file is
 #: wrong; by how much, rad of the mirror.
 _COARSE, _UNSURVEYED, _BESIDE = 1.0 / 3.0, 1.0 / 3.0, (0.018, 0.022)
 #: Share of the days on which a mirror is covered: it throws no light.
 _COVERED = 0.25
-#: Share of the runs of `mixed` that are a working day, and nothing else.
-DAYS_SHARE = 0.1
+#: Share of the runs of `mixed` that are a working day, or repairs, and nothing else.
+ALONE_SHARE = 0.1
 
 
 def checked(worlds: Sequence[str]) -> None:
@@ -76,15 +84,22 @@ def checked(worlds: Sequence[str]) -> None:
 
 
 def mixed(seed: int) -> tuple[str, ...]:
-    """Return worlds drawn from a seed: some of `MIX`, and seldom one of `RARE`; or a day alone."""
-    if random.Random(f"{DAYS} {seed}").random() < DAYS_SHARE:
-        return (DAYS,)
+    """Return worlds drawn from a seed: some of `MIX`, and seldom one of `RARE`; or one alone."""
+    for alone in (DAYS, REPAIRS):
+        if random.Random(f"{alone} {seed}").random() < ALONE_SHARE:
+            return (alone,)
     chance = random.Random(f"worlds {seed}")
     share = chance.choice([0.0, 0.2, 0.5, 0.8])
     found = [name for name in MIX if chance.random() < share]
     found += [name for name in RARE if random.Random(f"{name} {seed}").random() < RARE_SHARE]
     # Automatic control of a second plant is not judged.
     return tuple(name for name in found if name != "twice" or not works(found))
+
+
+#: Weights of the actions of persons while much is repaired: emergencies are frequent; and of those
+#: who leave mirrors up for a while.
+_REPAIRING = (60, 14, 2, 6, 2, 2, 2, 3, 1)
+_REPAIRING_CALMLY = (60, 10, 1, 1.5, 0.3, 0.3, 2, 2, 1)
 
 
 @dataclass(frozen=True)
@@ -103,16 +118,23 @@ class Habits:
         Whether they command IDLE to all: heliostats at stow are stuck in it.
     calibrates
         Share of their actions that change parameters beyond those of every run.
+    locks
+        Share of their actions that lock a mirror, return a lock, write to what is locked, or mend
+        a board.
     """
 
     pause: float = 2.0
     weights: tuple[float, ...] = (60, 14, 8, 4, 2, 3, 5, 4, 4)
     idle: bool = True
     calibrates: float = 0.0
+    locks: float = 0.0
 
     @classmethod
     def of(cls, worlds: Sequence[str], seed: int) -> "Habits":
         """Return the habits of a run."""
+        if REPAIRS in worlds:
+            calm = "calm" in worlds
+            return cls(2.0, _REPAIRING_CALMLY if calm else _REPAIRING, locks=0.02 if calm else 0.5)
         calibrates = 0.15 if "calibrations" in worlds else 0.0
         habits = cls(calibrates=calibrates)
         if "calm" in worlds:
@@ -139,6 +161,8 @@ def pause_of(worlds: Sequence[str], seed: int, pause: float) -> float:
     """Return the mean time between two faults of a run, s."""
     if works(worlds):
         pause *= _SELDOM_BY_DAY if DAYS in worlds else _SELDOM
+    if REPAIRS in worlds:
+        pause *= _REPAIRED
     if "swarm" not in worlds:
         return pause
     return pause * random.Random(f"pause {seed}").choice([0.5, 1.0, 3.0, 10.0])
@@ -173,7 +197,7 @@ def drawn(worlds: Sequence[str]) -> bool:
 
 def knows_boards(worlds: Sequence[str]) -> bool:
     """Whether the plant of a run knows what every board should store, as a real one does."""
-    return works(worlds) or not {"parameters", "calibrations"}.isdisjoint(worlds)
+    return works(worlds) or not {"parameters", "calibrations", REPAIRS}.isdisjoint(worlds)
 
 
 def stored_by(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
@@ -259,6 +283,14 @@ def narrow_limits() -> dict[str, bytes]:
         )
         for axis, end in zip(axes, ends, strict=True)
     }
+
+
+def common_error(worlds: Sequence[str], seed: int) -> timedelta:
+    """Return by how much the time of plant and clusters alike is ahead of the true one."""
+    if COMMON not in worlds:
+        return timedelta()
+    chance = random.Random(f"{COMMON} {seed}")
+    return timedelta(seconds=chance.choice([-1, 1]) * chance.choice([300.0, 600.0, 3600.0]))
 
 
 class PodErrors:

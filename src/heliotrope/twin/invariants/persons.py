@@ -1,0 +1,226 @@
+"""The observer of persons: what a person has ordered or locked stands until it is ended (17).
+
+It keeps a ledger of its own, from the calls of persons and not from the plant: who has ordered an
+emergency, by which act, and who has withdrawn it; who has locked a heliostat, and has returned the
+lock. While an order stands, the plant shows it under its owner's name, an emergency of at least
+that act holds, and no mirror is up once it has had the time to turn away. A heliostat that a person
+has locked stands still at stow until the last lock on it is returned, whatever is ordered, and
+nothing is written to it.
+
+A board that starts anew is left out until it stands still again: what it does at a start no lock
+can prevent, which is why a person at a mirror uses its switch.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from heliotrope.lcu import states
+from heliotrope.lcu.node import Node
+from heliotrope.plant.controller import PlantController
+from heliotrope.safety import Act
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.invariants.invariants import WORDS, InvariantError, Violation
+
+#: A new program goes on with what holds within this, and an order shows within this, s.
+RECALLED_WITHIN, SHOWN_WITHIN = 2.0, 1.0
+#: No mirror is up this long after an order, s: 30 s, and the time between two judgements.
+DOWN_WITHIN = 31.0
+#: A command that left before a lock is over by then, s: its life, and late on the bus.
+UNDER_WAY = 15.0
+#: A locked mirror moves if its motors turn by more than this, steps: drivers that rest let a
+#: coarse motor turn to its nearest full step.
+STANDS = 32
+#: States in which a mirror follows or seeks the sun.
+_UP = (states.APPROACHING, states.TRACKING, states.SEARCHING)
+
+
+@dataclass
+class _Lock:
+    """The locks on a heliostat: owners, since when; and where it stands by which program."""
+
+    owners: dict[str, float] = field(default_factory=dict)
+    node: Node | None = None
+    place: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Words:
+    """What persons had ordered and locked at some time: orders by owner, owners of locks."""
+
+    orders: dict[str, tuple[Act, float]]
+    locks: dict[str, tuple[str, ...]]
+
+
+class PersonsObserver:
+    """Observes what becomes of persons' orders and locks; see the module.
+
+    Parameters
+    ----------
+    start
+        Zero of the times that it reports, s.
+    boards
+        All heliostats.
+    alone
+        Whether no other plant commands the heliostats at times.
+
+    Attributes
+    ----------
+    checks
+        Number of checks of each invariant.
+    orders
+        Emergency orders that stand: act and time, s, by owner.
+    """
+
+    def __init__(self, start: float, boards: Sequence[Board], *, alone: bool = True) -> None:
+        self.checks: Counter[int] = Counter()
+        self.orders: dict[str, tuple[Act, float]] = {}
+        self._start, self._alone = start, alone
+        self._boards = {board.outfit.name: board for board in boards}
+        self._locks: dict[str, _Lock] = {}
+        self._plant: PlantController | None = None
+        self._since, self._confirmed = float("inf"), True
+
+    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
+        self.checks[WORDS] += 1
+        if not good:
+            raise InvariantError(Violation(WORDS, now - self._start, subject, saw))
+
+    # -- what persons do -----------------------------------------------------------------------
+
+    def ordered(self, owner: str, act: Act, now: float) -> None:
+        """Note an emergency order; a person has one, of the stronger act."""
+        before, at = self.orders.get(owner, (act, now))
+        self.orders[owner] = max(act, before), at
+
+    def withdrew(self, owner: str) -> None:
+        """Note that a person's order is withdrawn, by that person or by an engineer."""
+        self.orders.pop(owner, None)
+
+    def withdrawal_refused(self, owner: str, reason: str, now: float) -> None:
+        """Check the refusal of a withdrawal: no plant refuses that of an order that stands."""
+        self._check(False, now, "plant", f"the withdrawal of {owner}'s order is refused: {reason}")
+
+    def locked(self, owner: str, heliostats: Sequence[str], now: float) -> None:
+        """Note that a person has locked heliostats."""
+        for name in heliostats:
+            self._locks.setdefault(name, _Lock()).owners[owner] = now
+
+    def written(self, heliostat: str, what: str, now: float) -> None:
+        """Check that nothing is written to a locked heliostat: its next STOW would move it."""
+        lock = self._locks.get(heliostat)
+        since = now - min(lock.owners.values()) if lock is not None else 0.0
+        saw = f"{what} is sent to it {since:.1f} s after it was locked"
+        self._check(since <= UNDER_WAY, now, heliostat, saw)
+
+    def returned(self, owner: str, heliostats: Sequence[str]) -> None:
+        """Note that a person's locks are returned, by that person or by an engineer."""
+        for name in heliostats:
+            lock = self._locks.get(name, _Lock())
+            lock.owners.pop(owner, None)
+            if not lock.owners:
+                self._locks.pop(name, None)
+
+    @property
+    def sure(self) -> bool:
+        """Whether the plant's store has the locks of now."""
+        return self._confirmed
+
+    @property
+    def locks(self) -> dict[str, tuple[str, ...]]:
+        """Owners of the locks on each heliostat."""
+        return {name: tuple(lock.owners) for name, lock in self._locks.items()}
+
+    @property
+    def parked(self) -> tuple[str, ...]:
+        """Heliostats that are locked and stand still at stow, so that somebody may be at them."""
+        return tuple(name for name, lock in self._locks.items() if lock.place is not None)
+
+    # -- the plant's store ---------------------------------------------------------------------
+
+    def words(self) -> Words:
+        """Return what stands now: a backup of the plant's store that is made now has it."""
+        return Words(dict(self.orders), self.locks)
+
+    def restored(self, words: Words, now: float) -> None:
+        """Note that the plant's store is a backup: it has the orders of that time.
+
+        The locks of now go on, until persons have confirmed what the store has (`confirmed`).
+        """
+        self.orders = {owner: (act, now) for owner, (act, _) in words.orders.items()}
+        self._confirmed = False
+
+    def confirmed(self) -> None:
+        """Note that persons have put their locks again, and returned old ones."""
+        self._confirmed = True
+
+    def forget(self) -> None:
+        """Forget all: the plant had no store, and has ended."""
+        self.orders, self._locks = {}, {}
+
+    # -- judgement -----------------------------------------------------------------------------
+
+    def look(self, plant: PlantController | None, now: float) -> None:
+        """Judge orders and locks; None: the plant's program does not run."""
+        if plant is not self._plant:
+            self._plant, self._since = plant, now
+        if plant is not None and now - self._since > RECALLED_WITHIN:
+            self._stands(plant, now)
+            if self._confirmed:
+                self._shown(plant, now)
+        if self._alone:
+            self._down(now)
+        for name, lock in self._locks.items():
+            self._still(name, lock, now)
+
+    def _stands(self, plant: PlantController, now: float) -> None:
+        """Check that each order stands under its owner's name, and that no other does."""
+        shown = {call.who for call in plant.calls}
+        for owner, (act, at) in self.orders.items():
+            if now - at <= SHOWN_WITHIN:
+                continue
+            saw = f"{owner} ordered {act.name} {now - at:.1f} s ago and has not withdrawn it, and "
+            self._check(owner in shown, now, "plant", f"{saw}the plant names no such order")
+            order = plant.emergency
+            holds = plant.emergency_on and order is not None and order.act >= act
+            does = f"{order.act.name} holds" if order and plant.emergency_on else "none holds"
+            self._check(holds, now, "plant", f"{saw}{does}")
+        for owner in shown:
+            saw = f"an emergency order of {owner} stands, which is withdrawn"
+            self._check(owner in self.orders, now, "plant", saw)
+
+    def _shown(self, plant: PlantController, now: float) -> None:
+        """Check that the plant has the locks of each person, and no others."""
+        here = {(lock.name, lock.who) for lock in plant.lockouts}
+        wanted = {(name, owner) for name, lock in self._locks.items() for owner in lock.owners}
+        for name, owner in sorted(wanted ^ here):
+            what = "is not there" if (name, owner) in wanted else "is there, and was returned"
+            self._check(False, now, name, f"the lock of {owner} {what}")
+        self._check(True, now, "plant", "")
+
+    def _down(self, now: float) -> None:
+        """Check that no mirror is up while somebody's order stands."""
+        if not self.orders:
+            return
+        owner, (act, at) = min(self.orders.items(), key=lambda each: each[1][1])
+        for name, board in self._boards.items():
+            saw = f"{states.STATES[board.state]} {now - at:.1f} s after {owner} ordered {act.name}"
+            self._check(now - at <= DOWN_WITHIN or board.state not in _UP, now, name, saw)
+
+    def _still(self, name: str, lock: _Lock, now: float) -> None:
+        """Check that a locked heliostat stands still once it has come to stow."""
+        board = self._boards[name]
+        if board.node is None:
+            return
+        one, two = (axis.turned for axis in board.axes)
+        rests = all(axis.idle for axis in board.axes)
+        if board.node is not lock.node or lock.place is None:
+            lock.node, lock.place = board.node, None
+            since = min(lock.owners.values())
+            if rests and board.state == states.STOWED and now - since > UNDER_WAY:
+                lock.place = one, two
+            return
+        moved = max(abs(one - lock.place[0]), abs(two - lock.place[1]))
+        saw = f"{states.STATES[board.state]}, {moved} steps from where it stood when it was locked "
+        saw += f"by {', '.join(lock.owners)}"
+        self._check(moved <= STANDS, now, name, saw)

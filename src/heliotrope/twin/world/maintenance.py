@@ -1,0 +1,176 @@
+"""Persons who work at the mirrors of the world "repairs": they lock, return, write and mend.
+
+Two of them lock mirrors, each with a lock of their own, mostly one that the other has locked too.
+They try to write to what is locked, declare the step counts of boards that do not know them, and
+confirm what a restored store has.
+"""
+
+import math
+import random
+from collections.abc import Sequence
+
+import numpy as np
+
+from heliotrope.links.clock import Clock
+from heliotrope.mechanism.board_items import packed
+from heliotrope.plant.authority import Person
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.lockouts import TOWER, Kind
+from heliotrope.plant.operations.service import Service
+from heliotrope.store.backup import OWNER
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.outfit import MACHINE
+from heliotrope.twin.invariants.beams import BeamObserver
+from heliotrope.twin.invariants.plant_observer import MOMENT, PlantObserver
+from heliotrope.twin.world.operator import ENGINEER, OPERATOR, VIEWER, Operator
+
+#: Share of the locks that are put on a mirror which somebody has locked already.
+_AGAIN = 0.6
+#: Chance that persons wait once more before they confirm what a restored store has.
+_LATER = 0.5
+#: Share of these writes that are stow positions; a board at stow refuses other counts itself.
+_STOWS = 0.8
+#: A stow position, or counts, that persons write to a locked mirror differ by this, steps.
+_OTHER = 2500
+
+
+class Maintenance:
+    """The persons at the mirrors.
+
+    Parameters
+    ----------
+    operator
+        The persons who command; one of them writes and declares counts.
+    observer, beams
+        Told of what the plant accepts.
+    boards
+        All heliostats.
+    clock
+        True time.
+    seed
+        Seed of what they do.
+
+    Attributes
+    ----------
+    service
+        Locks of the plant's program, set by the owner; None while it does not run.
+    """
+
+    def __init__(
+        self,
+        operator: Operator,
+        observer: PlantObserver,
+        beams: BeamObserver,
+        boards: Sequence[Board],
+        clock: Clock,
+        seed: int,
+    ) -> None:
+        self.service: Service | None = None
+        self._operator, self._observer, self._beams = operator, observer, beams
+        self._boards, self._clock = tuple(boards), clock
+        self._names = tuple(board.outfit.name for board in boards)
+        self._chance = random.Random(f"maintenance {seed}")
+        self._persons = operator.persons
+        self._put_at, self._written = -math.inf, ""
+
+    def acts(self, plant: PlantController) -> None:
+        """Do one thing."""
+        if self.service is None:
+            return
+        if self._written:
+            self._operator.safe(plant, "STOW", self._written)
+            self._written = ""
+            return
+        does = self._chance.choice(["lock", "lock", "return", "write", "write", "mend", "two off"])
+        if does == "lock":
+            self._locks(self.service)
+        elif does == "two off":
+            self._takes_off(plant)
+        elif does == "return":
+            self._returns(self.service)
+        elif does == "write" and self._persons.parked:
+            self._writes(plant, self._chance.choice(self._persons.parked))
+        elif does == "write":
+            self._locks(self.service)
+        else:
+            self._mends(plant)
+
+    def _locks(self, service: Service) -> None:
+        """Take a mirror out of service, mostly one that another person has locked."""
+        locked = sorted(self._persons.locks)
+        again = locked and self._chance.random() < _AGAIN
+        name = self._chance.choice(locked if again else self._names)
+        self._puts(service, self._chance.choice([OPERATOR, ENGINEER]), name)
+
+    def _puts(self, service: Service, person: Person, name: str) -> None:
+        if self._clock.monotonic() - self._put_at < MOMENT:
+            return  # the plant takes the same order of a moment for one
+        self._put_at = self._clock.monotonic()
+        concerned = service.take(person, [(Kind.HELIOSTAT, name)], "washing", math.nan)
+        now = self._clock.monotonic()
+        self._persons.locked(person.name, (name,), now)
+        self._beams.taken(concerned)
+        self._observer.obeyed(person.name, "STOW", now)
+        self._operator.counts["locks"] += 1
+
+    def _returns(self, service: Service) -> None:
+        """Return a lock: its owner does."""
+        locks = self._persons.locks
+        if locks and self._persons.sure:
+            name = self._chance.choice(sorted(locks))
+            owner = self._chance.choice(sorted(locks[name]))
+            self._gives_back(service, Kind.HELIOSTAT, name, owner)
+            self._persons.returned(owner, (name,))
+
+    def _gives_back(self, service: Service, kind: Kind, name: str, owner: str) -> None:
+        service.give_back(OPERATOR if owner == OPERATOR.name else ENGINEER, [(kind, name)], owner)
+        self._operator.counts["locks returned"] += 1
+
+    def confirms(self, plant: PlantController) -> None:
+        """Do what a restored store asks for: put the locks of now, and return those of then.
+
+        The last one is that on the tower; then the standby points are given again.
+        """
+        service = self.service
+        asks = service is not None and any(lock.who == OWNER for lock in service.out)
+        if service is None or not asks or self._chance.random() < _LATER:
+            return
+        there = {(lock.name, lock.who) for lock in service.out if lock.who != OWNER}
+        here = {(name, owner) for name, some in self._persons.locks.items() for owner in some}
+        if missing := sorted(here - there):
+            name, owner = missing[0]
+            self._puts(service, ENGINEER if owner == ENGINEER.name else OPERATOR, name)
+            return
+        for name, owner in sorted(there - here):
+            self._gives_back(service, Kind.HELIOSTAT, name, owner)
+        self._gives_back(service, Kind.TOWER, TOWER, OWNER)
+        self._persons.confirmed()
+        self._operator.give(plant, "STANDBY")
+
+    def _writes(self, plant: PlantController, name: str) -> None:
+        """Write another stow position, or other counts, to a locked mirror; later it goes to stow.
+
+        The plant must refuse both: the mirror would turn under the hands of whoever is at it.
+        """
+        steps = [self._chance.choice([-_OTHER, _OTHER]) for _ in range(2)]
+        if self._chance.random() < _STOWS:
+            stow = (MACHINE.stow[0] + steps[0], MACHINE.stow[1] + steps[1])
+            self._operator.push(plant, name, {"stow": packed("stow", stow)})
+        else:
+            counts = plant.field.counts(np.array([plant.field.place(name)]))[0] + steps
+            self._operator.zero(plant, name, [int(each) for each in counts])
+        self._written = name
+
+    def _takes_off(self, plant: PlantController) -> None:
+        """Take two mirrors off by one order, of which a cluster may know one only."""
+        names = self._chance.sample(self._names, min(2, len(self._names)))
+        ticket = plant.defocus(VIEWER.name, names)
+        self._observer.obeyed(VIEWER.name, "DEFOCUS", self._clock.monotonic(), ticket.identity)
+
+    def _mends(self, plant: PlantController) -> None:
+        """Declare the true step counts of a mirror that does not know them."""
+        board = self._chance.choice(self._boards)
+        rests = all(axis.idle for axis in board.axes)
+        if board.node is not None and not board.node.controller.motion.known and rests:
+            place = [axis.turned for axis in board.axes]
+            self._operator.zero(plant, board.outfit.name, place)
