@@ -257,6 +257,9 @@ def test_broadcasting() -> None:
     assert (one.angles == found.angles[:, 2]).all()
     empty = track(field[:0], suns[0], (0.0, 0.0, 90.0))
     assert empty.angles.shape == (0, 2, 2)
+    # An armature of no mirror has the drives that it is given.
+    bare = track(field[:0].armature, suns[0], (0.0, 0.0, 90.0), drives=field[:0].drives)
+    assert bare.angles.shape == (0, 2, 2)
     assert found.chosen(found.normal).shape == (6, 4, 3)
 
 

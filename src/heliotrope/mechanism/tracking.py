@@ -381,7 +381,9 @@ def _tables(mechanism: Steered | Armature, drives: Drive | None) -> tuple[Armatu
         )
     if isinstance(mechanism, Armature):
         armature = mechanism
-        own = np.stack([direct().table] * (2 if armature.axis_2.any() else 1))
+        # A single axis has none to turn the second; no mirror at all says nothing.
+        single = armature.axis_2.size > 0 and not armature.axis_2.any()
+        own = np.stack([direct().table] * (1 if single else 2))
     else:
         armature, own = mechanism.armature, mechanism.drives.table
     table = own if drives is None else drives.table

@@ -71,7 +71,7 @@ from heliotrope.twin.world.instruments import READINGS, Instruments
 from heliotrope.twin.world.maintenance import Maintenance
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
-from heliotrope.twin.world.scene import scene_of
+from heliotrope.twin.world.scene import Scene, scene_of
 from heliotrope.twin.world.shift import Shift, Working
 from heliotrope.twin.world.store import PlantStore
 from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
@@ -311,21 +311,7 @@ class Simulation:
         ]
         self.boards = [self._board(each) for each in stored]
         self.pods = self._new_pods()
-        alone = "twice" not in plan.worlds
-        self.persons = PersonsObserver(self.begin, self.boards, alone=alone)
-        boards = {pod.name: pod.boards for pod in self.pods}
-        most = LOSSES if works(plan.worlds) else None
-        self.beams = BeamObserver(self.begin, boards, self.sun, scene.keep_outs, most, self._astray)
-        self.beams.contradicted = COMMON in plan.worlds
-        self.readings = SensorObserver(self.begin, boards)
-        self.alarms = AlarmObserver(self.begin, boards, plan.worlds)
-        accounts = {each.name: each for pod in self.pods for each in pod.observer.accounts}
-        self.tickets = TicketObserver(self.begin, accounts)
-        self.quiet = self._quiet_observer()
-        for pod in self.pods:
-            if self.quiet is not None:
-                pod.answers.quiet = self.quiet.calm
-        self.instruments = Instruments(self._clock, plan.seed, self._flux, self.readings)
+        self._observe(scene)
         self._measured = measured(plan.worlds)
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
         together = parties(plan.worlds)
@@ -343,6 +329,32 @@ class Simulation:
             self._assigned, self._emergency = self._store.points, self._store.keeper
         self._assigned.keep({"STANDBY": {each.name: STANDBY for each in fits}})
         self.disk = RecordsDisk()
+        self._employ(fits, scene)
+        self.plant: PlantController | None = None
+        self._program: list[asyncio.Task[None]] = []
+
+    def _observe(self, scene: Scene) -> None:
+        """Let observers see boards, beams, sensors, alarms and persons."""
+        plan = self.plan
+        alone = "twice" not in plan.worlds
+        self.persons = PersonsObserver(self.begin, self.boards, alone=alone)
+        boards = {pod.name: pod.boards for pod in self.pods}
+        most = LOSSES if works(plan.worlds) else None
+        self.beams = BeamObserver(self.begin, boards, self.sun, scene.keep_outs, most, self._astray)
+        self.beams.contradicted = COMMON in plan.worlds
+        self.readings = SensorObserver(self.begin, boards)
+        self.alarms = AlarmObserver(self.begin, boards, plan.worlds)
+        accounts = {each.name: each for pod in self.pods for each in pod.observer.accounts}
+        self.tickets = TicketObserver(self.begin, accounts)
+        self.quiet = self._quiet_observer()
+        for pod in self.pods:
+            if self.quiet is not None:
+                pod.answers.quiet = self.quiet.calm
+        self.instruments = Instruments(self._clock, plan.seed, self._flux, self.readings)
+
+    def _employ(self, fits: Sequence[Outfit], scene: Scene) -> None:
+        """Let persons, automatic control and the tour work at the plant, before its observer."""
+        plan = self.plan
         observers = [pod.observer for pod in self.pods]
         self.observer = PlantObserver(
             self.begin, self.disk, SETTINGS, observers, automatic=works(plan.worlds)
@@ -362,8 +374,6 @@ class Simulation:
                 self.operator, self.observer, self.boards, self._clock, self.sun, plan.seed
             )
         self._second = self._second_plant(fits) if "twice" in plan.worlds else None
-        self.plant: PlantController | None = None
-        self._program: list[asyncio.Task[None]] = []
         for pod in self.pods:
             pod.plant = self.observer
 
