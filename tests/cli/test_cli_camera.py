@@ -296,7 +296,10 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
         ((*TEACH, *points(), "--size", "0"), "size 0.0 m; give metres above 0"),
         ((*TEACH, *points(), "--size", "1", "--size", "2"), "'2': given twice"),
         ((*TEACH, *points(), "--size", "dot=1", "--size", "dot=2"), "given twice for point dot"),
-        ((*TEACH, *points(), "--sigma-px", "0"), "sigma 0.0 px; give a standard deviation above 0"),
+        (
+            (*TEACH, *points(), "--sigma-px", "0"),
+            "--sigma-px '0': give a number from 0.001 to 1,000",
+        ),
         ((*TEACH, *points(), "--out", "plant.xml"), "plant.xml: only plant files (TOML)"),
         ((*TEACH, *points(), "--out", "no/plant.toml"), "folder no does not exist; make it first"),
         (
@@ -358,7 +361,7 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
                 "--square",
                 "-1",
             ),
-            "squares of -1.0 m; give their side in metres, above 0",
+            "--square '-1': give a number from 0.001 to 100",
         ),
         (
             (

@@ -88,7 +88,7 @@ app.command()(demo)
 def main() -> None:
     """Run the command line; bad input ends with one line on standard error and exit code 2."""
     try:
-        sys.exit(app(standalone_mode=False) or 0)
+        sys.exit(app(prog_name="heliotrope", standalone_mode=False) or 0)
     except TyperException as error:
         line = refusal(error)
         print(error.message if line is None else f"heliotrope: {line}", file=sys.stderr)
