@@ -70,6 +70,7 @@ def test_an_emergency_in_a_joint_visit_leaves_nothing_locked(
     page.wait_for_selector(".hx-alert.on:has-text('done 12')")
     page.click(".hx-alert >> text=Withdraw")
     page.click("dialog >> text='Withdraw'")
+    page.wait_for_selector(".hx-alert >> text=acknowledge its alarms")
     field.calm()
     page.wait_for_function("!document.querySelector('.hx-alert.on')")
     page.click(".hx-tabs >> text=Calibration")

@@ -76,7 +76,7 @@ function alert(box) {
     box.classList.toggle("on", now.emergency || Boolean(now.resume));
     box.classList.toggle("waits", !now.emergency);
     back.hidden = !now.emergency || !now.order.calls.length; resume.hidden = !now.resume;
-    text.textContent = now.emergency ? `EMERGENCY ${now.order.act} by ${now.order.calls.length ? now.order.calls.map((call) => `${call.who} (${call.reason})`).join(", ") : now.order.who || "the safety table"} · acknowledged ${count(now.order.acknowledged)} of ${count(now.order.heliostats)} · done ${count(now.order.done)} · ${now.order.basis}` : now.resume;
+    text.textContent = now.emergency ? `EMERGENCY ${now.order.act} by ${now.order.calls.length ? now.order.calls.map((call) => `${call.who} (${call.reason})`).join(", ") : now.order.who || "the safety table"} · acknowledged ${count(now.order.acknowledged)} of ${count(now.order.heliostats)} · done ${count(now.order.done)} · ${now.order.basis}${now.order.calls.length ? "" : " · acknowledge its alarms (tab Alarms) when their causes have gone"}` : now.resume;
   });
 }
 
