@@ -82,6 +82,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "ctl automatic": ("A1",),
     "ctl stow": ("A1",),
     "ctl defocus": ("A1",),
+    "ctl timetable": ("a", "A1"),
 }  # fmt: skip
 #: Commands whose right values compute for seconds: left to the slow test.
 SLOW = {
