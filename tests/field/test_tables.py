@@ -573,3 +573,15 @@ def test_messages_do_not_begin_with_an_empty_name() -> None:
         Site(95, 0, 0)
     with pytest.raises(InputError, match=r"^site 'A': latitude_deg = 95"):
         Site(95, 0, 0, name="A")
+
+
+def test_a_site_of_another_type_is_refused_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"\(36\.1, -5\.2, 10\.0\) is not a Site; give Site\(lat"):
+        open_plant(tmp_path / "layout.csv", site=(36.1, -5.2, 10.0))  # type: ignore[arg-type]
+
+
+def test_a_layout_with_two_heliostats_at_one_place_is_refused_with_its_file(tmp_path: Path) -> None:
+    layout = tmp_path / "layout.csv"
+    layout.write_text("id,x,y,z\nA,10,20,0\nB,10,20,0\n")
+    with pytest.raises(FormatError, match=r"layout\.csv: heliostats A and B stand at one place"):
+        open_plant(layout, site=SITE)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from heliotrope.errors import FormatError
+from heliotrope.errors import FormatError, InputError
 from heliotrope.field.formats import heliok, opencsp, solarpilot
 from heliotrope.field.plant import Plant
 from heliotrope.sun import Site
@@ -43,8 +43,28 @@ def open_plant(
     FormatError
         If it does not exist, cannot be used, or needs a site; the text names file, place, value
         and limit.
+    InputError
+        If ``site`` is something else.
     """
     place = Path(path)
+    if site is not None and not isinstance(site, Site):
+        raise InputError(
+            f"site: {site!r} is not a Site; give Site(latitude_deg, longitude_deg, height)"
+        )
+    try:
+        return _read(place, site, centroids, templates)
+    except FormatError:
+        raise
+    except InputError as error:
+        raise FormatError(place, str(error)) from error
+
+
+def _read(
+    place: Path,
+    site: Site | None,
+    centroids: str | Path | None,
+    templates: Mapping[int, solarpilot.Template] | None,
+) -> Plant:
     if place.is_dir():
         # These readers load libraries that an opener of another format does not need.
         from heliotrope.field.formats import paint
