@@ -257,6 +257,8 @@ class BeamObserver:
             mirror = self._mirrors[name]
             mirror.ordered_at = mirror.off_at = now
             mirror.seen_up &= not mirror.up  # what is up leaves by this order, and is not lost
+            if mirror.state == states.LOCKED:  # it has left when it is unlocked, unless it is IDLE
+                mirror.reports = 0
 
     def resumed(self, heliostats: Iterable[str], what: str, now: float) -> None:
         """Note a command of a person that the plant has accepted."""
@@ -295,7 +297,8 @@ class BeamObserver:
             mirror, age = self._mirrors.get(name), 1e-3 * int(row["heard_ms"])
             if mirror is None:
                 continue  # the cluster's file names none like it
-            if age <= _HEARD and now - age >= mirror.changed_at:
+            locked = mirror.state == states.LOCKED
+            if not locked and age <= _HEARD and now - age >= mirror.changed_at:
                 mirror.reports += 1
                 if mirror.reports == REPORTS:
                     self._known(mirror, now)
