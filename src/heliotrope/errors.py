@@ -14,6 +14,7 @@ to do. The outcome of a solver (unreachable, not converged) is a value with a te
 never an exception.
 """
 
+import numbers
 import re
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -50,6 +51,19 @@ class HeliotropeError(Exception):
 
 class InputError(HeliotropeError, ValueError):
     """A value, a file or an argument that cannot be used."""
+
+
+def require(name: str, value: object, kind: type | tuple[type, ...], advice: str) -> None:
+    """Refuse an argument of another type, by its name.
+
+    Raises
+    ------
+    InputError
+        The text says what it is, and the advice: what to give.
+    """
+    counted = kind in (numbers.Integral, numbers.Real) and isinstance(value, bool)
+    if counted or not isinstance(value, kind):
+        raise InputError(f"{name} is {kind_of(value)}, {shown(value)}; give {advice}")
 
 
 class FormatError(InputError):

@@ -3,6 +3,7 @@
 import json
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -575,7 +576,7 @@ def test_warnings_of_check(tmp_path: Path) -> None:
     texts = [f.text for f in plant_file.check_plant(tmp_path / "p.toml")]
     assert any("no receiver" in t for t in texts)
     assert any("1 pairs of mirrors can touch: the nearest, A and B" in t for t in texts)
-    assert any("1 heliostats stand behind its plane" in t for t in texts)
+    assert any("1 of 3 heliostats stand behind its plane" in t for t in texts)
 
 
 def receiver_document(folder: Path, more: str = "") -> Path:
@@ -676,3 +677,41 @@ CORNERS = example_plant().targets[0].corners
 def test_guards(make, text: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(InputError, match=text):
         make()
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"center": (-19.0, -20.0, 1.0)}, "receiver receiver: its centre is 0."),
+        ({"center": (0.0, 0.0, -16.5)}, "its centre, -16.50 m up, is below every heliostat"),
+        ({"normal": (0.0, 1.0, 0.0)}, "18 of 18 heliostats stand behind its plane"),
+        ({"center": (0.0, 0.0, 13.0)}, "target and receiver have one centre"),
+    ],
+)
+def test_check_names_a_receiver_that_cannot_be_meant(
+    changed: dict[str, Any], says: str, tmp_path: Path
+) -> None:
+    plant = example_plant()
+    (receiver,) = plant.receivers
+    if says.startswith("receiver"):
+        changed = {"center": plant.position[0] + (0.0, 0.0, 0.5)}
+    plant_file.write_plant(
+        replace(plant, receivers=(replace(receiver, **changed),)), tmp_path / "p.toml"
+    )
+    texts = [f.text for f in plant_file.check_plant(tmp_path / "p.toml")]
+    assert [text for text in texts if says in text], texts
+
+
+def test_check_names_a_target_that_stands_on_its_head(tmp_path: Path) -> None:
+    plant = example_plant()
+    (target,) = plant.targets
+    turned = replace(target, corners=target.corners[[2, 3, 0, 1]])
+    plant_file.write_plant(replace(plant, targets=(turned,)), tmp_path / "p.toml")
+    texts = [f.text for f in plant_file.check_plant(tmp_path / "p.toml")]
+    assert any("its upper corners lie below its lower ones" in text for text in texts), texts
+
+
+def test_an_aim_point_beside_its_target_is_refused() -> None:
+    (target,) = example_plant().targets
+    with pytest.raises(InputError, match=r"its center lies 17\.00 m from the middle"):
+        replace(target, center=target.center + (0.0, 0.0, 17.0))

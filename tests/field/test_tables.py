@@ -5,6 +5,7 @@ import errno
 import io
 import json
 import os
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,7 @@ from heliotrope.field.example import example_plant
 from heliotrope.field.formats import open_plant, opencsp, solarpilot
 from heliotrope.field.formats.measurements import _read_table as read_measured
 from heliotrope.field.formats.plant_edit import values
-from heliotrope.field.formats.plant_file import check_plant, read_plant
+from heliotrope.field.formats.plant_file import check_plant, read_plant, write_plant
 from heliotrope.field.target import Target
 from heliotrope.files.cells import check_names
 from heliotrope.files.text import write_file
@@ -576,7 +577,7 @@ def test_messages_do_not_begin_with_an_empty_name() -> None:
 
 
 def test_a_site_of_another_type_is_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"\(36\.1, -5\.2, 10\.0\) is not a Site; give Site\(lat"):
+    with pytest.raises(InputError, match=r"site is a tuple, \(36.1, -5.2, 10.0\); give Site\(lat"):
         open_plant(tmp_path / "layout.csv", site=(36.1, -5.2, 10.0))  # type: ignore[arg-type]
 
 
@@ -585,3 +586,37 @@ def test_a_layout_with_two_heliostats_at_one_place_is_refused_with_its_file(tmp_
     layout.write_text("id,x,y,z\nA,10,20,0\nB,10,20,0\n")
     with pytest.raises(FormatError, match=r"layout\.csv: heliostats A and B stand at one place"):
         open_plant(layout, site=SITE)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("id,x,y,z,units\nA,10,20,0,ft\n", "a column of units is not read; give metres"),
+        ("1,10,20,0\n2,30,20,0\n", "each row has another number in column 1, as ids have"),
+        ("id,x_mm,y_mm,z_mm\nA,10,20,0\n", "column x_mm is in mm; give m"),
+        ("id,x/m,y/km,z/m\nA,10,20,0\n", "column y/km is in km; give m"),
+        ("id,x,y,z\nA,10m,20m,0m\n", "'10m' has more than a number: give metres without"),
+    ],
+)
+def test_units_and_ids_of_a_layout_are_not_guessed(tmp_path: Path, text: str, says: str) -> None:
+    (tmp_path / "layout.csv").write_text(text)
+    with pytest.raises(FormatError, match=re.escape(says)):
+        open_plant(tmp_path / "layout.csv", site=SITE)
+
+
+def test_a_layout_with_metres_and_degrees_says_which_it_reads(tmp_path: Path) -> None:
+    layout = tmp_path / "both.csv"
+    layout.write_text("id,x,y,z,lat,lon,alt\nA,10,20,0,50,6,80\nB,30,20,0,50,6,80\n")
+    plant = open_plant(layout, site=SITE)
+    assert plant.notes["columns not read"] == "lat, lon, alt"
+
+
+def test_an_argument_that_a_format_has_no_use_for_is_refused(tmp_path: Path) -> None:
+    plant = tmp_path / "plant.toml"
+    write_plant(example_plant(), plant)
+    with pytest.raises(FormatError, match="site is given, but files of this format"):
+        open_plant(plant, site=SITE)
+    layout = tmp_path / "layout.csv"
+    layout.write_text("id,x,y,z\nA,10,20,0\n")
+    with pytest.raises(FormatError, match="centroids is given"):
+        open_plant(layout, site=SITE, centroids=layout)

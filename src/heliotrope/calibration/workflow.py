@@ -4,6 +4,8 @@
 `evaluate` only tests how well held-out sightings are predicted.
 """
 
+import math
+import numbers
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,7 +33,7 @@ from heliotrope.calibration.plausibility import Judgement, judge_in
 from heliotrope.calibration.report.content import CalibrationReport
 from heliotrope.calibration.sighting_table import read_sightings
 from heliotrope.calibration.sightings import Sightings, of_measurements
-from heliotrope.errors import FormatError, InputError
+from heliotrope.errors import FormatError, InputError, require, shown
 from heliotrope.field.formats import measurements
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
@@ -104,7 +106,15 @@ def read_field_sightings(
     FormatError
         If no measurement can be used.
     """
+    require("plant", plant, Plant, "a plant, as from heliotrope.open")
+    require("place", place, (str, Path), "the file or folder that the plant was read from")
     place = Path(place)
+    if centroid not in ("utis", "helios"):
+        raise InputError(f"centroid {shown(centroid)}: give 'utis' or 'helios'")
+    if now is not None:
+        require("now", now, numbers.Real, "Unix seconds")
+        if not math.isfinite(now):
+            raise InputError(f"now is {now}; give Unix seconds")
     if table is not None:
         found = _read_table(plant, place, Path(table), now)
     elif place.is_dir():
@@ -354,6 +364,11 @@ def calibrate(
     fraction
         Share to learn from when testing; 1: no test.
     """
+    require("field", field, FieldSightings, "what read_field_sightings returns")
+    require("fraction", fraction, numbers.Real, "a share from 0 to 1")
+    require("seed", seed, numbers.Integral, "a whole number, 0 or more")
+    if seed < 0:
+        raise InputError(f"seed {seed} is below 0; give a whole number, 0 or more")
     if fraction != 1.0:
         evaluation.check_fraction(fraction)
     names, mechanism = field.heliostats.names, field.heliostats.mechanism

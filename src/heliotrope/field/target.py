@@ -12,6 +12,9 @@ from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray, as_vectors, normalize
 from heliotrope.values import Card, Value, amount
 
+#: A target's aim point lies no further in front of or behind its corners, m.
+_DEPTH = 0.5
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Target(Value):
@@ -56,6 +59,14 @@ class Target(Value):
             raise InputError(
                 f"target {self.name}: its corners span no area; give four corners of a rectangle"
             )
+        away = center - corners.mean(axis=0)
+        across, up = np.abs(self.axes @ away)
+        depth = abs(float(away @ self.normal))
+        if across > 0.5 * self.width or up > 0.5 * self.height or depth > _DEPTH:
+            raise InputError(
+                f"target {self.name}: its center lies {np.linalg.norm(away):.2f} m from the middle "
+                "of its corners, outside them; it is the aim point on the target: correct one"
+            )
 
     def _card(self) -> Card:
         east, north, up = self.center
@@ -97,6 +108,11 @@ class Target(Value):
         """Unit normal out of the front, (3,)."""
         return normalize(np.cross(self._across, self._up))
 
+    @property
+    def upside_down(self) -> bool:
+        """Whether its upper edge is the lower one."""
+        return bool(self._up[2] < 0.0)
+
     @cached_property
     def axes(self) -> FloatArray:
         """Unit axes in the plane, to the right as seen from the front, and up, (2, 3)."""
@@ -111,7 +127,7 @@ class Target(Value):
         """Return ENU points (..., 3) from metres right of and above the center (..., 2)."""
         return self.center + np.asarray(plane, dtype=np.float64) @ self.axes
 
-    def holds(self, points: npt.ArrayLike, off: float = 0.5) -> npt.NDArray[np.bool_]:
+    def holds(self, points: npt.ArrayLike, off: float = _DEPTH) -> npt.NDArray[np.bool_]:
         """Return which points (..., 3), ENU, lie on the target; one that is not finite does not.
 
         They are within its border, and at most ``off`` m in front of or behind it.

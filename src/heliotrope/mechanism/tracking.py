@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import InputError, kind_of, shown
+from heliotrope.errors import InputError, kind_of, require, shown
 from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray, as_numbers, as_vectors, normalize, reflect
 from heliotrope.jit import as_input
@@ -244,6 +244,8 @@ def track(
     if branch not in ("both", 0, 1):
         raise InputError(f"branch {shown(branch)}: give 'both', 0 or 1")
     _check_settings(tolerance, max_iterations)
+    for name, value in (("local", local), ("newton", newton)):
+        require(name, value, (bool, np.bool_), "True or False")
     axes = table.shape[-2]
     now = None if current is None else _current(current, axes)
     batches = [armature.shape, table.shape[:-2], s.shape[:-1], p.shape[:-1]]

@@ -22,7 +22,7 @@ from heliotrope.calibration.fit import _fit_kernels as kernels
 from heliotrope.calibration.fit.residuals import whitening
 from heliotrope.calibration.named import Field, members
 from heliotrope.calibration.sightings import Sightings, ray_directions
-from heliotrope.errors import InputError, UnknownNameError, kind_of
+from heliotrope.errors import InputError, UnknownNameError, kind_of, require
 from heliotrope.frames import Framed, Labelled, Variable
 from heliotrope.geometry import (
     FloatArray,
@@ -423,6 +423,7 @@ def mask_of(given: npt.ArrayLike | None, rows: int, name: str) -> npt.NDArray[np
 def _priors(
     mechanism: Mechanism, names: tuple[str, ...], given: Mapping[str, npt.ArrayLike]
 ) -> FloatArray:
+    require("priors", given, Mapping, "standard deviations by name of the parameter")
     for name in given:
         mechanism.parameter(name)
     for name in names:

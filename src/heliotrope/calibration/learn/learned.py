@@ -22,7 +22,7 @@ from heliotrope.calibration.learn.unusable import is_usable
 from heliotrope.calibration.named import NOWHERE, Members, Surroundings
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.calibration.sightings import sightings as make_sightings
-from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.errors import InputError, UnknownNameError, require
 from heliotrope.field.target import Receiver, Target, point_of
 from heliotrope.frames import ACROSS, Framed, Labelled, Variable
 from heliotrope.frames import times as as_times
@@ -342,6 +342,7 @@ def predict(learned: Learned, sightings: Sightings) -> Prediction:
     sightings
         M of these heliostats, at any time.
     """
+    require("learned", learned, Learned, "what learn or calibrate returns")
     sightings = Members(learned.mechanism, learned.heliostats).rows_of(sightings)
     values, spread = learned.parameters_at(sightings.heliostat, sightings.time)
     return predict_with(learned, sightings, values, spread)

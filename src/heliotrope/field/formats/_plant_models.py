@@ -55,11 +55,11 @@ class PlantNameTable(StrictTable):
 class PlantSiteTable(StrictTable):
     """``[site]``: the origin of ENU, and its air."""
 
-    latitude_deg: Annotated[float, Field(ge=-90, le=90)]
-    longitude_deg: Annotated[float, Field(ge=-180, le=180)]
-    height_m: Annotated[float, Field(ge=-500, le=9000)] = 0.0
-    pressure_pa: Annotated[float, Field(ge=30e3, le=120e3)] | None = None
-    temperature_c: Annotated[float, Field(ge=-80, le=60)] = 12.0
+    latitude_deg: Annotated[float, Field(ge=-90, le=90, allow_inf_nan=False)]
+    longitude_deg: Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)]
+    height_m: Annotated[float, Field(ge=-500, le=9000, allow_inf_nan=False)] = 0.0
+    pressure_pa: Annotated[float, Field(ge=30e3, le=120e3, allow_inf_nan=False)] | None = None
+    temperature_c: Annotated[float, Field(ge=-80, le=60, allow_inf_nan=False)] = 12.0
     name: str = ""
     delta_t_s: Number | None = Field(None, description="TT - UT1; default from the date.")
 
@@ -99,8 +99,8 @@ class ReceiverTable(StrictTable):
     width_m: Positive
     height_m: Positive
     corners_m: Annotated[list[Vector], Field(min_length=4, max_length=4)] | None = None
-    radius_m: Annotated[float, Field(ge=0)] = 0.0
-    opening_angle_rad: Annotated[float, Field(ge=0)] = 0.0
+    radius_m: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    opening_angle_rad: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
 
 
 class CameraTable(StrictTable):
@@ -120,7 +120,7 @@ class CameraTable(StrictTable):
     )
     targets: list[str] = Field(default_factory=list)
     source: str = ""
-    deviation_px: Annotated[float, Field(ge=0)] = 0.0
+    deviation_px: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
 
 
 class BoxTable(StrictTable):
@@ -276,7 +276,7 @@ class MachineTable(StrictTable):
     )
     defocus_mrad: Pair | None = None
     defocus_rad: Pair | None = None
-    defocus_spread: Annotated[float, Field(ge=0.0, le=4.0)] = Field(
+    defocus_spread: Annotated[float, Field(ge=0.0, le=4.0, allow_inf_nan=False)] = Field(
         1.0,
         description="Each mirror turns by up to this many times more, so that their beams part; "
         "0: all by the same angles.",

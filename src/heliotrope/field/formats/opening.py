@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from heliotrope.errors import FormatError, InputError
+from heliotrope.errors import FormatError, InputError, require
 from heliotrope.field.formats import heliok, opencsp, solarpilot
 from heliotrope.field.plant import Plant
 from heliotrope.sun import Site
@@ -46,11 +46,12 @@ def open_plant(
     InputError
         If ``site`` is something else.
     """
+    require("path", path, (str, Path), "the path of a file or folder")
     place = Path(path)
-    if site is not None and not isinstance(site, Site):
-        raise InputError(
-            f"site: {site!r} is not a Site; give Site(latitude_deg, longitude_deg, height)"
-        )
+    if not str(path).strip():
+        raise InputError("path is empty; give the path of a file or folder")
+    if site is not None:
+        require("site", site, Site, "Site(latitude_deg, longitude_deg, height)")
     try:
         return _read(place, site, centroids, templates)
     except FormatError:
@@ -69,20 +70,25 @@ def _read(
         # These readers load libraries that an opener of another format does not need.
         from heliotrope.field.formats import paint
 
+        _refuse_unused(place, site=site, centroids=centroids, templates=templates)
         return paint.read_plant(place)
     if not place.exists():
         raise FormatError(place, "there is no such file; give a plant file or a folder")
     suffix = place.suffix.lower()
     if suffix == ".xml":
+        _refuse_unused(place, centroids=centroids, templates=templates)
         return _of_heliok(place, site)
     if suffix in _TABLES:
         if opencsp.is_field(place):
+            _refuse_unused(place, templates=templates)
             table = opencsp.read_field(place)
             known = None if centroids is None else opencsp.read_centroids(centroids)
             return opencsp.to_plant(table, _needed(place, site), known)
+        _refuse_unused(place, centroids=centroids)
         return _of_solarpilot(place, _needed(place, site), templates)
     from heliotrope.field.formats import plant_file
 
+    _refuse_unused(place, site=site, centroids=centroids, templates=templates)
     return plant_file.read_plant(place)
 
 
@@ -112,6 +118,15 @@ _GIVE = (
     "so the sun above it is unknown; give the site (site=Site(latitude, longitude, height), "
     "--site LATITUDE,LONGITUDE,HEIGHT)"
 )
+
+
+def _refuse_unused(place: Path, **arguments: object) -> None:
+    """Refuse an argument that the format of a file has no use for."""
+    for name, value in arguments.items():
+        if value is not None:
+            raise FormatError(
+                place, f"{name} is given, but files of this format have their own; leave it out"
+            )
 
 
 def _needed(place: Path, site: Site | None) -> Site:

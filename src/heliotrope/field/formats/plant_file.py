@@ -5,6 +5,7 @@ holds what differs: name, group, position, and any number of the group in a colu
 name. Files are written with every digit, so that a plant reads back exactly as it was.
 """
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -357,15 +358,50 @@ def _warnings(plant: Plant) -> list[str]:
     if len(plant) == 0:
         return [*found, "there are no heliostats"]
     found += _crowding(plant)
-    for surface in plant.targets:
-        behind = (plant.position - surface.center) @ surface.normal <= 0.0
-        if behind.any():
-            example = plant.names[int(np.flatnonzero(behind)[0])]
-            found.append(
-                f"target {surface.name}: {int(behind.sum())} heliostats stand behind its plane "
-                f"and cannot light it (for example {example})"
-            )
+    for surface in (*plant.targets, *plant.receivers):
+        found += _placing(plant, surface)
+    return found + _coinciding((*plant.targets, *plant.receivers))
+
+
+def _placing(plant: Plant, surface: Target | Receiver) -> list[str]:
+    """Return what is odd about where a surface stands and looks."""
+    what = f"{'target' if isinstance(surface, Target) else 'receiver'} {surface.name}"
+    found, lines = [], plant.position - surface.center
+    behind = lines @ surface.normal <= 0.0
+    if behind.any() and getattr(surface, "kind", "planar") == "planar":
+        example = plant.names[int(np.flatnonzero(behind)[0])]
+        found.append(
+            f"{what}: {int(behind.sum())} of {len(plant)} heliostats stand behind its plane "
+            f"and cannot light it (for example {example})"
+        )
+    nearest = int(np.argmin(np.linalg.norm(lines, axis=1)))
+    size = np.concatenate([np.hypot(g.width, g.height) for g in plant.groups.values()])
+    reach = 0.5 * (size[nearest] + np.hypot(surface.width, surface.height))
+    if np.linalg.norm(lines[nearest]) < reach:
+        found.append(
+            f"{what}: its centre is {np.linalg.norm(lines[nearest]):.2f} m from heliostat "
+            f"{plant.names[nearest]}, so that they touch; correct its center_m"
+        )
+    if surface.center[2] < plant.position[:, 2].min():
+        found.append(
+            f"{what}: its centre, {surface.center[2]:.2f} m up, is below every heliostat; "
+            "correct its center_m (metres above the site's height)"
+        )
+    if isinstance(surface, Target) and surface.upside_down:
+        found.append(
+            f"{what}: its upper corners lie below its lower ones, so photographs are read turned "
+            "by 180°; give upper left, upper right, lower right, lower left as seen from the front"
+        )
     return found
+
+
+def _coinciding(surfaces: Sequence[Target | Receiver]) -> list[str]:
+    """Return which surfaces have one centre."""
+    return [
+        f"{one.name} and {other.name} have one centre; correct one, or leave it out"
+        for one, other in itertools.combinations(surfaces, 2)
+        if np.linalg.norm(one.center - other.center) < 0.01
+    ]
 
 
 def _crowding(plant: Plant) -> list[str]:

@@ -83,7 +83,9 @@ _KNOWN = {n: (meaning, k) for meaning, ns in _NAMES.items() for k, n in enumerat
 _THREE = {"cantvect": "ijk", "cant": "ijk", "aim": "xyz", "aimpt": "xyz"}
 _METRES, _DEGREES = ("x", "y", "z"), ("latitude", "longitude", "altitude")
 _GROUPS = (("focus x", "focus y"), ("cant i", "cant j", "cant k"), ("aim x", "aim y", "aim z"))
-_UNIT = re.compile(r"\s*(?:[\[(<]\s*(.*?)\s*[\])>]|_(m|mm|cm|km|ft|deg|rad))\s*", re.IGNORECASE)
+_UNIT = re.compile(r"\s*(?:[\[(<]\s*(.*?)\s*[\])>]|[_/](mm|cm|km|m|ft|deg|rad))\s*", re.IGNORECASE)
+#: A cell that begins as a number does.
+_NUMBERED = re.compile(r"[-+]?\d")
 _EXAMPLE = (
     "give id,x,y,z (m east, north, up), id,latitude,longitude,altitude (degrees, m), or the "
     "columns of SolarPILOT"
@@ -196,7 +198,7 @@ def read_layout(path: str | Path, site: Site | None = None) -> Layout:
         tuple(name for name in rows.columns if name not in columns.values()),
     )
     rows.refuse_bad()
-    if first == 0 and len(layout) > 2 and len(set(layout.template)) == len(layout):
+    if first == 0 and len(layout) > 1 and len(set(layout.template)) == len(layout):
         raise FormatError(
             file,
             "each row has another number in column 1, as ids have, but without a header it is the "
@@ -232,7 +234,10 @@ def _by_header(file: Path, place: str, head: list[list[str]]) -> tuple[list[str]
     width = max(k + 1 for cells in head for k, cell in enumerate(cells) if cell)
     names, units = ([*row, *[""] * width][:width] for row in (head[0], (*head[1:2], [])[0]))
     if len(head) > 2 or not all(_UNIT.fullmatch(unit) for unit in units if unit):
-        raise FormatError(file, f"no number below the header; {_EXAMPLE}", place)
+        cell = next((cell for cells in head[1:] for cell in cells if _NUMBERED.match(cell)), "")
+        units = f" ({cell!r:.30} has more than a number: give metres without their unit)"
+        text = f"no number below the header{units if cell else ''}; {_EXAMPLE}"
+        raise FormatError(file, text, place)
     header: list[str] = []
     found: dict[str, list[tuple[int, str]]] = {}
     for cell, below in zip(names, units, strict=True):
@@ -254,6 +259,9 @@ def _by_header(file: Path, place: str, head: list[list[str]]) -> tuple[list[str]
     if {"group", "eastm"} <= {_form(name) for name in names} | unknown:
         text = "this is the table of a plant file; open the plant file (.toml) that names it"
         raise FormatError(file, text, place)
+    if unknown & {"unit", "units"}:
+        text = "a column of units is not read; give metres, or degrees and metres, and leave it out"
+        raise FormatError(file, text, place)
     for meaning, all_ in found.items():
         all_.sort()
         if len(all_) > 1 and (meaning != "name" or all_[0][0] == all_[1][0]):
@@ -262,6 +270,9 @@ def _by_header(file: Path, place: str, head: list[list[str]]) -> tuple[list[str]
     if not any(all(axis in columns for axis in axes) for axes in (_METRES, _DEGREES)):
         shown = ", ".join(name[:30] for name in names[:8])
         raise FormatError(file, f"the header ({shown}) gives no positions; {_EXAMPLE}", place)
+    if all(axis in columns for axis in _METRES):
+        # Positions in degrees beside them are not read.
+        columns = {meaning: name for meaning, name in columns.items() if meaning not in _DEGREES}
     flags = [columns.get("enabled", ""), columns.get("in layout", "")]
     if "template" in columns and all(flags):
         columns["enabled"], columns["in layout"] = sorted(flags, key=header.index)

@@ -1,0 +1,39 @@
+"""Arguments of other types end in one line that says what to give."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import heliotrope as ht
+from heliotrope.errors import InputError
+
+PLANT = ht.example_plant()
+ONE = PLANT["P1A"]
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: ht.open(5), "path is an int, 5; give the path of a file or folder"),
+        (lambda: ht.open(None), "path is a NoneType, None"),
+        (lambda: ht.open(""), "path is empty"),
+        (lambda: ht.calibrate("base.csv"), "field is a str, 'base.csv'; give what read_field"),
+        (lambda: ht.calibrate(PLANT), "field is a heliotrope Plant"),
+        (lambda: ht.predict(PLANT, None), "learned is a heliotrope Plant"),
+        (lambda: ht.read_field_sightings("plant.toml", "plant.toml"), "plant is a str"),
+        (lambda: ht.read_field_sightings(PLANT, None), "place is a NoneType"),
+        (lambda: ht.read_field_sightings(PLANT, "p", now="today"), "now is a str, 'today'"),
+        (lambda: ht.read_field_sightings(PLANT, "p", now=float("nan")), "now is nan"),
+        (lambda: ht.read_field_sightings(PLANT, "p", centroid="x"), "centroid 'x': give 'utis'"),
+        (lambda: ht.track(ONE, UP, UP, local="no"), "local is a str, 'no'; give True or False"),
+        (lambda: ht.track(ONE, UP, UP, newton=None), "newton is a NoneType"),
+    ],
+)
+def test_another_type_is_one_line(call: Callable[[], Any], says: str) -> None:
+    with pytest.raises(InputError) as caught:
+        call()
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
