@@ -135,16 +135,22 @@ def _assemble(
             problems.append(error)
         except InputError as error:
             problems.append(FormatError(path, str(error), f"groups.{name}"))
-    targets = _each(path, "targets", document.targets, _target, problems)
-    receivers = _each(path, "receivers", document.receivers, _receiver, problems)
-    cameras = _each(path, "cameras", document.cameras, build_camera, problems)
-    keep_outs = _each(path, "keep_out", document.keep_out, build_volume, problems)
+    targets = _all_built(path, "targets", document.targets, _target, problems)
+    receivers = _all_built(path, "receivers", document.receivers, _receiver, problems)
+    cameras = _all_built(path, "cameras", document.cameras, build_camera, problems)
+    keep_outs = _all_built(path, "keep_out", document.keep_out, build_volume, problems)
     eyes = {name: np.array(point) for name, point in document.eyes_m.items()}
-    joint = _one(path, "joint_visits", document.joint_visits, build_joint, problems)
-    given = document.receiver_visits
-    receiver_visits = _one(path, "receiver_visits", given, build_receiver_visits, problems)
-    timetable = _each(path, "timetable", document.timetable, _timetable_entry, problems)
-    _one(path, "safety", document.safety, lambda given: limited(CONDITIONS, given or {}), problems)
+    joint = _built(path, "joint_visits", document.joint_visits, build_joint, problems)
+    settings = document.receiver_visits
+    receiver_visits = _built(path, "receiver_visits", settings, build_receiver_visits, problems)
+    timetable = _all_built(path, "timetable", document.timetable, _timetable_entry, problems)
+    _built(
+        path,
+        "safety",
+        document.safety,
+        lambda settings: limited(CONDITIONS, settings or {}),
+        problems,
+    )
     if problems:
         return None
     try:
@@ -167,7 +173,7 @@ def _assemble(
         return None
 
 
-def _one(
+def _built(
     path: Path,
     key: str,
     table: Table | None,
@@ -182,7 +188,7 @@ def _one(
         return None
 
 
-def _each(
+def _all_built(
     path: Path,
     key: str,
     tables: Sequence[Table],
@@ -344,28 +350,30 @@ def check_plant(path: str | Path) -> list[Finding]:
         return [Finding("error", str(error))]
     problems = list(table.problems)
     plant = None if problems else _assemble(place, document, table, problems)
-    found = [Finding("error", str(problem)) for problem in problems]
-    return found if plant is None else found + [Finding("warning", w) for w in _warnings(plant)]
+    findings = [Finding("error", str(problem)) for problem in problems]
+    return (
+        findings if plant is None else findings + [Finding("warning", w) for w in _warnings(plant)]
+    )
 
 
 def _warnings(plant: Plant) -> list[str]:
-    found = []
+    texts = []
     if not plant.targets:
-        found.append("there is no target: calibration with a camera is not possible")
+        texts.append("there is no target: calibration with a camera is not possible")
     if not plant.receivers:
-        found.append("there is no receiver")
+        texts.append("there is no receiver")
     if len(plant) == 0:
-        return [*found, "there are no heliostats"]
-    found += _crowding(plant)
+        return [*texts, "there are no heliostats"]
+    texts += _crowding(plant)
     for surface in plant.targets:
         behind = (plant.position - surface.center) @ surface.normal <= 0.0
         if behind.any():
             example = plant.names[int(np.flatnonzero(behind)[0])]
-            found.append(
+            texts.append(
                 f"target {surface.name}: {int(behind.sum())} heliostats stand behind its plane "
                 f"and cannot light it (for example {example})"
             )
-    return found
+    return texts
 
 
 def _crowding(plant: Plant) -> list[str]:
