@@ -173,7 +173,7 @@ def checksums(items: Mapping[str, bytes]) -> dict[str, int]:
 
 
 def differing(required: Mapping[str, bytes], stored: Mapping[str, int]) -> tuple[str, ...]:
-    """Return the names of required items with another stored checksum, sorted."""
+    """Return the names of required items whose stored checksum differs, sorted."""
     return tuple(
         sorted(
             name

@@ -79,7 +79,7 @@ class Neighbours:
     def before(
         self, center: FloatArray, normal: FloatArray, size: tuple[float, float], *ways: FloatArray
     ) -> npt.NDArray[np.bool_]:
-        """Return the mask of neighbours that may hide a part of a mirror, (J,): mostly none; quick.
+        """Return the mask of neighbours that may hide a part of a mirror, (J,): a quick check.
 
         Their corners are projected into the mirror's plane, where their boxes must touch its own.
 
