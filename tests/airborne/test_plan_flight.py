@@ -107,8 +107,8 @@ def test_groups_hide_the_mirrors(flown: FlightPlan) -> None:
     one = Craft(endurance=1500.0)
     best = flight.fly(slow, order, air, home, one, flown.labels)
     place = {c: [r for r, s in enumerate(slow) if s.cluster == c] for c in order}
-    ways = flight._Ways(air, slow, flown.labels, {}, {})
-    alone = flight._one(0, grouped(order, place, 1), slow, home[0], one, ways)
+    routes = flight._Routes(air, slow, flown.labels, {}, {})
+    alone = flight._sorties_of(0, grouped(order, place, 1), slow, home[0], one, routes)
     waits = [sum(v.wait for s in sorties for v in s.visits) for sorties in (alone, best)]
     assert waits[1] < 0.3 * waits[0]
     assert best[-1].end < 0.9 * alone[-1].end

@@ -58,7 +58,7 @@ class Metadata:
 
 
 def read_metadata(path: str | Path) -> Metadata:
-    """Return what a JPEG's header states; the pixels are not decoded.
+    """Return the metadata of a JPEG's header; the pixels are not decoded.
 
     Raises
     ------
@@ -146,30 +146,30 @@ def _time(values: dict[str, str], tags: dict[int, object]) -> datetime | None:
     return None
 
 
-def exif_and_xmp(found: Metadata) -> tuple[bytes, bytes]:
-    """Return the EXIF block and the XMP packet that state ``found``."""
+def exif_and_xmp(metadata: Metadata) -> tuple[bytes, bytes]:
+    """Return the EXIF block and the XMP packet that state ``metadata``."""
     from PIL import Image
 
     exif = Image.Exif()
     exif[0x010F], exif[0x0110] = "Heliotrope", "rendered"
     stamp = ""
-    if found.time is not None:
-        utc = found.time.astimezone(UTC)
+    if metadata.time is not None:
+        utc = metadata.time.astimezone(UTC)
         stamp = utc.replace(tzinfo=None).isoformat(timespec="microseconds")
         exif.get_ifd(_EXIF_IFD)[_TAKEN] = utc.strftime("%Y:%m:%d %H:%M:%S")
         exif.get_ifd(_EXIF_IFD)[_OFFSET] = "+00:00"
         exif.get_ifd(_EXIF_IFD)[_SUBSECOND] = f"{utc.microsecond:06d}"
     values = {
-        "GpsLatitude": f"{found.latitude_deg:+.10f}",
-        "GpsLongitude": f"{found.longitude_deg:+.10f}",
-        "AbsoluteAltitude": f"{found.altitude:+.4f}",
-        "GimbalYawDegree": f"{found.yaw_deg:+.3f}",
-        "GimbalPitchDegree": f"{found.pitch_deg:+.3f}",
-        "GimbalRollDegree": f"{found.roll_deg:+.3f}",
-        **({} if found.rtk_flag is None else {"RtkFlag": str(found.rtk_flag)}),
-        "RtkStdLon": f"{found.sigma[0]:.5f}",
-        "RtkStdLat": f"{found.sigma[1]:.5f}",
-        "RtkStdHgt": f"{found.sigma[2]:.5f}",
+        "GpsLatitude": f"{metadata.latitude_deg:+.10f}",
+        "GpsLongitude": f"{metadata.longitude_deg:+.10f}",
+        "AbsoluteAltitude": f"{metadata.altitude:+.4f}",
+        "GimbalYawDegree": f"{metadata.yaw_deg:+.3f}",
+        "GimbalPitchDegree": f"{metadata.pitch_deg:+.3f}",
+        "GimbalRollDegree": f"{metadata.roll_deg:+.3f}",
+        **({} if metadata.rtk_flag is None else {"RtkFlag": str(metadata.rtk_flag)}),
+        "RtkStdLon": f"{metadata.sigma[0]:.5f}",
+        "RtkStdLat": f"{metadata.sigma[1]:.5f}",
+        "RtkStdHgt": f"{metadata.sigma[2]:.5f}",
         **({"UTCAtExposure": stamp} if stamp else {}),
     }
     inside = "".join(f' drone-dji:{name}="{value}"' for name, value in values.items())

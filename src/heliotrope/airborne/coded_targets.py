@@ -1,4 +1,4 @@
-"""Coded targets on the ground, by which photogrammetry finds where a drone was (appendix A).
+"""Coded targets on the ground: photogrammetry locates the drone from them (appendix A).
 
 A target is a black square with a pattern that tells its number (OpenCV's ArUco, dictionary 4×4,
 250 numbers), on a white sheet whose margin is one cell wide. Its four outer corners are measured;
@@ -46,7 +46,7 @@ class CodedTarget:
 
 @lru_cache(maxsize=NUMBERS)
 def white_cells(number: int) -> npt.NDArray[np.bool_]:
-    """Return which cells of the black square are white, (CELLS, CELLS), rows from the top.
+    """Return the mask of white cells of the black square, (CELLS, CELLS), rows from the top.
 
     Raises
     ------

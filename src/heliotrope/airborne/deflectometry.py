@@ -38,11 +38,11 @@ def find_deflectometry(folder: Path, name: str) -> Path | None:
     if own.exists():
         return own
     for place in (folder, folder / name / "Deflectometry"):
-        there = sorted(place.glob("*-deflectometry.h5")) if place.is_dir() else []
-        there = [file for file in there if file.name.startswith(f"{name}-")]
-        filled = [file for file in there if file.name.startswith(f"{name}-filled-")]
-        if there:
-            return (filled or there)[-1]
+        files = sorted(place.glob("*-deflectometry.h5")) if place.is_dir() else []
+        files = [file for file in files if file.name.startswith(f"{name}-")]
+        filled = [file for file in files if file.name.startswith(f"{name}-filled-")]
+        if files:
+            return (filled or files)[-1]
     return None
 
 

@@ -150,12 +150,12 @@ class MirrorShape:
 
     def along_facet(self, facet: npt.ArrayLike, xy: npt.ArrayLike) -> FloatArray:
         """Return concentrator positions (K, 2) m along the axes of ``facet`` (K,), m, (K, 2)."""
-        k, wanted = np.asarray(facet, dtype=np.intp), as_float(xy)
+        k, target = np.asarray(facet, dtype=np.intp), as_float(xy)
         inverse = np.linalg.inv(np.swapaxes(self.axes[k][:, :2, :2], -1, -2))
         uv = np.zeros((len(k), 2))
         for _ in range(8):
             # The height changes x and y only along the normal of a canted facet.
-            gap = wanted - self.on_facet(k, uv)[:, :2]
+            gap = target - self.on_facet(k, uv)[:, :2]
             uv = uv + (inverse @ gap[..., None])[..., 0]
             if np.abs(gap).max(initial=0.0) < 1e-12:
                 break
@@ -164,11 +164,11 @@ class MirrorShape:
     def facet_at(self, xy: npt.ArrayLike) -> IntArray:
         """Return the facet at each concentrator position (K, 2) m, or -1."""
         points = as_float(xy).reshape(-1, 2)
-        found = np.full(len(points), -1, dtype=np.intp)
+        facets = np.full(len(points), -1, dtype=np.intp)
         for k in range(len(self)):
             uv = self.along_facet(np.full(len(points), k), points)
-            found[(np.abs(uv) <= self.half_size[k] + 1e-9).all(axis=-1) & (found < 0)] = k
-        return found
+            facets[(np.abs(uv) <= self.half_size[k] + 1e-9).all(axis=-1) & (facets < 0)] = k
+        return facets
 
     def point_at(self, facet: npt.ArrayLike, xy: npt.ArrayLike) -> FloatArray:
         """Return the surface points (K, 3) at concentrator positions (K, 2) m."""
@@ -421,10 +421,10 @@ def reflection_points(
         np.atleast_2d(as_vectors(camera, "camera")), np.atleast_2d(as_vectors(led, "led"))
     )
     own = [(e - v) @ R for e in ends]
-    found = [_within(shape, own[0], own[1], a, b) for a, b in _blocks(shape, len(own[0]))]
-    position = np.concatenate([f[0] for f in found]) if found else np.empty(0, dtype=np.intp)
-    facet = np.concatenate([f[1] for f in found]) if found else np.empty(0, dtype=np.intp)
-    uv = np.concatenate([f[2] for f in found]) if found else np.empty((0, 2))
+    parts = [_within(shape, own[0], own[1], a, b) for a, b in _blocks(shape, len(own[0]))]
+    position = np.concatenate([f[0] for f in parts]) if parts else np.empty(0, dtype=np.intp)
+    facet = np.concatenate([f[1] for f in parts]) if parts else np.empty(0, dtype=np.intp)
+    uv = np.concatenate([f[2] for f in parts]) if parts else np.empty((0, 2))
     point = shape.on_facet(facet, uv)
     return ReflectionPoints(position, facet, point[:, :2], v + point @ R.T)
 
@@ -470,10 +470,10 @@ def _candidates(
     # Components are kept apart: sums over a last axis of 3 are slow.
     total = [np.zeros((len(camera), len(points))) for _ in range(3)]
     for end in (camera, led):
-        way = [end[:, k, None] - points[:, k] for k in range(3)]
-        scale = 1.0 / np.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2)
+        path = [end[:, k, None] - points[:, k] for k in range(3)]
+        scale = 1.0 / np.sqrt(path[0] ** 2 + path[1] ** 2 + path[2] ** 2)
         for k in range(3):
-            total[k] += way[k] * scale
+            total[k] += path[k] * scale
     axes = shape.axes[which]
     u, v, w = (sum(total[i] * axes[:, k, i] for i in range(3)) for k in range(3))
     # Nothing is seen from behind the facet: NaN compares false below.
@@ -506,12 +506,12 @@ def _bilinear_roots(corners: FloatArray) -> FloatArray:
     def cross(p: FloatArray, q: FloatArray) -> FloatArray:
         return as_float(p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0])
 
-    two, one, zero = cross(c, d), cross(a, d) + cross(c, b), cross(a, b)
-    root = np.sqrt(np.maximum(one**2 - 4.0 * two * zero, 0.0))
-    # The numerically stable pair: q / two and zero / q.
-    q = -0.5 * (one + np.where(one < 0.0, -root, root))
+    quadratic, linear, constant = cross(c, d), cross(a, d) + cross(c, b), cross(a, b)
+    root = np.sqrt(np.maximum(linear**2 - 4.0 * quadratic * constant, 0.0))
+    # The numerically stable pair: q / quadratic and constant / q.
+    q = -0.5 * (linear + np.where(linear < 0.0, -root, root))
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.stack([zero / q, q / two], axis=-1)
+        t = np.stack([constant / q, q / quadratic], axis=-1)
     t = np.clip(np.where(np.isfinite(t), t, 0.5), -0.5, 1.5)
     along = b[:, None] + d[:, None] * t[..., None]
     rest = a[:, None] + c[:, None] * t[..., None]
@@ -570,12 +570,12 @@ def _law(
     tangents = axes[:, :2] + (uv * curve[:, None])[..., None] * axes[:, 2:]
     total, change = np.zeros_like(point), np.zeros_like(tangents)
     for end in ends:
-        way = end - point
-        distance = np.linalg.norm(way, axis=-1)[:, None]
-        way = way / distance
-        along = np.einsum("kaj,kj->ka", tangents, way)
-        total += way
-        change -= (tangents - along[..., None] * way[:, None]) / distance[..., None]
+        direction = end - point
+        distance = np.linalg.norm(direction, axis=-1)[:, None]
+        direction = direction / distance
+        along = np.einsum("kaj,kj->ka", tangents, direction)
+        total += direction
+        change -= (tangents - along[..., None] * direction[:, None]) / distance[..., None]
     own = np.einsum("kj,kij->ki", total, axes)
     turned = np.einsum("kaj,kij->kia", change, axes)
     tilt = own[:, :2] / own[:, 2:]

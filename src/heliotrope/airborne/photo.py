@@ -178,13 +178,13 @@ def read_camera(path: str | Path) -> LedCamera:
     }  # fmt: skip
     values: dict[str, list[float]] = {}
     for key, length in lengths.items():
-        given = table.get(key)
-        numbers = isinstance(given, list) and all(
-            isinstance(v, int | float) and not isinstance(v, bool) for v in given
+        value = table.get(key)
+        numbers = isinstance(value, list) and all(
+            isinstance(v, int | float) and not isinstance(v, bool) for v in value
         )
-        if not numbers or given is None or len(given) != length:
-            raise FormatError(path, f"needs {length} numbers, not {given!r}", key)
-        values[key] = given
+        if not numbers or value is None or len(value) != length:
+            raise FormatError(path, f"needs {length} numbers, not {value!r}", key)
+        values[key] = value
     (fx, fy), (cx, cy) = values["focal_px"], values["principal_point_px"]
     width, height = values["size_px"]
     try:
@@ -258,14 +258,14 @@ def read_photos(
     sizes: dict[str, tuple[int, int]] = {}
     for file in files:
         try:
-            found = read_metadata(file)
-            sizes[file.name] = found.size
+            metadata = read_metadata(file)
+            sizes[file.name] = metadata.size
             if rows:
                 if file.name not in rows:
                     raise FormatError(file, f"{table.name} has no row for it; add one")
                 photos.append(_of_row(rows[file.name], table, file, plant_origin))
             else:
-                photos.append(_of_metadata(found, file, plant_origin))
+                photos.append(_of_metadata(metadata, file, plant_origin))
         except InputError as error:
             problems.append(str(error))
     missing = sorted(set(rows) - {f.name for f in files})
@@ -291,16 +291,16 @@ def _of_one_camera(
     return tuple(photos), tuple(problems)
 
 
-def _of_metadata(found: Metadata, file: Path, origin: tuple[float, float, float]) -> Photo:
+def _of_metadata(metadata: Metadata, file: Path, origin: tuple[float, float, float]) -> Photo:
     missing = [
         name
         for name, value in (
-            ("GpsLatitude", found.latitude_deg),
-            ("GpsLongitude", found.longitude_deg),
-            ("AbsoluteAltitude", found.altitude),
-            ("GimbalYawDegree", found.yaw_deg),
-            ("GimbalPitchDegree", found.pitch_deg),
-            ("GimbalRollDegree", found.roll_deg),
+            ("GpsLatitude", metadata.latitude_deg),
+            ("GpsLongitude", metadata.longitude_deg),
+            ("AbsoluteAltitude", metadata.altitude),
+            ("GimbalYawDegree", metadata.yaw_deg),
+            ("GimbalPitchDegree", metadata.pitch_deg),
+            ("GimbalRollDegree", metadata.roll_deg),
         )
         if not math.isfinite(value)
     ]
@@ -310,23 +310,25 @@ def _of_metadata(found: Metadata, file: Path, origin: tuple[float, float, float]
             f"its XMP lacks {', '.join(missing)}; copy the original file from the drone, or "
             "write the values into photos.csv",
         )
-    if found.rtk_flag != RTK_FIXED:
+    if metadata.rtk_flag != RTK_FIXED:
         what = (
             "its XMP has no RtkFlag, so nothing states how well its position is known"
-            if found.rtk_flag is None
-            else f"RtkFlag {found.rtk_flag} is not a fixed solution ({RTK_FIXED}): its position is "
-            "known to decimetres at best"
+            if metadata.rtk_flag is None
+            else f"RtkFlag {metadata.rtk_flag} is not a fixed solution ({RTK_FIXED}): its position "
+            "is known to decimetres at best"
         )
         remedy = "leave it out, or write photos.csv with corrected positions and their sigma_m"
         raise FormatError(file, f"{what}; {remedy}")
-    position = geodetic_to_enu(found.latitude_deg, found.longitude_deg, found.altitude, origin)
-    known = np.isfinite(found.sigma) & (found.sigma > 0.0)
+    position = geodetic_to_enu(
+        metadata.latitude_deg, metadata.longitude_deg, metadata.altitude, origin
+    )
+    known = np.isfinite(metadata.sigma) & (metadata.sigma > 0.0)
     return Photo(
         file.name,
-        found.time,
+        metadata.time,
         position,
-        rotation_of_gimbal(*(math.radians(a) for a in found.angles_deg)),
-        np.where(known, found.sigma, RTK_SIGMA),
+        rotation_of_gimbal(*(math.radians(a) for a in metadata.angles_deg)),
+        np.where(known, metadata.sigma, RTK_SIGMA),
         file,
     )
 

@@ -161,9 +161,9 @@ def _read_csv(file: Path) -> FloatArray:
     rows.need(_COLUMNS)
     index = np.stack([rows.numbers(n, "a whole number from 0") for n in _COLUMNS[:3]], axis=-1)
     values = np.stack([rows.numbers(n, "mrad") for n in _COLUMNS[3:]], axis=-1)
-    wrong = ~((index >= 0) & (index == np.floor(index)) & (index < 10_000)).all(axis=-1)
-    if wrong.any():
-        i = int(np.flatnonzero(wrong)[0])
+    invalid = ~((index >= 0) & (index == np.floor(index)) & (index < 10_000)).all(axis=-1)
+    if invalid.any():
+        i = int(np.flatnonzero(invalid)[0])
         raise FormatError(
             file,
             f"facet, row, column {index[i].tolist()} are not whole numbers from 0 to 9999",

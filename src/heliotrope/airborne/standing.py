@@ -145,17 +145,17 @@ def read_commands(
         raise InputError(f"{path}: no heliostat{of} in it; list those that the photographs show")
     rows.heliostat = rows.texts("heliostat")
     index = {name: i for i, name in enumerate(names)}
-    found: dict[int, int] = {}
+    commands: dict[int, int] = {}
     for i, name in enumerate(rows.heliostat):
         if name not in index:
             place = f"heliostat ({path}, {rows.places[i]}) in this field:"
             raise UnknownNameError(place, name, names)
-        if found.setdefault(index[name], i) != i:
+        if commands.setdefault(index[name], i) != i:
             twice = "it is listed twice, but photographs show one pose; give the cluster and the"
             rows.refuse(i, "heliostat", f"{twice} point of the photographs")
     counts = [rows.numbers(name, "drive counts") for name in _COUNTS if name in rows.columns]
     rows.refuse_bad()
-    return np.fromiter(found, dtype=np.intp), np.stack(counts, axis=-1)
+    return np.fromiter(commands, dtype=np.intp), np.stack(counts, axis=-1)
 
 
 def write_commands(path: str | Path, names: Sequence[str], counts: npt.ArrayLike) -> None:

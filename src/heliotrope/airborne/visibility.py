@@ -30,7 +30,7 @@ _BITS = 4
 def draw_labels(
     outlines: FloatArray, distance: FloatArray, size: tuple[int, int], scale: float = 1.0
 ) -> Labels:
-    """Return which mirror each pixel shows, (height, width): its row plus 1, or 0 for none.
+    """Return the mirror that each pixel shows, (height, width): its row plus 1, or 0 for none.
 
     Parameters
     ----------
@@ -51,8 +51,8 @@ def draw_labels(
     small = (outlines + 0.5) * scale - 0.5
     low, high = small.min(axis=1), small.max(axis=1)
     with np.errstate(invalid="ignore"):
-        there = (high > 0.0).all(axis=1) & (low < [width, height]).all(axis=1)
-    rows = np.flatnonzero(there)
+        in_frame = (high > 0.0).all(axis=1) & (low < [width, height]).all(axis=1)
+    rows = np.flatnonzero(in_frame)
     for row in rows[np.argsort(-distance[rows], kind="stable")].tolist():
         corners = np.round(small[row] * 2**_BITS).astype(np.int32)
         cv2.fillConvexPoly(labels, corners, row + 1, shift=_BITS)

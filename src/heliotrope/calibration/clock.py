@@ -117,8 +117,8 @@ def check_clock(
     if not len(chosen):
         return None
 
-    def cost(seen: Sightings, shift: float) -> FloatArray:
-        moved = later(seen, site, shift)
+    def cost(observed: Sightings, shift: float) -> FloatArray:
+        moved = later(observed, site, shift)
         return costs(fit(mechanism[chosen], moved, model, adapt_scale=False), mechanism[chosen])
 
     few, many = (_part(suns, chosen, most) for most in (FIRST, MOST))
@@ -139,11 +139,11 @@ class _Step:
 
 
 def _settled(
-    mechanism: Mechanism, seen: Sightings, model: tuple[str, ...], site: Site, shift: float
+    mechanism: Mechanism, sightings: Sightings, model: tuple[str, ...], site: Site, shift: float
 ) -> _Step:
     """Return the shift at which the sightings ask for no other, from a start."""
     for _ in range(ROUNDS):
-        step = _step(mechanism, seen, model, site, shift)
+        step = _step(mechanism, sightings, model, site, shift)
         done = abs(step.shift - shift) < 0.1 * step.sigma
         shift = float(np.clip(step.shift, shift - STEP, shift + STEP))
         if done:
@@ -152,22 +152,22 @@ def _settled(
 
 
 def _step(
-    mechanism: Mechanism, seen: Sightings, model: tuple[str, ...], site: Site, shift: float
+    mechanism: Mechanism, sightings: Sightings, model: tuple[str, ...], site: Site, shift: float
 ) -> _Step:
     """Return one Gauss-Newton step.
 
     With H, B and Z the normal matrices of a mirror's own parameters, of their coupling with the
     shift and of the shift, the mirror reveals Z - B^T H^-1 B of the shift (as in `fit.common`).
     """
-    moved = later(seen, site, shift)
+    moved = later(sightings, site, shift)
     fitted = fit(mechanism, moved, model, adapt_scale=False)
-    row, names = seen.heliostat, fitted.names
-    each = mechanism.with_parameters(fitted.parameters)[row]
-    line = linearise(each, moved, names)
-    vertex = each.pose(seen.counts).vertex
+    row, names = sightings.heliostat, fitted.names
+    mechanisms = mechanism.with_parameters(fitted.parameters)[row]
+    line = linearise(mechanisms, moved, names)
+    vertex = mechanisms.pose(sightings.counts).vertex
     axes, whiten = whitening(moved, vertex)
     before, after = (
-        np.sum(ray_directions(later(seen, site, shift + side), vertex), axis=0)
+        np.sum(ray_directions(later(sightings, site, shift + side), vertex), axis=0)
         for side in (-1.0, 1.0)
     )
     rate = -0.5 * (normalize(after) - normalize(before))
@@ -208,7 +208,7 @@ def _noise(fitted: FieldFit) -> FloatArray:
     return np.asarray((data + FREEDOM) / (2.0 * many + FREEDOM))
 
 
-def later(seen: Sightings, site: Site, shift: float) -> Sightings:
+def later(sightings: Sightings, site: Site, shift: float) -> Sightings:
     """Return sightings of the sun with the suns as they stood ``shift`` s later.
 
     Where a time is known and the given sun stood there, that is the sun of the other time; else the
@@ -216,14 +216,16 @@ def later(seen: Sightings, site: Site, shift: float) -> Sightings:
     """
     latitude = np.radians(site.latitude_deg)
     turn = rotation(np.array([0.0, np.cos(latitude), np.sin(latitude)]), -RATE * shift)
-    source = seen.source @ turn.T
-    rows = np.flatnonzero(np.isfinite(seen.time))
-    agree = angle_between(seen.source[rows], solar.vector(seen.time[rows], site)) < MOVED
+    source = sightings.source @ turn.T
+    rows = np.flatnonzero(np.isfinite(sightings.time))
+    agree = angle_between(sightings.source[rows], solar.vector(sightings.time[rows], site)) < MOVED
     rows = rows[agree]
-    source[rows] = solar.vector(seen.time[rows] + shift, site)
+    source[rows] = solar.vector(sightings.time[rows] + shift, site)
     # A sun sensor looks at the sun too.
-    far = seen.destination_at_infinity[:, None]
-    return replace(seen, source=source, destination=np.where(far, source, seen.destination))
+    far = sightings.destination_at_infinity[:, None]
+    return replace(
+        sightings, source=source, destination=np.where(far, source, sightings.destination)
+    )
 
 
 def _part(suns: Sightings, chosen: npt.NDArray[np.intp], most: int) -> Sightings:

@@ -48,14 +48,22 @@ def measure(
     for day in days:
         times = solar.daylight(day, site, every=timedelta(minutes=70), min_elevation=0.2)
         for time, sun in zip(times, solar.vector(times, site), strict=True):
-            wanted = track(nominal, sun, target.center)
-            counts = np.round(wanted.best_counts)
+            tracking = track(nominal, sun, target.center)
+            counts = np.round(tracking.best_counts)
             pose = truth.pose(counts)
             spot = target.intersect(pose.vertex, reflect(sun, pose.normal))
             spot = spot + rng.normal(0.0, noise, (len(nominal), 2)) @ target.axes
-            lit = np.flatnonzero(np.isfinite(spot).all(axis=-1))
-            suns = np.tile(sun, (len(lit), 1))
-            parts.append((lit, counts[lit], suns, spot[lit], np.full(len(lit), time.timestamp())))
+            visible = np.flatnonzero(np.isfinite(spot).all(axis=-1))
+            suns = np.tile(sun, (len(visible), 1))
+            parts.append(
+                (
+                    visible,
+                    counts[visible],
+                    suns,
+                    spot[visible],
+                    np.full(len(visible), time.timestamp()),
+                )
+            )
     rows, counts, source, spots, seconds = (np.concatenate(p) for p in zip(*parts, strict=True))
     distance = np.linalg.norm(nominal.position[rows] - target.center, axis=-1)
     return sightings(rows, counts, source, spots, time=seconds, sigma=noise / distance)
@@ -101,11 +109,11 @@ def track_day(
     suns = solar.vector(times, site)
 
     def beam(mechanism: Mechanism) -> FloatArray:
-        wanted = track(mechanism, suns[:, None, :], aim)
-        pose = truth.pose(np.round(wanted.best_counts))
-        way = aim - pose.vertex
-        way = way / np.linalg.norm(way, axis=-1, keepdims=True)
-        return angle_between(reflect(suns[:, None, :], pose.normal), way)
+        tracking = track(mechanism, suns[:, None, :], aim)
+        pose = truth.pose(np.round(tracking.best_counts))
+        to_aim = aim - pose.vertex
+        to_aim = to_aim / np.linalg.norm(to_aim, axis=-1, keepdims=True)
+        return angle_between(reflect(suns[:, None, :], pose.normal), to_aim)
 
     return TrackedDay(list(times), beam(group.mechanism), beam(group.calibrated))
 

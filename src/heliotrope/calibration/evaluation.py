@@ -66,9 +66,9 @@ class BeamErrors(Value, Framed):
         )
 
     def _card(self) -> Card:
-        found = summarise(self.beam)
-        line = f"{found.count} sightings, beam {1e3 * found.median:.3g} mrad median, "
-        line += f"{1e3 * found.rms:.3g} RMS, {1e3 * found.p95:.3g} for 95 %"
+        summary = summarise(self.beam)
+        line = f"{summary.count} sightings, beam {1e3 * summary.median:.3g} mrad median, "
+        line += f"{1e3 * summary.rms:.3g} RMS, {1e3 * summary.p95:.3g} for 95 %"
         rows = [
             ("beam", span(self.beam, 1e3, "mrad")),
             ("normal", span(self.normal, 1e3, "mrad")),
@@ -88,25 +88,25 @@ def beam_errors(mechanism: Field, sightings: Sightings) -> BeamErrors:
     sightings
         M sightings of these heliostats.
     """
-    given = members(mechanism, "calibrated")
-    sightings = given.rows_of(sightings)
-    pose = given.mechanism[sightings.heliostat].pose(sightings.counts)
-    source, way = ray_directions(sightings, pose.vertex)
+    field = members(mechanism, "calibrated")
+    sightings = field.rows_of(sightings)
+    pose = field.mechanism[sightings.heliostat].pose(sightings.counts)
+    source, destination = ray_directions(sightings, pose.vertex)
     ray = reflect(source, pose.normal)
     distance = np.where(
         sightings.destination_at_infinity,
         np.nan,
         np.linalg.norm(sightings.destination - pose.vertex, axis=-1),
     )
-    forward = np.sum(ray * way, axis=-1)
-    across = np.einsum("mck,mk->mc", frame(way), ray)
+    forward = np.sum(ray * destination, axis=-1)
+    across = np.einsum("mck,mk->mc", frame(destination), ray)
     plane = across * (distance / np.where(forward > 0, forward, np.nan))[:, None]
-    beam = angle_between(ray, way)
+    beam = angle_between(ray, destination)
     # Scaled to the length of the angle, because sines decrease again beyond a right angle.
     size = np.maximum(np.linalg.norm(across, axis=-1), 1e-300)
     return BeamErrors(
         beam=beam,
-        normal=angle_between(pose.normal, bisector(source, way)),
+        normal=angle_between(pose.normal, bisector(source, destination)),
         offset=across * (beam / size)[:, None],
         plane=plane,
     )
@@ -188,12 +188,12 @@ def _by_neighbourhood(
     sky = sightings.source[rows]
     many = max(3, round(NEIGHBOURHOOD * len(rows)))
     free = np.ones(len(rows), dtype=np.bool_)
-    wanted = len(rows) - round(fraction * len(rows))
-    while (~free).sum() < wanted:
+    required = len(rows) - round(fraction * len(rows))
+    while (~free).sum() < required:
         centre = rng.choice(np.flatnonzero(free))
         apart = np.where(free, np.linalg.norm(sky - sky[centre], axis=1), np.inf)
-        left = min(many, wanted - int((~free).sum()))
-        free[np.argsort(apart, kind="stable")[:left]] = False
+        remaining = min(many, required - int((~free).sum()))
+        free[np.argsort(apart, kind="stable")[:remaining]] = False
     return np.concatenate([rows[free], rows[~free]])
 
 

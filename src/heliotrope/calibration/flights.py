@@ -237,9 +237,9 @@ def read_flight(path: str | Path) -> FlightDocument:
 
 def write_flight(path: str | Path, document: FlightDocument) -> None:
     """Write the file of a flight, one row a line."""
-    given = document.model_dump()
-    rows = ",\n  ".join(_text(row) for row in given.pop("rows"))
-    head = ",\n ".join(f"{json.dumps(key)}: {_text(value)}" for key, value in given.items())
+    content = document.model_dump()
+    rows = ",\n  ".join(_text(row) for row in content.pop("rows"))
+    head = ",\n ".join(f"{json.dumps(key)}: {_text(value)}" for key, value in content.items())
     write_text(path, f'{{{head},\n "rows": [\n  {rows}]}}\n')
 
 

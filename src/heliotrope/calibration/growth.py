@@ -63,7 +63,7 @@ class Growth:
         )
 
     def variances(self, names: Sequence[str], days: npt.ArrayLike) -> FloatArray:
-        """Return what is added to the variances of parameters after days, (..., P).
+        """Return the growth of the variances of parameters over days, (..., P).
 
         Parameters
         ----------
@@ -88,7 +88,7 @@ class Growth:
 
 
 def default_growth(mechanism: Mechanism) -> Growth:
-    """Return the growth that a kind of mechanism has before anything was learnt of its field."""
+    """Return the growth of a kind of mechanism before its field has sightings."""
     hyper = drift.start(mechanism, drift.zeros(mechanism))
     tau, rate = drift.START_DAYS["slow"], drift.step_rate(())
     wander = f"zeros wander by {1e3 * drift.START_RAD['slow']:g} mrad over {tau:.0f} days"
@@ -98,6 +98,6 @@ def default_growth(mechanism: Mechanism) -> Growth:
 
 def _places(parameters: tuple[str, ...], names: Sequence[str]) -> FloatArray:
     """Return the matrix that adds figures of parameters to those of the same name, (C, P)."""
-    wanted = np.array(names, dtype=np.str_)
-    given = np.array(parameters, dtype=np.str_)
-    return as_float(given[:, None] == wanted)
+    columns = np.array(names, dtype=np.str_)
+    rows = np.array(parameters, dtype=np.str_)
+    return as_float(rows[:, None] == columns)

@@ -100,7 +100,7 @@ class Members:
         return sightings
 
 
-def members(given: Field, state: Literal["nominal", "calibrated"] = "nominal") -> Members:
+def members(field: Field, state: Literal["nominal", "calibrated"] = "nominal") -> Members:
     """Return heliostats with their nominal or their calibrated mechanisms.
 
     Raises
@@ -108,23 +108,23 @@ def members(given: Field, state: Literal["nominal", "calibrated"] = "nominal") -
     InputError
         If a plant has heliostats of several kinds, or mechanisms have several batch axes.
     """
-    if isinstance(given, Mechanism):
-        if len(given.shape) > 1:
+    if isinstance(field, Mechanism):
+        if len(field.shape) > 1:
             raise InputError(
-                f"mechanism: shape {given.shape}; give one mechanism, or N of shape (N,)"
+                f"mechanism: shape {field.shape}; give one mechanism, or N of shape (N,)"
             )
-        return Members(given if given.shape else given[None], single=not given.shape)
-    if isinstance(given, Heliostat):
-        group = given.heliostats
+        return Members(field if field.shape else field[None], single=not field.shape)
+    if isinstance(field, Heliostat):
+        group = field.heliostats
         chosen = group.mechanism if state == "nominal" else group.calibrated
-        return Members(chosen, group.names, True, Surroundings(given.site, given.targets))
-    if isinstance(given, Heliostats):
-        return Members(given.mechanism if state == "nominal" else given.calibrated, given.names)
-    if isinstance(given, Plant):
-        chosen = given.nominal if state == "nominal" else given.calibrated
-        return Members(chosen, given.names, around=Surroundings(given.site, given.targets))
+        return Members(chosen, group.names, True, Surroundings(field.site, field.targets))
+    if isinstance(field, Heliostats):
+        return Members(field.mechanism if state == "nominal" else field.calibrated, field.names)
+    if isinstance(field, Plant):
+        chosen = field.nominal if state == "nominal" else field.calibrated
+        return Members(chosen, field.names, around=Surroundings(field.site, field.targets))
     raise InputError(
-        f"mechanism: {kind_of(given)} is not a Mechanism; give nominal mechanisms, plant[name], a "
+        f"mechanism: {kind_of(field)} is not a Mechanism; give nominal mechanisms, plant[name], a "
         "group of the plant, or the plant"
     )
 
@@ -134,8 +134,8 @@ def _matched(sightings: Sightings, names: tuple[str, ...]) -> Sightings:
         return sightings
     place = {name: i for i, name in enumerate(names)}
     rows = np.array([place.get(name, -1) for name in sightings.names], dtype=np.intp)
-    found = rows[sightings.heliostat]
-    if (found < 0).any():
-        stranger = sightings.names[int(sightings.heliostat[int(np.argmin(found))])]
+    indices = rows[sightings.heliostat]
+    if (indices < 0).any():
+        stranger = sightings.names[int(sightings.heliostat[int(np.argmin(indices))])]
         raise UnknownNameError("heliostat (of a sighting)", stranger, names)
-    return replace(sightings, heliostat=found, names=names)
+    return replace(sightings, heliostat=indices, names=names)

@@ -45,13 +45,13 @@ class Unobstructed:
 
     def __str__(self) -> str:
         """One line."""
-        told = self.summary()
-        if not told["corrected"]:
+        figures = self.summary()
+        if not figures["corrected"]:
             return "shading and blocking: no neighbour in the plant file hides any of the mirrors"
         return (
-            f"shading and blocking: {told['corrected']:,} of {told['sightings']:,} centroids "
-            f"corrected by {told['median_shift_mm']:.0f} mm in the median, "
-            f"{told['largest_shift_mm']:.0f} mm at most"
+            f"shading and blocking: {figures['corrected']:,} of {figures['sightings']:,} centroids "
+            f"corrected by {figures['median_shift_mm']:.0f} mm in the median, "
+            f"{figures['largest_shift_mm']:.0f} mm at most"
         )
 
     def summary(self) -> dict[str, float]:
@@ -67,7 +67,7 @@ class Unobstructed:
 
 
 def unobstructed(
-    heliostats: Heliostats, targets: tuple[Target, ...], seen: Sightings, aim: FloatArray
+    heliostats: Heliostats, targets: tuple[Target, ...], sightings: Sightings, aim: FloatArray
 ) -> Unobstructed:
     """Return sightings corrected for shading and blocking.
 
@@ -77,7 +77,7 @@ def unobstructed(
         All mirrors that may hide one another; rows as those of the sightings.
     targets
         Sightings of the sun's beam on one of them are corrected; others stay as they are.
-    seen
+    sightings
         The sightings.
     aim
         Where the neighbours look, ENU metres, (3,), unless they have aims of their own.
@@ -92,31 +92,31 @@ def unobstructed(
     own = np.full_like(place, np.nan) if heliostats.aim is None else heliostats.aim
     aims = np.where(np.isfinite(own), own, aim)
     near = nearest(place)
-    shift, hidden = np.zeros((len(seen), 2)), np.zeros(len(seen))
-    destination, covariance = seen.destination.copy(), seen.destination_covariance.copy()
-    for m in np.flatnonzero(seen.source_at_infinity & ~seen.destination_at_infinity):
-        target = _under(targets, seen.destination[m])
+    shift, hidden = np.zeros((len(sightings), 2)), np.zeros(len(sightings))
+    destination, covariance = sightings.destination.copy(), sightings.destination_covariance.copy()
+    for m in np.flatnonzero(sightings.source_at_infinity & ~sightings.destination_at_infinity):
+        target = _under(targets, sightings.destination[m])
         if target is None or not near.shape[1]:
             continue
-        i, sun = int(seen.heliostat[m]), seen.source[m]
+        i, sun = int(sightings.heliostat[m]), sightings.source[m]
         others = near[i]
-        ways = normalize(aims[others] - place[others])
+        directions = normalize(aims[others] - place[others])
         beside = Neighbours(
             place[others],
-            bisector(np.broadcast_to(sun, ways.shape), ways),
+            bisector(np.broadcast_to(sun, directions.shape), directions),
             heliostats.width[others],
             heliostats.height[others],
         )
-        found, spread, hidden[m] = shift_of(
-            heliostats, i, target, seen.destination[m], sun, place[i], beside
+        moved, spread, hidden[m] = shift_of(
+            heliostats, i, target, sightings.destination[m], sun, place[i], beside
         )
-        if not hidden[m] > 0.0 or not np.isfinite(found).all():
+        if not hidden[m] > 0.0 or not np.isfinite(moved).all():
             hidden[m] = 0.0
             continue
-        shift[m] = found
-        destination[m] -= found @ target.axes
+        shift[m] = moved
+        destination[m] -= moved @ target.axes
         covariance[m] += target.axes.T @ spread @ target.axes
-    corrected = replace(seen, destination=destination, destination_covariance=covariance)
+    corrected = replace(sightings, destination=destination, destination_covariance=covariance)
     return Unobstructed(corrected, shift, hidden)
 
 
@@ -163,24 +163,24 @@ def shift_of(
         Right and up on the target, m, (2,), and m², (2, 2); zeros if nothing is hidden.
     """
     slant = float(np.linalg.norm(centroid - center))
-    way = (centroid - center) / slant
-    normal = bisector(sun, way)
+    direction = (centroid - center) / slant
+    normal = bisector(sun, direction)
     size = float(heliostats.width[i]), float(heliostats.height[i])
-    hides = neighbours.before(center, normal, size, sun, way)
+    hides = neighbours.before(center, normal, size, sun, direction)
     nothing = np.zeros(2), np.zeros((2, 2)), 0.0
     if not hides.any():
         return nothing
     near = neighbours.of(hides)
-    found = []
+    shifts = []
     for focal in (slant, slant / (1.0 + _FOCAL), slant * (1.0 + _FOCAL)):
         facets = _facets(heliostats, i, focal)
-        found.append(centroid_shift(target, center, sun, normal, facets, near, facet_focal=focal))
-        if not found[0].hidden:
+        shifts.append(centroid_shift(target, center, sun, normal, facets, near, facet_focal=focal))
+        if not shifts[0].hidden:
             return nothing
-    usual = found[0].shift
-    other = np.max([np.linalg.norm(one.shift - usual) for one in found[1:]])
+    usual = shifts[0].shift
+    other = np.max([np.linalg.norm(candidate.shift - usual) for candidate in shifts[1:]])
     covariance = other**2 * np.eye(2) + unknown**2 * np.outer(usual, usual)
-    return usual, covariance, found[0].hidden
+    return usual, covariance, shifts[0].hidden
 
 
 def _facets(heliostats: Heliostats, i: int, focal: float) -> Facets:

@@ -72,7 +72,7 @@ def judge(
     kinds: Sequence[str] = (),
     now: float | None = None,
 ) -> Judgement:
-    """Return which sightings cannot have happened, and why.
+    """Return the impossible sightings and their reasons.
 
     A sighting gets the first reason that applies. The more is known of the plant, the more is
     judged.
@@ -88,7 +88,7 @@ def judge(
     surfaces
         Targets and receivers of the plant: for the destinations of kind "camera_target".
     kinds
-        Kind of each sighting, (M,), "" if unknown.
+        Kind of each sighting, (M,); empty if unknown.
     now
         The computer's clock, Unix seconds: for times that are still to come.
     """
@@ -101,8 +101,11 @@ def judge(
         _add(reasons, rows, text)
         notes += [note] if note else []
     if surfaces and kinds:
-        given = np.array([kind == "camera_target" for kind in kinds], np.bool_)
-        _add(reasons, *_off_target(seen, given & ~seen.destination_at_infinity, surfaces))
+        camera_rows = np.array([kind == "camera_target" for kind in kinds], np.bool_)
+        _add(
+            reasons,
+            *_off_target(seen, camera_rows & ~seen.destination_at_infinity, surfaces),
+        )
     if mechanism is not None and len(seen):
         for rows, text in _beyond_machine(seen, mechanism, reasons):
             _add(reasons, rows, text)
@@ -110,11 +113,11 @@ def judge(
 
 
 def judge_in(
-    plant: Plant, seen: Sightings, kinds: Sequence[str] = (), now: float | None = None
+    plant: Plant, sightings: Sightings, kinds: Sequence[str] = (), now: float | None = None
 ) -> Judgement:
     """Return the judgement by all that a plant knows; rows are those of its heliostats."""
     return judge(
-        seen,
+        sightings,
         mechanism=plant.nominal if len(plant.groups) == 1 else None,
         site=plant.site,
         surfaces=(*plant.targets, *plant.receivers),
@@ -126,14 +129,14 @@ def judge_in(
 def _add(reasons: dict[int, str], rows: Rows, texts: Texts) -> None:
     """Give rows their reason, one text for all of them or one for each, where they have none."""
     places = np.flatnonzero(rows)
-    each = [texts] * len(places) if isinstance(texts, str) else texts
-    for i, text in zip(places, each, strict=True):
+    listed = [texts] * len(places) if isinstance(texts, str) else texts
+    for i, text in zip(places, listed, strict=True):
         reasons.setdefault(int(i), text)
 
 
-def _impossible(seen: Sightings, now: float | None) -> Iterator[tuple[Rows, Texts]]:
+def _impossible(sightings: Sightings, now: float | None) -> Iterator[tuple[Rows, Texts]]:
     """Yield what is impossible for any mirror anywhere."""
-    time = seen.time
+    time = sightings.time
     out = (time < EARLIEST) | (time > LATEST)
     yield out, YEAR
     if now is not None:
@@ -143,38 +146,46 @@ def _impossible(seen: Sightings, now: float | None) -> Iterator[tuple[Rows, Text
             ahead,
             f"the time is more than a year ahead of this computer's clock, {clock}: correct one",
         )
-    low = seen.source_at_infinity & (seen.source[:, 2] < np.sin(LOWEST))
-    angles = np.degrees(np.arcsin(np.clip(seen.source[low, 2], -1.0, 1.0)))
+    low = sightings.source_at_infinity & (sightings.source[:, 2] < np.sin(LOWEST))
+    angles = np.degrees(np.arcsin(np.clip(sightings.source[low, 2], -1.0, 1.0)))
     yield low, [f"the sun is below the horizon: its elevation is {angle:.1f}°" for angle in angles]
-    yield copies(seen), "an exact copy of another sighting"
+    yield copies(sightings), "an exact copy of another sighting"
 
 
-def copies(seen: Sightings) -> Rows:
-    """Return which sightings repeat an earlier one: same mirror, time, counts and ray, (M,)."""
-    known = np.nan_to_num(seen.time, nan=-np.inf)[:, None]
-    table = np.hstack([seen.heliostat[:, None], known, seen.counts, seen.source, seen.destination])
-    again = np.ones(len(seen), np.bool_)
-    if len(seen):
+def copies(sightings: Sightings) -> Rows:
+    """Return the mask of sightings that repeat an earlier one (mirror, time, counts, ray), (M,)."""
+    known = np.nan_to_num(sightings.time, nan=-np.inf)[:, None]
+    table = np.hstack(
+        [
+            sightings.heliostat[:, None],
+            known,
+            sightings.counts,
+            sightings.source,
+            sightings.destination,
+        ]
+    )
+    again = np.ones(len(sightings), np.bool_)
+    if len(sightings):
         again[np.unique(table, axis=0, return_index=True)[1]] = False
     return again
 
 
 def _contradicted(
-    seen: Sightings, site: Site, reasons: Mapping[int, str]
+    sightings: Sightings, site: Site, reasons: Mapping[int, str]
 ) -> tuple[Rows, Texts, str]:
     """Return the suns that did not stand there at their time; a note where a mirror has most."""
-    able = seen.source_at_infinity & np.isfinite(seen.time)
+    able = sightings.source_at_infinity & np.isfinite(sightings.time)
     able[list(reasons)] = False
     if not able.any():
         return able, "", ""
-    expected, away = np.zeros((len(seen), 3)), np.zeros(len(seen))
-    expected[able] = solar.vector(seen.time[able], site)
-    away[able] = angle_between(seen.source[able], expected[able])
+    expected, away = np.zeros((len(sightings), 3)), np.zeros(len(sightings))
+    expected[able] = solar.vector(sightings.time[able], site)
+    away[able] = angle_between(sightings.source[able], expected[able])
     rows = away > MOVED
-    wrong, known = (np.bincount(seen.heliostat[mask]) for mask in (rows, able))
+    contradicted, known = (np.bincount(sightings.heliostat[mask]) for mask in (rows, able))
     mostly = np.zeros(len(known), np.bool_)
-    mostly[: len(wrong)] = 2 * wrong > known[: len(wrong)]
-    whole = rows & mostly[seen.heliostat] if rows.any() else rows
+    mostly[: len(contradicted)] = 2 * contradicted > known[: len(contradicted)]
+    whole = rows & mostly[sightings.heliostat] if rows.any() else rows
     note = ""
     if whole.any():
         middle = float(np.degrees(np.median(away[whole])))
@@ -184,22 +195,25 @@ def _contradicted(
             "[site]"
         )
         rows = rows & ~whole
-    where, there = azimuth_elevation(seen.source[rows]), azimuth_elevation(expected[rows])
+    where, expected_angles = (
+        azimuth_elevation(sightings.source[rows]),
+        azimuth_elevation(expected[rows]),
+    )
     texts = [
         f"the sun is given at azimuth {a % 360.0:.1f}°, elevation {e:.1f}°, and stood at "
         f"{b % 360.0:.1f}°, {f:.1f}° at that time: correct one of them"
-        for a, e, b, f in zip(*np.degrees(where), *np.degrees(there), strict=True)
+        for a, e, b, f in zip(*np.degrees(where), *np.degrees(expected_angles), strict=True)
     ]
     return rows, texts, note
 
 
 def _off_target(
-    seen: Sightings, given: Rows, surfaces: Sequence[Target | Receiver]
+    sightings: Sightings, camera_rows: Rows, surfaces: Sequence[Target | Receiver]
 ) -> tuple[Rows, Texts]:
-    away = np.full((len(surfaces), len(seen)), np.inf)
-    on = np.zeros(len(seen), np.bool_)
+    away = np.full((len(surfaces), len(sightings)), np.inf)
+    on = np.zeros(len(sightings), np.bool_)
     for k, surface in enumerate(surfaces):
-        gap = seen.destination - surface.center
+        gap = sightings.destination - surface.center
         away[k] = np.linalg.norm(gap, axis=1)
         if isinstance(surface, Receiver):
             on |= away[k] <= np.hypot(surface.width, surface.height)
@@ -208,7 +222,7 @@ def _off_target(
             [surface.width, surface.height]
         )
         on |= (across <= OFF).all(axis=1) & (np.abs(gap @ surface.normal) <= OFF)
-    rows = given & ~on
+    rows = camera_rows & ~on
     nearest = np.argmin(away[:, rows], axis=0)
     texts = [
         f"the beam's point is on no target: {away[k, i]:.1f} m from the centre of "
@@ -219,64 +233,65 @@ def _off_target(
 
 
 def _beyond_machine(
-    seen: Sightings, mechanism: Mechanism, reasons: Mapping[int, str]
+    sightings: Sightings, mechanism: Mechanism, reasons: Mapping[int, str]
 ) -> Iterator[tuple[Rows, Texts]]:
     """Yield what the mirror of a sighting cannot do."""
-    each = mechanism[seen.heliostat]
-    pose = each.pose(seen.counts)
-    near = np.zeros(len(seen), np.bool_)
+    mechanisms = mechanism[sightings.heliostat]
+    pose = mechanisms.pose(sightings.counts)
+    near = np.zeros(len(sightings), np.bool_)
     for points, far in (
-        (seen.source, seen.source_at_infinity),
-        (seen.destination, seen.destination_at_infinity),
+        (sightings.source, sightings.source_at_infinity),
+        (sightings.destination, sightings.destination_at_infinity),
     ):
         near |= ~far & (np.linalg.norm(points - pose.vertex, axis=1) < NEAREST)
     yield near, f"the ray begins or ends within {NEAREST} m of the mirror"
     with np.errstate(invalid="ignore", divide="ignore"):
-        source, way = ray_directions(seen, pose.vertex)
-        total = source + way
+        source, destination = ray_directions(sightings, pose.vertex)
+        total = source + destination
         size = np.linalg.norm(total, axis=1)
         edge = ~near & ~(size > 2.0 * np.cos(EDGE_ON))
         miss = angle_between(pose.normal, total / np.maximum(size, 1e-9)[:, None])
     yield edge, f"the beam passes the mirror edge-on, {np.degrees(EDGE_ON):.0f}° from its normal"
     # Only a nominal mechanism that holds for most of a mirror's sightings judges the others.
-    good = np.flatnonzero(~(near | edge) & ~np.isin(np.arange(len(seen)), list(reasons)))
+    good = np.flatnonzero(~(near | edge) & ~np.isin(np.arange(len(sightings)), list(reasons)))
     holds = np.zeros(len(mechanism), np.bool_)
-    for row in np.unique(seen.heliostat[good]):
-        mine = good[seen.heliostat[good] == row]
+    for row in np.unique(sightings.heliostat[good]):
+        mine = good[sightings.heliostat[good] == row]
         holds[row] = np.nan_to_num(np.median(miss[mine]), nan=np.inf) < FAR
-    judged = holds[seen.heliostat]
+    judged = holds[sightings.heliostat]
     for drive, joint in enumerate(mechanism.driven):
-        value, low, high, most, unit = _reach(each, seen.counts, drive)
+        value, low, high, most, unit = _reach(mechanisms, sightings.counts, drive)
         rows = ~((value >= low) & (value <= high)) & (judged | ~(np.abs(value) <= most))
         yield (
             rows,
             [
-                f"the counts {seen.counts[i, drive]:.10g} of {mechanism.joints[joint]} are beyond "
-                f"its stops: {value[i]:.5g}{unit} is outside {low[i]:.5g} to {high[i]:.5g}{unit}"
+                f"the counts {sightings.counts[i, drive]:.10g} of "
+                f"{mechanism.joints[joint]} are beyond its stops: "
+                f"{value[i]:.5g}{unit} is outside {low[i]:.5g} to {high[i]:.5g}{unit}"
                 for i in np.flatnonzero(rows)
             ],
         )
     behind = judged & (
-        np.minimum((pose.normal * source).sum(axis=1), (pose.normal * way).sum(axis=1))
+        np.minimum((pose.normal * source).sum(axis=1), (pose.normal * destination).sum(axis=1))
         < -np.sin(PLAY)
     )
     yield behind, "the beam comes from the back of the mirror at these counts"
 
 
 def _reach(
-    each: Mechanism, counts: FloatArray, drive: int
+    mechanisms: Mechanism, counts: FloatArray, drive: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, str]:
-    """Return what a drive did, its limits with play, what no zero or sense explains, and the unit.
+    """Return values of a drive, its limits with play, the greatest possible one, and the unit.
 
     All (M,), in counts where the drive has limits of counts, else in degrees.
     """
-    table = each.drives.table[:, drive]
+    table = mechanisms.drives.table[:, drive]
     low, high = (table[:, SLOTS[name]] for name in ("min_count", "max_count"))
     if np.isfinite(low).all() and np.isfinite(high).all():
         play = 0.02 * (high - low)
         most = 2.0 * np.maximum(np.abs(low), np.abs(high))
         return counts[:, drive], low - play, high + play, most, " counts"
-    angle = each.drives.angles(counts)[:, drive]
+    angle = mechanisms.drives.angles(counts)[:, drive]
     low, high = (table[:, SLOTS[name]] for name in ("min_angle", "max_angle"))
     limits = np.clip(np.array([low - PLAY, high + PLAY]), -MOST_TURNS, MOST_TURNS)
     most = np.full(len(counts), np.degrees(MOST_TURNS))

@@ -180,7 +180,7 @@ class HeliostatCalibration(Value, Framed):
 
     def _labelled(self) -> Labelled:
         row, units = ("heliostat",), tuple(map(unit_of, self.names))
-        both, seen = ("parameter", "parameter_2"), ("sighting", "across")
+        both, by_sighting = ("parameter", "parameter_2"), ("sighting", "across")
         variables = {
             "at": Variable(row, times([self.at])),
             "value": Variable(("parameter",), self.values, units),
@@ -192,8 +192,8 @@ class HeliostatCalibration(Value, Framed):
             "scale": Variable(row, [self.scale]),
             "outcome": Variable(row, [int(self.outcome)]),
             "version": Variable(row, [self.version]),
-            "residual_before": Variable(seen, self.residual_before, "rad"),
-            "residual_after": Variable(seen, self.residual_after, "rad"),
+            "residual_before": Variable(by_sighting, self.residual_before, "rad"),
+            "residual_after": Variable(by_sighting, self.residual_after, "rad"),
         }
         labels: dict[str, npt.ArrayLike] = {
             "heliostat": (self.heliostat,),

@@ -65,13 +65,13 @@ def precision(
         If a parameter is not in the table.
     """
     count = _batch(mechanism)
-    given = priors or {}
-    found = np.zeros((count, len(names), len(names)))
+    sigmas = priors or {}
+    information = np.zeros((count, len(names), len(names)))
     for p, name in enumerate(names):
-        sigma = as_float(given.get(name, mechanism.parameter(name).prior))
+        sigma = as_float(sigmas.get(name, mechanism.parameter(name).prior))
         if not (np.isfinite(sigma) & (sigma > 0)).all():
             raise InputError(f"prior of {name}: {sigma} must be above 0 and finite")
-        found[:, p, p] = 1.0 / sigma**2
+        information[:, p, p] = 1.0 / sigma**2
     if made is not None and len(made):
         if int(made.heliostat.max()) >= count:
             raise InputError(
@@ -79,8 +79,8 @@ def precision(
                 f"{count} heliostats"
             )
         slope = linearise(mechanism[made.heliostat], made, names).jacobian
-        np.add.at(found, made.heliostat, np.swapaxes(slope, -1, -2) @ slope)
-    return found
+        np.add.at(information, made.heliostat, np.swapaxes(slope, -1, -2) @ slope)
+    return information
 
 
 def expected_error(
@@ -119,12 +119,12 @@ def expected_error(
     count = max(len(suns), len(aims))
     suns = np.broadcast_to(suns, (count, 3))
     aims = np.broadcast_to(aims, (count, 3))
-    each = mechanism if mechanism.shape else mechanism[None]
-    each = each[np.zeros(count, dtype=np.intp)] if len(each) == 1 else each
-    found = track(each, suns, aims, current=current)
-    reachable = found.reachable
-    counts = np.where(reachable[:, None], found.best_counts, 0.0)
-    slope = _beam_slope(each, counts, suns, aims, names)
+    mechanisms = mechanism if mechanism.shape else mechanism[None]
+    mechanisms = mechanisms[np.zeros(count, dtype=np.intp)] if len(mechanisms) == 1 else mechanisms
+    tracking = track(mechanisms, suns, aims, current=current)
+    reachable = tracking.reachable
+    counts = np.where(reachable[:, None], tracking.best_counts, 0.0)
+    slope = _beam_slope(mechanisms, counts, suns, aims, names)
     spread = slope @ as_float(covariance) @ np.swapaxes(slope, -1, -2)
     spread = spread + noise**2 * np.eye(2)
     return ExpectedError(np.where(reachable[:, None, None], spread, np.nan), reachable)
@@ -186,8 +186,8 @@ def _beam_slope(
     names: tuple[str, ...],
 ) -> FloatArray:
     """Derivative of the beam's direction by the parameters at M poses, (M, 2, P)."""
-    seen = sightings(np.arange(len(counts)), counts, suns, aims)
-    line = linearise(mechanism, seen, names)
+    observed = sightings(np.arange(len(counts)), counts, suns, aims)
+    line = linearise(mechanism, observed, names)
     return np.asarray(line.beam @ line.jacobian)
 
 
@@ -227,8 +227,8 @@ def suns_of_year(
     shift = np.modf(np.arange(days) * 0.618034)[0]
     offsets = np.arange(0.0, 24.0, hours)
     times = noon[:, None] + 3600.0 * (offsets + hours * shift[:, None])
-    found = solar.position(times.ravel(), site)
-    suns = found.vector[found.elevation >= min_elevation]
+    position = solar.position(times.ravel(), site)
+    suns = position.vector[position.elevation >= min_elevation]
     if not len(suns):
         raise InputError(
             f"{site.label}: the sun never reaches {np.degrees(min_elevation):g}° in {year}; "
@@ -285,7 +285,7 @@ def unobservable(
     used = np.flatnonzero(before > 0)
     scaled = as_float(covariance)[np.ix_(used, used)] / np.outer(before[used], before[used])
     values, vectors = np.linalg.eigh(scaled)
-    found = []
+    spots = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
         if value < PRIOR_ONLY:
             break
@@ -299,8 +299,8 @@ def unobservable(
             shift = as_float(slope)[:, :, used] @ (vector * before[used]) * np.sqrt(value)
             beam = float(np.sqrt(np.mean(np.sum(shift**2, axis=-1))))
         text = _in_words(loadings, line_of_sight)
-        found.append(BlindSpot(text, loadings, float(min(value, 1.0)), beam))
-    return tuple(found)
+        spots.append(BlindSpot(text, loadings, float(min(value, 1.0)), beam))
+    return tuple(spots)
 
 
 def _in_words(loadings: tuple[tuple[str, float], ...], line: npt.ArrayLike | None) -> str:
@@ -308,8 +308,8 @@ def _in_words(loadings: tuple[tuple[str, float], ...], line: npt.ArrayLike | Non
     parts = dict(loadings)
     if line is not None and parts and all(name in places for name in parts):
         shift = np.array([parts.get(name, 0.0) for name in places])
-        way = as_float(line)
-        along = abs(shift @ way) / (np.linalg.norm(shift) * np.linalg.norm(way))
+        direction = as_float(line)
+        along = abs(shift @ direction) / (np.linalg.norm(shift) * np.linalg.norm(direction))
         if along > 0.9:
             return "position along the line of sight is known by the prior only"
     if len(loadings) == 1:

@@ -116,17 +116,17 @@ def read_field_sightings(
         if not math.isfinite(now):
             raise InputError(f"now is {now}; give Unix seconds")
     if table is not None:
-        found = _read_table(plant, place, Path(table), now)
+        field = _read_table(plant, place, Path(table), now)
     elif place.is_dir():
-        found = _read_folder(plant, place, centroid, now)
+        field = _read_folder(plant, place, centroid, now)
     else:
         raise InputError(
             f"{place}: a plant without measurements; give --sightings TABLE, or a folder with both"
         )
-    if not len(found.seen):
-        reason = f"; the first: {found.left_out[0]}" if found.left_out else ""
+    if not len(field.seen):
+        reason = f"; the first: {field.left_out[0]}" if field.left_out else ""
         raise FormatError(table or place, f"no measurement can be used{reason}")
-    return found
+    return field
 
 
 def _read_table(plant: Plant, place: Path, table: Path, now: float | None) -> FieldSightings:
@@ -138,33 +138,33 @@ def _read_table(plant: Plant, place: Path, table: Path, now: float | None) -> Fi
     ((group, heliostats),) = plant.groups.items()
     judged: list[Judgement] = []
 
-    def judge(seen: Sightings, kinds: Sequence[str]) -> Mapping[int, str]:
-        judged.append(judge_in(plant, seen, kinds, now))
+    def judge(observed: Sightings, kinds: Sequence[str]) -> Mapping[int, str]:
+        judged.append(judge_in(plant, observed, kinds, now))
         return judged[0].reasons
 
-    seen, _, left = read_sightings(table, heliostats.names, judge)
-    ids = tuple(f"{heliostats.names[h]} {k}" for k, h in enumerate(seen.heliostat))
-    return FieldSightings(plant, group, seen, ids, tuple(left), judged[0].notes)
+    observed, _, left_out = read_sightings(table, heliostats.names, judge)
+    ids = tuple(f"{heliostats.names[h]} {k}" for k, h in enumerate(observed.heliostat))
+    return FieldSightings(plant, group, observed, ids, tuple(left_out), judged[0].notes)
 
 
 def _read_folder(
     plant: Plant, place: Path, centroid: Literal["utis", "helios"], now: float | None
 ) -> FieldSightings:
     ((group, heliostats),) = plant.groups.items()
-    found = measurements.read_measurements(place, centroid=centroid)
-    seen, left = of_measurements(found, heliostats)
+    table = measurements.read_measurements(place, centroid=centroid)
+    observed, left_out = of_measurements(table, heliostats)
     known = set(heliostats.names)
-    pairs = zip(found.heliostat, found.ids, strict=True)
+    pairs = zip(table.heliostat, table.ids, strict=True)
     ids = [f"{name} {number}" for name, number in pairs if name in known]
-    judged = judge_in(plant, seen, ["camera_target"] * len(seen), now)
-    kept = [k for k in range(len(seen)) if k not in judged.reasons]
+    judged = judge_in(plant, observed, ["camera_target"] * len(observed), now)
+    kept = [k for k in range(len(observed)) if k not in judged.reasons]
     impossible = [f"{ids[k]}: {reason}" for k, reason in sorted(judged.reasons.items())]
     return FieldSightings(
         plant,
         group,
-        seen.take(kept),
+        observed.take(kept),
         tuple(ids[k] for k in kept),
-        (*found.left_out, *left, *impossible),
+        (*table.left_out, *left_out, *impossible),
         judged.notes,
     )
 
@@ -192,8 +192,8 @@ class ModelChoice:
 
     def describe(self) -> tuple[str, ...]:
         """Return lines for people: the comparison, and the periodic errors that were found."""
-        found = tuple(f"{error}." for error in self.periodic if error.found)
-        return (*models.describe(self.scores), *found)
+        lines = tuple(f"{error}." for error in self.periodic if error.found)
+        return (*models.describe(self.scores), *lines)
 
 
 def find_model(
@@ -332,14 +332,14 @@ def evaluate(
         runner=runner,
         progress=_step(steps, "learning from the training part"),
     )
-    found = None
+    prediction = None
     if split == "sequential":
         step = _step(steps, "predicting each sighting from those before it")
         if learner == "stream":
-            found = predict_by_stream(learned, progress=step)
+            prediction = predict_by_stream(learned, progress=step)
         else:
-            found = predict_in_turn(learned, priors=priors, runner=runner, progress=step)
-    return HeldOutEvaluation(learned, assess(names, learned, found, tested), choice)
+            prediction = predict_in_turn(learned, priors=priors, runner=runner, progress=step)
+    return HeldOutEvaluation(learned, assess(names, learned, prediction, tested), choice)
 
 
 def calibrate(
@@ -412,8 +412,8 @@ def calibrate(
 def clock_of(field: FieldSightings, learned: Learned) -> ClockCheck | None:
     """Return the common error of the clock by the sightings of all mirrors that fit."""
     rows = [misfit.row for misfit in learned.misfits]
-    seen = field.seen.take(~np.isin(field.seen.heliostat, rows))
-    return check_clock(learned.mechanism, seen, learned.model, field.plant.site)
+    observed = field.seen.take(~np.isin(field.seen.heliostat, rows))
+    return check_clock(learned.mechanism, observed, learned.model, field.plant.site)
 
 
 def _with_mechanism(plant: Plant, group: str, mechanism: Mechanism) -> Plant:

@@ -287,14 +287,14 @@ def undistort(camera: Pinhole, pixels: npt.ArrayLike) -> FloatArray:
     """Return the normalised places x/z, y/z (..., 2) of pixels (..., 2), without distortion."""
     import cv2
 
-    given = as_float(pixels)
-    flat = np.ascontiguousarray(given).reshape(-1, 1, 2)
+    array = as_float(pixels)
+    flat = np.ascontiguousarray(array).reshape(-1, 1, 2)
     if len(flat) == 0:
-        return np.empty(given.shape)
+        return np.empty(array.shape)
     # Brown's series has no closed inverse; the iteration ends below a thousandth of a pixel.
     end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
-    found = cv2.undistortPoints(flat, camera.matrix, camera.distortion, criteria=end)
-    return as_float(found).reshape(given.shape)
+    places = cv2.undistortPoints(flat, camera.matrix, camera.distortion, criteria=end)
+    return as_float(places).reshape(array.shape)
 
 
 def local_rays(camera: Pinhole, pixels: npt.ArrayLike) -> FloatArray:

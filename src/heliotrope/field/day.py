@@ -137,12 +137,12 @@ def _aim(heliostat: Steered, aim: str | Target | Receiver | npt.ArrayLike | None
         raise InputError("aim: there is no target; give a point, east, north and up in m")
     first = targets[0].center if targets else None
     own = _own_aims(heliostat)
-    if first is None and not all(one is not None for one in own):
+    if first is None and not all(point is not None for point in own):
         raise InputError("aim: there is no target; give a point, east, north and up in m")
-    if all(one is None for one in own):
+    if all(point is None for point in own):
         return np.asarray(first)
-    each = np.array([first if one is None else one for one in own])
-    return each[0] if isinstance(heliostat, Heliostat) else each
+    aims = np.array([first if point is None else point for point in own])
+    return aims[0] if isinstance(heliostat, Heliostat) else aims
 
 
 def _own_aims(heliostat: Steered) -> list[FloatArray | None]:

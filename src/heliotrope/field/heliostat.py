@@ -119,7 +119,7 @@ class Heliostat(Value, Framed):
 
     @property
     def cluster(self) -> str:
-        """Name of its cluster, "" if none."""
+        """Name of its cluster; empty without one."""
         return self.heliostats.cluster[0] if self.heliostats.cluster else ""
 
     @property

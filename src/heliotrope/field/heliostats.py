@@ -65,7 +65,7 @@ class Heliostats(Value, Framed):
     aim
         Aim points in operation, ENU metres, (N, 3); NaN where not given.
     cluster
-        Name of each heliostat's cluster, "" if none.
+        Name of each heliostat's cluster; empty without one.
     machines
         Motor limits and resting places of each, or () where the plant file gives none.
     """
@@ -89,15 +89,15 @@ class Heliostats(Value, Framed):
         check_names("heliostat", self.names)
         for what in ("width", "height"):
             values = np.broadcast_to(as_float(getattr(self, what)), (count,))
-            wrong = ~(np.isfinite(values) & (values > 0))
-            if wrong.any():
-                i = int(np.flatnonzero(wrong)[0])
+            invalid = ~(np.isfinite(values) & (values > 0))
+            if invalid.any():
+                i = int(np.flatnonzero(invalid)[0])
                 raise InputError(f"heliostat {self.names[i]}: {what} {values[i]} m must be above 0")
             object.__setattr__(self, what, values)
         clean = {}
-        for name, given in self.parameters.items():
+        for name, parameter in self.parameters.items():
             self.mechanism.parameter(name)
-            values = np.array(np.broadcast_to(as_float(given), (count,)))
+            values = np.array(np.broadcast_to(as_float(parameter), (count,)))
             if not np.isfinite(values).all():
                 i = int(np.flatnonzero(~np.isfinite(values))[0])
                 raise InputError(
@@ -214,10 +214,10 @@ class Heliostats(Value, Framed):
         if index.dtype == bool:
             index = np.flatnonzero(index)
         index = index.reshape(-1).astype(np.intp)
-        wrong = (index < -len(self)) | (index >= len(self))
-        if wrong.any():
+        outside = (index < -len(self)) | (index >= len(self))
+        if outside.any():
             raise InputError(
-                f"rows: {index[wrong][0]} is not there; rows go from 0 to {len(self) - 1}"
+                f"rows: {index[outside][0]} is not there; rows go from 0 to {len(self) - 1}"
             )
         facets = self.facets
         return replace(
@@ -256,10 +256,10 @@ class Heliostats(Value, Framed):
 
     def with_rows(self, calibration: Calibrated, rows: npt.NDArray[np.intp]) -> "Heliostats":
         """Return the heliostats with given rows of a calibration, (N,); −1 keeps their own."""
-        given, merged = calibration.parameters, {}
-        for name in dict.fromkeys((*self.parameters, *given)):
+        fitted, merged = calibration.parameters, {}
+        for name in dict.fromkeys((*self.parameters, *fitted)):
             own = self.parameters.get(name, np.zeros(len(self)))
-            new = np.broadcast_to(as_float(given.get(name, 0.0)), _size(calibration))
+            new = np.broadcast_to(as_float(fitted.get(name, 0.0)), _size(calibration))
             merged[name] = np.where(rows >= 0, new[rows], own)
         return self.with_parameters(merged)
 

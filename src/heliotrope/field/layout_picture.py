@@ -50,8 +50,8 @@ def _whole(ax: "Axes", plant: Plant) -> None:
     ax.scatter(plant.position[:, 0], plant.position[:, 1], s=size, c=colours, linewidths=0.0)
     for k, target in enumerate(plant.targets):
         ax.plot(*target.corners[:2, :2].T, "k-", lw=3.0, label=None if k else "target")
-    seen = [c.position for c in plant.cameras if c.position is not None]
-    for k, place in enumerate(seen):
+    positions = [c.position for c in plant.cameras if c.position is not None]
+    for k, place in enumerate(positions):
         ax.plot(place[0], place[1], "k^", ms=7, mfc="white", label=None if k else "camera")
     for k, receiver in enumerate(plant.receivers):
         ax.plot(*receiver.center[:2], "ks", ms=7, label=None if k else "receiver")

@@ -148,7 +148,7 @@ class Ground:
         return np.asarray(self.bearing + around[np.abs(around) * step <= self.half_angle] * step)
 
     def clear(self, places: FloatArray) -> np.ndarray:
-        """Return which places (N, 2) are in no circle that is kept free."""
+        """Return the mask of places (N, 2) outside all circles that are kept free, (N,)."""
         kept = np.ones(len(places), dtype=np.bool_)
         for east, north, radius in self.free:
             kept &= np.hypot(places[:, 0] - east, places[:, 1] - north) > radius
@@ -210,8 +210,8 @@ def _ring_step(radius: float, zone: float, mirror: HeliostatSize, ground: Ground
     """Return the distance from one ring to the next, m."""
     dense = 0.5 * np.sqrt(3.0) * mirror.reach
     # A ring that begins a zone has other azimuths, so no stagger can be relied on.
-    seen = 0.5 * mirror.height / np.sin(ground.elevation(radius))
-    step = float(max(dense, seen))
+    sightline = 0.5 * mirror.height / np.sin(ground.elevation(radius))
+    step = float(max(dense, sightline))
     return float(max(step, mirror.reach)) if radius + step >= 2.0 * zone else step
 
 
@@ -263,17 +263,17 @@ def _two_fields(count: int, ground: Ground, pitch: float, step: Callable[[float]
     _check_count(count)
     parts: list[FloatArray] = []
     names: list[str] = []
-    for field, wanted in {"N": (count + 1) // 2, "S": count // 2}.items():
+    for field, needed in {"N": (count + 1) // 2, "S": count // 2}.items():
         sign = 1.0 if field == "N" else -1.0
-        across = _row_length(wanted, ground.nearest, pitch, step)
+        across = _row_length(needed, ground.nearest, pitch, step)
         north, row, made = ground.nearest, 0, 0
-        while made < wanted:
+        while made < needed:
             shift = 0.5 if row % 2 else 0.0
             half = max(0, int(across / 2.0))
             east = (np.arange(-half, half + 1) + shift) * pitch
             flat = np.stack([east, np.full(len(east), sign * north)], axis=-1)
             flat = flat[ground.clear(flat)]
-            flat = _central(flat, wanted - made)
+            flat = _central(flat, needed - made)
             row += 1
             names += [f"{field}{row:03d}-{k:03d}" for k in range(1, len(flat) + 1)]
             parts.append(flat)
@@ -282,10 +282,10 @@ def _two_fields(count: int, ground: Ground, pitch: float, step: Callable[[float]
     return _places(names, parts)
 
 
-def _row_length(wanted: int, nearest: float, pitch: float, step: Callable[[float], float]) -> float:
-    """Places of a row, so that a field of ``wanted`` mirrors is about twice as wide as deep."""
+def _row_length(count: int, nearest: float, pitch: float, step: Callable[[float], float]) -> float:
+    """Return the places of a row that make ``count`` mirrors about twice as wide as deep."""
     north, rows_made = nearest, 0
-    while rows_made * 2.0 * (north - nearest) / pitch < wanted:
+    while rows_made * 2.0 * (north - nearest) / pitch < count:
         north += step(north)
         rows_made += 1
     return 2.0 * (north - nearest) / pitch
@@ -312,8 +312,8 @@ def six_packs(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
         middle = radius + depth
         packs = _triangles(around, middle, step)
         packs = packs[ground.clear(packs.reshape(-1, 2)).reshape(-1, PACK).all(axis=1)]
-        left = -(-count // PACK) - made
-        packs = _central(packs, left)
+        remaining = -(-count // PACK) - made
+        packs = _central(packs, remaining)
         parts.append(packs.reshape(-1, 2))
         made += len(packs)
         road = max(step, mirror.height / np.sin(ground.elevation(radius)))
@@ -388,9 +388,9 @@ PATTERNS: dict[str, Callable[[int, HeliostatSize, Ground], Places]] = {
 TWO_SIDED = ("rows", "twin-field")
 
 
-def clusters(count: int, each: int = CLUSTER) -> tuple[str, ...]:
+def clusters(count: int, size: int = CLUSTER) -> tuple[str, ...]:
     """Return the cluster of each heliostat in the order of their places, from "C001" on."""
-    return tuple(f"C{1 + i // each:03d}" for i in range(count))
+    return tuple(f"C{1 + i // size:03d}" for i in range(count))
 
 
 def stepped(position: FloatArray, mirror: HeliostatSize) -> Mechanism:
@@ -465,18 +465,18 @@ def unlit_machines(
         rad, north positive.
     """
     drives, armature = Drive(mechanism.drives.table), mechanism.armature
-    stow = np.array([one.stow for one in machines])
+    stow = np.array([machine.stow for machine in machines])
     center = np.mean([place for place, _ in things], axis=0)
     away = armature.origin_1 - center
     turned = np.stack([np.arctan2(away[:, 0], away[:, 1]), np.full(len(stow), _STOW)], axis=-1)
-    left = _lights(armature.pose(drives.angles(stow.astype(np.float64))), things, latitude)
-    while left.any() and turned[:, 1].min() >= _LOWEST_STOW:
-        turned[left, 1] -= _STOW_STEP
-        stow[left] = np.round(drives.counts(turned))[left]
-        left &= _lights(armature.pose(turned), things, latitude)
+    lighting = _lights(armature.pose(drives.angles(stow.astype(np.float64))), things, latitude)
+    while lighting.any() and turned[:, 1].min() >= _LOWEST_STOW:
+        turned[lighting, 1] -= _STOW_STEP
+        stow[lighting] = np.round(drives.counts(turned))[lighting]
+        lighting &= _lights(armature.pose(turned), things, latitude)
     return tuple(
-        replace(one, stow=(int(a), int(b)), stow_lights=bool(left.any()))
-        for one, (a, b) in zip(machines, stow.tolist(), strict=True)
+        replace(machine, stow=(int(a), int(b)), stow_lights=bool(lighting.any()))
+        for machine, (a, b) in zip(machines, stow.tolist(), strict=True)
     )
 
 
@@ -492,15 +492,15 @@ def _lights(
     """
     normal, vertex = pose
     pole = np.array([0.0, np.cos(latitude), np.sin(latitude)])
-    found = np.zeros(len(normal), dtype=np.bool_)
+    reached = np.zeros(len(normal), dtype=np.bool_)
     for center, radius in things:
-        way = center - vertex
-        distance = np.linalg.norm(way, axis=-1)
+        path = center - vertex
+        distance = np.linalg.norm(path, axis=-1)
         cone = np.arcsin(np.minimum((radius + _ROOM) / distance, 1.0)) + _SPREAD
-        sun = reflect(way / distance[:, None], normal)
+        sun = reflect(path / distance[:, None], normal)
         up = np.arcsin(np.clip(sun[:, 2], -1.0, 1.0)) + cone > _SUNRISE
-        found |= up & (np.abs(np.arcsin(np.clip(sun @ pole, -1.0, 1.0))) - cone < _TROPIC)
-    return found
+        reached |= up & (np.abs(np.arcsin(np.clip(sun @ pole, -1.0, 1.0))) - cone < _TROPIC)
+    return reached
 
 
 def malan_plant(heliostats: int = 10_000) -> Plant:
@@ -613,9 +613,9 @@ def _middle(
     right = direction(facing - 0.5 * np.pi, 0.0)
     base = np.array([0.0, 0.0, pivot])
     # As seen by someone who faces the tower. Each of two fields has its own target.
-    ways = {"left": (-1.0, facing), "right": (1.0, facing + np.pi if both else facing)}
+    sides = {"left": (-1.0, facing), "right": (1.0, facing + np.pi if both else facing)}
     targets, cameras = [], []
-    for name, (side, front) in ways.items():
+    for name, (side, front) in sides.items():
         center = side * aside * right + np.array([0.0, 0.0, up])
         target = tower.square_target(name, center, 12.0 * share, front)
         targets.append(target)

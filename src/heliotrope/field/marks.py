@@ -1,4 +1,4 @@
-"""Marks on a target, by which a camera finds it."""
+"""Marks on a target: a camera finds the target by them."""
 
 from dataclasses import dataclass
 

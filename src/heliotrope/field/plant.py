@@ -108,17 +108,17 @@ class Plant(Value, Framed):
         same = (np.diff(cells[order], axis=0) == 0.0).all(axis=1)
         if same.any():
             k = int(np.flatnonzero(same)[0])
-            one, other = (self.names[i] for i in sorted(order[k : k + 2].tolist()))
+            first, other = (self.names[i] for i in sorted(order[k : k + 2].tolist()))
             east, north, up = self.position[order[k]]
             raise InputError(
-                f"heliostats {one} and {other} stand at one place: {east:.2f} m east, "
+                f"heliostats {first} and {other} stand at one place: {east:.2f} m east, "
                 f"{north:.2f} m north, {up:.2f} m up; correct one, or leave it out"
             )
 
     def _card(self) -> Card:
         s = self.site
         counts = ((self.targets, "target"), (self.receivers, "receiver"), (self.cameras, "camera"))
-        parts = ", ".join(amount(len(found), noun) for found, noun in counts if found)
+        parts = ", ".join(amount(len(surfaces), noun) for surfaces, noun in counts if surfaces)
         line = f"{self.name}, {amount(len(self), 'heliostat')}; {parts or 'no target'}; site "
         line += (
             f"{s.name} {s.latitude_deg:.4f}° north, {s.longitude_deg:.4f}° east, {s.height:.0f} m"

@@ -6,7 +6,7 @@ mirrors of 0.3 m by 0.3 m; 200-step motors in eighths of a step behind a worm of
 in the north-west, about 40 m from the upper one to the middle of the heliostats (6.1), the lower
 one 13 m up (4.3); the heliostat of 6.3, 30.8 m south and 19.2 m east of the tower with its pivot
 1.2 m up; and stow, the mirror upright and facing north (6.5). Beams go to the upper target, which
-stands for a receiver, or to the lower one for calibration.
+serves as the receiver, or to the lower one for calibration.
 
 The thesis does not give the size of a structure, the place of the other heliostats, the bearing of
 the targets, the motors' rate, the camera's place or the latitude: these are ours.

@@ -32,7 +32,7 @@ class Target(Value):
     markers
         Further known points by name, ENU metres.
     marks
-        Marks painted on it, by which cameras find it.
+        Marks painted on it; cameras find it by them.
     """
 
     name: str
@@ -128,12 +128,12 @@ class Target(Value):
         return self.center + np.asarray(plane, dtype=np.float64) @ self.axes
 
     def holds(self, points: npt.ArrayLike, off: float = _DEPTH) -> npt.NDArray[np.bool_]:
-        """Return which points (..., 3), ENU, lie on the target; one that is not finite does not.
+        """Return the mask of points (..., 3), ENU, on the target; NaN is not on it.
 
         They are within its border, and at most ``off`` m in front of or behind it.
         """
-        given = np.asarray(points, dtype=np.float64)
-        away = given - self.center
+        array = np.asarray(points, dtype=np.float64)
+        away = array - self.center
         place = away @ self.axes.T
         corners = self.plane_coordinates(self.corners)
         inside = (place >= corners.min(axis=0)) & (place <= corners.max(axis=0))

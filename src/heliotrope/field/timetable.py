@@ -84,8 +84,8 @@ class TimetableEntry:
     def document(self) -> dict[str, Any]:
         """The entry with the keys of the plant file; what is not set is left out."""
         rest = {"target": self.target, "at": list(self.at), "every_s": self.every}
-        given = {key: value for key, value in rest.items() if value}
-        return {"name": self.name, "heliostats": list(self.heliostats), **given}
+        settings = {key: value for key, value in rest.items() if value}
+        return {"name": self.name, "heliostats": list(self.heliostats), **settings}
 
     @cached_property
     def seconds(self) -> FloatArray:
@@ -101,8 +101,8 @@ class TimetableEntry:
     def next(self, after: float) -> float:
         """Return when it is due first after a time, POSIX s."""
         day = math.floor(after / DAY) * DAY
-        left = self.seconds[self.seconds > after - day]
-        return day + (float(left[0]) if len(left) else DAY + float(self.seconds[0]))
+        remaining = self.seconds[self.seconds > after - day]
+        return day + (float(remaining[0]) if len(remaining) else DAY + float(self.seconds[0]))
 
 
 def check_timetable(
@@ -133,12 +133,12 @@ def check_timetable(
 def _second_of_day(who: str, text: str) -> float:
     """Return the time of day, s after midnight UTC."""
     try:
-        found = time.fromisoformat(text)
+        parsed = time.fromisoformat(text)
     except (ValueError, TypeError):
         raise InputError(
             f"{who}: {text!r} is no time of day; write 08:30Z or 10:30+02:00"
         ) from None
-    if found.tzinfo is None:
+    if parsed.tzinfo is None:
         raise InputError(f"{who}: {text!r} has no zone; write {text}Z for UTC, or {text}+02:00")
-    utc = datetime.combine(date(2000, 1, 2), found).astimezone(UTC)
+    utc = datetime.combine(date(2000, 1, 2), parsed).astimezone(UTC)
     return 3600.0 * utc.hour + 60.0 * utc.minute + utc.second

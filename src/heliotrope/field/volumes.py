@@ -72,8 +72,8 @@ class Cylinder:
     radius: float
 
     def __post_init__(self) -> None:
-        way = _point(self.name, "end", self.end) - _point(self.name, "start", self.start)
-        if not np.linalg.norm(way) > 0.0:
+        axis = _point(self.name, "end", self.end) - _point(self.name, "start", self.start)
+        if not np.linalg.norm(axis) > 0.0:
             raise InputError(f"volume {self.name}: its two ends coincide; give two points")
         _positive(self.name, "radius", self.radius)
 
@@ -164,12 +164,12 @@ def outline(volume: Volume) -> FloatArray:
 
 def _shadow(start: FloatArray, end: FloatArray, circle: FloatArray) -> FloatArray:
     """Return the outline of a cylinder from above; its ends are seen as ellipses."""
-    way = (end - start) / np.linalg.norm(end - start)
-    flat = float(np.hypot(way[0], way[1]))
-    along = way[:2] / flat if flat > 0.0 else np.array([1.0, 0.0])
+    axis = (end - start) / np.linalg.norm(end - start)
+    flat = float(np.hypot(axis[0], axis[1]))
+    along = axis[:2] / flat if flat > 0.0 else np.array([1.0, 0.0])
     across = np.array([-along[1], along[0]])
     # An end is a disc: upright it is a circle, lying down a line across.
-    disc = circle[:, :1] * abs(way[2]) * along + circle[:, 1:] * across
+    disc = circle[:, :1] * abs(axis[2]) * along + circle[:, 1:] * across
     ahead = circle[:, :1] >= 0.0
     return np.asarray(np.where(ahead, end[:2], start[:2]) + disc)
 

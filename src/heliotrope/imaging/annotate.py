@@ -57,8 +57,8 @@ class _Sheet:
         if max(width, height) < LONGEST // 2:
             self.factor = float(LONGEST // 2 // max(width, height))
         size = (round(width * self.factor), round(height * self.factor))
-        way = cv2.INTER_AREA if self.factor < 1.0 else cv2.INTER_NEAREST
-        self.picture: Image = np.ascontiguousarray(cv2.resize(pixels, size, interpolation=way))
+        method = cv2.INTER_AREA if self.factor < 1.0 else cv2.INTER_NEAREST
+        self.picture: Image = np.ascontiguousarray(cv2.resize(pixels, size, interpolation=method))
         self.faces = photograph.faces
 
     def at(self, pixels: FloatArray) -> Image:
@@ -66,7 +66,7 @@ class _Sheet:
         place = (np.asarray(pixels) + 0.5) * self.factor - 0.5
         return np.round(16.0 * np.clip(place, -1e5, 1e5)).astype(np.int32)
 
-    def seen(self, face: LookedAt, plane: FloatArray) -> FloatArray:
+    def frame_pixels(self, face: LookedAt, plane: FloatArray) -> FloatArray:
         """Return frame pixels of places in a face's plane; a crop has no view."""
         picture = face.picture
         if picture.view is not None:
@@ -91,7 +91,7 @@ class _Sheet:
             sides = [
                 a + t * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
             ]
-            self.line(self.seen(face, np.concatenate(sides)), FACE)
+            self.line(self.frame_pixels(face, np.concatenate(sides)), FACE)
 
     def marks(self, reading: TargetReading) -> None:
         import cv2
@@ -114,17 +114,17 @@ class _Sheet:
             if f.picture.shape == placed.spot.region.shape
             and (placed.target is None or placed.target in f.picture.face.targets)
         )
-        found = cv2.findContours(
+        contours = cv2.findContours(
             placed.spot.region.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
         )
-        for contour in found[0]:
+        for contour in contours[0]:
             border = face.picture.plane(contour.reshape(-1, 2).astype(np.float64))
-            self.line(self.seen(face, border), colour)
+            self.line(self.frame_pixels(face, border), colour)
         centre = placed.spot.centroid
-        self.line(self.seen(face, _ellipse(centre, placed.spot.second_moments)), colour)
-        sure = self.seen(face, _ellipse(centre, placed.covariance, _NINETY))
+        self.line(self.frame_pixels(face, _ellipse(centre, placed.spot.second_moments)), colour)
+        sure = self.frame_pixels(face, _ellipse(centre, placed.covariance, _NINETY))
         cv2.fillPoly(self.picture, [self.at(sure).reshape(-1, 1, 2)], colour, cv2.LINE_AA, 4)
-        x, y = (self.at(self.seen(face, centre)) / 16.0).astype(int)
+        x, y = (self.at(self.frame_pixels(face, centre)) / 16.0).astype(int)
         cv2.drawMarker(
             self.picture, (int(x), int(y)), (0, 0, 0), cv2.MARKER_TILTED_CROSS, 12, 1, cv2.LINE_AA
         )
@@ -134,9 +134,9 @@ class _Sheet:
         import cv2
 
         lines = []
-        seen = [r for r in photograph.readings if r.found.found]
+        present = [r for r in photograph.readings if r.found.found]
         # A camera sees few of a plant's targets: absent ones matter only if all are absent.
-        for reading in seen or photograph.readings:
+        for reading in present or photograph.readings:
             colour = GOOD if reading.good else BAD
             lines += [(line, colour) for line in _said(reading)]
         if photograph.beside:

@@ -95,7 +95,7 @@ class Outcome:
     document
         Everything found, ready for JSON; empty if the file could not be read.
     problem
-        Why it could not be read; "" if it could.
+        Why it could not be read; empty if it was.
     point, covariance
         Place of the spot that counts, ENU, (3,) and (3, 3); None if no spot can be trusted.
     target
@@ -227,27 +227,27 @@ def _target(job: Job, name: str, path: Path) -> Target:
 
 
 def meant(photograph: Photograph, target: str) -> tuple[TargetReading | None, str]:
-    """Return the reading that counts and why it cannot be trusted ("" if it can).
+    """Return the reading that counts, and the reasons not to trust it (empty: it is good).
 
     Parameters
     ----------
     photograph
         The photograph, already read.
     target
-        Target that the beam was sent to; "" if unknown, and then exactly one must have a spot.
+        Target that the beam was sent to; if empty, exactly one must have a spot.
     """
     if target:
         reading = photograph.reading(target)
         return reading, _why(reading)
-    lit = [r for r in photograph.readings if r.spots]
-    if len(lit) > 1:
-        names = ", ".join(r.found.target.name for r in lit)
+    with_spots = [r for r in photograph.readings if r.spots]
+    if len(with_spots) > 1:
+        names = ", ".join(r.found.target.name for r in with_spots)
         return None, f"several targets have spots ({names}) and none is named as the intended one"
-    if lit:
-        return lit[0], _why(lit[0])
-    found = [r for r in photograph.readings if r.found.found]
-    if found:
-        return found[0], _why(found[0])
+    if with_spots:
+        return with_spots[0], _why(with_spots[0])
+    present = [r for r in photograph.readings if r.found.found]
+    if present:
+        return present[0], _why(present[0])
     texts = {r.found.reason for r in photograph.readings}
     return None, "no target was found: " + "; ".join(sorted(texts))
 
@@ -270,10 +270,10 @@ def document(photograph: Photograph, origin: Origin, annotated: Path | None) -> 
 
 
 def _reading(reading: TargetReading, origin: Origin) -> dict[str, Any]:
-    found = reading.found
+    result = reading.found
     entry: dict[str, Any] = {
-        "target": found.target.name,
-        "found": found.found,
+        "target": result.target.name,
+        "found": result.found,
         "good": reading.good,
         "reasons": [
             {"name": r.name, "value": r.value, "limit": r.limit, "text": r.text}
@@ -282,11 +282,11 @@ def _reading(reading: TargetReading, origin: Origin) -> dict[str, Any]:
         "spots": [_spot(s, origin) for s in reading.spots],
         "marks": [
             {"name": m.mark.name, "pixel": m.pixel.tolist(), "used": m.used, "reason": m.reason}
-            for m in found.marks
+            for m in result.marks
         ],
     }
-    if found.view is not None:
-        entry["marks_residual_px"] = found.view.residual
+    if result.view is not None:
+        entry["marks_residual_px"] = result.view.residual
     return entry
 
 
@@ -343,12 +343,12 @@ def process_many(
         Called with the numbers of finished and of all photographs.
     """
     tasks = list(zip(paths, entries, strict=True))
-    found: list[Outcome | None] = [None] * len(tasks)
+    outcomes: list[Outcome | None] = [None] * len(tasks)
     for done, (k, outcome) in enumerate(_outcomes(tasks, job, processes, client), start=1):
-        found[k] = outcome
+        outcomes[k] = outcome
         if progress is not None:
             progress(done, len(tasks))
-    return [outcome for outcome in found if outcome is not None]
+    return [outcome for outcome in outcomes if outcome is not None]
 
 
 def _outcomes(
@@ -404,13 +404,13 @@ def entries_of(paths: Sequence[Path], log: Log | None, heliostat: str = "") -> l
     FormatError
         If a file beside a photograph cannot be read.
     """
-    found: list[Entry | None] = []
+    entries: list[Entry | None] = []
     for path in paths:
         entry = None if log is None else log.find(path)
         if entry is None:
             entry = beside(path, heliostat)
-        found.append(entry)
-    return found
+        entries.append(entry)
+    return entries
 
 
 def to_sightings(
@@ -457,7 +457,7 @@ def to_sightings(
         rows.append((index[entry.heliostat], entry.counts, sun, outcome, seconds, spread))
     if not rows:
         return None, left_out
-    seen = camera_target(
+    sightings = camera_target(
         np.array([r[0] for r in rows]),
         np.array([r[1] for r in rows]),
         np.array([r[2] for r in rows]),
@@ -467,11 +467,11 @@ def to_sightings(
         sun_covariance=np.array([r[5] for r in rows]),
         centroid_covariance=np.array([r[3].covariance for r in rows]),
     )
-    judged = judge(seen, mechanism=mechanism, site=site, now=now)
+    judged = judge(sightings, mechanism=mechanism, site=site, now=now)
     left_out += [f"{rows[k][3].path.name}: {text}" for k, text in sorted(judged.reasons.items())]
     left_out += judged.notes
-    kept = np.flatnonzero(~np.isin(np.arange(len(seen)), list(judged.reasons)))
-    return seen.take(kept) if len(kept) else None, left_out
+    kept = np.flatnonzero(~np.isin(np.arange(len(sightings)), list(judged.reasons)))
+    return sightings.take(kept) if len(kept) else None, left_out
 
 
 def sighting_of(
@@ -496,7 +496,7 @@ def sighting_of(
     site
         For the sun's direction.
     target
-        Target that the beam was sent to; "" if exactly one has a spot.
+        Target that the beam was sent to; may be empty where exactly one has a spot.
     time
         See `heliotrope.sun.Times`; by default that of the frame.
     sun

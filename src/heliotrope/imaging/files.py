@@ -170,7 +170,7 @@ def find_images(folder: str | Path, recursive: bool = False) -> list[Path]:
     try:
         if not stat.S_ISDIR(place.stat().st_mode):
             raise InputError(f"{place}: not a folder; give one with images")
-        found = [
+        images = [
             item
             for item in check_entries(place, place.rglob("*") if recursive else place.iterdir())
             if item.suffix.lower() in IMAGE_SUFFIXES
@@ -181,7 +181,7 @@ def find_images(folder: str | Path, recursive: bool = False) -> list[Path]:
         raise InputError(
             f"{place}: cannot be read ({error.strerror}); give a folder with images"
         ) from None
-    return sorted(found, key=_natural)
+    return sorted(images, key=_natural)
 
 
 def _natural(path: Path) -> tuple[list[tuple[int, str, int]], str]:
@@ -334,12 +334,12 @@ def _check_tiff(file: Path, image: TiffImagePlugin.TiffImageFile, data: bytes) -
 def _further_pages(data: bytes) -> Iterator[int]:
     """Yield NewSubfileType of each page after the first; bit 0 marks a smaller version."""
     stream, directory = io.BytesIO(data), TiffImagePlugin.ImageFileDirectory_v2(data[:8])
-    seen: set[int] = set()
-    while directory.next and directory.next not in seen:
-        seen.add(directory.next)
+    visited: set[int] = set()
+    while directory.next and directory.next not in visited:
+        visited.add(directory.next)
         stream.seek(directory.next)
         directory.load(stream)
-        if len(seen) > 1:
+        if len(visited) > 1:
             yield directory.get(254, 0)
 
 
@@ -381,7 +381,7 @@ def _is_deep_colour(container: _Container) -> bool:
 
 
 def _eight_bit(image: ImageFile.ImageFile) -> Pixels:
-    """Return what Pillow decodes: 8 bits, or grey of 16."""
+    """Return the pixels that Pillow decodes: 8 bits, or grey of 16."""
     import cv2
 
     image.load()

@@ -93,14 +93,14 @@ def find_chessboard(grey: npt.ArrayLike, pattern: tuple[int, int]) -> FloatArray
     picture: Any = _eight_bit(grey)
     # Errors on drawn boards: 0.04 to 0.1 px by SB without flags, 0.2 to 0.4 px with EXHAUSTIVE,
     # and 0.03 to 0.06 px after cornerSubPix, whatever the start.
-    found, corners = cv2.findChessboardCornersSB(picture, pattern)
-    if not found:
+    complete, corners = cv2.findChessboardCornersSB(picture, pattern)
+    if not complete:
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-        found, corners = cv2.findChessboardCornersSB(picture, pattern, flags=flags)
-    if not found:
+        complete, corners = cv2.findChessboardCornersSB(picture, pattern, flags=flags)
+    if not complete:
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-        found, corners = cv2.findChessboardCorners(picture, pattern, flags=flags)
-    if not found:
+        complete, corners = cv2.findChessboardCorners(picture, pattern, flags=flags)
+    if not complete:
         return None
     grid = as_float(corners).reshape(pattern[1], pattern[0], 2)
     apart = min(np.linalg.norm(np.diff(grid, axis=k), axis=-1).min() for k in (0, 1))
@@ -163,8 +163,8 @@ def calibrate_chessboard(
                 f"{name}: {picture.shape[1]} × {picture.shape[0]} px, but {called[0]} has "
                 f"{width} × {height} px; give pictures of one camera at one setting"
             )
-    found = [find_chessboard(picture, (columns, rows)) for picture in pictures]
-    return calibrate_corners((width, height), found, (columns, rows), square, called)
+    corners = [find_chessboard(picture, (columns, rows)) for picture in pictures]
+    return calibrate_corners((width, height), corners, (columns, rows), square, called)
 
 
 def calibrate_corners(
@@ -186,8 +186,8 @@ def calibrate_corners(
     points = np.pad(plane, ((0, 0), (0, 1)))
     what = f"the pattern of {columns} × {rows} inner corners"
     boards = [
-        Chessboard(name, seen, f"{what} was not found" if seen is None else "")
-        for name, seen in zip(names, corners, strict=True)
+        Chessboard(name, own, f"{what} was not found" if own is None else "")
+        for name, own in zip(names, corners, strict=True)
     ]
     if sum(board.used for board in boards) < 3:
         have = ", ".join(board.name for board in boards if board.used) or "none"
@@ -200,8 +200,8 @@ def calibrate_corners(
     lens, _, normals = min(solved, key=lambda triple: triple[1])
     _check_lens(lens, normals)
     outer = [0, columns - 1, rows * columns - 1, (rows - 1) * columns]
-    seen = [b.corners[outer] for b in boards if b.used and b.corners is not None]
-    lens = replace(lens, coverage=_coverage(size, seen))
+    outlines = [b.corners[outer] for b in boards if b.used and b.corners is not None]
+    lens = replace(lens, coverage=_coverage(size, outlines))
     return replace(lens, notes=_lens_notes(lens))
 
 
@@ -218,27 +218,27 @@ def _solve(
         (cv2.CALIB_FIX_K3, 4),
     )
     flags = sum(flag for flag, term in kept if term not in MODELS[model])
-    seen = [np.float32(b.corners).reshape(-1, 1, 2) for b in boards if b.used]
-    where = [np.float32(points).reshape(-1, 1, 3)] * len(seen)
+    pixels = [np.float32(b.corners).reshape(-1, 1, 2) for b in boards if b.used]
+    where = [np.float32(points).reshape(-1, 1, 3)] * len(pixels)
     end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
     try:
         deviation, matrix, distortion, turns, _, sigma, _, apart = cv2.calibrateCameraExtended(
-            where, seen, size, np.eye(3), np.zeros(5), flags=flags, criteria=end
+            where, pixels, size, np.eye(3), np.zeros(5), flags=flags, criteria=end
         )
     except cv2.error:
         raise InputError(_FRONTAL.format("the focal length")) from None
     if not (np.isfinite(matrix).all() and np.isfinite(sigma).all() and np.isfinite(deviation)):
         raise InputError(_FRONTAL.format("the focal length"))
     normals = np.stack([cv2.Rodrigues(as_float(turn))[0][:, 2] for turn in turns])
-    n = 2 * len(seen) * len(points)
+    n = 2 * len(pixels) * len(points)
     # The noise is unknown; its lower bound is the rounding of the 32-bit corners.
     floor = (np.finfo(np.float32).eps * max(size)) ** 2
     criterion = n * np.log(0.5 * deviation**2 + floor) + len(MODELS[model]) * np.log(n)
     tilts = np.arccos(np.clip(np.abs(normals[:, 2]), 0.0, 1.0))
-    told = zip(boards, np.cumsum([b.used for b in boards]) - 1, strict=True)
+    numbered = zip(boards, np.cumsum([b.used for b in boards]) - 1, strict=True)
     after = [
         replace(b, deviation=float(np.ravel(apart)[k]), tilt=float(tilts[k])) if b.used else b
-        for b, k in told
+        for b, k in numbered
     ]
     lens = Lens(
         size,

@@ -27,11 +27,11 @@ class Entry:
     Attributes
     ----------
     heliostat
-        Heliostat of the beam; "" if unknown.
+        Heliostat of the beam; empty if unknown.
     counts
         Motor counts, (D,); None if unknown.
     target
-        Target that the beam was sent to; "" if unknown.
+        Target that the beam was sent to; empty if unknown.
     time
         Time with its zone; None if unknown.
     sun
@@ -147,10 +147,10 @@ def beside(path: Path, heliostat: str = "") -> Entry | None:
     file = path.with_name(f"{_number(path)}-calibration-properties.json")
     if not file.exists():
         return None
-    found: Any = read_calibration_properties(file)
+    properties: Any = read_calibration_properties(file)
     return Entry(
         heliostat=heliostat or heliostat_of(path),
-        counts=np.array(found.motors),
-        target=found.target,
-        sun=_sun(found.sun_azimuth_deg, found.sun_elevation_deg),
+        counts=np.array(properties.motors),
+        target=properties.target,
+        sun=_sun(properties.sun_azimuth_deg, properties.sun_elevation_deg),
     )

@@ -153,7 +153,7 @@ def detect_motion(
     mask: npt.ArrayLike | None = None,
     settings: MotionSettings = DEFAULT,
 ) -> FrameMotion:
-    """Return what moved between two frames of a fixed camera.
+    """Return the motion between two frames of a fixed camera.
 
     Parameters
     ----------
@@ -170,8 +170,8 @@ def detect_motion(
     InputError
         If the sizes differ, or the mask has another size or covers everything.
     """
-    one, two = _view(before), _view(after)
-    return _compare(one, two, _mask(mask, one), settings)
+    first, second = _view(before), _view(after)
+    return _compare(first, second, _mask(mask, first), settings)
 
 
 def find_shift(before: Frame | Pixels, after: Frame | Pixels) -> _Pair | None:
@@ -181,18 +181,18 @@ def find_shift(before: Frame | Pixels, after: Frame | Pixels) -> _Pair | None:
     Below 1 px it is accurate to about 0.05 px where there is texture. Raises InputError if the
     sizes differ.
     """
-    one, two = _view(before), _view(after)
-    found = _register(_expected(one, two)[0], two.image)
-    return (found[0] * one.factor, found[1] * one.factor) if found else None
+    first, second = _view(before), _view(after)
+    shift = _register(_expected(first, second)[0], second.image)
+    return (shift[0] * first.factor, shift[1] * first.factor) if shift else None
 
 
 # -- preparation -----------------------------------------------------------------------
 
 
-def _view(given: Frame | Pixels) -> _View:
+def _view(picture: Frame | Pixels) -> _View:
     import cv2
 
-    frame = given if isinstance(given, Frame) else Frame(given)
+    frame = picture if isinstance(picture, Frame) else Frame(picture)
     width, height = frame.size
     if min(width, height) < 16:
         raise InputError(f"a frame of {width} × {height} px; motion needs 16 × 16 px or more")
@@ -212,13 +212,13 @@ def _mask(mask: npt.ArrayLike | None, view: _View) -> _Image | None:
 
     if mask is None:
         return None
-    given = np.asarray(mask) != 0
-    if given.shape != (view.size[1], view.size[0]):
-        raise InputError(f"a mask of {given.shape} does not fit frames of {view.size[::-1]} px")
-    if not given.any():
+    counting = np.asarray(mask) != 0
+    if counting.shape != (view.size[1], view.size[0]):
+        raise InputError(f"a mask of {counting.shape} does not fit frames of {view.size[::-1]} px")
+    if not counting.any():
         raise InputError("the mask excludes the whole frame; clear a part of it")
     size = view.image.shape[1::-1]
-    share = cv2.resize(given.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    share = cv2.resize(counting.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return np.asarray(share > 0.0, dtype=np.uint8)
 
 
@@ -233,35 +233,35 @@ def _cells(image: _Image) -> _Image:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float64)
 
 
-def _expected(one: _View, two: _View) -> tuple[_Image, float]:
+def _expected(first: _View, second: _View) -> tuple[_Image, float]:
     """Return the first frame in the light of the second, and the ratio of brightness.
 
     Gain, its slopes across the frame and the offset are fitted with Tukey's weights. Without
     contrast, offset and gain cannot be separated, and the offset is left out.
     """
-    if one.size != two.size:
+    if first.size != second.size:
         raise InputError(
-            f"frames of {one.size[0]} × {one.size[1]} and {two.size[0]} × {two.size[1]} px "
-            "cannot be compared; give two of the same camera"
+            f"frames of {first.size[0]} × {first.size[1]} and {second.size[0]} × {second.size[1]} "
+            "px cannot be compared; give two of the same camera"
         )
-    a, b = one.cells, two.cells
+    a, b = first.cells, second.cells
     y, x = np.mgrid[-1.0 : 1.0 : a.shape[0] * 1j, -1.0 : 1.0 : a.shape[1] * 1j]
-    dark = one.step + two.step
+    dark = first.step + second.step
     good = (a < _PARTLY) & (b < _PARTLY) & (a > dark)
     good |= good.sum() < 32
     a, b, x, y = a[good], b[good], x[good], y[good]
-    start = max(float(_median(b)), one.step) / max(float(_median(a)), one.step)
+    start = max(float(_median(b)), first.step) / max(float(_median(a)), first.step)
     spread = _NORMAL * float(_median(np.abs(a - _median(a))))
     design = np.stack([a, a * x, a * y, np.ones_like(a)], axis=-1)
-    p, rest = _fitted(design, b, start, one.step)
+    p, rest = _fitted(design, b, start, first.step)
     if spread < 10.0 * rest + dark:
-        p, _ = _fitted(design[:, :3], b, start, one.step)
-    h, w = one.image.shape
+        p, _ = _fitted(design[:, :3], b, start, first.step)
+    h, w = first.image.shape
     u = np.linspace(-1.0, 1.0, w, dtype=np.float32)
     v = np.linspace(-1.0, 1.0, h, dtype=np.float32)[:, None]
     gain = (np.float32(p[0]) + np.float32(p[1]) * u) + np.float32(p[2]) * v
     offset = np.float32(p[3] if len(p) > 3 else 0.0)
-    return one.image * gain + offset, float(p[0])
+    return first.image * gain + offset, float(p[0])
 
 
 def _fitted(design: _Image, b: _Image, start: float, step: float) -> tuple[_Image, float]:
@@ -296,8 +296,8 @@ def _register(a: _Image, b: _Image) -> _Pair | None:
     halves = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (a, b)]
     (x, y), _ = cv2.phaseCorrelate(halves[0], halves[1], cv2.createHanningWindow(size, cv2.CV_32F))
     far = _refine(a, b, (2.0 * x, 2.0 * y)) if math.hypot(x, y) < 0.25 * min(size) else None
-    found = [refined for refined in (near, far) if refined is not None]
-    return max(found)[1] if found else None
+    accepted = [refined for refined in (near, far) if refined is not None]
+    return max(accepted)[1] if accepted else None
 
 
 def _refine(a: _Image, b: _Image, start: _Pair) -> tuple[int, _Pair] | None:
@@ -309,10 +309,10 @@ def _refine(a: _Image, b: _Image, start: _Pair) -> tuple[int, _Pair] | None:
     x, y = start
     agreed = 0
     for _ in range(3):
-        found = _tile_shift(_moved(a, x, y), b)
-        if found is None:
+        step = _tile_shift(_moved(a, x, y), b)
+        if step is None:
             return None
-        agreed, dx, dy = found
+        agreed, dx, dy = step
         x, y = x + dx, y + dy
         if math.hypot(dx, dy) < 0.01:
             break
@@ -363,9 +363,9 @@ def _tile_shift(a: _Image, b: _Image) -> tuple[int, float, float] | None:
     dx, dy = (yy * xd - xy * yd) / safe, (xx * yd - xy * xd) / safe
     # Deviation of a tile's shift in its weaker direction, from the residuals.
     pixels = a.size / len(xx) / _JOINED
-    left = np.maximum(dd - xd * dx - yd * dy, 1e-12)
-    deviation = np.sqrt(left / np.maximum(pixels * weaker, 1e-30))
-    good = (determinant > 0.0) & (deviation < 0.1) & (weaker > 2.0 * left * _NOISE_GRADIENT)
+    residual = np.maximum(dd - xd * dx - yd * dy, 1e-12)
+    deviation = np.sqrt(residual / np.maximum(pixels * weaker, 1e-30))
+    good = (determinant > 0.0) & (deviation < 0.1) & (weaker > 2.0 * residual * _NOISE_GRADIENT)
     if good.sum() < 4:
         return None
     mx, my = _median(dx[good]), _median(dy[good])
@@ -384,32 +384,34 @@ def _tile_shift(a: _Image, b: _Image) -> tuple[int, float, float] | None:
 # -- difference ------------------------------------------------------------------------
 
 
-def _compare(one: _View, two: _View, mask: _Image | None, settings: MotionSettings) -> FrameMotion:
-    if problem := _exposed(one, "first") or _exposed(two, "second"):
+def _compare(
+    first: _View, second: _View, mask: _Image | None, settings: MotionSettings
+) -> FrameMotion:
+    if problem := _exposed(first, "first") or _exposed(second, "second"):
         return FrameMotion(problem=problem)
-    wanted, ratio = _expected(one, two)
+    expected, ratio = _expected(first, second)
     if not 1.0 / settings.max_ratio <= ratio <= settings.max_ratio:
         text = f"the brightness changed by {ratio:.3g}, the limit is {settings.max_ratio:g}"
         return FrameMotion(brightness_ratio=ratio, problem=text)
-    believed = _register(wanted, two.image)
-    found = believed or (0.0, 0.0)
-    edge = max(_MOST_EDGE, 0.0 if believed else _UNSURE / one.factor)
-    shift = (found[0] * one.factor, found[1] * one.factor)
+    believed = _register(expected, second.image)
+    reduced = believed or (0.0, 0.0)
+    edge = max(_MOST_EDGE, 0.0 if believed else _UNSURE / first.factor)
+    shift = (reduced[0] * first.factor, reduced[1] * first.factor)
     if math.hypot(*shift) > settings.max_shift_px:
         text = f"the camera moved by {math.hypot(*shift):.1f} of {settings.max_shift_px:g} px"
         return FrameMotion(shift_px=shift, brightness_ratio=ratio, problem=text)
-    parts = _difference(one, two, wanted, found, ratio)
-    counts = np.ones(wanted.shape, np.uint8) if mask is None else mask
+    parts = _difference(first, second, expected, reduced, ratio)
+    counts = np.ones(expected.shape, np.uint8) if mask is None else mask
     threshold = _threshold(places := int(np.count_nonzero(counts)), settings)
-    high, low, weight = _significance(parts, counts, two.step, edge)
-    unit = 2 * one.factor
+    high, low, weight = _significance(parts, counts, second.step, edge)
+    unit = 2 * first.factor
     regions = [
         *_regions(high, weight, threshold, True, unit, settings.min_area_px),
         *_regions(-low, weight, threshold, False, unit, settings.min_area_px),
     ]
     regions.sort(key=lambda pair: -pair[0].significance)
     area = sum(region.area_px for region, _ in regions)
-    if area > 0.5 * places * one.factor**2:
+    if area > 0.5 * places * first.factor**2:
         problem = "more than half of the frame changed: another scene, or another light"
     return FrameMotion(
         moved=bool(regions) and not problem,
@@ -434,25 +436,27 @@ def _exposed(view: _View, which: str) -> str:
     return ""
 
 
-def _difference(one: _View, two: _View, wanted: _Image, shift: _Pair, ratio: float) -> list[_Image]:
+def _difference(
+    first: _View, second: _View, expected: _Image, shift: _Pair, ratio: float
+) -> list[_Image]:
     """Return the difference, the lesser brightness and gradient, and 1 where they are valid."""
     import cv2
 
-    bright = np.maximum(one.image, wanted)
+    bright = np.maximum(first.image, expected)
     if math.hypot(*shift) > 0.005:
-        wanted, bright = _moved(wanted, *shift), _moved(bright, *shift)
-    wanted = np.minimum(wanted, np.float32(1.0))
-    d = two.image - wanted
+        expected, bright = _moved(expected, *shift), _moved(bright, *shift)
+    expected = np.minimum(expected, np.float32(1.0))
+    d = second.image - expected
     # Partly saturated places show only that they are bright.
-    level = np.minimum(wanted, two.image)
-    blind = np.maximum(bright, two.image) > _PARTLY
+    level = np.minimum(expected, second.image)
+    blind = np.maximum(bright, second.image) > _PARTLY
     blind &= level > (_PARTLY - 0.1) * min(1.0, ratio)
     x, y = (math.ceil(abs(s)) + 1 for s in shift)  # a shifted frame is unknown at its edges
     blind[:y], blind[-y:], blind[:, :x], blind[:, -x:] = True, True, True, True
     d[blind] = 0.0
     slopes = [
         cv2.magnitude(*(cv2.Sobel(i, cv2.CV_32F, k, 1 - k, scale=0.125) for k in (0, 1)))
-        for i in (wanted, two.image)
+        for i in (expected, second.image)
     ]
     gradient = cv2.dilate(np.minimum(*slopes), np.ones((3, 3), np.uint8))
     return [d, level, gradient, 1.0 - blind.astype(np.float32)]
@@ -486,8 +490,8 @@ def _deviation(parts: list[_Image], step: float, edge: float) -> _Image:
     quiet = cv2.LUT(cv2.convertScaleAbs(level, alpha=255.0), table.astype(np.float32))
     # Residuals of a shift per gradient, where the gradient is greatest.
     sharp = np.argpartition(slope, -(len(slope) // 32))[-(len(slope) // 32) :]
-    left = np.square(rest[sharp]) - np.square(quiet[every].ravel()[known][sharp])
-    ratio = np.sqrt(np.maximum(left, 0.0)) / np.maximum(slope[sharp], 1e-9)
+    excess = np.square(rest[sharp]) - np.square(quiet[every].ravel()[known][sharp])
+    ratio = np.sqrt(np.maximum(excess, 0.0)) / np.maximum(slope[sharp], 1e-9)
     share = min(max(_EDGE * float(_median(ratio)), _LEAST_EDGE), edge)
     return cv2.magnitude(quiet, np.float32(share) * gradient)
 
@@ -544,7 +548,7 @@ def _regions(
 
     grown = (z > 0.6 * threshold).astype(np.uint8)
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(grown, connectivity=8)
-    found = []
+    regions = []
     for label in np.unique(labels[z > threshold]):
         x, y, w, h, n = (int(v) for v in boxes[label])
         cut = (slice(y, y + h), slice(x, x + w))
@@ -558,12 +562,14 @@ def _regions(
             float((light.sum(axis=1) @ np.arange(y, y + h)) / total + 0.5) * unit - 0.5,
         )
         peak = float((z[cut] * inside).max())
-        found.append((Region(appeared, float(n * unit * unit), middle, peak), total))
-    return found
+        regions.append((Region(appeared, float(n * unit * unit), middle, peak), total))
+    return regions
 
 
-def _centroid(found: list[tuple[Region, float]], appeared: bool) -> _Pair:
-    own = [(region.centroid_px, weight) for region, weight in found if region.appeared == appeared]
+def _centroid(regions: list[tuple[Region, float]], appeared: bool) -> _Pair:
+    own = [
+        (region.centroid_px, weight) for region, weight in regions if region.appeared == appeared
+    ]
     total = sum(weight for _, weight in own) or math.nan
     x, y = (sum(place[i] * weight for place, weight in own) / total for i in (0, 1))
     return x, y
@@ -610,7 +616,7 @@ class MotionDetector:
         self._mask, self._settings = mask, settings
         self._memory, self._warm_up = memory, warm_up
         self._background: _View | None = None
-        self._learnt = self._refused = 0
+        self._averaged = self._refused = 0
 
     def update(self, frame: Frame | Pixels) -> tuple[MotionState, FrameMotion]:
         """Compare the next frame with the background.
@@ -622,7 +628,7 @@ class MotionDetector:
         if self._background is None:
             if problem := _exposed(view, "first"):
                 return MotionState.UNUSABLE, FrameMotion(problem=problem)
-            self._background, self._learnt, self._refused = view, 1, 0
+            self._background, self._averaged, self._refused = view, 1, 0
             return MotionState.WARMING_UP, FrameMotion(brightness_ratio=1.0)
         motion = _compare(self._background, view, mask, self._settings)
         if motion.problem:
@@ -630,7 +636,7 @@ class MotionDetector:
             self._background = None if self._refused >= self._memory else self._background
             return MotionState.UNUSABLE, motion
         self._learn(view, motion)
-        if self._learnt <= self._warm_up:
+        if self._averaged <= self._warm_up:
             return MotionState.WARMING_UP, motion
         return MotionState.MOVING if motion.moved else MotionState.STILL, motion
 
@@ -640,7 +646,7 @@ class MotionDetector:
         old, _ = _expected(self._background, view)
         x, y = (-s / view.factor for s in motion.shift_px)
         new = _moved(view.image, x, y) if math.hypot(x, y) > 0.005 else view.image
-        self._learnt, self._refused = self._learnt + 1, 0
-        share = np.float32(max(1.0 / self._learnt, 1.0 - math.exp(-1.0 / self._memory)))
+        self._averaged, self._refused = self._averaged + 1, 0
+        share = np.float32(max(1.0 / self._averaged, 1.0 - math.exp(-1.0 / self._memory)))
         image = old + share * (new - old)
         self._background = replace(view, image=image, cells=_cells(image))

@@ -12,7 +12,7 @@ from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.spots import background as backgrounds
-from heliotrope.imaging.spots.background import Background, EmptyTarget, Way
+from heliotrope.imaging.spots.background import Background, EmptyTarget, Method
 from heliotrope.imaging.spots.centroid import Centroid, with_centroid
 from heliotrope.imaging.spots.placed import PlacedSpot, place
 from heliotrope.imaging.spots.quality import Expectation, Limits, Reason, judge
@@ -136,7 +136,7 @@ class PhotographSettings:
     """
 
     limits: Limits = field(default_factory=Limits)
-    background: Way = "auto"
+    background: Method = "auto"
     empty: Mapping[str, EmptyTarget] = field(default_factory=dict)
     expectations: Mapping[str, Expectation] = field(default_factory=dict)
     pictures: Pictures = field(default_factory=dict)
@@ -190,23 +190,23 @@ def _read(
     previous: Sequence[FaceView],
     without: Frame | None,
 ) -> Photograph:
-    given, frame = frame, frame.linear(chosen.gamma)
-    found = find_targets(frame, targets, camera, previous, chosen.pictures)
-    readings = {f.target.name: TargetReading(f, (), (_missing(f),)) for f in found if not f.found}
+    original, frame = frame, frame.linear(chosen.gamma)
+    results = find_targets(frame, targets, camera, previous, chosen.pictures)
+    readings = {f.target.name: TargetReading(f, (), (_missing(f),)) for f in results if not f.found}
     beside: list[PlacedSpot] = []
     faces: list[LookedAt] = []
     grey = np.ascontiguousarray(frame.grey)
     dark = None if without is None else without.linear(chosen.gamma)
-    for view, own in _by_view(found):
+    for view, own in _by_view(results):
         picture = rectify(frame, view, grey, rim=rim_of(own))
         empty = None if dark is None else _empty_picture(dark, view, camera, chosen, rim_of(own))
-        seen, on_face = _read_face(picture, chosen, empty, frame.exposure * frame.gain)
-        faces.append(seen)
+        face, on_face = _read_face(picture, chosen, empty, frame.exposure * frame.gain)
+        faces.append(face)
         for result in own:
-            readings[result.target.name] = _reading(result, on_face, seen, chosen)
+            readings[result.target.name] = _reading(result, on_face, face, chosen)
         beside += [s for s in on_face if s.target is None]
     ordered = tuple(readings[t.name] for t in targets)
-    return Photograph(given, ordered, tuple(beside), tuple(faces))
+    return Photograph(original, ordered, tuple(beside), tuple(faces))
 
 
 def read_crop(
@@ -226,24 +226,24 @@ def read_crop(
     chosen = settings or PhotographSettings()
     picture = from_crop(frame.linear(chosen.gamma), target, rim=LEAST_RIM)
     with _one_thread().limit(limits=1, user_api="blas"):
-        seen, spots = _read_face(picture, chosen, None, frame.exposure * frame.gain)
-    found = FoundTarget(target, True, "")
+        face, spots = _read_face(picture, chosen, None, frame.exposure * frame.gain)
+    result = FoundTarget(target, True, "")
     return Photograph(
         frame,
-        (_reading(found, spots, seen, chosen),),
+        (_reading(result, spots, face, chosen),),
         tuple(s for s in spots if s.target is None),
-        (seen,),
+        (face,),
     )
 
 
-def _missing(found: FoundTarget) -> Reason:
-    return Reason("target not found", float("nan"), float("nan"), found.reason)
+def _missing(result: FoundTarget) -> Reason:
+    return Reason("target not found", float("nan"), float("nan"), result.reason)
 
 
-def _by_view(found: Sequence[FoundTarget]) -> list[tuple[FaceView, list[FoundTarget]]]:
-    """Return each view of a face with the targets that were found in it."""
-    views = {id(f.view): f.view for f in found if f.view is not None}
-    return [(view, [f for f in found if f.view is view]) for view in views.values()]
+def _by_view(results: Sequence[FoundTarget]) -> list[tuple[FaceView, list[FoundTarget]]]:
+    """Return each view of a face with its targets."""
+    views = {id(f.view): f.view for f in results if f.view is not None}
+    return [(view, [f for f in results if f.view is view]) for view in views.values()]
 
 
 def _empty_picture(
@@ -271,9 +271,9 @@ def _read_face(
 
 
 def _reading(
-    found: FoundTarget, on_face: Sequence[PlacedSpot], seen: LookedAt, chosen: PhotographSettings
+    result: FoundTarget, on_face: Sequence[PlacedSpot], face: LookedAt, chosen: PhotographSettings
 ) -> TargetReading:
-    name = found.target.name
+    name = result.target.name
     expected = chosen.expectations.get(name, Expectation())
     own = [s for s in on_face if s.target is not None and s.target.name == name]
     place = expected.place
@@ -282,15 +282,17 @@ def _reading(
         others = sorted(own[1:], key=lambda s: -s.spot.power)
         own = [own[0], *others]
     if own and chosen.centroid is not None:
-        own[0] = with_centroid(own[0], found.target, seen.picture, seen.background, chosen.centroid)
+        own[0] = with_centroid(
+            own[0], result.target, face.picture, face.background, chosen.centroid
+        )
     reasons = judge(
-        None if found.view is None else found,
+        None if result.view is None else result,
         [s.spot for s in own],
         own[0].deviation if own else float("nan"),
-        seen.background.seen,
+        face.background.seen,
         chosen.limits,
         expected,
         own[0].flux if own else float("nan"),
-        seen.unexplained,
+        face.unexplained,
     )
-    return TargetReading(found, tuple(own), tuple(reasons))
+    return TargetReading(result, tuple(own), tuple(reasons))

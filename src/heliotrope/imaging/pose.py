@@ -124,8 +124,8 @@ def calibrate_marks(
         )
     noise = [sigma] * len(points) if isinstance(sigma, int | float) else sigma
     frames = [_observed(*frame) for frame in zip(points, pixels, noise, strict=True)]
-    where, seen, white = (np.concatenate(part) for part in zip(*frames, strict=True))
-    problem = _problem(where, seen, white, _pinhole(size, 3.0, name), free=True)
+    where, observed, white = (np.concatenate(part) for part in zip(*frames, strict=True))
+    problem = _problem(where, observed, white, _pinhole(size, 3.0, name), free=True)
     tried = []
     for wide in 0.5 * 2.0 ** np.arange(8):
         guess = _pinhole(size, wide, name)
@@ -191,13 +191,13 @@ class _Problem:
 
         matrix, distortion = self.lens(x)
         shift = self.shift(x)
-        seen, found = cv2.projectPoints(local, x[:3], shift, matrix, distortion)
-        slope = as_float(found).reshape(len(local), 2, -1)
+        projected, derivatives = cv2.projectPoints(local, x[:3], shift, matrix, distortion)
+        slope = as_float(derivatives).reshape(len(local), 2, -1)
         f = matrix[0, 0]
         focal = (slope[..., 6] + slope[..., 7]) * f + slope[..., 3:6] @ shift
         inner = [f * slope[..., 3:6], focal[..., None], slope[..., 8:11]]
         parts = [slope[..., :3], *inner] if self.free else [slope[..., :6]]
-        return as_float(seen).reshape(-1, 2), np.concatenate(parts, axis=-1)
+        return as_float(projected).reshape(-1, 2), np.concatenate(parts, axis=-1)
 
     def shift(self, x: FloatArray) -> FloatArray:
         """Return the translation, m."""
@@ -229,23 +229,25 @@ def _observed(
     points: npt.ArrayLike, pixels: npt.ArrayLike, sigma: npt.ArrayLike
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return points, pixels and W (N, 2, 2) with ``W.T @ W`` the inverse of the covariance."""
-    where, seen, given = as_vectors(points, "points"), as_float(pixels), as_float(sigma)
-    if where.ndim != 2 or seen.shape != (len(where), 2):
-        raise InputError(f"points {where.shape} and pixels {seen.shape}; give (N, 3) and (N, 2)")
-    if not np.isfinite(seen).all():
-        row = int(np.argwhere(~np.isfinite(seen))[0, 0])
-        raise InputError(f"pixels[{row}]: {seen[row]} is not finite; leave such points out")
-    if given.shape in ((), (len(where),)):
-        given = np.eye(2) * np.broadcast_to(np.sign(given) * given**2, len(where))[:, None, None]
-    if given.shape != (len(where), 2, 2):
-        raise InputError(f"sigma {given.shape}; give one number, (N,) or (N, 2, 2)")
-    if not (np.isfinite(given).all() and (np.linalg.eigvalsh(given) > 0.0).all()):
+    where, observed, noise = as_vectors(points, "points"), as_float(pixels), as_float(sigma)
+    if where.ndim != 2 or observed.shape != (len(where), 2):
+        raise InputError(
+            f"points {where.shape} and pixels {observed.shape}; give (N, 3) and (N, 2)"
+        )
+    if not np.isfinite(observed).all():
+        row = int(np.argwhere(~np.isfinite(observed))[0, 0])
+        raise InputError(f"pixels[{row}]: {observed[row]} is not finite; leave such points out")
+    if noise.shape in ((), (len(where),)):
+        noise = np.eye(2) * np.broadcast_to(np.sign(noise) * noise**2, len(where))[:, None, None]
+    if noise.shape != (len(where), 2, 2):
+        raise InputError(f"sigma {noise.shape}; give one number, (N,) or (N, 2, 2)")
+    if not (np.isfinite(noise).all() and (np.linalg.eigvalsh(noise) > 0.0).all()):
         raise InputError("sigma of the pixels: a variance is not finite and above 0")
-    return where, seen, np.linalg.inv(np.linalg.cholesky(given))
+    return where, observed, np.linalg.inv(np.linalg.cholesky(noise))
 
 
 def _problem(
-    where: FloatArray, seen: FloatArray, white: FloatArray, base: Camera, free: bool
+    where: FloatArray, observed: FloatArray, white: FloatArray, base: Camera, free: bool
 ) -> _Problem:
     if len(where) < 4:
         raise InputError(f"{len(where)} points; four or more are needed to locate a camera")
@@ -253,7 +255,7 @@ def _problem(
     spread = np.linalg.svd(where - origin, compute_uv=False)
     if spread[1] <= 1e-3 * spread[0]:
         raise InputError(f"the {len(where)} points lie on one line; take some that span an area")
-    return _Problem(origin, where - origin, seen, white, base, free)
+    return _Problem(origin, where - origin, observed, white, base, free)
 
 
 def _starts(problem: _Problem, lens: Camera) -> list[tuple[FloatArray, FloatArray]]:
@@ -263,21 +265,25 @@ def _starts(problem: _Problem, lens: Camera) -> list[tuple[FloatArray, FloatArra
     local = problem.local
     _, spread, axes = np.linalg.svd(local)
     axes = axes * np.linalg.det(axes)
-    ways = [(local, np.eye(3), cv2.SOLVEPNP_SQPNP)]
+    methods = [(local, np.eye(3), cv2.SOLVEPNP_SQPNP)]
     if spread[2] < 0.05 * spread[1]:
-        ways.insert(0, (local @ axes.T * [1.0, 1.0, 0.0], axes, cv2.SOLVEPNP_IPPE))
-    found = []
-    for shape, turned, way in ways:
+        methods.insert(0, (local @ axes.T * [1.0, 1.0, 0.0], axes, cv2.SOLVEPNP_IPPE))
+    starts = []
+    for shape, turned, method in methods:
         try:
             _, turns, shifts, _ = cv2.solvePnPGeneric(
-                np.ascontiguousarray(shape), problem.pixels, lens.matrix, lens.distortion, flags=way
+                np.ascontiguousarray(shape),
+                problem.pixels,
+                lens.matrix,
+                lens.distortion,
+                flags=method,
             )
         except cv2.error:
             continue
         for turn, shift in zip(turns, shifts, strict=True):
             whole = as_float(cv2.Rodrigues(cv2.Rodrigues(turn)[0] @ turned)[0])
-            found.append((whole.ravel(), as_float(shift).ravel()))
-    return [start for start in found if np.isfinite(start).all()]
+            starts.append((whole.ravel(), as_float(shift).ravel()))
+    return [start for start in starts if np.isfinite(start).all()]
 
 
 def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
@@ -287,7 +293,7 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
 
     solved = []
     for start in starts:
-        found = least_squares(
+        solution = least_squares(
             problem.residuals,
             start,
             problem.slopes,
@@ -297,8 +303,8 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
             ftol=1e-12,
             gtol=1e-12,
         )
-        if (problem.local @ problem.turn(found.x)[2] + problem.shift(found.x)[2] > 0.0).all():
-            solved.append((2.0 * float(found.cost), found.x))
+        if (problem.local @ problem.turn(solution.x)[2] + problem.shift(solution.x)[2] > 0.0).all():
+            solved.append((2.0 * float(solution.cost), solution.x))
     name = f"camera {problem.base.name}"
     if not solved:
         raise InputError(f"{name}: no pose explains the points; are their names right?")
@@ -310,9 +316,9 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
     # Scale only if chance explains the residuals in less than 1 %; otherwise it would add noise.
     scale = chi2 / freedom if freedom and chi2 > chdtri(freedom, 0.01) else 1.0
     slopes[: 2 * len(problem.local)] /= np.sqrt(scale)
-    rivals = [y for cost, y in solved[1:] if cost - chi2 < 9.0 * scale]
+    close = [y for cost, y in solved[1:] if cost - chi2 < 9.0 * scale]
     # Ignore the same pose reached from another start.
-    differ = [y for y in rivals if np.ptp(problem.turn(y) - problem.turn(x)) > 0.01]
+    differ = [y for y in close if np.ptp(problem.turn(y) - problem.turn(x)) > 0.01]
     other = problem.camera(differ[0]) if differ else None
     size = np.linalg.norm(slopes, axis=0)
     if not (size.min() > 0.0 and np.linalg.cond(slopes / size) < 1e8):

@@ -106,10 +106,10 @@ class ReceiverSight:
                 f"{who}: it has {pixels} px in the frame, the limit is {LEAST_FACE}; use a longer "
                 "lens"
             )
-        seen = sum(int(side.sum()) >= LEAST_SIDE for side in self.sides)
-        if seen < LEAST_SIDES:
+        visible = sum(int(side.sum()) >= LEAST_SIDE for side in self.sides)
+        if visible < LEAST_SIDES:
             raise InputError(
-                f"{who}: {seen} of its four sides have room about it in the frame, the limit is "
+                f"{who}: {visible} of its four sides have room about it in the frame, the limit is "
                 f"{LEAST_SIDES}; use a wider lens"
             )
 
@@ -229,7 +229,7 @@ class ReceiverLight:
         Share of the nominal flux, 0 or more; a lower bound if there is a ``doubt``. NaN if the
         frame cannot be measured at all.
     doubt
-        Why the flux may be higher, "" if nothing speaks for it.
+        Why the flux may be higher; empty if it is not.
     """
 
     share: float
@@ -251,13 +251,13 @@ def receiver_light(frame: Frame, reference: ReceiverReference) -> ReceiverLight:
         kind = f"{frame.size[0]} × {frame.size[1]} px of {_bits(frame)} bit"
         first = f"{sight.size[0]} × {sight.size[1]} px of {reference.bits} bit"
         return ReceiverLight(math.nan, f"its frames have {kind}, those of the reference {first}")
-    seen = _Levels.of(frame, sight)
-    lit = np.asarray((seen.sides - reference.black) / reference.sides)
-    counting = np.isfinite(lit) & (seen.clipped_sides <= CLIPPED_SIDE)
-    daylight = float(lit[counting].min()) if counting.any() else 0.0
-    rise = seen.face - reference.black - max(daylight, 0.0) * reference.face
+    levels = _Levels.of(frame, sight)
+    brightness = np.asarray((levels.sides - reference.black) / reference.sides)
+    counting = np.isfinite(brightness) & (levels.clipped_sides <= CLIPPED_SIDE)
+    daylight = float(brightness[counting].min()) if counting.any() else 0.0
+    rise = levels.face - reference.black - max(daylight, 0.0) * reference.face
     share = rise / reference.rise
-    doubt = _doubt(frame, seen, reference, daylight, int(counting.sum()), share)
+    doubt = _doubt(frame, levels, reference, daylight, int(counting.sum()), share)
     if not math.isfinite(frame.exposure * frame.gain * reference.exposure):
         # A darker picture may be one of a shorter exposure.
         share /= min(max(daylight, DIMMEST), 1.0)
@@ -266,13 +266,13 @@ def receiver_light(frame: Frame, reference: ReceiverReference) -> ReceiverLight:
 
 def _doubt(
     frame: Frame,
-    seen: "_Levels",
+    levels: "_Levels",
     reference: ReceiverReference,
     daylight: float,
     counting: int,
     share: float,
 ) -> str:
-    """Return why there may be more light than was measured."""
+    """Return the reason why the light may exceed the measurement; empty if none."""
     exposure = frame.exposure * frame.gain
     if abs(exposure / reference.exposure - 1.0) > EXPOSED:
         return (
@@ -291,9 +291,9 @@ def _doubt(
             f"the surroundings of the receiver are {daylight:.1f} times as bright as in the "
             f"reference, the limit is {BRIGHTEST:g}"
         )
-    if seen.clipped_face > CLIPPED_FACE:
-        return f"{seen.clipped_face:.1%} of the receiver is overexposed; shorten the exposure"
-    if text := _strange(reference.sight, reference.surroundings, seen.picture):
+    if levels.clipped_face > CLIPPED_FACE:
+        return f"{levels.clipped_face:.1%} of the receiver is overexposed; shorten the exposure"
+    if text := _view_change(reference.sight, reference.surroundings, levels.picture):
         return text
     if share < DARKER:
         return (
@@ -304,22 +304,22 @@ def _doubt(
 
 
 def _check_photographs(
-    sight: ReceiverSight, capped: Frame, dark: Frame, lit: Sequence[tuple[Frame, float]]
+    sight: ReceiverSight, capped: Frame, dark: Frame, with_beams: Sequence[tuple[Frame, float]]
 ) -> None:
     """Refuse photographs of another size, shares that cannot be, and none with beams."""
     who = f"camera {sight.camera}"
-    for frame in (capped, dark, *(frame for frame, _ in lit)):
+    for frame in (capped, dark, *(frame for frame, _ in with_beams)):
         if frame.size != sight.size:
             raise InputError(
                 f"{who}: {frame.name} has {frame.size[0]} × {frame.size[1]} px, the camera "
                 f"{sight.size[0]} × {sight.size[1]}"
             )
-    for frame, share in lit:
+    for frame, share in with_beams:
         if not 0.0 < share <= 2.0:
             raise InputError(
                 f"{who}: {frame.name} at a share of {share:g}; give above 0 to 2, 1 is nominal"
             )
-    if not lit:
+    if not with_beams:
         raise InputError(f"{who}: no photograph with beams; give one with its share of the flux")
 
 
@@ -366,21 +366,21 @@ def take_reference(
     usual = np.where(good, sides, math.nan)
     rises, shares = [], []
     for frame, share in lit:
-        seen = _Levels.of(frame, sight)
-        if seen.clipped_face > CLIPPED_FACE:
+        levels = _Levels.of(frame, sight)
+        if levels.clipped_face > CLIPPED_FACE:
             raise InputError(
-                f"{who}: {frame.name}: {seen.clipped_face:.1%} of the receiver is overexposed; use "
-                "fewer beams, or a shorter exposure for all photographs"
+                f"{who}: {frame.name}: {levels.clipped_face:.1%} of the receiver is overexposed; "
+                "use fewer beams, or a shorter exposure for all photographs"
             )
-        daylight = float(np.nanmin((seen.sides - level) / usual))
+        daylight = float(np.nanmin((levels.sides - level) / usual))
         if not _ALIKE[0] <= daylight <= _ALIKE[1]:
             raise InputError(
                 f"{who}: the surroundings in {frame.name} are {daylight:.2f} times as bright as in "
                 f"{dark.name}; take all photographs with one fixed exposure, within a minute"
             )
-        if text := _strange(sight, plain.picture, seen.picture):
+        if text := _view_change(sight, plain.picture, levels.picture):
             raise InputError(f"{who}: {frame.name}: {text}")
-        rises.append(seen.face - level - daylight * (plain.face - level))
+        rises.append(levels.face - level - daylight * (plain.face - level))
         shares.append(share)
     slope = float(np.dot(rises, shares) / np.dot(shares, shares))
     for (frame, share), rise in zip(lit, rises, strict=True):
@@ -431,9 +431,13 @@ class _Levels:
         pairs = [*zip(sight.sides, good, strict=True)]
         return cls(
             float(grey[sight.face].mean()),
-            np.array([float(grey[side].mean()) if seen else nan for side, seen in pairs]),
+            np.array(
+                [float(grey[side].mean()) if sufficient else nan for side, sufficient in pairs]
+            ),
             float(clipped[sight.face].mean()),
-            np.array([float(clipped[side].mean()) if seen else 1.0 for side, seen in pairs]),
+            np.array(
+                [float(clipped[side].mean()) if sufficient else 1.0 for side, sufficient in pairs]
+            ),
             np.asarray(np.round(65535.0 * np.clip(reduced(grey), 0.0, 1.0)), dtype=np.uint16),
         )
 
@@ -461,8 +465,8 @@ def _factor(shape: tuple[int, ...]) -> int:
     return max(1, math.ceil(max(shape) / _LONGEST))
 
 
-def _strange(sight: ReceiverSight, usual: Image, now: Image) -> str:
-    """Return why the surroundings are not those of the reference, in the same place; "" if so.
+def _view_change(sight: ReceiverSight, usual: Image, now: Image) -> str:
+    """Return the reason why the surroundings differ from the reference; empty if they agree.
 
     The directions of slopes are compared, weighted by the reference's slopes, so that neither the
     strength of the light nor a veil over the picture counts.

@@ -201,8 +201,11 @@ def _tube(
     points = np.concatenate([start + ring, end + ring])
     faces = []
     for k in range(_SIDES):
-        here, there = k, (k + 1) % _SIDES
-        faces += [(here, there, here + _SIDES), (there, there + _SIDES, here + _SIDES)]
+        current, following = k, (k + 1) % _SIDES
+        faces += [
+            (current, following, current + _SIDES),
+            (following, following + _SIDES, current + _SIDES),
+        ]
     return points, np.array(faces, dtype=np.uint32)
 
 

@@ -69,11 +69,11 @@ def axis_accuracy(
         "computed_gamma",
         "azimuth_weight",
     )
-    given = {k: numbers(v, k) for k, v in zip(names, values, strict=True)}
-    shape = common_shape(**given)
+    arrays = {k: numbers(v, k) for k, v in zip(names, values, strict=True)}
+    shape = common_shape(**arrays)
     if not shape or shape[-1] < 2:
         raise InputError(f"axis accuracy: shape {shape}; the last axis must hold 2 or more")
-    alpha, gamma, alpha_i, gamma_i, weight = (np.broadcast_to(a, shape) for a in given.values())
+    alpha, gamma, alpha_i, gamma_i, weight = (np.broadcast_to(a, shape) for a in arrays.values())
     if (weight < 0.0).any() or (weight.sum(axis=-1) == 0.0).any():
         raise InputError("azimuth_weight: weights must not be negative nor all 0; give cos² α")
     gamma_0, gamma_rest = _circular(gamma - gamma_i, weight, "gamma")

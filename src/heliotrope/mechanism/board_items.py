@@ -172,12 +172,12 @@ def checksums(items: Mapping[str, bytes]) -> dict[str, int]:
     return {name: crc32(data) for name, data in items.items()}
 
 
-def differing(wanted: Mapping[str, bytes], stored: Mapping[str, int]) -> tuple[str, ...]:
-    """Return the names of wanted items whose stored checksum differs, sorted."""
+def differing(required: Mapping[str, bytes], stored: Mapping[str, int]) -> tuple[str, ...]:
+    """Return the names of required items whose stored checksum differs, sorted."""
     return tuple(
         sorted(
             name
-            for name, data in wanted.items()
+            for name, data in required.items()
             if name not in OWN and stored.get(name) != crc32(data)
         )
     )

@@ -121,7 +121,7 @@ class Calibrated(Protocol):
         """Names of the heliostats, (N,); () if unknown."""
 
 
-def check_calibration(given: object) -> None:
+def check_calibration(calibration: object) -> None:
     """Refuse what holds no deviations of parameters.
 
     Raises
@@ -129,10 +129,10 @@ def check_calibration(given: object) -> None:
     InputError
         If it is neither a fit nor a record.
     """
-    if not isinstance(given, Calibrated):
+    if not isinstance(calibration, Calibrated):
         raise InputError(
-            f"calibration: {kind_of(given)}; give what fit returns, a HeliostatCalibration, or "
-            "with_parameters the values by name"
+            f"calibration: {kind_of(calibration)}; give what fit returns, a HeliostatCalibration, "
+            "or with_parameters the values by name"
         )
 
 
@@ -217,8 +217,8 @@ class Mechanism(Value, Framed):
             "origin": of(self.origins, "joint", "own_axis", unit="m"),
             "angle": of(self.angles, "joint", unit="rad"),
         }
-        for name, one in drives.variables((*rows, "drive")).items():
-            variables[f"drive_{name}"] = one
+        for name, variable in drives.variables((*rows, "drive")).items():
+            variables[f"drive_{name}"] = variable
         for name, values in self.deviations.items():
             variables[f"deviation_{name}"] = of(
                 np.asarray(values), unit=self.parameter(name).unit.strip("1")
@@ -265,11 +265,11 @@ class Mechanism(Value, Framed):
         """The parameter table of this kind, by name."""
         kinds = self.drives.table[..., slot.KIND].reshape(-1, len(self.driven))
         linear = tuple(bool((kinds[:, d] == slot.LINEAR).all()) for d in range(kinds.shape[1]))
-        found = parameter_table.table(self.joints, self.driven, linear)
+        table = parameter_table.table(self.joints, self.driven, linear)
         for row in self.own:
             code = (slot.MOVES_JOINT, self.joints.index(row.name), 0)
-            found[row.name] = replace(row, code=code)
-        return found
+            table[row.name] = replace(row, code=code)
+        return table
 
     def parameter(self, name: str) -> Parameter:
         """Return the row of parameter ``name``.
@@ -352,8 +352,8 @@ class Mechanism(Value, Framed):
         """
         check_calibration(calibration)
         moved = {}
-        for name, given in calibration.parameters.items():
-            value = np.asarray(given)
+        for name, values in calibration.parameters.items():
+            value = np.asarray(values)
             if value.size != 1 and value.shape != self.shape:
                 raise InputError(
                     f"calibration of {value.size} heliostats: the mechanisms have shape "
@@ -492,22 +492,22 @@ class Mechanism(Value, Framed):
         self, counts: npt.ArrayLike
     ) -> tuple[FloatArray, npt.NDArray[np.intp], tuple[int, ...]]:
         """Return counts (M, D), the mechanism's row of each, and the batch shape."""
-        given, drives = as_numbers(counts, "counts"), len(self.driven)
-        if given.ndim == 0 or given.shape[-1] != drives:
+        array, drives = as_numbers(counts, "counts"), len(self.driven)
+        if array.ndim == 0 or array.shape[-1] != drives:
             raise InputError(
-                f"counts: shape {given.shape}; the last axis must hold the {drives} drives"
+                f"counts: shape {array.shape}; the last axis must hold the {drives} drives"
             )
-        if not np.isfinite(given).all():
+        if not np.isfinite(array).all():
             raise InputError("counts: a value is not finite; give the motor positions")
         try:
-            shape = np.broadcast_shapes(self.shape, given.shape[:-1])
+            shape = np.broadcast_shapes(self.shape, array.shape[:-1])
         except ValueError:
             raise InputError(
-                f"counts: shape {given.shape[:-1]} does not fit mechanisms of shape {self.shape}"
+                f"counts: shape {array.shape[:-1]} does not fit mechanisms of shape {self.shape}"
             ) from None
         index = np.arange(int(np.prod(self.shape, dtype=np.int64))).reshape(self.shape)
         rows = as_input(np.broadcast_to(index, shape)).reshape(-1)
-        flat = as_input(np.broadcast_to(given, (*shape, drives)))
+        flat = as_input(np.broadcast_to(array, (*shape, drives)))
         return flat.reshape(-1, drives), rows, shape
 
 

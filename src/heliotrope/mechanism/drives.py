@@ -71,18 +71,18 @@ class Drive(Value, Framed):
         """Return the numbers for a frame, by name; ``axes`` name the batch axes."""
         table = self.table if self.shape else self.table[None]
         rotary = table[..., slot.KIND] == slot.ROTARY
-        found = {"kind": Variable(axes, np.where(rotary, "rotary", "jack"))}
+        variables = {"kind": Variable(axes, np.where(rotary, "rotary", "jack"))}
         for name, place in SLOTS.items():
             if name != "initial_angle":
-                found[name] = Variable(axes, table[..., place], _UNITS.get(name, ""))
-        return found
+                variables[name] = Variable(axes, table[..., place], _UNITS.get(name, ""))
+        return variables
 
     @property
     def kinds(self) -> str:
         """Names of its kinds: "rotary", "jack" or "rotary and jack"."""
-        found = self.table[..., slot.KIND]
+        codes = self.table[..., slot.KIND]
         names = {"rotary": slot.ROTARY, "jack": slot.LINEAR}
-        return " and ".join(name for name, kind in names.items() if (found == kind).any())
+        return " and ".join(name for name, kind in names.items() if (codes == kind).any())
 
     def describe(self) -> str:
         """Return step and stops in one line for people."""
@@ -134,21 +134,21 @@ class Drive(Value, Framed):
         for name in values:
             if name not in SLOTS:
                 raise InputError(f"drive: there is no {name!r}; known: {', '.join(SLOTS)}")
-        given = {name: _number(value, name) for name, value in values.items()}
-        shapes = {name: value.shape for name, value in given.items()}
+        numbers = {name: _number(value, name) for name, value in values.items()}
+        shapes = {name: value.shape for name, value in numbers.items()}
         shape = common_batch({"drive": self.shape, **shapes})
         table = np.array(np.broadcast_to(self.table, (*shape, slot.DRIVE_SLOTS)))
-        for name, value in given.items():
+        for name, value in numbers.items():
             table[..., SLOTS[name]] = value
         return _checked(Drive(table))
 
     def _run(self, block: Any, values: npt.ArrayLike, what: str) -> FloatArray:
-        given = as_numbers(values, f"drive: {what}")
-        shape = common_batch({"drive": self.shape, what: given.shape})
+        array = as_numbers(values, f"drive: {what}")
+        shape = common_batch({"drive": self.shape, what: array.shape})
         rows = as_input(
             np.broadcast_to(np.arange(_size(self.shape)).reshape(self.shape), shape)
         ).reshape(-1)
-        flat = as_input(np.broadcast_to(given, shape)).reshape(-1, 1)
+        flat = as_input(np.broadcast_to(array, shape)).reshape(-1, 1)
         table = as_input(self.table).reshape(-1, 1, slot.DRIVE_SLOTS)
         out = np.empty(flat.shape)
         run_blocks(lambda a, b: block(table, flat, rows, out, a, b), len(rows))
@@ -231,10 +231,10 @@ def _build(kind: float, numbers: dict[int, npt.ArrayLike]) -> Drive:
         slot.SPEED: np.inf,
         **numbers,
     }
-    given = {index: _number(value, _NAMES[index]) for index, value in numbers.items()}
-    shape = common_batch({_NAMES[index]: value.shape for index, value in given.items()})
+    arrays = {index: _number(value, _NAMES[index]) for index, value in numbers.items()}
+    shape = common_batch({_NAMES[index]: value.shape for index, value in arrays.items()})
     table = np.zeros((*shape, slot.DRIVE_SLOTS))
-    for index, value in given.items():
+    for index, value in arrays.items():
         table[..., index] = value
     return _checked(Drive(table))
 
@@ -273,9 +273,9 @@ def _checked(drive: Drive) -> Drive:
 
 def _check_triangles(jacks: FloatArray) -> None:
     c, r, k = jacks[:, slot.OFFSET], jacks[:, slot.RADIUS], jacks[:, slot.STROKE]
-    wrong = (c <= 0) | (r <= 0) | (k <= np.abs(c - r)) | (k >= c + r)
-    if wrong.any():
-        i = int(np.flatnonzero(wrong)[0])
+    invalid = (c <= 0) | (r <= 0) | (k <= np.abs(c - r)) | (k >= c + r)
+    if invalid.any():
+        i = int(np.flatnonzero(invalid)[0])
         raise InputError(
             f"linear drive: offset {c[i]:g} m, pivot radius {r[i]:g} m and initial stroke "
             f"length {k[i]:g} m do not form a triangle; the stroke must lie between "

@@ -539,9 +539,9 @@ def numbers(value: npt.ArrayLike, name: str) -> FloatArray:
 
 
 def refuse(
-    wrong: npt.NDArray[np.bool_], what: str, problem: Callable[[tuple[int, ...]], str]
+    invalid: npt.NDArray[np.bool_], what: str, problem: Callable[[tuple[int, ...]], str]
 ) -> None:
-    """Raise for the first place where ``wrong`` holds, naming it."""
-    if np.any(wrong):
-        i = tuple(int(k) for k in np.argwhere(wrong)[0])
+    """Raise for the first place where ``invalid`` holds, naming it."""
+    if np.any(invalid):
+        i = tuple(int(k) for k in np.argwhere(invalid)[0])
         raise InputError(f"{what}{list(i) if i else ''}: {problem(i)}")

@@ -49,13 +49,13 @@ def from_his_names(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
     InputError
         If he has no such name, or a value is not finite.
     """
-    given = {}
+    parameters = {}
     for name, value in values.items():
         if name not in NAMES:
             raise UnknownNameError("parameter of Guo's", name, NAMES)
         _, ours, unit = NAMES[name]
-        given[ours] = as_float(value) if unit == "m" else as_float(np.radians(value))
-    return GuoParameters(**given)
+        parameters[ours] = as_float(value) if unit == "m" else as_float(np.radians(value))
+    return GuoParameters(**parameters)
 
 
 def of_mechanism(mechanism: Mechanism, *, zeros: bool = False) -> tuple[GuoParameters, FloatArray]:

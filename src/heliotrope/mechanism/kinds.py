@@ -173,12 +173,16 @@ def with_joint(
     sigma = as_numbers(prior, f"prior of {name}", 0.0, 0.5 * np.pi, "rad", "give radians")
     if sigma.shape or not sigma > 0.0:
         raise InputError(f"prior of {name}: {prior} rad; give one number above 0")
-    way, point = normalize(axis, f"axis of {name}"), as_vectors(origin, f"origin of {name}")
-    shapes = {"mechanism": mechanism.shape, "axis": way.shape[:-1], "origin": point.shape[:-1]}
+    direction, point = normalize(axis, f"axis of {name}"), as_vectors(origin, f"origin of {name}")
+    shapes = {
+        "mechanism": mechanism.shape,
+        "axis": direction.shape[:-1],
+        "origin": point.shape[:-1],
+    }
     if common_batch(shapes) != mechanism.shape:
         raise InputError(
-            f"own joint {name}: axis {way.shape} and origin {point.shape} do not fit mechanisms of "
-            f"shape {mechanism.shape}; give one vector, or one for each"
+            f"own joint {name}: axis {direction.shape} and origin {point.shape} do not fit "
+            f"mechanisms of shape {mechanism.shape}; give one vector, or one for each"
         )
     place = 0 if after is None else mechanism.joints.index(after) + 1
     origins = np.insert(mechanism.origins, place, point, axis=-2)
@@ -192,7 +196,7 @@ def with_joint(
         mechanism,
         joints=(*mechanism.joints[:place], name, *mechanism.joints[place:]),
         driven=tuple(d + (d >= place) for d in mechanism.driven),
-        axes=np.insert(mechanism.axes, place, way, axis=-2),
+        axes=np.insert(mechanism.axes, place, direction, axis=-2),
         origins=origins,
         angles=np.insert(mechanism.angles, place, 0.0, axis=-1),
         vertex=vertex,
@@ -207,8 +211,8 @@ def _lean_names(end: FloatArray) -> tuple[str, str]:
     first = end.reshape(-1, 3)[0]
     kept = np.argsort(np.abs(first), kind="stable")[:2]
     order = [("north", 1), ("east", 0), ("up", 2)]
-    found = [name for name, i in order if i in kept]
-    return found[0], found[1]
+    names = [name for name, i in order if i in kept]
+    return names[0], names[1]
 
 
 def _assemble(
@@ -266,11 +270,11 @@ def _tables(drives: object, driven: tuple[int, ...]) -> list[FloatArray]:
     """Return the tables of the drives, one for each driven joint."""
     if drives is None:
         return [direct().table for _ in driven]
-    given = tuple(drives) if isinstance(drives, tuple | list) else (drives,)
-    if len(given) != len(driven):
-        raise InputError(f"drives: {len(given)} given; this kind has {len(driven)}")
+    drive_list = tuple(drives) if isinstance(drives, tuple | list) else (drives,)
+    if len(drive_list) != len(driven):
+        raise InputError(f"drives: {len(drive_list)} given; this kind has {len(driven)}")
     tables = []
-    for drive in given:
+    for drive in drive_list:
         if not isinstance(drive, Drive):
             raise InputError(
                 f"drives: {kind_of(drive)} is not a Drive; give {len(driven)} drives made by "

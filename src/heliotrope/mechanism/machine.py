@@ -61,7 +61,7 @@ class AxisLimits:
 
     @property
     def lead(self) -> int:
-        """Steps by which a goal that goes down with the sun is set ahead, as in `lcu.stepper`."""
+        """Steps that a goal going down with the sun is set ahead, as in `lcu.stepper`."""
         return math.ceil(self.backlash / 8)
 
     def __post_init__(self) -> None:
@@ -118,7 +118,7 @@ class Machine:
     stow
         Position of both axes at stow, steps.
     defocus
-        Angles by which both axes turn away, rad.
+        Angles that both axes turn away, rad.
     standby
         Standby point, ENU, m; None: the local controller keeps the one it has.
     azimuth_axis
@@ -216,9 +216,9 @@ def spread_machines(
     Heliostats with the same angles share one object.
     """
     made: dict[tuple[float, float], Machine] = {}
-    found = []
-    for one, two in spread_defocus(machine.defocus, names, spread).tolist():
-        if (one, two) not in made:
-            made[one, two] = replace(machine, defocus=(one, two))
-        found.append(made[one, two])
-    return tuple(found)
+    machines = []
+    for primary, secondary in spread_defocus(machine.defocus, names, spread).tolist():
+        if (primary, secondary) not in made:
+            made[primary, secondary] = replace(machine, defocus=(primary, secondary))
+        machines.append(made[primary, secondary])
+    return tuple(machines)

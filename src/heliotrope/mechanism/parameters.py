@@ -330,10 +330,10 @@ def model(name: str, known: dict[str, Parameter]) -> tuple[str, ...]:
     UnknownNameError
         If there is no such model, or the mechanism lacks one of its parameters.
     """
-    found: dict[str, None] = {}
+    names: dict[str, None] = {}
     for part in name.split("+"):
-        found |= dict.fromkeys(_part(part.strip(), known))
-    return tuple(found)
+        names |= dict.fromkeys(_part(part.strip(), known))
+    return tuple(names)
 
 
 def _part(name: str, known: dict[str, Parameter]) -> tuple[str, ...]:
@@ -374,13 +374,13 @@ def _role(role: str, known: dict[str, Parameter]) -> tuple[str, ...]:
     if role in begins:
         # A drive that is called tilt has parameters of its own, such as tilt_bias.
         kind = slot.MOVES_POSITION if role == "position" else slot.MOVES_JOINT
-        found = [n for n, p in known.items() if n.startswith(begins[role]) and p.code[0] == kind]
+        names = [n for n, p in known.items() if n.startswith(begins[role]) and p.code[0] == kind]
     else:
         end = ends.get(role, role)
-        found = [n for n, p in known.items() if n.endswith(end) and p.code[0] == slot.MOVES_DRIVE]
-    if not found:
+        names = [n for n, p in known.items() if n.endswith(end) and p.code[0] == slot.MOVES_DRIVE]
+    if not names:
         raise UnknownNameError("parameters of this role in this kind of mechanism:", role, known)
-    return tuple(found)
+    return tuple(names)
 
 
 def unit_of(name: str) -> str:
@@ -388,10 +388,10 @@ def unit_of(name: str) -> str:
     rows = (*_PLACE, *_JOINTS.values(), _SAG)
     units = {row.name: row.unit for row in rows}
     units |= {suffix: row.unit for suffix, _, row in (*_ANY_DRIVE, *_LINEAR_DRIVE)}
-    found = units.get(name) or next(
+    match = units.get(name) or next(
         (unit for end, unit in units.items() if name.endswith(f"_{end}")), "1"
     )
-    return "" if found == "1" else found
+    return "" if match == "1" else match
 
 
 def shown_in(name: str) -> tuple[float, str]:

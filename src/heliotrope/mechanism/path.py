@@ -50,7 +50,7 @@ class Slew(Value):
     reason: str
 
     def _card(self) -> Card:
-        turns = ", ".join(f"{np.degrees(one):.1f}°" for one in self.turn)
+        turns = ", ".join(f"{np.degrees(angle):.1f}°" for angle in self.turn)
         return Card(f"before pose {self.step} of heliostat {self.row}: {self.reason} ({turns})")
 
 
@@ -169,10 +169,10 @@ def track_path(
         raise InputError("sun: no times; a path needs at least one")
     if light.ndim == 2 and batch:
         light = light.reshape(len(light), *(1,) * len(batch), 3)
-    found = track(mechanism, light, aim, local=local)
-    flat = _flat(found)
+    tracking = track(mechanism, light, aim, local=local)
+    flat = _flat(tracking)
     steps, rows, _, axes = flat.angles.shape
-    shape = found.best.shape[1:]
+    shape = tracking.best.shape[1:]
     table = np.broadcast_to(mechanism.drives.table, (*shape, axes, slot.DRIVE_SLOTS))
     axles = np.broadcast_to(mechanism.armature.table, (*shape, slot.ARMATURE_SIZE))
     choices = _Choices.of(
@@ -212,11 +212,13 @@ def track_path(
     )
 
 
-def _flat(found: Tracking) -> Tracking:
+def _flat(tracking: Tracking) -> Tracking:
     """Return solutions with one axis of heliostats behind that of time, (T, N, …)."""
-    batch = found.best.ndim
-    steps = found.best.shape[0]
-    return Tracking(**{k: v.reshape(steps, -1, *v.shape[batch:]) for k, v in vars(found).items()})
+    batch = tracking.best.ndim
+    steps = tracking.best.shape[0]
+    return Tracking(
+        **{k: v.reshape(steps, -1, *v.shape[batch:]) for k, v in vars(tracking).items()}
+    )
 
 
 @dataclass(frozen=True)
@@ -252,22 +254,22 @@ class _Choices:
     turns: npt.NDArray[np.intp]
 
     @classmethod
-    def of(cls, found: Tracking, table: FloatArray, armature: FloatArray) -> "_Choices":
+    def of(cls, tracking: Tracking, table: FloatArray, armature: FloatArray) -> "_Choices":
         low, high = _stops(table)
         jack = table[..., slot.KIND] == slot.LINEAR
         free = ~jack & ~(np.isfinite(low) & np.isfinite(high))
-        able = found.status == TrackingStatus.OK
+        able = tracking.status == TrackingStatus.OK
         turning = ~jack & ~free
         # A pose at a stop, or out of reach, stays in the turn where it was found.
-        lowest = found.angles - TAU * np.floor(
-            (found.angles - np.where(turning, low, 0.0)[:, None] + 1e-9) / TAU
+        lowest = tracking.angles - TAU * np.floor(
+            (tracking.angles - np.where(turning, low, 0.0)[:, None] + 1e-9) / TAU
         )
-        angles = np.where(turning[:, None] & able[..., None], lowest, found.angles)
+        angles = np.where(turning[:, None] & able[..., None], lowest, tracking.angles)
         span = np.where(turning, high - low, 0.0)
         most = [int(n) for n in (1 + np.floor((span.max(axis=0) + 2e-9) / TAU))]
         grid = np.meshgrid(*(np.arange(n) for n in (2, *most)), indexing="ij")
         turns = np.stack([g.ravel() for g in grid], axis=-1).astype(np.intp)
-        top = _over_the_top(armature, found.angles, low, high)
+        top = _over_the_top(armature, tracking.angles, low, high)
         return cls(table, angles, able, top, free, np.where(turning, high, np.inf), turns)
 
     def at(self, step: int) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
@@ -318,7 +320,7 @@ def _stops(table: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _over_the_top(
     armature: FloatArray, angles: FloatArray, low: FloatArray, high: FloatArray
 ) -> npt.NDArray[np.bool_]:
-    """Return which branches stand on the other side of the keyhole than the home, (T, N, 2).
+    """Return the mask of branches beyond the keyhole, as seen from the home, (T, N, 2).
 
     With a₁, a₂ the axes and n the normal, a₁·R(a₂, θ)n = p + q cos θ + r sin θ is largest at the
     keyhole.
@@ -360,9 +362,9 @@ def _cheapest(choices: _Choices, start: FloatArray | None, top_cost: float) -> n
         else:
             turn = np.abs(choices.steps(before[:, :, None], angles[:, None])).max(axis=-1)
             turn = np.nan_to_num(turn)
-            way = cost[:, :, None] + turn + _SLEW * (other | (turn > np.pi + 1e-9))
-            back[t] = np.argmin(way, axis=1)
-            cost = np.take_along_axis(way, back[t][:, None].astype(np.intp), axis=1)[:, 0] + price
+            total = cost[:, :, None] + turn + _SLEW * (other | (turn > np.pi + 1e-9))
+            back[t] = np.argmin(total, axis=1)
+            cost = np.take_along_axis(total, back[t][:, None].astype(np.intp), axis=1)[:, 0] + price
         before = angles
     states = np.empty((steps, rows), dtype=np.intp)
     if steps:
@@ -385,7 +387,7 @@ def _slews(
     whole = np.asarray((np.abs(turn) > np.pi + 1e-9).any(axis=-1))
     shift = angle_between(normal[1:], normal[:-1])
     strays = shift > _FOLLOWS * angle_between(sun[1:], sun[:-1]) + _SLACK
-    found = []
+    slews = []
     for step, row in np.argwhere(changed | whole | strays):
         before = choices.top[step, row, branch[step, row]]
         after = choices.top[step + 1, row, branch[step + 1, row]]
@@ -398,5 +400,5 @@ def _slews(
             reason = f"joint {joint + 1} turns back by a whole turn at its stop"
         else:
             reason = "between a pose at a stop and one that follows the sun"
-        found.append(Slew(int(step) + 1, int(row), turn[step, row], reason))
-    return tuple(found)
+        slews.append(Slew(int(step) + 1, int(row), turn[step, row], reason))
+    return tuple(slews)

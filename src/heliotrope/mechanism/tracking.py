@@ -138,8 +138,8 @@ class Tracking(Value, Framed):
 
     def _card(self) -> Card:
         best = self.chosen(self.status)
-        found = [(s.name.lower(), s.text, int((best == s).sum())) for s in TrackingStatus]
-        seen = [(name, text, str(count)) for name, text, count in found if count]
+        counted = [(s.name.lower(), s.text, int((best == s).sum())) for s in TrackingStatus]
+        present = [(name, text, str(count)) for name, text, count in counted if count]
         angles = np.degrees(self.chosen(self.angles))
         rows = [
             (f"drive {d + 1}", f"{span(angles[..., d])} °", span(self.chosen(self.counts)[..., d]))
@@ -147,8 +147,8 @@ class Tracking(Value, Framed):
         ]
         size = " × ".join(map(str, best.shape)) or "one"
         line = f"{size} of {amount(self.status.shape[-1], 'branch').replace('chs', 'ches')}: "
-        line += ", ".join(f"{count} {name}" for name, _, count in seen)
-        return Card(line, ("best branch", "angle or meaning", "counts"), [*rows, *seen])
+        line += ", ".join(f"{count} {name}" for name, _, count in present)
+        return Card(line, ("best branch", "angle or meaning", "counts"), [*rows, *present])
 
     @property
     def served(self) -> npt.NDArray[np.bool_]:
@@ -357,13 +357,13 @@ def trace(
         before = np.inf
         for k in range(1, most + 1):
             # A tolerance that no step reaches, so that each step is made.
-            found = track(
+            solution = track(
                 armature, s, p, drives=free_drives, tolerance=1e-300, max_iterations=k, newton=False
             )
-            normal, vertex = found.normal[branch], found.vertex[branch]
+            normal, vertex = solution.normal[branch], solution.vertex[branch]
             ray = reflect(light, normalize(flat @ normal))
             miss = float(np.linalg.norm(np.cross(flat @ (p - vertex), ray)))
-            steps.append(TraceStep(k, branch, found.angles[branch], miss))
+            steps.append(TraceStep(k, branch, solution.angles[branch], miss))
             if miss < tolerance or miss > 0.999 * before:
                 break
             before = miss

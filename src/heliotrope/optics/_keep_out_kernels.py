@@ -159,12 +159,12 @@ def enter(table, corners, origin, direction, reach, radius, near, spread, first,
 
 
 @njit(**INLINED)
-def _pose(a, one, two):
+def _pose(a, angle_1, angle_2):
     """Normal and vertex of an armature (18) at its joint angles."""
     axis_1, axis_2 = (a[0], a[1], a[2]), (a[6], a[7], a[8])
     o1, o2 = (a[3], a[4], a[5]), (a[9], a[10], a[11])
     m, n = (a[12], a[13], a[14]), (a[15], a[16], a[17])
-    s1, c1, s2, c2 = math.sin(one), math.cos(one), math.sin(two), math.cos(two)
+    s1, c1, s2, c2 = math.sin(angle_1), math.cos(angle_1), math.sin(angle_2), math.cos(angle_2)
     normal = about(axis_1, s1, c1, about(axis_2, s2, c2, n))
     arm = add(minus(o2, o1), about(axis_2, s2, c2, minus(m, o2)))
     return normal, add(o1, about(axis_1, s1, c1, arm))
@@ -180,7 +180,7 @@ def _levers(a):
 
 
 @njit(**INNER)
-def _move(row, corners, a, path, sun, reach, radius, near, spread, resolution, found):
+def _move(row, corners, a, path, sun, reach, radius, near, spread, resolution, entry):
     """Where along the path (K, 2) of joint angles a beam first enters the volume.
 
     Over a span of the path whose joints turn by at most δ₁ and δ₂ from its middle, the normal
@@ -189,7 +189,7 @@ def _move(row, corners, a, path, sun, reach, radius, near, spread, resolution, f
     the span. If it is not, the span is halved, down to a turn of the beam of ``resolution``:
     what is not proven clear there counts as an entry.
 
-    Writes into found: index of the path's corner plus share of the leg up to which it is
+    Writes into ``entry``: index of the path's corner plus share of the leg up to which it is
     clear, distance along the beam, m, origin and direction in the pose just after. Returns the
     poses that were tried, negative at an entry.
     """
@@ -215,9 +215,9 @@ def _move(row, corners, a, path, sun, reach, radius, near, spread, resolution, f
                 t = contact(row, corners, o, d, reach, radius + moved, near, spread + 2.0 * turned)
                 clear = t < 0.0
                 if not clear and span <= smallest * 1.0000001:
-                    found[0], found[1] = k + begin, t
+                    entry[0], entry[1] = k + begin, t
                     for i in range(3):
-                        found[2 + i], found[5 + i] = o[i], d[i]
+                        entry[2 + i], entry[5 + i] = o[i], d[i]
                     return -tried
             if clear:
                 begin += span
@@ -228,8 +228,8 @@ def _move(row, corners, a, path, sun, reach, radius, near, spread, resolution, f
 
 
 @njit(**OPTIONS)
-def move(table, corners, armatures, path, sun, reach, radius, near, spread, resolution, found):
-    """As `_move`, for N heliostats and V volumes, into found (N, V, 8); NaN if clear.
+def move(table, corners, armatures, path, sun, reach, radius, near, spread, resolution, entries):
+    """As `_move`, for N heliostats and V volumes, into ``entries`` (N, V, 8); NaN if clear.
 
     Returns the number of poses that were tried.
     """
@@ -237,8 +237,8 @@ def move(table, corners, armatures, path, sun, reach, radius, near, spread, reso
     for i in range(len(armatures)):
         s = (sun[i, 0], sun[i, 1], sun[i, 2])
         for v in range(len(table)):
-            for c in range(found.shape[2]):
-                found[i, v, c] = math.nan
+            for c in range(entries.shape[2]):
+                entries[i, v, c] = math.nan
             poses = _move(
                 table[v],
                 corners,
@@ -250,7 +250,7 @@ def move(table, corners, armatures, path, sun, reach, radius, near, spread, reso
                 near[i],
                 spread[i],
                 resolution,
-                found[i, v],
+                entries[i, v],
             )
             tried += abs(poses)
     return tried

@@ -76,12 +76,12 @@ def checked(name: str, value: npt.ArrayLike, unit: str, *, positive: bool = Fals
     InputError
         If a number is not finite, negative, or 0 where ``positive`` is set.
     """
-    given = as_float(value)
-    wrong = ~(np.isfinite(given) & ((given > 0.0) if positive else (given >= 0.0)))
-    if wrong.any():
+    array = as_float(value)
+    invalid = ~(np.isfinite(array) & ((array > 0.0) if positive else (array >= 0.0)))
+    if invalid.any():
         limit = "above 0" if positive else "0 or more"
-        raise InputError(f"{name}: {given[wrong].flat[0]:g} {unit} must be {limit} and finite")
-    return given
+        raise InputError(f"{name}: {array[invalid].flat[0]:g} {unit} must be {limit} and finite")
+    return array
 
 
 @dataclass(frozen=True)
@@ -124,15 +124,15 @@ class MirrorOptics:
         InputError
             If a number is out of range.
         """
-        given = {
+        arguments = {
             "width": width,
             "height": height,
             "focus": focus,
             "error": error,
             "reflectivity": reflectivity,
         }
-        arrays = np.broadcast_arrays(*(np.atleast_1d(as_float(v)) for v in given.values()))
-        values = dict(zip(given, (np.ascontiguousarray(a) for a in arrays), strict=True))
+        arrays = np.broadcast_arrays(*(np.atleast_1d(as_float(v)) for v in arguments.values()))
+        values = dict(zip(arguments, (np.ascontiguousarray(a) for a in arrays), strict=True))
         if values["width"].ndim != 1:
             raise InputError(f"mirrors: shape {values['width'].shape}; give numbers or (N,)")
         limits = {
@@ -141,11 +141,11 @@ class MirrorOptics:
             "reflectivity": (0.0, 1.0 + 1e-12, ""),
         }
         for name, (low, high, unit) in limits.items():
-            wrong = ~((values[name] > low) & (values[name] < high))
-            if wrong.any():
-                found = values[name][wrong][0]
+            invalid = ~((values[name] > low) & (values[name] < high))
+            if invalid.any():
+                value = values[name][invalid][0]
                 raise InputError(
-                    f"mirrors: {name} {found} {unit} must be above 0"
+                    f"mirrors: {name} {value} {unit} must be above 0"
                     f"{' and at most 1' if name == 'reflectivity' else ' and finite'}"
                 )
         if not (values["focus"] > 0.0).all():
@@ -231,13 +231,13 @@ def beams(
         If shapes do not fit, or an aim coincides with its vertex.
     """
     origin = np.atleast_2d(as_vectors(vertex, "vertex"))
-    way = np.atleast_2d(as_vectors(aim, "aim")) - origin
-    origin = np.ascontiguousarray(np.broadcast_to(origin, way.shape))
+    to_aim = np.atleast_2d(as_vectors(aim, "aim")) - origin
+    origin = np.ascontiguousarray(np.broadcast_to(origin, to_aim.shape))
     if origin.ndim != 2:
-        raise InputError(f"beams: vertices and aims of shape {way.shape}; give (N, 3)")
+        raise InputError(f"beams: vertices and aims of shape {to_aim.shape}; give (N, 3)")
     return Beams(
         origin,
-        normalize(way, "aim - vertex"),
+        normalize(to_aim, "aim - vertex"),
         mirrors.broadcast(len(origin)),
         reaches(reach, len(origin)),
     )
@@ -329,15 +329,15 @@ def crossing(given: Beams, points: npt.ArrayLike, *, dni: float = NOMINAL_DNI) -
     along = np.einsum("pnk,nk->pn", to, given.direction)
     off = np.sqrt(np.maximum(np.einsum("pnk,pnk->pn", to, to) - along**2, 0.0))
     mirrors = given.mirrors
-    lit = (along > 0.0) & (along <= given.reach)
-    x = np.where(lit, along, 1.0)
-    # Closer to the focus the seen disk covers the mirror anyway.
+    within = (along > 0.0) & (along <= given.reach)
+    x = np.where(within, along, 1.0)
+    # Closer to the focus the visible disk covers the mirror anyway.
     gap = np.maximum(np.abs(1.0 - x / mirrors.focus), 1e-4)
     radius = np.broadcast_to(np.sqrt(mirrors.area / np.pi), x.shape)
-    seen = _common_area(radius, x * SUN_RADIUS / gap, off / gap)
-    each = np.where(lit, seen / (np.pi * (x * SUN_RADIUS) ** 2), 0.0)
-    total = dni * (each @ mirrors.reflectivity)
-    return Crossing(each, total, np.count_nonzero(each > 0.0, axis=1))
+    overlap = _common_area(radius, x * SUN_RADIUS / gap, off / gap)
+    concentrations = np.where(within, overlap / (np.pi * (x * SUN_RADIUS) ** 2), 0.0)
+    total = dni * (concentrations @ mirrors.reflectivity)
+    return Crossing(concentrations, total, np.count_nonzero(concentrations > 0.0, axis=1))
 
 
 @dataclass(frozen=True)
@@ -392,7 +392,11 @@ def _common_area(r: FloatArray, s: FloatArray, d: FloatArray) -> FloatArray:
 
 def reaches(reach: npt.ArrayLike, count: int) -> FloatArray:
     """Return the reach of each beam, m, (count,), from one number or one for each beam."""
-    given = as_float(reach)
-    if not (np.isfinite(given) & (given > 0.0)).all() or given.shape not in ((), (1,), (count,)):
+    lengths = as_float(reach)
+    if not (np.isfinite(lengths) & (lengths > 0.0)).all() or lengths.shape not in (
+        (),
+        (1,),
+        (count,),
+    ):
         raise InputError(f"reach {reach!r} m: give numbers above 0, one or one for each beam")
-    return np.ascontiguousarray(np.broadcast_to(given, (count,)))
+    return np.ascontiguousarray(np.broadcast_to(lengths, (count,)))

@@ -163,10 +163,10 @@ def predict_flux(
         0.5 * MARGIN * s * np.linspace(-1.0, 1.0, n + 1) for s, n in zip(size, cells, strict=True)
     ]
     middle = [0.5 * (e[1:] + e[:-1]) for e in edges]
-    way = points - places
-    slant = np.linalg.norm(way, axis=-1)
+    path = points - places
+    slant = np.linalg.norm(path, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        ray = way / slant[:, None]
+        ray = path / slant[:, None]
     cosine = -(ray @ normal)
     # Beams from behind, or nearly along the plane, do not enter the aperture.
     good = np.isfinite(cosine) & (cosine > 0.05) & (light[2] > 0.0)
@@ -239,12 +239,12 @@ def field_flux(
     light = vector(time, plant.site)
     if light.shape != (3,):
         raise InputError(f"flux: times of shape {light.shape[:-1]}; give one time")
-    found = track(plant, light, aperture.center)
-    good = found.reachable
+    tracking = track(plant, light, aperture.center)
+    good = tracking.reachable
     area = np.concatenate([g.width * g.height for g in plant.groups.values()])
     return predict_flux(
         aperture,
-        found.chosen(found.vertex)[good],
+        tracking.chosen(tracking.vertex)[good],
         np.broadcast_to(aperture.center, (int(good.sum()), 3)),
         area[good],
         np.broadcast_to(as_float(error), area.shape)[good],

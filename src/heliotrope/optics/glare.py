@@ -173,9 +173,9 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
         raise InputError("glare of many: give finite irradiances and angles, (..., N)")
     if (e < 0.0).any() or (w < 0.0).any():
         raise InputError("glare of many: irradiances and angles must be 0 or more")
-    lit = (e > 0.0) & (w > 0.0)
-    e, size = np.where(lit, e, 0.0), np.where(lit, np.maximum(w, SMALLEST) ** 2, 0.0)
-    radiance = np.divide(e, size, out=np.zeros_like(e), where=lit)
+    bright = (e > 0.0) & (w > 0.0)
+    e, size = np.where(bright, e, 0.0), np.where(bright, np.maximum(w, SMALLEST) ** 2, 0.0)
+    radiance = np.divide(e, size, out=np.zeros_like(e), where=bright)
     order = np.argsort(-radiance, axis=-1)
     light = np.cumsum(np.take_along_axis(e, order, axis=-1), axis=-1)
     room = np.cumsum(np.take_along_axis(size, order, axis=-1), axis=-1)
@@ -184,11 +184,11 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
     # No source is wider than the half space; a smaller angle errs to the safe side.
     angle = np.minimum(np.sqrt(np.concatenate([room, corner_room[..., None]], axis=-1)), math.pi)
     dark = angle == 0.0
-    one = glare_of_one(every_light, np.where(dark, 1.0, angle), eye)
+    combined = glare_of_one(every_light, np.where(dark, 1.0, angle), eye)
     total = np.sqrt(room[..., -1]) if e.shape[-1] else np.zeros(e.shape[:-1])
     return Glare(
-        np.max(np.where(dark, 0.0, one.burn), axis=-1),
-        np.max(np.where(dark, 0.0, one.flash), axis=-1),
+        np.max(np.where(dark, 0.0, combined.burn), axis=-1),
+        np.max(np.where(dark, 0.0, combined.flash), axis=-1),
         np.sum(e, axis=-1),
         as_float(total),
     )
@@ -216,9 +216,9 @@ def glare_at(
     concentration C is seen under ω = 2 β √C, since it shows the sun at the sun's radiance.
     """
     _irradiance(dni)
-    seen = crossing(given, points, dni=dni).concentration
-    corneal = dni * given.mirrors.reflectivity * seen
-    return glare_of_many(corneal, 2.0 * SUN_RADIUS * np.sqrt(seen), eye)
+    concentration = crossing(given, points, dni=dni).concentration
+    corneal = dni * given.mirrors.reflectivity * concentration
+    return glare_of_many(corneal, 2.0 * SUN_RADIUS * np.sqrt(concentration), eye)
 
 
 def safe_range(
@@ -377,8 +377,8 @@ def safe_distance(
     distances = np.append(np.arange(step, reach, step), reach)
     for away in distances[::-1]:
         points = given.point(np.stack([to - away, to + away], axis=-1)).reshape(-1, 3)
-        found = glare_at(given, points, dni=dni, eye=eye)
-        if (found.hazard >= limit).any():
+        glare = glare_at(given, points, dni=dni, eye=eye)
+        if (glare.hazard >= limit).any():
             return math.inf if away == distances[-1] else float(away + step)
     return 0.0 if not (glare_at(given, middle, dni=dni, eye=eye).hazard >= limit).any() else step
 

@@ -186,7 +186,7 @@ def _chords(
 
 
 def _offset(name: str, value: npt.ArrayLike) -> FloatArray:
-    given = as_float(value)
-    if np.isinf(given).any():
+    offset = as_float(value)
+    if np.isinf(offset).any():
         raise InputError(f"{name}: an offset is infinite; give metres, or NaN for no beam")
-    return given
+    return offset

@@ -208,36 +208,36 @@ def sweep(
     s = np.broadcast_to(normalize(sun, "sun"), (count, 3))
     table, corners = _packed(volumes)
     every = mirrors.broadcast(count)
-    found = np.empty((count, len(volumes), 8))
+    entries = np.empty((count, len(volumes), 8))
     far = reaches(reach, count)
     inputs = (table, corners, _rows(rows, count), _rows(joints, count), s, far, *every.arrays())
-    poses = kernels.move(*map(as_input, inputs), resolution, found)
-    first = found[..., 1]
-    last = _leaving(found, table, corners, every, far)
+    poses = kernels.move(*map(as_input, inputs), resolution, entries)
+    first = entries[..., 1]
+    last = _leaving(entries, table, corners, every, far)
     return Sweep(
         tuple(v.name for v in volumes),
-        found[..., 0],
+        entries[..., 0],
         first,
-        found[..., 2:5] + first[..., None] * found[..., 5:8],
+        entries[..., 2:5] + first[..., None] * entries[..., 5:8],
         _strongest(every, first, last, dni),
         int(poses),
     )
 
 
 def _leaving(
-    found: FloatArray,
+    entries: FloatArray,
     table: FloatArray,
     corners: FloatArray,
     mirrors: MirrorOptics,
     reach: FloatArray,
 ) -> FloatArray:
     """Return the last contact in the pose of the entry, m, (N, V); at least the first."""
-    last = found[..., 1].copy()
+    last = entries[..., 1].copy()
     radius, near, spread = mirrors.arrays()
     for v in range(len(table)):
         hit = np.flatnonzero(np.isfinite(last[:, v]))
         end = np.empty((2, len(hit), 1))
-        pose = found[hit, v]
+        pose = entries[hit, v]
         beams = (pose[:, 2:5], pose[:, 5:8], reach[hit], radius[hit], near[hit], spread[hit])
         kernels.enter(*map(as_input, (table[v : v + 1], corners, *beams)), end[0], end[1])
         last[hit, v] = np.fmax(last[hit, v], end[1, :, 0])
@@ -294,8 +294,8 @@ def ground_way(
         sight = normalize(begin + share * (end - begin) - m, "aim - vertex")
         turned = np.cumsum(np.linalg.norm(np.diff(sight, axis=0), axis=1))
         pieces = max(1, int(np.ceil(turned[-1] / WAY_STEP)))
-        wanted = turned[-1] * np.arange(1, pieces + 1) / pieces
-        at = np.interp(wanted, np.concatenate([[0.0], turned]), share[:, 0])
+        angles = turned[-1] * np.arange(1, pieces + 1) / pieces
+        at = np.interp(angles, np.concatenate([[0.0], turned]), share[:, 0])
         aims += list(begin + at[:, None] * (end - begin))
     aims[-1] = corners[2]
     return np.stack(aims)
@@ -359,11 +359,11 @@ def safe_way(
         flat = first_distance * direction(towards + np.radians(side), 0.0)
         first = np.array([vertex[0] + flat[0], vertex[1] + flat[1], foot_[2]])
         aims = ground_way(vertex, first, foot_, standby)
-        way = _verified(armature, begin, aims, sun, mirrors, volumes, drives, reach)
-        if way.clear:
-            return way
-        tried.append(way)
-    return max(tried, key=lambda way: np.nanmin(way.motion.at, initial=np.inf))
+        candidate = _verified(armature, begin, aims, sun, mirrors, volumes, drives, reach)
+        if candidate.clear:
+            return candidate
+        tried.append(candidate)
+    return max(tried, key=lambda candidate: np.nanmin(candidate.motion.at, initial=np.inf))
 
 
 def _verified(
@@ -406,18 +406,18 @@ def _angles(
 ) -> tuple[FloatArray, npt.NDArray[np.int8]]:
     """Return joint angles (K, 2) for the aims, each the nearest to the one before, and status."""
     s = normalize(sun, "sun")
-    found = track(armature, s, aims, drives=drives)
+    tracking = track(armature, s, aims, drives=drives)
     angles, status, before = np.empty((len(aims), 2)), np.empty(len(aims), np.int8), stow
     for k in range(len(aims)):
         # A whole turn of a joint is the same pose; without drives nothing stops it.
-        options = found.angles[k]
+        options = tracking.angles[k]
         if drives is None:
             options = before + (options - before + np.pi) % (2.0 * np.pi) - np.pi
-        ok = found.status[k] == TrackingStatus.OK
+        ok = tracking.status[k] == TrackingStatus.OK
         cost = np.abs(options - before).max(axis=1) + np.where(ok, 0.0, 1e3)
         best = int(np.argmin(cost))
         before = angles[k] = options[best]
-        status[k] = found.status[k, best]
+        status[k] = tracking.status[k, best]
     return angles, status
 
 
@@ -444,15 +444,15 @@ def _packed(volumes: Sequence[Volume]) -> tuple[FloatArray, FloatArray]:
                 row[5:8] = (end - start) / length
                 row[8:10] = 0.5 * length, volume.radius
             case Prism():
-                given = as_float(volume.corners)
-                middle = 0.5 * (given.min(axis=0) + given.max(axis=0))
+                outline = as_float(volume.corners)
+                middle = 0.5 * (outline.min(axis=0) + outline.max(axis=0))
                 half_height = 0.5 * (volume.top - volume.bottom)
-                wide = float(np.linalg.norm(given - middle, axis=1).max())
+                wide = float(np.linalg.norm(outline - middle, axis=1).max())
                 center = np.array([*middle, 0.5 * (volume.top + volume.bottom)])
                 _head(row, kernels.PRISM, center, float(np.hypot(wide, half_height)))
-                row[5:8] = half_height, count, len(given)
-                corners.append(given)
-                count += len(given)
+                row[5:8] = half_height, count, len(outline)
+                corners.append(outline)
+                count += len(outline)
     return table, np.concatenate(corners) if corners else np.empty((0, 2))
 
 

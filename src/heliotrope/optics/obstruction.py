@@ -1,7 +1,7 @@
 """Shading and blocking by neighbours, and how far they move the centroid of a beam.
 
-A neighbour shades an element of a mirror if it stands between the element and the sun, and blocks
-it if it stands in the way of the reflected ray. What is left of the mirror has another middle. A
+A neighbour shades an element of a mirror if it is between the element and the sun, and blocks
+it if it is in the path of the reflected ray. The rest of the mirror has another middle. A
 flat mirror's beam moves by as much; the beam of a mirror that is focused on the target hardly moves
 while light comes along the axis, and moves by a part of it at an angle, where it is astigmatic.
 """
@@ -26,8 +26,8 @@ _ROOM = 0.1
 def nearest(places: FloatArray, count: int = NEAREST) -> npt.NDArray[np.intp]:
     """Return the rows of the nearest other places of each place (N, 3), (N, J)."""
     most = min(count + 1, len(places))
-    found = np.asarray(cKDTree(places).query(places, k=most)[1]).reshape(len(places), most)
-    return np.asarray(found[:, 1:], dtype=np.intp)
+    neighbours = np.asarray(cKDTree(places).query(places, k=most)[1]).reshape(len(places), most)
+    return np.asarray(neighbours[:, 1:], dtype=np.intp)
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Neighbours:
     height: FloatArray
 
     def hide(self, points: FloatArray, way: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return which points cannot be seen along a way from them, (E,).
+        """Return the mask of points whose ray the neighbours block, (E,).
 
         Parameters
         ----------
@@ -79,7 +79,7 @@ class Neighbours:
     def before(
         self, center: FloatArray, normal: FloatArray, size: tuple[float, float], *ways: FloatArray
     ) -> npt.NDArray[np.bool_]:
-        """Return which may hide a part of a mirror along ways, (J,): mostly none, and soon told.
+        """Return the mask of neighbours that may hide a part of a mirror, (J,): a quick check.
 
         Their corners are projected into the mirror's plane, where their boxes must touch its own.
 
@@ -99,9 +99,9 @@ class Neighbours:
         height = corners @ normal
         room = (0.5 + _ROOM) * np.array(size)
         hides = np.zeros(len(self.center), dtype=np.bool_)
-        for way in ways:
-            along = height / max(float(way @ normal), 1e-6)
-            plane = (corners - along[..., None] * way) @ tangent_axes(normal).T
+        for direction in ways:
+            along = height / max(float(direction @ normal), 1e-6)
+            plane = (corners - along[..., None] * direction) @ tangent_axes(normal).T
             low, high = plane.min(axis=1), plane.max(axis=1)
             touches = (low <= room).all(axis=-1) & (high >= -room).all(axis=-1)
             hides |= touches & (height > 0.0).any(axis=-1)
@@ -170,9 +170,9 @@ def centroid_shift(
     plane = target.plane_coordinates(target.intersect(points, rays))
     power = areas * np.maximum(normals @ sun, 0.0)
     shaded, blocked = neighbours.hide(points, sun), neighbours.hide(points, rays)
-    left = power * ~(shaded | blocked)
+    remaining = power * ~(shaded | blocked)
     shift = np.full(2, np.nan)
-    if left.any():
-        shift = left @ plane / left.sum() - power @ plane / power.sum()
+    if remaining.any():
+        shift = remaining @ plane / remaining.sum() - power @ plane / power.sum()
     shares = [float(areas @ mask / areas.sum()) for mask in (shaded, blocked, shaded | blocked)]
     return CentroidShift(shift, *shares)

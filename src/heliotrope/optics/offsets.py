@@ -1,7 +1,7 @@
 """Image offsets: where an imperfect heliostat throws its beam, Malan's error model run forwards.
 
 A controller knows the *nominal* mechanism and moves the drives so that this one would send
-the sun to the aim. The *actual* mechanism, with its imperfections, stands at the same
+the sun to the aim. The *actual* mechanism, with its imperfections, takes the same
 counts, and its beam misses the aim by the offsets that this module returns. Nothing here
 depends on the kind of mechanism or of imperfection: both are data of the chain.
 

@@ -70,13 +70,13 @@ def entered_over_the_year(
     suns = suns_of_the_year(latitude)
     wide = MirrorOptics(**{**vars(mirrors), "error": mirrors.error + 0.71 * _STEP})
     for v, (volume, center, radius) in enumerate(zip(volumes, *bounds(volumes), strict=True)):
-        way = center - vertex
-        distance = np.linalg.norm(way, axis=-1)
+        path = center - vertex
+        distance = np.linalg.norm(path, axis=-1)
         share = (radius + mirrors.half_diagonal) / np.maximum(distance, 1e-9)
         # All suns whose beams may touch the ball about the volume are in this cone.
         room = np.arcsin(np.minimum(share, 1.0)) + wide.spread
         room = np.where(share >= 1.0, np.pi, room)
-        toward = reflect(normalize(way, "way"), normal)
+        toward = reflect(normalize(path, "center - vertex"), normal)
         for i in range(len(vertex)):
             near = suns[suns @ toward[i] >= np.cos(min(room[i], np.pi))]
             near = near[near @ normal[i] > -SUN_RADIUS]
@@ -96,14 +96,16 @@ def _enters(
 ) -> bool:
     """Return whether the beam of one mirror enters a volume with one of the suns (S, 3)."""
     count = len(suns)
-    one = MirrorOptics(**{k: np.repeat(v[row : row + 1], count) for k, v in vars(mirrors).items()})
-    given = Beams(
+    mirror = MirrorOptics(
+        **{k: np.repeat(v[row : row + 1], count) for k, v in vars(mirrors).items()}
+    )
+    beams = Beams(
         np.repeat(vertex[None], count, axis=0),
         np.ascontiguousarray(reflect(suns, normal)),
-        one,
+        mirror,
         np.full(count, reach),
     )
-    return bool(find_entries(given, [volume]).entered.any())
+    return bool(find_entries(beams, [volume]).entered.any())
 
 
 def standing_beams(
@@ -122,8 +124,8 @@ def standing_beams(
     reach
         Length over which they are followed, m.
     """
-    way = np.ascontiguousarray(reflect(np.broadcast_to(sun, normal.shape), normal))
-    return Beams(np.ascontiguousarray(vertex), way, mirrors, np.full(len(vertex), reach))
+    rays = np.ascontiguousarray(reflect(np.broadcast_to(sun, normal.shape), normal))
+    return Beams(np.ascontiguousarray(vertex), rays, mirrors, np.full(len(vertex), reach))
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,7 @@ class Hottest:
     reach: float
 
 
-def hottest(given: Beams, center: FloatArray, around: float, limit: float = 10.0) -> Hottest:
+def hottest(beams: Beams, center: FloatArray, around: float, limit: float = 10.0) -> Hottest:
     """Return where beams are strongest together, near a place in the air.
 
     Points on the beams' axes are asked first, evenly chosen, then the neighbourhood of the best of
@@ -153,7 +155,7 @@ def hottest(given: Beams, center: FloatArray, around: float, limit: float = 10.0
 
     Parameters
     ----------
-    given
+    beams
         N beams.
     center
         The middle of the search, such as a receiver's, ENU, m, (3,).
@@ -162,17 +164,17 @@ def hottest(given: Beams, center: FloatArray, around: float, limit: float = 10.0
     limit
         Suns of `Hottest.reach`.
     """
-    near = np.einsum("nk,nk->n", center - given.origin, given.direction)
-    points = given.point(near[:, None] + np.linspace(-around, around, _ALONG)).reshape(-1, 3)
+    near = np.einsum("nk,nk->n", center - beams.origin, beams.direction)
+    points = beams.point(near[:, None] + np.linspace(-around, around, _ALONG)).reshape(-1, 3)
     chosen = np.unique(np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(np.intp))
     points = points[chosen]
-    suns = _suns(given, points)
+    suns = _suns(beams, points)
     away = np.linalg.norm(points - center, axis=-1)
     reach = float(np.max(away, where=suns > limit, initial=0.0))
     best, most, step = points[suns.argmax()], float(suns.max()), _COARSE
     while step > _FINE:
         grid = np.stack(np.meshgrid(*[np.arange(-2, 3) * step] * 3), axis=-1).reshape(-1, 3) + best
-        suns = _suns(given, grid)
+        suns = _suns(beams, grid)
         if suns.max() > most * (1.0 + 1e-6):
             best, most = grid[suns.argmax()], float(suns.max())
         else:
@@ -184,7 +186,7 @@ def hottest(given: Beams, center: FloatArray, around: float, limit: float = 10.0
     )
 
 
-def _suns(given: Beams, points: FloatArray) -> FloatArray:
+def _suns(beams: Beams, points: FloatArray) -> FloatArray:
     """Return the light of all beams at points (P, 3), in suns, (P,)."""
-    parts = np.array_split(points, 1 + len(points) * len(given) // _PAIRS)
-    return np.concatenate([crossing(given, part, dni=1.0).irradiance for part in parts])
+    parts = np.array_split(points, 1 + len(points) * len(beams) // _PAIRS)
+    return np.concatenate([crossing(beams, part, dni=1.0).irradiance for part in parts])

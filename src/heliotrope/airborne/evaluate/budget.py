@@ -119,9 +119,9 @@ def lever(
     m, across = as_vectors(point, "point"), as_float(axes)
     parts, total = [], np.zeros_like(m)
     for end in (as_vectors(led, "led"), as_vectors(camera, "camera")):
-        way = end - m
-        distance = np.linalg.norm(way, axis=-1, keepdims=True)
-        unit = way / distance
+        path = end - m
+        distance = np.linalg.norm(path, axis=-1, keepdims=True)
+        unit = path / distance
         total = total + unit
         parts.append((np.eye(3) - unit[..., :, None] * unit[..., None, :]) / distance[..., None])
     size = np.linalg.norm(total, axis=-1)[..., None, None]

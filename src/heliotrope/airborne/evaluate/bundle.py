@@ -349,9 +349,9 @@ def _place_covariances(
     The second is that of the mean over all mirrors that were seen, (3, 3).
     """
     unit = np.eye(3)
-    found = np.empty((layout.mirrors, 3, 3))
+    covariances = np.empty((layout.mirrors, 3, 3))
     pairs = np.unique(np.stack([corners.mirror, corners.photo]), axis=1)
-    seen = len(np.unique(pairs[0]))
+    count = len(np.unique(pairs[0]))
     whole: dict[int, FloatArray] = {}
     for n in range(layout.mirrors):
         mine = pairs[1, pairs[0] == n]
@@ -359,10 +359,10 @@ def _place_covariances(
         parts += [(layout.offset, unit), (layout.mirror + _OF_MIRROR * n, unit)]
         if layout.heliostats:
             parts.append((layout.survey + 3 * int(layout.owner[n]), unit))
-        found[n] = _covariance(solver, layout.size, parts)
+        covariances[n] = _covariance(solver, layout.size, parts)
         for place, share in parts if len(mine) else ():
-            whole[place] = whole.get(place, 0.0) + share / seen
-    return found, _covariance(solver, layout.size, list(whole.items()))
+            whole[place] = whole.get(place, 0.0) + share / count
+    return covariances, _covariance(solver, layout.size, list(whole.items()))
 
 
 def _priors(

@@ -88,7 +88,7 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
     InputError
         If no flight gives a reflection.
     """
-    found: list[FlightEvaluation | None] = [None] * len(flights)
+    evaluations: list[FlightEvaluation | None] = [None] * len(flights)
     problems = [tuple(flight.unused()) for flight in flights]
     # The error of a single flight is raised as it is.
     usable = [k for k, f in enumerate(flights) if f.corners or f.dark or len(flights) == 1]
@@ -105,48 +105,48 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
         done.append(joint)
         for k, part in zip(group, _parts([flights[k] for k in group], joint), strict=True):
             if len(part.reflections):
-                found[k] = part
+                evaluations[k] = part
             else:
                 problems[k] = (*problems[k], "no reflection on any mirror in its photographs")
-    if all(one is None for one in found):
+    if all(evaluation is None for evaluation in evaluations):
         if not flights:
             raise InputError("there is no flight to evaluate")
         first = f"{flights[0].name}: {_cause(problems[0])}".removeprefix(": ")
         raise InputError(f"no flight of {len(flights)} gives a reflection; the first: {first}")
     offset, covariance = common_offset(done, (priors or Priors()).offset)
-    return Campaign(tuple(found), tuple(problems), offset, covariance, len(done))
+    return Campaign(tuple(evaluations), tuple(problems), offset, covariance, len(done))
 
 
 def _cause(lines: Sequence[str]) -> str:
-    """Return why a flight failed: the reason of most of its lines, with an example."""
-    given = [line for line in lines if line.strip(" :")]
-    if not given:
+    """Return the cause of a failed flight: the reason of most of its lines, with an example."""
+    reasons = [line for line in lines if line.strip(" :")]
+    if not reasons:
         return "its photographs show no reflection of the lamp"
     # A line of a photograph is "name: kind: reason".
-    kinds = Counter(line.partition(": ")[2].partition(":")[0] or line for line in given)
+    kinds = Counter(line.partition(": ")[2].partition(":")[0] or line for line in reasons)
     kind, count = kinds.most_common(1)[0]
-    line = next(one for one in given if kind in one)
+    line = next(text for text in reasons if kind in text)
     return line if count == 1 else f"{line} (and {count - 1} more for the same reason)"
 
 
 def flight_groups(flights: Sequence[FlightData], usable: Sequence[int]) -> list[list[int]]:
     """Return flights that share heliostats and camera, in groups of `MOST_CORNERS`."""
     groups = [[k] for k in usable if flights[k].dark]
-    left = [k for k in usable if not flights[k].dark]
-    while left:
-        group = [left.pop(0)]
+    remaining = [k for k in usable if not flights[k].dark]
+    while remaining:
+        group = [remaining.pop(0)]
         camera, heliostats = flights[group[0]].camera, set(flights[group[0]].heliostat.tolist())
         grown = True
         while grown:
             near = [
                 k
-                for k in left
+                for k in remaining
                 if heliostats & set(flights[k].heliostat.tolist())
                 and _alike(camera, flights[k].camera)
             ]
             grown = bool(near)
             for k in near:
-                left.remove(k)
+                remaining.remove(k)
                 heliostats |= set(flights[k].heliostat.tolist())
             group += near
         group.sort()
@@ -156,9 +156,9 @@ def flight_groups(flights: Sequence[FlightData], usable: Sequence[int]) -> list[
     return groups
 
 
-def _alike(one: LedCamera, other: LedCamera) -> bool:
-    return one.size == other.size and all(
-        np.array_equal(getattr(one, name), getattr(other, name))
+def _alike(camera: LedCamera, other: LedCamera) -> bool:
+    return camera.size == other.size and all(
+        np.array_equal(getattr(camera, name), getattr(other, name))
         for name in ("matrix", "distortion", "led_offset")
     )
 
@@ -166,12 +166,14 @@ def _alike(one: LedCamera, other: LedCamera) -> bool:
 def _together(flights: Sequence[FlightData], priors: Priors | None) -> FlightEvaluation:
     """Evaluate several flights as one, with a mirror for each heliostat and pose."""
     if len(flights) == 1:
-        one = flights[0]
-        return evaluate(one.photos, one.seen, one.camera, one.stand, one.shape, priors=priors)
+        flight = flights[0]
+        return evaluate(
+            flight.photos, flight.seen, flight.camera, flight.stand, flight.shape, priors=priors
+        )
     first = np.cumsum([0] + [len(f.stand) for f in flights])
     numbers = np.concatenate([f.heliostat for f in flights])
     _, owner = np.unique(numbers, return_inverse=True)
-    seen = [
+    readings = [
         replace(s, mirror=s.mirror + start, spot_mirror=s.spot_mirror + start)
         for f, start in zip(flights, first[:-1].tolist(), strict=True)
         for s in f.seen
@@ -183,7 +185,7 @@ def _together(flights: Sequence[FlightData], priors: Priors | None) -> FlightEva
 
     photos = [photo for f in flights for photo in f.photos]
     stand = join_standing([f.stand for f in flights])
-    return evaluate(photos, seen, flights[0].camera, stand, shape, priors=priors, owner=owner)
+    return evaluate(photos, readings, flights[0].camera, stand, shape, priors=priors, owner=owner)
 
 
 def _parts(flights: Sequence[FlightData], joint: FlightEvaluation) -> list[FlightEvaluation]:
@@ -194,17 +196,17 @@ def _parts(flights: Sequence[FlightData], joint: FlightEvaluation) -> list[Fligh
     for flight in flights:
         rows = np.arange(row, row + len(flight.stand))
         used = sum(s.has_corners for s in flight.seen)
-        here = slice(photo, photo + used)
+        part = slice(photo, photo + used)
         at = joint.reflections.photo
         mine = joint.reflections.take(np.flatnonzero((at >= photo) & (at < photo + used)))
         parts.append(
             replace(
                 joint,
-                photos=joint.photos[here],
-                recorded=joint.recorded[here],
+                photos=joint.photos[part],
+                recorded=joint.recorded[part],
                 seen=tuple(
                     replace(s, mirror=s.mirror - row, spot_mirror=s.spot_mirror - row)
-                    for s in joint.seen[here]
+                    for s in joint.seen[part]
                 ),
                 stand=joint.stand.take(rows),
                 place_covariance=joint.place_covariance[rows],
@@ -223,9 +225,9 @@ def common_offset(done: Sequence[FlightEvaluation], prior: float) -> tuple[Float
     """
     own = np.eye(3) / prior**2
     weight, drawn = own, np.zeros(3)
-    for one in done:
-        share = np.linalg.inv(one.adjusted.offset_covariance)
-        drawn = drawn + share @ one.adjusted.state.offset
+    for evaluation in done:
+        share = np.linalg.inv(evaluation.adjusted.offset_covariance)
+        drawn = drawn + share @ evaluation.adjusted.state.offset
         weight = weight + share - own
     covariance = np.linalg.inv(weight)
     return as_float(covariance @ drawn), as_float(covariance)

@@ -33,7 +33,7 @@ class SeenTargets:
     sigma
         Standard deviation of a corner in each direction, px, (T,).
     problem
-        Why there are none; "" if there are.
+        Why there are none; empty if there are.
     """
 
     number: npt.NDArray[np.intp]
@@ -49,10 +49,10 @@ def find_targets(picture: Picture) -> SeenTargets:
     finder = cv2.aruco.ArucoDetector(
         cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250), cv2.aruco.DetectorParameters()
     )
-    found, numbers, _ = finder.detectMarkers(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
-    if not len(found):
+    squares, numbers, _ = finder.detectMarkers(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+    if not len(squares):
         return _none("there is no coded target in it")
-    corners = as_float(np.stack(found)).reshape(-1, 4, 2)
+    corners = as_float(np.stack(squares)).reshape(-1, 4, 2)
     number = np.asarray(numbers, dtype=np.intp).reshape(-1)
     # A number that is read twice belongs to a false target, and nobody knows to which.
     once = np.bincount(number, minlength=NUMBERS)[number] == 1
@@ -72,7 +72,7 @@ def find_targets(picture: Picture) -> SeenTargets:
 
 
 def read_targets(photos: Sequence[Photo], camera: LedCamera) -> tuple[SeenTargets, ...]:
-    """Return what the files of photographs show, in their order."""
+    """Return the targets in the files of photographs, in their order."""
     return tuple(_read(photo, camera) for photo in photos)
 
 

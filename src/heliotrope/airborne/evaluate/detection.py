@@ -101,7 +101,7 @@ class Overlap:
     own: Rows
 
     def clear(self, places: FloatArray, steps: FloatArray) -> Mask:
-        """Return which profiles across edges, (M, 4, P), lead from their mirror to the ground.
+        """Return the mask of profiles across edges, (M, 4, P), from their mirror to the ground.
 
         ``places`` are pixels, (M, 4, P, S, 2); ``steps`` the S distances from the edge, px.
         """
@@ -202,7 +202,7 @@ def find_patches(picture: Picture, expected: float) -> tuple[Patches, ...]:
 
     scale = float(np.clip(12.0 / np.sqrt(expected), 0.05, 1.0))
     side = max(3, int(10.0 * np.sqrt(expected) * scale)) | 1
-    found = []
+    answers = []
     for feature in brightness(picture, scale):
         above = np.clip(feature - cv2.blur(feature, (side, side)), 0.0, None)
         # A quantile rather than the maximum: the lamp is brighter than any mirror, but small.
@@ -215,8 +215,8 @@ def find_patches(picture: Picture, expected: float) -> tuple[Patches, ...]:
             patches = _whole_patches(np.asarray(closed, np.uint8), expected * scale**2)
             # The centre of a reduced pixel is the middle of the pixels it stands for.
             center = (patches.center + 0.5) / scale - 0.5
-            found.append(Patches(center, patches.area / scale**2))
-    return tuple(found)
+            answers.append(Patches(center, patches.area / scale**2))
+    return tuple(answers)
 
 
 def _whole_patches(mask: npt.NDArray[np.uint8], expected: float) -> Patches:
@@ -367,7 +367,7 @@ def _crossings(lines: FloatArray) -> FloatArray:
 def find_spots(
     picture: Picture, corners: FloatArray, most: int = 12, shown: Overlap | None = None
 ) -> tuple[Spots, tuple[str, ...]]:
-    """Return the lamp's spots on mirrors, and why a mirror gives none ("" if it may).
+    """Return the lamp's spots on mirrors, and for each mirror the reason why it gives none, or "".
 
     Parameters
     ----------
@@ -380,20 +380,20 @@ def find_spots(
     shown
         What each pixel shows, if mirrors overlap: hidden parts are not searched.
     """
-    found: list[tuple[int, FloatArray, float, float, int]] = []
+    spots: list[tuple[int, FloatArray, float, float, int]] = []
     reasons = []
     for k, outline in enumerate(corners):
-        seen, reason = _spots_of(picture, outline, shown, k)
-        if len(seen) > most:
-            seen, reason = [], f"cluttered: {len(seen)} bright spots"
+        own, reason = _spots_of(picture, outline, shown, k)
+        if len(own) > most:
+            own, reason = [], f"cluttered: {len(own)} bright spots"
         reasons.append(reason)
-        found += [(k, *one) for one in seen]
+        spots += [(k, *spot) for spot in own]
     return Spots(
-        np.array([f[0] for f in found], dtype=np.intp),
-        as_float([f[1] for f in found]).reshape(-1, 2),
-        as_float([f[2] for f in found]),
-        as_float([f[3] for f in found]),
-        np.array([f[4] for f in found], dtype=np.intp),
+        np.array([f[0] for f in spots], dtype=np.intp),
+        as_float([f[1] for f in spots]).reshape(-1, 2),
+        as_float([f[2] for f in spots]),
+        as_float([f[3] for f in spots]),
+        np.array([f[4] for f in spots], dtype=np.intp),
     ), tuple(reasons)
 
 
@@ -439,7 +439,7 @@ def _spots_of(
     noise = 1.4826 * float(np.median(np.abs(values - np.median(values))))
     limit = max(_SPOT_SIGMAS * noise, _SPOT_LEAST)
     top = cv2.dilate(raised, np.ones((7, 7), np.uint8))
-    found = []
+    spots = []
     peaks = (raised >= top) & (raised > limit)
     own = _own_peaks(light, raised, peaks, inside, whole)
     # Corners of facets at a gap rise by less than this: they are no light beside another one.
@@ -447,10 +447,10 @@ def _spots_of(
     places = [(a, b) for a, b, height, _ in own if height > least]
     for i, j, excess, held in own:
         alone = _without(held, (i, j), places)
-        one = _centroid(light, bright, alone, i, j, noise, excess)
-        if one is not None:
-            found.append((one[0] + low, *one[1:]))
-    return found, ""
+        spot = _centroid(light, bright, alone, i, j, noise, excess)
+        if spot is not None:
+            spots.append((spot[0] + low, *spot[1:]))
+    return spots, ""
 
 
 def _own_peaks(
@@ -474,7 +474,7 @@ def _own_peaks(
         return []
     smooth = cv2.GaussianBlur(light.astype(np.float32), (0, 0), 0.9)
     around = cv2.dilate(smooth, _disc(_BESIDE - 1))
-    found: dict[tuple[int, int], tuple[float, npt.NDArray[np.uint8]]] = {}
+    tops: dict[tuple[int, int], tuple[float, npt.NDArray[np.uint8]]] = {}
     for i, j in np.argwhere(peaks).tolist():
         first = max(i - 2, 0), max(j - 2, 0)
         part = smooth[first[0] : i + 3, first[1] : j + 3]
@@ -482,8 +482,8 @@ def _own_peaks(
         top = first[0] + int(a), first[1] + int(b)
         if whole[top] and smooth[top] >= around[top]:
             # Only a peak beside the part that is searched needs more of the mirror.
-            found.setdefault(top, (float(raised[i, j]), inside if inside[top] else whole))
-    return [(*place, *one) for place, one in found.items()]
+            tops.setdefault(top, (float(raised[i, j]), inside if inside[top] else whole))
+    return [(*place, *peak) for place, peak in tops.items()]
 
 
 def _without(

@@ -82,8 +82,8 @@ class Panel:
         width: float = 1.2,
     ) -> None:
         """Draw a line through points (n,)."""
-        way = " ".join(f"{a:.1f},{b:.1f}" for a, b in self.place(x, y))
-        drawn = {"points": way, "fill": "none", "stroke": colour, "stroke-width": width}
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in self.place(x, y))
+        drawn = {"points": points, "fill": "none", "stroke": colour, "stroke-width": width}
         self.parts.append(SvgElement("polygon" if closed else "polyline", drawn))
 
     def dots(
@@ -107,8 +107,8 @@ class Panel:
     ) -> None:
         """Draw crosses (n,), each with its tooltip."""
         for k, (a, b) in enumerate(self.place(x, y)):
-            way = f"M{a - 4:.1f} {b - 4:.1f}l8 8m-8 0l8 -8"
-            drawn = {"d": way, "stroke": colour, "stroke-width": 1.6, "fill": "none"}
+            path = f"M{a - 4:.1f} {b - 4:.1f}l8 8m-8 0l8 -8"
+            drawn = {"d": path, "stroke": colour, "stroke-width": 1.6, "fill": "none"}
             self.parts.append(SvgElement("path", drawn, tips[k] if tips else ""))
 
     def arrows(self, x: npt.ArrayLike, y: npt.ArrayLike, step: npt.ArrayLike, colour: str) -> None:
@@ -122,11 +122,11 @@ class Panel:
             head = min(max(0.25 * length, 3.0), 6.0) / length
             left = (-head * (dx + 0.5 * up), head * (up - 0.5 * dx))
             right = (-head * (dx - 0.5 * up), head * (up + 0.5 * dx))
-            way = (
+            path = (
                 f"M{a:.1f} {b:.1f}l{dx:.1f} {-up:.1f}l{left[0]:.1f} {left[1]:.1f}"
                 f"m{-left[0]:.1f} {-left[1]:.1f}l{right[0]:.1f} {right[1]:.1f}"
             )
-            self.parts.append(SvgElement("path", {"d": way, "fill": "none", "stroke": colour}))
+            self.parts.append(SvgElement("path", {"d": path, "fill": "none", "stroke": colour}))
 
     def bars(self, edges: npt.ArrayLike, heights: npt.ArrayLike, colour: str) -> None:
         """Draw a histogram of n + 1 edges and n heights."""
@@ -146,26 +146,26 @@ class Panel:
     def frame(self) -> list[SvgElement]:
         """Return the frame with its ticks and texts."""
         size = {"x": self.left, "y": self.top, "width": self.width, "height": self.height}
-        found = [SvgElement("rect", {**size, "fill": "none", "stroke": "#888"})]
+        elements = [SvgElement("rect", {**size, "fill": "none", "stroke": "#888"})]
         low = self.top + self.height
         across = [(float(k), text) for k, text in enumerate(self.labels)] or numbered(*self.x, 6)
         for value, text in across:
             a = self.left + float(self.place(value, self.y[0])[0])
-            found += [_tick(a, low, 0.0, _TICK), *_text(a, low + 16.0, text, "middle")]
+            elements += [_tick(a, low, 0.0, _TICK), *_text(a, low + 16.0, text, "middle")]
         for value, text in numbered(*self.y, 5):
             b = self.top + float(self.place(self.x[0], value)[1])
-            found += [
+            elements += [
                 _tick(self.left, b, -_TICK, 0.0),
                 *_text(self.left - 7.0, b + 4.0, text, "end"),
             ]
-        found += _text(self.left, self.top - 8.0, self.title, "start")
-        found += _text(self.left + 0.5 * self.width, low + 32.0, self.across, "middle")
+        elements += _text(self.left, self.top - 8.0, self.title, "start")
+        elements += _text(self.left + 0.5 * self.width, low + 32.0, self.across, "middle")
         if self.up:
             a, b = self.left - 34.0, self.top + 0.5 * self.height
             turned = {"x": a, "y": b, "text-anchor": "middle"}
             turned["transform"] = f"rotate(-90 {a:g} {b:g})"
-            found.append(SvgElement("text", turned, text=self.up))
-        return found
+            elements.append(SvgElement("text", turned, text=self.up))
+        return elements
 
 
 def drawing(panels: Sequence[Panel], width: float, height: float, title: str) -> str:
@@ -182,11 +182,11 @@ def drawing(panels: Sequence[Panel], width: float, height: float, title: str) ->
 
 def around(values: npt.ArrayLike, share: float = 0.08) -> tuple[float, float]:
     """Return the range of the finite values (...), widened by a share of it at both ends."""
-    given = as_float(values)
-    given = given[np.isfinite(given)]
-    if not len(given):
+    finite = as_float(values)
+    finite = finite[np.isfinite(finite)]
+    if not len(finite):
         return -1.0, 1.0
-    low, high = float(given.min()), float(given.max())
+    low, high = float(finite.min()), float(finite.max())
     room = share * (high - low) or max(0.1 * abs(high), 1e-3)
     return low - room, high + room
 

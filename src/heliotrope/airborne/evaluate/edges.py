@@ -120,16 +120,16 @@ def _fit_edges(
             blur[pair == side] = np.median(alone[even, 3])
     whole, gap = _fit(flat, steps, first, blur, -_INSIDE, free=False)
     near, _ = _fit(flat, steps, first, blur, _OUTSIDE, free=False)
-    seen = usable.reshape(start.shape)
-    uneven = _uneven(gap.reshape(profile.shape), seen)[seen.any(axis=-1)]
+    measured = usable.reshape(start.shape)
+    uneven = _uneven(gap.reshape(profile.shape), measured)[measured.any(axis=-1)]
     # All edges of a photograph alike: if some mirrors seemed larger than others, it would turn.
-    found = near if uneven.size >= _ENOUGH and uneven.mean() > _MANY else whole
-    kept = usable & _plausible(found, first, jump)
-    return as_float(np.where(kept, found[:, 2], first)).reshape(start.shape)
+    fits = near if uneven.size >= _ENOUGH and uneven.mean() > _MANY else whole
+    kept = usable & _plausible(fits, first, jump)
+    return as_float(np.where(kept, fits[:, 2], first)).reshape(start.shape)
 
 
 def _uneven(gap: FloatArray, usable: Mask) -> Mask:
-    """Return which edges (M, 4) leave alike in all their groups more than noise, (M, 4, G, S)."""
+    """Return the mask of edges (M, 4) that leave more than noise in all groups, (M, 4, G, S)."""
     count = np.maximum(usable.sum(axis=-1), 1)
     kept = np.where(usable[..., None], gap, 0.0)
     mean = kept.sum(axis=2) / count[..., None]
@@ -139,13 +139,13 @@ def _uneven(gap: FloatArray, usable: Mask) -> Mask:
     return np.asarray(alike > _EVEN**2 * noise)
 
 
-def _plausible(found: FloatArray, first: FloatArray, jump: FloatArray) -> Mask:
-    """Return which fits (K, 4) are of an edge near the first estimate."""
+def _plausible(fits: FloatArray, first: FloatArray, jump: FloatArray) -> Mask:
+    """Return the mask of fits (K, 4) of an edge near the first estimate, (K,)."""
     with np.errstate(invalid="ignore"):
-        near = np.abs(found[:, 2] - first) < _FARTHEST
-        strong = found[:, 1] > _WEAKEST * jump
-        sharp = (found[:, 3] > _SHARPEST) & (found[:, 3] < _SOFTEST)
-    return np.asarray(np.isfinite(found).all(axis=1) & near & strong & sharp)
+        near = np.abs(fits[:, 2] - first) < _FARTHEST
+        strong = fits[:, 1] > _WEAKEST * jump
+        sharp = (fits[:, 3] > _SHARPEST) & (fits[:, 3] < _SOFTEST)
+    return np.asarray(np.isfinite(fits).all(axis=1) & near & strong & sharp)
 
 
 def _fit(
@@ -168,20 +168,20 @@ def _fit(
     inner = np.sum(np.where(away < _INSIDE + 1.0, weight, 0.0) * profile, axis=1)
     level = inner / np.maximum(np.sum(np.where(away < _INSIDE + 1.0, weight, 0.0), axis=1), 1e-9)
     count = 4 if free else 3
-    found = np.stack([level, np.zeros_like(level), start, blur], axis=1)
+    numbers = np.stack([level, np.zeros_like(level), start, blur], axis=1)
     for turn in range(_ROUNDS):
-        u = (steps - found[:, 2:3]) / found[:, 3:]
+        u = (steps - numbers[:, 2:3]) / numbers[:, 3:]
         share, bell = ndtr(u), np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi)
         if turn == 0:
             # The contrast is linear: the best for the first estimate of the place.
             top = np.sum(weight * share * (level[:, None] - profile), axis=1)
-            found[:, 1] = top / np.maximum(np.sum(weight * share**2, axis=1), 1e-12)
-        light, height = found[:, :1], found[:, 1:2]
+            numbers[:, 1] = top / np.maximum(np.sum(weight * share**2, axis=1), 1e-12)
+        light, height = numbers[:, :1], numbers[:, 1:2]
         gap = profile - (light - height * share)
         slope = np.stack(
             [
-                np.ones_like(u), -share, height * bell / found[:, 3:],
-                height * bell * u / found[:, 3:],
+                np.ones_like(u), -share, height * bell / numbers[:, 3:],
+                height * bell * u / numbers[:, 3:],
             ][:count], axis=-1,
         )  # fmt: skip
         heavy = slope * weight[..., None]
@@ -189,6 +189,6 @@ def _fit(
         normal += 1e-9 * np.eye(count)
         step = np.linalg.solve(normal, np.einsum("ksi,ks->ki", heavy, gap)[..., None])[..., 0]
         step[:, 2:] = np.clip(step[:, 2:], -0.5, 0.5)
-        found[:, :count] += step
-        found[:, 3] = np.clip(found[:, 3], _SHARPEST, _SOFTEST)
-    return found, as_float(weight * gap / np.maximum(np.abs(found[:, 1:2]), 1e-12))
+        numbers[:, :count] += step
+        numbers[:, 3] = np.clip(numbers[:, 3], _SHARPEST, _SOFTEST)
+    return numbers, as_float(weight * gap / np.maximum(np.abs(numbers[:, 1:2]), 1e-12))

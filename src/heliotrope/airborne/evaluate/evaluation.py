@@ -80,7 +80,7 @@ def evaluate(
     Parameters
     ----------
     photos, seen
-        Photographs as recorded, and what each shows.
+        Photographs as recorded, and their readings.
     camera
         The camera with its lamp.
     stand
@@ -118,8 +118,8 @@ def evaluate(
         for photo, place, turned in zip(recorded, state.position, state.rotation, strict=True)
     ]
     shifts = _local_shifts(adjusted, corners, len(used), len(stand))
-    found = spot_reflections(places, used, camera, state.stand, shape, shifts=shifts)
-    if not len(found):
+    reflections = spot_reflections(places, used, camera, state.stand, shape, shifts=shifts)
+    if not len(reflections):
         raise InputError(
             f"no reflection on the mirrors in {len(used)} photographs; check that the lamp was on "
             "and that the mirrors were commanded towards the drone (commands.csv)"
@@ -131,14 +131,14 @@ def evaluate(
         adjusted,
         state.stand,
         adjusted.place_covariance,
-        found,
+        reflections,
         problems,
     )
 
 
 def _evaluate_dark(
     recorded: Sequence[Photo],
-    seen: Sequence[PhotoReading],
+    readings: Sequence[PhotoReading],
     camera: LedCamera,
     stand: MirrorPoses,
     shape: ShapeOf,
@@ -146,19 +146,19 @@ def _evaluate_dark(
     problems: tuple[str, ...],
 ) -> FlightEvaluation:
     """Evaluate a dark flight: attitudes from the lights alone, positions from RTK."""
-    start = [p.moved(p.position, s.rotation) for p, s in zip(recorded, seen, strict=True)]
-    found = turn_together(start, seen, camera, stand, shape)
+    start = [p.moved(p.position, s.rotation) for p, s in zip(recorded, readings, strict=True)]
+    turned = turn_together(start, readings, camera, stand, shape)
     position = as_float([p.position for p in recorded])
     state = State(
         position,
-        as_float([p.rotation for p in found.photos]),
+        as_float([p.rotation for p in turned.photos]),
         np.zeros_like(position),
         np.zeros(3),
-        found.stand,
+        turned.stand,
         np.zeros((len(stand), 3)),
     )
     place = float(np.linalg.norm([priors.offset, priors.position, priors.kinematics]))
-    places = found.place_covariance(place)
+    places = turned.place_covariance(place)
     adjusted = Adjusted(
         state,
         priors.offset**2 * np.eye(3),
@@ -173,29 +173,29 @@ def _evaluate_dark(
         True,
     )
     return FlightEvaluation(
-        found.photos,
+        turned.photos,
         tuple(recorded),
-        tuple(seen),
+        tuple(readings),
         adjusted,
-        found.stand,
+        turned.stand,
         places,
-        found.reflections,
+        turned.reflections,
         problems,
     )
 
 
-def corners_of(seen: Sequence[PhotoReading]) -> Corners:
+def corners_of(readings: Sequence[PhotoReading]) -> Corners:
     """Return the corners found in photographs, for the adjustment."""
     parts = []
-    for k, one in enumerate(seen):
-        row, corner = np.nonzero(np.isfinite(one.corners).all(axis=-1))
+    for k, reading in enumerate(readings):
+        row, corner = np.nonzero(np.isfinite(reading.corners).all(axis=-1))
         parts.append(
             (
                 np.full(len(row), k),
-                one.mirror[row],
+                reading.mirror[row],
                 corner,
-                one.corners[row, corner],
-                one.corner_sigma[row],
+                reading.corners[row, corner],
+                reading.corner_sigma[row],
             )
         )
     joined = [np.concatenate(p) for p in zip(*parts, strict=True)]
@@ -210,7 +210,7 @@ def corners_of(seen: Sequence[PhotoReading]) -> Corners:
 
 def adjust_photos(
     recorded: Sequence[Photo],
-    seen: Sequence[PhotoReading],
+    readings: Sequence[PhotoReading],
     camera: LedCamera,
     stand: MirrorPoses,
     priors: Priors,
@@ -221,23 +221,25 @@ def adjust_photos(
     The priors are widened by what the edges of mirrors may be off. If the corners scatter more or
     less than stated, the adjustment is repeated with their standard deviations rescaled.
     """
-    corners = corners_of(seen)
+    corners = corners_of(readings)
     places = as_float([p.position for p in recorded])
     spreads = as_float([p.sigma_position for p in recorded])
-    turns = as_float([s.rotation for s in seen])
+    turns = as_float([s.rotation for s in readings])
     distance = float(np.median(np.linalg.norm(stand.vertex - places.mean(axis=0), axis=-1)))
     bias = EDGE_BIAS * distance / camera.focal
     known = replace(priors, kinematics=float(np.hypot(priors.kinematics, bias)))
-    found = adjust(places, spreads, turns, stand, corners, known, owner=owner)
-    if disagrees(found):
-        scaled = replace(corners, sigma=corners.sigma * found.deviation)
-        found = adjust(places, spreads, found.state.rotation, stand, scaled, known, owner=owner)
-    return found
+    adjusted = adjust(places, spreads, turns, stand, corners, known, owner=owner)
+    if disagrees(adjusted):
+        scaled = replace(corners, sigma=corners.sigma * adjusted.deviation)
+        adjusted = adjust(
+            places, spreads, adjusted.state.rotation, stand, scaled, known, owner=owner
+        )
+    return adjusted
 
 
-def disagrees(found: Adjusted) -> bool:
+def disagrees(adjusted: Adjusted) -> bool:
     """Return whether the corners scatter more or less than their standard deviations say."""
-    return bool(np.isfinite(found.deviation) and not 1.0 / _AGREE < found.deviation < _AGREE)
+    return bool(np.isfinite(adjusted.deviation) and not 1.0 / _AGREE < adjusted.deviation < _AGREE)
 
 
 def _local_shifts(adjusted: Adjusted, corners: Corners, photos: int, mirrors: int) -> FloatArray:

@@ -97,18 +97,18 @@ class CampaignResult:
 
     def sightings(self) -> Sightings | None:
         """Return the plausible sightings of all flights; None if there are none."""
-        seen, reasons = self._judged
-        if seen is None or len(reasons) == len(seen):
+        sightings, reasons = self._judged
+        if sightings is None or len(reasons) == len(sightings):
             return None
-        return seen.take(~np.isin(np.arange(len(seen)), list(reasons)))
+        return sightings.take(~np.isin(np.arange(len(sightings)), list(reasons)))
 
     @property
     def impossible(self) -> tuple[str, ...]:
         """A line for each sighting that cannot have happened."""
-        seen, reasons = self._judged
-        if seen is None:
+        sightings, reasons = self._judged
+        if sightings is None:
             return ()
-        names = [self.plant.names[row] for row in seen.heliostat]
+        names = [self.plant.names[row] for row in sightings.heliostat]
         return tuple(f"{names[k]}: {text}" for k, text in sorted(reasons.items()))
 
     @cached_property
@@ -116,8 +116,8 @@ class CampaignResult:
         parts = [s for s in (f.sightings() for f in self.flights) if s is not None]
         if not parts:
             return None, {}
-        seen = join(parts)
-        return seen, judge_in(self.plant, seen).reasons
+        sightings = join(parts)
+        return sightings, judge_in(self.plant, sightings).reasons
 
     def orientation_rows(self) -> list[dict[str, Any]]:
         """Return one record for each orientation, its systematic part split by cause."""
@@ -232,15 +232,15 @@ def evaluate_flight(
     if matches is not None:
         named, left_out = read_matches(matches, plant.names)
         opened = [_turned(flight, named) for flight in opened]
-        warnings += [*left_out, *_strange(named, opened)]
+        warnings += [*left_out, *_missing_photographs(named, opened)]
     flights = [read_flight(f, keep, processes, client, progress) for f in opened]
     campaign = evaluate_campaign(flights, priors)
     # The RTK base is part of each mirror's position as the adjustment knows it.
     budget = Budget(priors.position, priors.kinematics, 0.0)
     results = [
-        _measure(flight, found, budget, axis)
-        for flight, found in zip(flights, campaign.flights, strict=True)
-        if found is not None
+        _measure(flight, evaluation, budget, axis)
+        for flight, evaluation in zip(flights, campaign.flights, strict=True)
+        if evaluation is not None
     ]
     lines = [(f.name, line) for f in flights for line in f.problems]
     for flight, problems in zip(flights, campaign.problems, strict=True):
@@ -256,10 +256,10 @@ def _turned(flight: FlightData, named: Matches) -> FlightData:
     return replace(flight, photos=photos, problems=(*flight.problems, *problems))
 
 
-def _strange(named: Matches, flights: Sequence[FlightData]) -> list[str]:
+def _missing_photographs(named: Matches, flights: Sequence[FlightData]) -> list[str]:
     """Return a line for each photograph that is named but not there."""
-    there = {name for f in flights for p in f.photos for name in (p.name, f"{f.name}/{p.name}")}
-    missing = dict.fromkeys(name for name in named.photo if name not in there)
+    present = {name for f in flights for p in f.photos for name in (p.name, f"{f.name}/{p.name}")}
+    missing = dict.fromkeys(name for name in named.photo if name not in present)
     return [
         f"{named.path.name}: there is no photograph {name!r}; its places are not used"
         for name in missing
@@ -275,7 +275,7 @@ def read_flight(
 ) -> FlightData:
     """Return a flight with what its photographs show; see `evaluate_flight`."""
     what = f"reading {flight.name}".strip()
-    seen = read_many(
+    readings = read_many(
         flight.photos,
         flight.camera,
         flight.stand,
@@ -284,29 +284,29 @@ def read_flight(
         keep=keep,
         progress=None if progress is None else lambda done, of: progress(what, done, of),
     )
-    return replace(flight, seen=seen)
+    return replace(flight, seen=readings)
 
 
 def _measure(
-    flight: FlightData, found: FlightEvaluation, budget: Budget, axis: Mean
+    flight: FlightData, evaluation: FlightEvaluation, budget: Budget, axis: Mean
 ) -> FlightResult:
     """Measure the mirrors of one flight where the photographs showed them to stand."""
     orientations = measure_field(
-        found.reflections,
+        evaluation.reflections,
         flight.stand.names,
         flight.shape,
         flight.stand.rotation,
-        found.stand.vertex,
+        evaluation.stand.vertex,
         budget=budget,
-        places=found.place_covariance,
+        places=evaluation.place_covariance,
         mean=axis,
     )
     measured = MeasuredFlight(
         flight.name,
         orientations,
         flight.shape,
-        found.stand.vertex,
+        evaluation.stand.vertex,
         budget,
-        found.place_covariance,
+        evaluation.place_covariance,
     )
-    return FlightResult(flight, found, measured)
+    return FlightResult(flight, evaluation, measured)

@@ -129,7 +129,7 @@ def _row(flight: FlightResult, o: Orientation, group: _Group, count: int, at: fl
 
 
 def _beside(whole: FloatArray, common: FloatArray) -> FloatArray:
-    """Return what a covariance holds beside a common part: no variance is negative, (3, 3)."""
+    """Return a covariance without a common part, with no negative variance, (3, 3)."""
     values, vectors = np.linalg.eigh(whole - common)
-    found = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return np.asarray(0.5 * (found + found.T))
+    remainder = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return np.asarray(0.5 * (remainder + remainder.T))

@@ -26,7 +26,7 @@ class FlightData:
     Attributes
     ----------
     name
-        Name of the flight; "" if it is the only one.
+        Name of the flight; empty if it is the only one.
     photos
         Photographs as recorded by the drone.
     camera
@@ -128,24 +128,28 @@ def open_flights(
         flight = open_flight(folder, plant, surfaces.of, camera, commands, cluster, point)
         return [flight], [], surfaces.missing
     flights, problems = [], []
-    for one in sorted(below, key=lambda d: natural_key(d.name)):
-        lens = one / "camera.toml" if (one / "camera.toml").exists() else folder / "camera.toml"
-        table, of, at = one / "commands.csv", cluster, point
+    for subfolder in sorted(below, key=lambda d: natural_key(d.name)):
+        lens = (
+            subfolder / "camera.toml"
+            if (subfolder / "camera.toml").exists()
+            else folder / "camera.toml"
+        )
+        table, of, at = subfolder / "commands.csv", cluster, point
         own = commands is None and table.exists()
         if not own:
             table = commands or folder / "commands.csv"
-            of, _, at = one.name.rpartition("-")
+            of, _, at = subfolder.name.rpartition("-")
         try:
             if not (own or (of and at)):
                 raise InputError(
                     "its commands are unknown; name the folder CLUSTER-POINT, such as C1-3, or put "
                     "its commands.csv into it"
                 )
-            flight = open_flight(one, plant, surfaces.of, camera or lens, table, of, at)
+            flight = open_flight(subfolder, plant, surfaces.of, camera or lens, table, of, at)
         except InputError as error:
-            problems.append(f"{one.name}: {error}")
+            problems.append(f"{subfolder.name}: {error}")
             continue
-        flights.append(replace(flight, name=one.name))
+        flights.append(replace(flight, name=subfolder.name))
     if not flights:
         raise InputError(f"{folder}: none of {len(below)} flights can be used; {problems[0]}")
     return flights, problems, surfaces.missing
@@ -226,10 +230,10 @@ class _Surfaces:
             shape = self._designed(name)
             if self._folder is not None:
                 files = [self._folder / f"{name}{suffix}" for suffix in (".npz", ".csv")]
-                there = next((f for f in files if f.exists()), None)
-                measured = there or find_deflectometry(self._folder, name)
-                if there is not None:
-                    shape = shape.with_slopes(read_slopes(there, len(shape)))
+                own = next((f for f in files if f.exists()), None)
+                measured = own or find_deflectometry(self._folder, name)
+                if own is not None:
+                    shape = shape.with_slopes(read_slopes(own, len(shape)))
                 elif measured is not None:
                     shape = shape.with_slopes(read_deflectometry(measured, shape))
                 else:

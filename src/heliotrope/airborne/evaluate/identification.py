@@ -61,7 +61,7 @@ class Identified:
     mirror, patch
         Pairs of a mirror's row and a patch, (K,).
     reason
-        Why no solution is trusted; "" if one is.
+        Why no solution is trusted; empty if one is.
     shifted
         Whether the field seems to fit only where it is shifted: laid over the photograph it would
         fit there too.
@@ -91,8 +91,8 @@ def expected_size(
     width, height = camera.size
     limit = np.array([width, height]) / (2.0 * camera.focal) * 1.1 + np.tan(gimbal)
     middle = plane.mean(axis=1)
-    seen = front & np.isfinite(area) & (np.abs(middle) < limit).all(axis=-1)
-    return np.sqrt(np.nan_to_num(area)) * camera.focal, seen
+    visible = front & np.isfinite(area) & (np.abs(middle) < limit).all(axis=-1)
+    return np.sqrt(np.nan_to_num(area)) * camera.focal, visible
 
 
 def quad_area(corners: FloatArray) -> FloatArray:
@@ -102,12 +102,12 @@ def quad_area(corners: FloatArray) -> FloatArray:
     return as_float(0.5 * np.abs(cross.sum(axis=1)))
 
 
-def nearest_rotation(ways: FloatArray, rays: FloatArray) -> FloatArray:
-    """Return the rotation (3, 3) that best turns unit ``rays`` into ``ways``, (K, 3) each.
+def nearest_rotation(directions: FloatArray, rays: FloatArray) -> FloatArray:
+    """Return the rotation (3, 3) that best turns unit ``rays`` into ``directions``, (K, 3) each.
 
     Wahba's problem, solved by singular values.
     """
-    u, _, vt = np.linalg.svd(ways.T @ rays)
+    u, _, vt = np.linalg.svd(directions.T @ rays)
     return as_float(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
 
@@ -119,7 +119,7 @@ def identify(
     *,
     far: bool = True,
 ) -> Identified:
-    """Return which mirrors the patches show, and the attitude of the camera.
+    """Return the mirrors that the patches show, and the attitude of the camera.
 
     Parameters
     ----------
@@ -132,12 +132,12 @@ def identify(
     patches
         Centres of patches, px, (K, 2).
     far
-        Whether an attitude up to `FAR_GIMBAL` away is looked for where the mirrors fit badly. If
-        it fits clearly better, it counts.
+        Whether to search attitudes up to `FAR_GIMBAL` away where the mirrors fit badly. One that
+        fits clearly better counts.
     """
     none = np.empty(0, dtype=np.intp)
-    _, seen = expected_size(camera, photo, stand)
-    rows = np.flatnonzero(seen)
+    _, visible = expected_size(camera, photo, stand)
+    rows = np.flatnonzero(visible)
     if len(rows) < FEWEST:
         text = f"wrong_field: {len(rows)} mirrors of the field can be in it; is this the right one?"
         return Identified(photo.rotation, none, none, text)
@@ -161,16 +161,16 @@ def _search(
 ) -> "list[_Tried]":
     """Return the solutions within `GIMBAL` of some attitudes; their mirrors count in ``rows``."""
     side, _ = expected_size(camera, photo, stand)
-    ways = stand.corners[rows].mean(axis=1) - photo.position
-    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+    directions = stand.corners[rows].mean(axis=1) - photo.position
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     plane = undistort(camera, patches)
     rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     size = float(np.median(side[rows])) / camera.focal
     return [
-        _refine(start, ways, rays, side[rows] / camera.focal)
+        _refine(start, directions, rays, side[rows] / camera.focal)
         for turned in about
-        for start in _starts(turned, ways, plane, size)
+        for start in _starts(turned, directions, plane, size)
     ]
 
 
@@ -184,8 +184,8 @@ def _farther(
 ) -> Identified:
     """Return an attitude far from the gimbal's if it fits clearly better than the near one."""
     none = np.empty(0, dtype=np.intp)
-    _, seen = expected_size(camera, photo, stand, FAR_GIMBAL)
-    rows = np.flatnonzero(seen)
+    _, visible = expected_size(camera, photo, stand, FAR_GIMBAL)
+    rows = np.flatnonzero(visible)
     yaw, pitch, roll = gimbal_of_rotation(photo.rotation)
     step = 2.0 * GIMBAL
     about = [
@@ -198,17 +198,17 @@ def _farther(
     ranked = _ranked(tried, photo, camera, stand, rows, len(patches), FAR_GIMBAL)
     best = max(ranked, key=lambda r: r.evidence, default=None)
     others = [r.evidence for r in ranked if best is not None and best.differs(r)]
-    rivals = [0.0 if fit is None else fit.evidence, *others]
-    if best is not None and best.good and best.evidence > max(rivals) + MARGIN:
-        one = best.one
-        return Identified(as_float(one.rotation), rows[one.mirror], one.patch)
+    competing = [0.0 if fit is None else fit.evidence, *others]
+    if best is not None and best.good and best.evidence > max(competing) + MARGIN:
+        solution = best.solution
+        return Identified(as_float(solution.rotation), rows[solution.mirror], solution.patch)
     if fit is None:
         return near
     better = best is not None and best.evidence > fit.evidence + MARGIN
-    if better or fit.apart > _WORST_FIT or fit.left > _LEFT:
+    if better or fit.apart > _WORST_FIT or fit.unmatched > _LEFT:
         text = (
-            f"ambiguous: {len(fit.one.mirror)} mirrors match badly, {100 * fit.apart:.0f} % of a "
-            f"side apart and {100 * fit.matched:.0f} % of all; the gimbal may be more than "
+            f"ambiguous: {len(fit.solution.mirror)} mirrors match badly, {100 * fit.apart:.0f} % "
+            f"of a side apart and {100 * fit.matched:.0f} % of all; the gimbal may be more than "
             f"{np.degrees(GIMBAL):.0f}° off: check its angles"
         )
         return Identified(photo.rotation, none, none, text, shifted=True)
@@ -230,19 +230,19 @@ class _Tried:
 
 
 def _starts(
-    turned: FloatArray, ways: FloatArray, plane: FloatArray, size: float
+    turned: FloatArray, directions: FloatArray, plane: FloatArray, size: float
 ) -> list[FloatArray]:
     """Return the rotations with the most votes."""
     from scipy.ndimage import uniform_filter
 
-    local = ways @ turned
+    local = directions @ turned
     reach = np.tan(GIMBAL) * 1.2
     cells = int(np.clip(2.0 * reach / (0.35 * size), 16, 400))
-    found: list[tuple[float, FloatArray]] = []
+    ranked: list[tuple[float, FloatArray]] = []
     for turn in np.linspace(-GIMBAL, GIMBAL, _TURNS):
         spun = local @ rotation([0.0, 0.0, 1.0], turn)
-        there = spun[:, :2] / spun[:, 2:]
-        shift = (plane[:, None] - there[None]).reshape(-1, 2)
+        projected = spun[:, :2] / spun[:, 2:]
+        shift = (plane[:, None] - projected[None]).reshape(-1, 2)
         votes, *_ = np.histogram2d(
             shift[:, 0], shift[:, 1], bins=cells, range=[[-reach, reach]] * 2
         )
@@ -253,19 +253,21 @@ def _starts(
             # To shift the image by (x, y) the camera turns about its down and right axes.
             move = rotation([0.0, 1.0, 0.0], x) @ rotation([1.0, 0.0, 0.0], -y)
             total = turned @ rotation([0.0, 0.0, 1.0], turn) @ move.T
-            found.append((float(votes[i, j]), total))
+            ranked.append((float(votes[i, j]), total))
             votes[max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3] = 0.0
-    found.sort(key=lambda f: -f[0])
+    ranked.sort(key=lambda f: -f[0])
     # Neighbouring turns vote for the same solution: keep different ones.
     apart = max(0.7 * size, 2.2 * GIMBAL / (_TURNS - 1))
     kept: list[FloatArray] = []
-    for _, start in found:
+    for _, start in ranked:
         if len(kept) < _CANDIDATES and all(rotation_angle(start, k) > apart for k in kept):
             kept.append(start)
     return kept
 
 
-def _refine(turned: FloatArray, ways: FloatArray, rays: FloatArray, size: FloatArray) -> _Tried:
+def _refine(
+    turned: FloatArray, directions: FloatArray, rays: FloatArray, size: FloatArray
+) -> _Tried:
     """Return the solution that a start converges to."""
     from scipy.spatial import cKDTree
 
@@ -274,8 +276,8 @@ def _refine(turned: FloatArray, ways: FloatArray, rays: FloatArray, size: FloatA
     mirror, patch = np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
     for k in range(_ROUNDS):
         reach = size * max(0.25, 0.9 * 0.6**k)
-        found = tree.query(ways @ turned)
-        distance, nearest = as_float(found[0]), np.asarray(found[1], dtype=np.intp)
+        neighbours = tree.query(directions @ turned)
+        distance, nearest = as_float(neighbours[0]), np.asarray(neighbours[1], dtype=np.intp)
         close = np.flatnonzero(distance < reach)
         # A patch belongs to the mirror nearest to it.
         order = close[np.argsort(distance[close])]
@@ -287,7 +289,7 @@ def _refine(turned: FloatArray, ways: FloatArray, rays: FloatArray, size: FloatA
         if len(mirror) < 3:
             break
         apart = float(np.sqrt(np.mean(away**2)))
-        turned = nearest_rotation(ways[mirror], rays[patch])
+        turned = nearest_rotation(directions[mirror], rays[patch])
     return _Tried(score, apart, turned, mirror, patch)
 
 
@@ -312,12 +314,12 @@ class _Fit:
         RMS distance of patches from their mirrors, in mirrors' sides.
     """
 
-    one: _Tried
+    solution: _Tried
     merit: float
     evidence: float
     inside: int
     matched: float
-    left: float
+    unmatched: float
     apart: float
 
     @property
@@ -328,10 +330,10 @@ class _Fit:
     def differs(self, other: "_Fit") -> bool:
         """Return whether another solution names most mirrors otherwise."""
         pairs = [
-            set(zip(f.one.patch.tolist(), f.one.mirror.tolist(), strict=True))
+            set(zip(f.solution.patch.tolist(), f.solution.mirror.tolist(), strict=True))
             for f in (self, other)
         ]
-        return len(pairs[0] & pairs[1]) < 0.5 * len(other.one.mirror)
+        return len(pairs[0] & pairs[1]) < 0.5 * len(other.solution.mirror)
 
 
 def _ranked(
@@ -344,22 +346,24 @@ def _ranked(
     most: float,
 ) -> list[_Fit]:
     """Return the solutions at most an angle from the gimbal's, the best first."""
-    found = []
-    for one in tried:
-        angle = rotation_angle(one.rotation, photo.rotation)
-        matched = len(one.mirror)
+    fits = []
+    for solution in tried:
+        angle = rotation_angle(solution.rotation, photo.rotation)
+        matched = len(solution.mirror)
         if angle > most or matched < FEWEST:
             continue
-        pixels = photo.moved(photo.position, one.rotation).pixels(camera, stand.vertex[rows])
+        pixels = photo.moved(photo.position, solution.rotation).pixels(camera, stand.vertex[rows])
         inside = int(((pixels > 0) & (pixels < np.array(camera.size) - 1)).all(axis=-1).sum())
         # Mirrors without a patch, and patches without a mirror.
-        absent, strange = max(inside - matched, 0), patches - matched
+        absent, surplus = max(inside - matched, 0), patches - matched
         usual = 0.5 * (angle / USUAL_GIMBAL) ** 2
-        evidence = one.score - 0.5 * (absent + strange)
+        evidence = solution.score - 0.5 * (absent + surplus)
         share = matched / max(inside, patches, 1)
-        left = min(absent, strange) / matched
-        found.append(_Fit(one, evidence - usual, evidence, inside, share, left, one.apart))
-    return sorted(found, key=lambda f: -f.merit)
+        unmatched = min(absent, surplus) / matched
+        fits.append(
+            _Fit(solution, evidence - usual, evidence, inside, share, unmatched, solution.apart)
+        )
+    return sorted(fits, key=lambda f: -f.merit)
 
 
 def _choose(
@@ -376,7 +380,7 @@ def _choose(
     if not ranked:
         text = "nothing: no mirrors of the field match its patches"
         return Identified(photo.rotation, none, none, text), None
-    best = ranked[0].one
+    best = ranked[0].solution
     if best.score < LEAST_SHARE * ranked[0].inside:
         text = (
             f"wrong_field: {len(best.mirror)} patches match the {ranked[0].inside} mirrors of the "
@@ -388,7 +392,7 @@ def _choose(
         close = other.merit > ranked[0].merit - max(MARGIN, 0.03 * best.score)
         if ranked[0].differs(other) and close:
             text = (
-                f"ambiguous: {len(other.one.mirror)} mirrors match if the camera pointed "
+                f"ambiguous: {len(other.solution.mirror)} mirrors match if the camera pointed "
                 f"elsewhere, {len(best.mirror)} as it is; record the gimbal more accurately or "
                 "photograph more of the field"
             )
@@ -432,33 +436,33 @@ def find_lights(
     spots, _ = find_spots(picture, frame[None], most=_MOST_LIGHTS)
     feet, rows = expected_feet(photo, camera, stand)
     none = np.empty(0, dtype=np.intp)
-    found = Identified(photo.rotation, none, none)
+    identified = Identified(photo.rotation, none, none)
     if len(spots) < FEWEST:
         text = f"nothing: it is dark and shows {len(spots)} lights, {FEWEST} are needed"
-        return replace(found, reason=text), spots
+        return replace(identified, reason=text), spots
     if not photo.by_hand:
-        found = identify(
+        identified = identify(
             camera, photo, replace(stand.take(rows), vertex=feet), spots.pixel, far=False
         )
-    if found.reason:
+    if identified.reason:
         text = (
             f"ambiguous: it is dark, and its {len(spots)} lights cannot be assigned to mirrors; "
             "check the field and the commands that were given"
         )
-        return replace(found, reason=text), spots
-    mirror = _mirrors_of(undistort(camera, spots.pixel), photo, found.rotation, stand)
+        return replace(identified, reason=text), spots
+    mirror = _mirrors_of(undistort(camera, spots.pixel), photo, identified.rotation, stand)
     kept = mirror >= 0
     named = Spots(
         mirror[kept], spots.pixel[kept], spots.sigma[kept], spots.flux[kept], spots.clipped[kept]
     )
-    return replace(found, mirror=rows[found.mirror]), named
+    return replace(identified, mirror=rows[identified.mirror]), named
 
 
 def _mirrors_of(plane: FloatArray, photo: Photo, turn: FloatArray, stand: MirrorPoses) -> Rows:
     """Return the mirror that each light lies on, -1 for none."""
-    ways = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1) @ turn.T
+    directions = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1) @ turn.T
     start = np.einsum("nji,nj->ni", stand.rotation, photo.position - stand.vertex)
-    local = np.einsum("nji,sj->sni", stand.rotation, ways)
+    local = np.einsum("nji,sj->sni", stand.rotation, directions)
     with np.errstate(divide="ignore", invalid="ignore"):
         length = -start[:, 2] / local[..., 2]
         at = start[:, :2] + length[..., None] * local[..., :2]

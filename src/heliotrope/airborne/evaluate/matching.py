@@ -68,7 +68,7 @@ class Matches:
 def read_matches(path: str | Path, names: Sequence[str]) -> tuple[Matches, list[str]]:
     """Return the places that a table names, and a line for each row that was left out.
 
-    Rows without a heliostat are skipped: they are outlines that nobody has named. An empty
+    Rows without a heliostat are skipped: they are outlines without a name. An empty
     ``corner`` is the middle of the mirror.
 
     Parameters
@@ -93,8 +93,8 @@ def read_matches(path: str | Path, names: Sequence[str]) -> tuple[Matches, list[
     for k in blank:
         rows.reasons.pop(k, None)
     if not good:
-        left = f"; {rows.left_out[0]}" if rows.left_out else ""
-        raise FormatError(rows.path, f"no row names a heliostat; fill in the column{left}")
+        hint = f"; {rows.left_out[0]}" if rows.left_out else ""
+        raise FormatError(rows.path, f"no row names a heliostat; fill in the column{hint}")
     photo = rows.texts("photo")
     return Matches(
         rows.path,
@@ -107,13 +107,13 @@ def read_matches(path: str | Path, names: Sequence[str]) -> tuple[Matches, list[
 
 def _corners(rows: Rows) -> list[str]:
     known = (*CORNERS, MIDDLE, LIGHT)
-    found = []
+    names = []
     for k, text in enumerate(rows.texts("corner")):
         name = " ".join(text.replace("_", " ").split()).casefold() or MIDDLE
         if name not in known:
             rows.refuse(k, "corner", f"{text!r} is none of {', '.join(known)}")
-        found.append(name)
-    return found
+        names.append(name)
+    return names
 
 
 def turn_by_hand(
@@ -136,7 +136,7 @@ def turn_by_hand(
     matches
         Places that were named.
     flight
-        Name of the flight, "" if it is the only one.
+        Name of the flight; empty if it is the only one.
 
     Returns
     -------
@@ -145,11 +145,11 @@ def turn_by_hand(
     turned, problems = [], []
     for photo in photos:
         rows = matches.of(photo.name, flight)
-        found = _turned(photo, camera, stand, matches, rows) if len(rows) else photo
-        if isinstance(found, str):
-            problems.append(f"{matches.path.name}: {photo.name}: {found}")
-            found = photo
-        turned.append(found)
+        result = _turned(photo, camera, stand, matches, rows) if len(rows) else photo
+        if isinstance(result, str):
+            problems.append(f"{matches.path.name}: {photo.name}: {result}")
+            result = photo
+        turned.append(result)
     return tuple(turned), tuple(problems)
 
 
@@ -166,26 +166,26 @@ def _turned(
         return f"heliostat {unknown[0]} was not commanded in this flight; correct the name"
     if len(rows) < FEWEST:
         return f"{len(rows)} place is named, {FEWEST} are needed and 3 show a wrong name; name more"
-    seen = undistort(camera, matches.pixel[rows])
-    rays = np.concatenate([seen, np.ones((len(seen), 1))], axis=-1)
+    plane = undistort(camera, matches.pixel[rows])
+    rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     mirrors = np.array([stand.names.index(matches.heliostat[k]) for k in rows])
-    here = photo
+    current = photo
     # Where the lamp is seen on a mirror depends on the lamp's own place, and so on the attitude.
     for _ in range(2):
         points = np.stack(
             [
-                _point(here, camera, stand, int(row), matches.corner[k])
+                _point(current, camera, stand, int(row), matches.corner[k])
                 for row, k in zip(mirrors, rows, strict=True)
             ]
         )
-        ways = points - photo.position
-        ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
-        if float(np.linalg.svd(ways - ways.mean(axis=0))[1][0]) < 1e-3:
+        directions = points - photo.position
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        if float(np.linalg.svd(directions - directions.mean(axis=0))[1][0]) < 1e-3:
             return "its places are all at one point; name mirrors farther from each other"
-        here = photo.moved(photo.position, nearest_rotation(ways, rays))
-    gap = np.linalg.norm(here.pixels(camera, points) - matches.pixel[rows], axis=-1)
-    side = np.sqrt(quad_area(here.pixels(camera, stand.corners[mirrors])))
+        current = photo.moved(photo.position, nearest_rotation(directions, rays))
+    gap = np.linalg.norm(current.pixels(camera, points) - matches.pixel[rows], axis=-1)
+    side = np.sqrt(quad_area(current.pixels(camera, stand.corners[mirrors])))
     off = gap / np.where(np.isfinite(side), side, 1.0)
     worst = int(np.argmax(np.where(np.isfinite(off), off, np.inf)))
     if not off[worst] < _OFF:
@@ -194,7 +194,7 @@ def _turned(
             f"{name}, {corner}, is {gap[worst]:.0f} px from where the other places put it; "
             "correct its name or its place"
         )
-    return replace(here, by_hand=True)
+    return replace(current, by_hand=True)
 
 
 def _point(
@@ -204,7 +204,7 @@ def _point(
     if corner in CORNERS:
         return as_float(stand.corners[row, CORNERS.index(corner)])
     if corner == LIGHT:
-        feet, found = expected_feet(photo, camera, stand.take([row]))
-        if len(found):
+        feet, visible = expected_feet(photo, camera, stand.take([row]))
+        if len(visible):
             return as_float(feet[0])
     return as_float(stand.corners[row].mean(axis=0))

@@ -39,14 +39,14 @@ class Sheets:
     outlines: tuple[int, ...]
 
 
-def write_sheets(flights: "Sequence[FlightData]", wanted: Sequence[str], out: Path) -> Sheets:
-    """Write a picture of each photograph that is wanted, and the table to be filled in.
+def write_sheets(flights: "Sequence[FlightData]", names: Sequence[str], out: Path) -> Sheets:
+    """Write a picture of each chosen photograph, and the table to be filled in.
 
     Parameters
     ----------
     flights
         Flights whose photographs have been read.
-    wanted
+    names
         Names of photographs, NAME or FLIGHT/NAME; none: all in which no mirror was identified.
     out
         Folder.
@@ -61,7 +61,7 @@ def write_sheets(flights: "Sequence[FlightData]", wanted: Sequence[str], out: Pa
         raise InputError(
             f"{table}: there is one already, perhaps with names in it; move it, or give --out"
         )
-    chosen = _chosen(flights, wanted)
+    chosen = _chosen(flights, names)
     pictures, counts, rows = [], [], []
     for flight, photo in chosen:
         assert photo.path is not None
@@ -84,24 +84,24 @@ def write_sheets(flights: "Sequence[FlightData]", wanted: Sequence[str], out: Pa
 
 
 def _chosen(
-    flights: "Sequence[FlightData]", wanted: Sequence[str]
+    flights: "Sequence[FlightData]", names: Sequence[str]
 ) -> "list[tuple[FlightData, Photo]]":
     every = [
-        (flight, photo, seen)
+        (flight, photo, reading)
         for flight in flights
-        for photo, seen in zip(flight.photos, flight.seen, strict=True)
+        for photo, reading in zip(flight.photos, flight.seen, strict=True)
         if photo.path is not None
     ]
-    if not wanted:
-        found = [(f, p) for f, p, seen in every if seen.nameable]
-        if not found:
+    if not names:
+        unnamed = [(f, p) for f, p, reading in every if reading.nameable]
+        if not unnamed:
             raise InputError(
                 "the mirrors of all photographs are identified, or cannot be seen; nothing is to "
                 "be named. --photo NAME writes the picture of a certain photograph"
             )
-        return found
+        return unnamed
     chosen = []
-    for name in wanted:
+    for name in names:
         mine = [(f, p) for f, p, _ in every if name in (p.name, f"{f.name}/{p.name}")]
         if not mine:
             raise InputError(f"--photo: there is no photograph {name}; give the name of a file")
@@ -114,9 +114,9 @@ def _patches(picture: Picture, camera: LedCamera, photo: Photo, stand: MirrorPos
     side, near = expected_size(camera, photo, stand)
     if not near.any():
         return Patches(np.empty((0, 2)), np.empty(0))
-    found = find_patches(picture, float(np.median(side[near])) ** 2)
-    few = [p for p in found if len(p) <= 2 * int(near.sum())]
-    return max(few, key=len, default=found[0])
+    patches = find_patches(picture, float(np.median(side[near])) ** 2)
+    few = [p for p in patches if len(p) <= 2 * int(near.sum())]
+    return max(few, key=len, default=patches[0])
 
 
 def _drawn(

@@ -81,7 +81,7 @@ class Turned:
 
 def turn_together(
     photos: Sequence[Photo],
-    seen: Sequence[PhotoReading],
+    readings: Sequence[PhotoReading],
     camera: LedCamera,
     stand: MirrorPoses,
     shape: ShapeOf,
@@ -90,8 +90,8 @@ def turn_together(
 
     Parameters
     ----------
-    photos, seen
-        Photographs with attitudes to a few mrad, and what each shows.
+    photos, readings
+        Photographs with attitudes to a few mrad, and their readings.
     camera
         The camera with its lamp.
     stand
@@ -107,21 +107,21 @@ def turn_together(
 
     def found_by(photos: Sequence[Photo], mirrors: MirrorPoses) -> Reflections:
         # The common turn moves lights beside the mirrors they lie on.
-        return spot_reflections(photos, seen, camera, mirrors, shape, beside=BESIDE)
+        return spot_reflections(photos, readings, camera, mirrors, shape, beside=BESIDE)
 
     now, mirrors = list(photos), stand
     for _ in range(_ROUNDS):
-        found = found_by(now, mirrors)
-        rows = np.unique(found.heliostat)
+        reflections = found_by(now, mirrors)
+        rows = np.unique(reflections.heliostat)
         if len(rows) < FEWEST:
             raise InputError(
                 f"the photographs are dark, and {len(rows)} mirrors show the lamp; {FEWEST} are "
                 "needed to find the attitude of the camera"
             )
-        now = _attitudes(now, found, mirrors, shape)
-        found = found_by(now, mirrors)
+        now = _attitudes(now, reflections, mirrors, shape)
+        reflections = found_by(now, mirrors)
         before = mirrors
-        mirrors = _orientations(mirrors, found, shape)
+        mirrors = _orientations(mirrors, reflections, shape)
         now, mirrors = _as_commanded(now, mirrors, stand, rows)
         if np.abs(mirrors.rotation - before.rotation).max() < _STILL:
             break
@@ -138,38 +138,38 @@ def _lever(stand: MirrorPoses, rows: Rows) -> FloatArray:
 
 
 def _attitudes(
-    photos: Sequence[Photo], found: Reflections, stand: MirrorPoses, shape: ShapeOf
+    photos: Sequence[Photo], reflections: Reflections, stand: MirrorPoses, shape: ShapeOf
 ) -> list[Photo]:
     """Turn each photograph so that its lights are seen along the normals of the mirrors."""
-    seen, wanted = np.empty((len(found), 3)), np.empty((len(found), 3))
-    for row in np.unique(found.heliostat).tolist():
-        mine = np.flatnonzero(found.heliostat == row)
-        own, R = found.take(mine), stand.rotation[row]
+    rays, targets = np.empty((len(reflections), 3)), np.empty((len(reflections), 3))
+    for row in np.unique(reflections.heliostat).tolist():
+        mine = np.flatnonzero(reflections.heliostat == row)
+        own, R = reflections.take(mine), stand.rotation[row]
         surface = shape(int(row))
         point = stand.vertex[row] + surface.point_at(own.facet, own.xy) @ R.T
         measured = measured_normal(point, own.camera, own.led)
         normal = surface.normal_at(own.facet, own.xy, slopes=False) @ R.T
-        way = point - own.camera
-        way /= np.linalg.norm(way, axis=-1, keepdims=True)
+        ray = point - own.camera
+        ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
         axis = np.cross(measured, normal)
         turn = rotation(axis, np.linalg.norm(axis, axis=-1))
-        seen[mine], wanted[mine] = way, np.einsum("nij,nj->ni", turn, way)
+        rays[mine], targets[mine] = ray, np.einsum("nij,nj->ni", turn, ray)
     turns = []
     for k, photo in enumerate(photos):
-        mine = found.photo == k
+        mine = reflections.photo == k
         if int(mine.sum()) < 3:
             turns.append(photo)
             continue
-        turn = nearest_rotation(wanted[mine], seen[mine])
+        turn = nearest_rotation(targets[mine], rays[mine])
         turns.append(photo.moved(photo.position, turn @ photo.rotation))
     return turns
 
 
-def _orientations(stand: MirrorPoses, found: Reflections, shape: ShapeOf) -> MirrorPoses:
+def _orientations(stand: MirrorPoses, reflections: Reflections, shape: ShapeOf) -> MirrorPoses:
     """Turn each mirror by the median difference of its lights."""
     turns = stand.rotation.copy()
-    for row in np.unique(found.heliostat).tolist():
-        own = found.of(row)
+    for row in np.unique(reflections.heliostat).tolist():
+        own = reflections.of(row)
         off = differences(own, shape(int(row)), turns[row], stand.vertex[row], slopes=False)
         turns[row] = turned(turns[row], np.median(off, axis=0))
     return replace(stand, rotation=turns)

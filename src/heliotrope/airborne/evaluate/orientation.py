@@ -304,11 +304,11 @@ def measure(
     omega = differences(own, shape, R, where(R), slopes=slopes)
     keep = ~(rosner(omega[:, 0], alpha=alpha) | rosner(omega[:, 1], alpha=alpha))
     R = update(R, mean)
-    found = differences(own, shape, R, where(R), slopes=slopes)
+    difference = differences(own, shape, R, where(R), slopes=slopes)
     known = budget or Budget()
     usual = SCATTER_WITH_MAP if slopes and shape.slope is not None else SCATTER
     prior = usual if scatter is None else scatter
-    return _result(own, shape, R, where(R), start, found, keep, known, mean, place, prior)
+    return _result(own, shape, R, where(R), start, difference, keep, known, mean, place, prior)
 
 
 def measure_field(
@@ -346,9 +346,9 @@ def measure_field(
     mirror has few reflections, its σ leans on the scatter of the well measured mirrors.
     """
     turns, feet = as_float(rotation), as_float(vertex)
-    seen = None if places is None else as_float(places)
+    covariances = None if places is None else as_float(places)
 
-    def one(row: int, mine: Reflections, scatter: float | None) -> Orientation:
+    def measure_one(row: int, mine: Reflections, scatter: float | None) -> Orientation:
         return measure(
             mine,
             shape(row),
@@ -357,29 +357,32 @@ def measure_field(
             slopes=slopes,
             budget=budget,
             mean=mean,
-            place=None if seen is None else seen[row],
+            place=None if covariances is None else covariances[row],
             scatter=scatter,
         )
 
-    found, left_out = [], {}
+    orientations, left_out = [], {}
     for row in range(len(names)):
         mine = reflections.of(row)
         if not len(mine):
             left_out[names[row]] = "no reflection in any photograph"
             continue
         try:
-            found.append(one(row, mine, None))
+            orientations.append(measure_one(row, mine, None))
         except InputError as error:
             left_out[names[row]] = str(error)
-    common = _common_scatter(found)
+    common = _common_scatter(orientations)
     if common is not None:
-        found = [o if o.count >= FIELD else one(o.heliostat, o.reflections, common) for o in found]
-    return Orientations(tuple(names), tuple(found), left_out)
+        orientations = [
+            o if o.count >= FIELD else measure_one(o.heliostat, o.reflections, common)
+            for o in orientations
+        ]
+    return Orientations(tuple(names), tuple(orientations), left_out)
 
 
-def _common_scatter(found: Sequence[Orientation]) -> float | None:
+def _common_scatter(orientations: Sequence[Orientation]) -> float | None:
     """Return the typical scatter of a flight's mirrors, rad; None if too few show it."""
-    known = [float(np.mean(o.sigma**2)) for o in found if o.count >= FEWEST]
+    known = [float(np.mean(o.sigma**2)) for o in orientations if o.count >= FEWEST]
     return float(np.sqrt(np.median(known))) if len(known) >= _ENOUGH_MIRRORS else None
 
 
@@ -419,14 +422,14 @@ def _result(
     R: FloatArray,
     vertex: FloatArray,
     start: FloatArray,
-    found: FloatArray,
+    difference: FloatArray,
     keep: npt.NDArray[np.bool_],
     budget: Budget,
     mean: Mean,
     place: npt.ArrayLike | None,
     prior: float,
 ) -> Orientation:
-    part, kept = own.take(keep), found[keep]
+    part, kept = own.take(keep), difference[keep]
     uv = shape.along_facet(part.facet, part.xy)
     known = spread_mean(kept, shape, part.facet, uv, prior)
     every = vertex + shape.point_at(own.facet, own.xy) @ R.T
@@ -445,13 +448,13 @@ def _result(
         point=every,
         outlier=~keep,
         weight=weight,
-        difference=found,
+        difference=difference,
         sigma=kept.std(axis=0, ddof=1) if len(kept) > 1 else np.full(2, np.nan),
         sigma_plain=plain_sigma(kept),
         sigma_mean=known.sigma_weighted if mean == "area" else known.sigma,
         systematic=np.sqrt(np.diag(shared)),
         normality=np.array([normality(column) for column in kept.T]),
-        facets=_facet_means(shape, own.facet, found, keep),
+        facets=_facet_means(shape, own.facet, difference, keep),
         distance=float(np.linalg.norm(part.camera - point, axis=-1).mean()),
         mean=mean,
     )
@@ -461,7 +464,7 @@ def _result(
 def _facet_means(
     shape: MirrorShape,
     facet: npt.NDArray[np.intp],
-    found: FloatArray,
+    difference: FloatArray,
     keep: npt.NDArray[np.bool_],
 ) -> tuple[FacetMean, ...]:
     means = []
@@ -469,7 +472,7 @@ def _facet_means(
         on = facet == k
         used = on & keep
         # On a canted facet most points are outliers of the mirror, but right for the facet.
-        mine = found[used if 2 * used.sum() >= on.sum() else on]
+        mine = difference[used if 2 * used.sum() >= on.sum() else on]
         mean = mine.mean(axis=0) if len(mine) else np.full(2, np.nan)
         means.append(FacetMean(k, len(mine), mean, plain_sigma(mine)))
     return tuple(means)

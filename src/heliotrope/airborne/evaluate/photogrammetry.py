@@ -95,34 +95,34 @@ class Photogrammetry:
         return as_float(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).reshape(-1, 3))
 
 
-def usable(seen: Sequence[SeenTargets]) -> tuple[list[int], dict[int, str]]:
+def usable(targets: Sequence[SeenTargets]) -> tuple[list[int], dict[int, str]]:
     """Return the photographs that can be used, and why others cannot, by their index.
 
     Targets that fewer than two photographs show do not count.
     """
-    number = np.concatenate([s.number for s in seen]) if seen else np.empty(0, np.intp)
+    number = np.concatenate([s.number for s in targets]) if targets else np.empty(0, np.intp)
     shared = np.flatnonzero(np.bincount(number, minlength=1) >= 2)
-    good, wrong = [], {}
-    for k, one in enumerate(seen):
-        count = int(np.isin(one.number, shared).sum())
+    good, unusable = [], {}
+    for k, shown in enumerate(targets):
+        count = int(np.isin(shown.number, shared).sum())
         if count >= FEWEST_OF_PHOTO:
             good.append(k)
         else:
-            wrong[k] = one.problem or (
+            unusable[k] = shown.problem or (
                 f"it shows {count} targets that other photographs show too, {FEWEST_OF_PHOTO} are "
                 "needed"
             )
-    return good, wrong
+    return good, unusable
 
 
 def locate(
-    photos: Sequence[Photo], seen: Sequence[SeenTargets], camera: LedCamera
+    photos: Sequence[Photo], targets: Sequence[SeenTargets], camera: LedCamera
 ) -> Photogrammetry:
     """Return where photographs were taken, from the targets that they show.
 
     Parameters
     ----------
-    photos, seen
+    photos, targets
         Photographs as recorded, and the targets in each; all usable.
     camera
         Lens, as its file states it.
@@ -137,7 +137,7 @@ def locate(
             f"{len(photos)} photographs show coded targets, {FEWEST_PHOTOS} are needed; fly a dome "
             "over them (heliotrope drone dome)"
         )
-    sights, numbers = _sights(seen)
+    sights, numbers = _sights(targets)
     if len(numbers) < FEWEST_TARGETS:
         raise InputError(
             f"{len(numbers)} coded targets are seen in two photographs or more, {FEWEST_TARGETS} "
@@ -147,19 +147,19 @@ def locate(
     return _result(*_adjusted(state, photos, camera, sights))
 
 
-def _sights(seen: Sequence[SeenTargets]) -> tuple[Sights, npt.NDArray[np.intp]]:
-    number = np.concatenate([s.number for s in seen])
+def _sights(targets: Sequence[SeenTargets]) -> tuple[Sights, npt.NDArray[np.intp]]:
+    number = np.concatenate([s.number for s in targets])
     numbers = np.flatnonzero(np.bincount(number) >= 2)
     parts = []
-    for k, one in enumerate(seen):
-        rows = np.flatnonzero(np.isin(one.number, numbers))
-        first = 4 * np.searchsorted(numbers, one.number[rows])
+    for k, shown in enumerate(targets):
+        rows = np.flatnonzero(np.isin(shown.number, numbers))
+        first = 4 * np.searchsorted(numbers, shown.number[rows])
         parts.append(
             (
                 np.full(4 * len(rows), k),
                 (first[:, None] + np.arange(4)).reshape(-1),
-                one.corners[rows].reshape(-1, 2),
-                np.repeat(one.sigma[rows], 4),
+                shown.corners[rows].reshape(-1, 2),
+                np.repeat(shown.sigma[rows], 4),
             )
         )
     photo, point, pixel, sigma = (np.concatenate(p) for p in zip(*parts, strict=True))
@@ -186,10 +186,10 @@ def _start(photos: Sequence[Photo], sights: Sights, camera: LedCamera, points: i
     left, right = np.zeros((points, 3, 3)), np.zeros((points, 3))
     np.add.at(left, sights.point, across)
     np.add.at(right, sights.point, np.einsum("kij,kj->ki", across, position[sights.photo]))
-    found = np.linalg.solve(left, right[..., None])[..., 0]
+    nearest = np.linalg.solve(left, right[..., None])[..., 0]
     m = camera.matrix
     lens = np.array([m[0, 0], m[1, 1], m[0, 2], m[1, 2], *camera.distortion])
-    return _State(position, turned, as_float(found), lens)
+    return _State(position, turned, as_float(nearest), lens)
 
 
 def _projected(state: _State, sights: Sights) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -323,12 +323,12 @@ def relative(position: FloatArray) -> FloatArray:
     return as_float(np.eye(3 * len(away)) - base @ base.T)
 
 
-def compared(recorded: FloatArray, found: FloatArray) -> tuple[FloatArray, float]:
-    """Return recorded positions less found ones after the best similarity, (P, 3), and its scale.
+def compared(recorded: FloatArray, adjusted: FloatArray) -> tuple[FloatArray, float]:
+    """Return recorded less adjusted positions after the best similarity, (P, 3), and its scale.
 
-    The found positions (P, 3) are fitted into the recorded ones (Umeyama 1991).
+    The adjusted positions (P, 3) are fitted into the recorded ones (Umeyama 1991).
     """
-    a, b = found - found.mean(axis=0), recorded - recorded.mean(axis=0)
+    a, b = adjusted - adjusted.mean(axis=0), recorded - recorded.mean(axis=0)
     u, size, vt = np.linalg.svd(b.T @ a)
     mirror = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     turned = u @ np.diag(mirror) @ vt

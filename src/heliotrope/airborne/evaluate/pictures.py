@@ -41,12 +41,12 @@ def heliostat_drawing(name: str, o: Orientation, shape: MirrorShape) -> str:
     return drawing(panels, *_SIZE, title)
 
 
-def field_map(found: Orientations, position: FloatArray, title: str = "") -> "Figure":
+def field_map(orientations: Orientations, position: FloatArray, title: str = "") -> "Figure":
     """Return a map of the field: deviations of the mirrors, and how well they are known.
 
     Parameters
     ----------
-    found
+    orientations
         Orientations of the N heliostats.
     position
         ENU metres, (N, 3).
@@ -56,10 +56,10 @@ def field_map(found: Orientations, position: FloatArray, title: str = "") -> "Fi
     figure, axes = figure_of(1, 2, (13.0, 5.6))
     figure.suptitle(title)
     places = as_float(position)
-    rows = np.array([o.heliostat for o in found.found], dtype=np.intp)
+    rows = np.array([o.heliostat for o in orientations.found], dtype=np.intp)
     values = (
-        ("deviation, mrad", [1e3 * np.linalg.norm(o.correction) for o in found.found]),
-        ("σ_tot (RMS of both), mrad", [1e3 * rms(o.sigma_total) for o in found.found]),
+        ("deviation, mrad", [1e3 * np.linalg.norm(o.correction) for o in orientations.found]),
+        ("σ_tot (RMS of both), mrad", [1e3 * rms(o.sigma_total) for o in orientations.found]),
     )
     for ax, (label, shown) in zip(axes[0], values, strict=True):
         ax.plot(places[:, 0], places[:, 1], ".", color="#cccccc", ms=4, zorder=0)
@@ -76,12 +76,16 @@ def field_map(found: Orientations, position: FloatArray, title: str = "") -> "Fi
     axes[0, 0].set_title("deviation of the orientation", fontsize=10)
     axes[0, 1].set_title("how well it is known", fontsize=10)
     if 0 < len(rows) <= MOST_ARROWS:
-        _leans(axes[0, 0], found, places[rows])
+        _leans(axes[0, 0], orientations, places[rows])
     if 0 < len(rows) <= MOST_NAMES:
         for row in rows:
             where = (float(places[row, 0]), float(places[row, 1]))
             axes[0, 1].annotate(
-                found.names[row], where, xytext=(4, 4), textcoords="offset points", fontsize=7
+                orientations.names[row],
+                where,
+                xytext=(4, 4),
+                textcoords="offset points",
+                fontsize=7,
             )
     return figure
 
@@ -92,9 +96,9 @@ def rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(known)))) if len(known) else float("nan")
 
 
-def _leans(ax: "Axes", found: Orientations, places: FloatArray) -> None:
+def _leans(ax: "Axes", orientations: Orientations, places: FloatArray) -> None:
     """Draw the direction in which normals lean from the expected ones, as seen from above."""
-    lean = 1e3 * np.array([_lean(o) for o in found.found])
+    lean = 1e3 * np.array([_lean(o) for o in orientations.found])
     size = max(rms(np.linalg.norm(lean[:, :2], axis=-1)), 1e-6)
     span = max(float(np.ptp(places[:, :2], axis=0).max()), 10.0)
     arrows = ax.quiver(
@@ -119,19 +123,19 @@ def _lean(o: Orientation) -> FloatArray:
 
 def _tips(o: Orientation, rows: npt.NDArray[np.bool_]) -> list[str]:
     """Return the tooltip of each reflection."""
-    seen, d = o.reflections, 1e3 * o.difference
+    reflections, d = o.reflections, 1e3 * o.difference
     return [
-        f"photograph {seen.photo[i]}, facet {seen.facet[i]}: rotX {d[i, 0]:+.2f}, "
+        f"photograph {reflections.photo[i]}, facet {reflections.facet[i]}: rotX {d[i, 0]:+.2f}, "
         f"rotY {d[i, 1]:+.2f} mrad"
         for i in np.flatnonzero(rows)
     ]
 
 
 def _points(o: Orientation, shape: MirrorShape) -> Panel:
-    seen, good = o.reflections, ~o.outlier
+    reflections, good = o.reflections, ~o.outlier
     corners = shape.corners[..., :2]
-    x = around(np.concatenate([corners[..., 0].ravel(), seen.x]))
-    y = around(np.concatenate([corners[..., 1].ravel(), seen.y]))
+    x = around(np.concatenate([corners[..., 0].ravel(), reflections.x]))
+    y = around(np.concatenate([corners[..., 1].ravel(), reflections.y]))
     panel = Panel(
         56.0,
         60.0,
@@ -153,14 +157,14 @@ def _points(o: Orientation, shape: MirrorShape) -> Panel:
     if size > 0.0:
         scale = _ARROW * panel.width / size
         for rows, colour in ((good, AFTER), (~good, OUTLIER)):
-            panel.arrows(seen.x[rows], seen.y[rows], scale * lean[rows], colour)
+            panel.arrows(reflections.x[rows], reflections.y[rows], scale * lean[rows], colour)
         key = round_below(size)
         step = (panel.y[1] - panel.y[0]) / panel.height
         corner = (panel.x[0] + 10.0 * step, panel.y[1] - 20.0 * step)
         panel.arrows(*corner, [scale * key, 0.0], "#000")
         panel.text(*corner, f"{key:g} mrad")
-    panel.dots(seen.x[good], seen.y[good], AFTER, _tips(o, good), size=1.8)
-    panel.crosses(seen.x[~good], seen.y[~good], OUTLIER, _tips(o, ~good))
+    panel.dots(reflections.x[good], reflections.y[good], AFTER, _tips(o, good), size=1.8)
+    panel.crosses(reflections.x[~good], reflections.y[~good], OUTLIER, _tips(o, ~good))
     return panel
 
 

@@ -68,15 +68,15 @@ def overlay(picture: Picture, camera: LedCamera, photo: Photo, stand: MirrorPose
     The result names mirrors but no patches.
     """
     none = np.empty(0, dtype=np.intp)
-    side, seen = expected_size(camera, photo, stand)
-    rows = np.flatnonzero(seen)
+    side, visible = expected_size(camera, photo, stand)
+    rows = np.flatnonzero(visible)
     scale = float(np.clip(_SIDE / np.median(side[rows]), 0.05, 1.0))
     reach = int(np.ceil(np.tan(GIMBAL) * camera.focal * scale))
     best: list[_Place] = []
     for feature in brightness(picture, scale):
-        found = _places(feature, camera, photo, stand, rows, scale, reach)
-        if found and (not best or found[0].fit > best[0].fit):
-            best = found
+        places = _places(feature, camera, photo, stand, rows, scale, reach)
+        if places and (not best or places[0].fit > best[0].fit):
+            best = places
         if best and best[0].fit > _CERTAIN:
             break
     if not best or best[0].fit < LEAST:
@@ -157,8 +157,8 @@ def _places(
         ahead = turned[:, 2]
         if len(kept) < _CANDIDATES and all(np.linalg.norm(ahead - k[:, 2]) > apart for k in kept):
             kept.append(turned)
-    found = [_refined(feature, camera, photo, stand, rows, scale, k) for k in kept]
-    return sorted((f for f in found if f is not None), key=lambda f: -f.fit)
+    refined = [_refined(feature, camera, photo, stand, rows, scale, k) for k in kept]
+    return sorted((f for f in refined if f is not None), key=lambda f: -f.fit)
 
 
 def _move(shift: FloatArray, focal: float) -> FloatArray:
@@ -191,16 +191,16 @@ def _refined(
             )
         except cv2.error:
             return None
-        seen = corners[rows].mean(axis=1)
-        good = np.isfinite(seen).all(axis=-1)
-        small = (seen[good] + 0.5) * scale - 0.5
+        middles = corners[rows].mean(axis=1)
+        good = np.isfinite(middles).all(axis=-1)
+        small = (middles[good] + 0.5) * scale - 0.5
         middle = ((small @ warp[:, :2].T + warp[:, 2]) + 0.5) / scale - 0.5
         plane = undistort(camera, middle)
         rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        ways = stand.corners[rows[good]].mean(axis=1) - photo.position
-        ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
-        turned = nearest_rotation(ways, rays)
+        directions = stand.corners[rows[good]].mean(axis=1) - photo.position
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        turned = nearest_rotation(directions, rays)
     angle = rotation_angle(turned, photo.rotation)
     if angle > 2.0 * GIMBAL:
         return None

@@ -22,7 +22,7 @@ _WEAK = 0.6
 
 def spot_reflections(
     photos: Sequence[Photo],
-    seen: Sequence[PhotoReading],
+    readings: Sequence[PhotoReading],
     camera: LedCamera,
     stand: MirrorPoses,
     shape: ShapeOf,
@@ -34,8 +34,8 @@ def spot_reflections(
 
     Parameters
     ----------
-    photos, seen
-        Photographs where they were taken, and what each shows.
+    photos, readings
+        Photographs where they were taken, and their readings.
     camera
         The camera with its lamp.
     stand
@@ -49,25 +49,25 @@ def spot_reflections(
         Rays that miss all facets by more than this (and a few per cent of a facet) are left
         out, m.
     """
-    number = np.concatenate([np.full(len(s.spot_mirror), k) for k, s in enumerate(seen)])
-    mirror = np.concatenate([s.spot_mirror for s in seen])
-    place = np.concatenate([s.spot for s in seen])
+    number = np.concatenate([np.full(len(s.spot_mirror), k) for k, s in enumerate(readings)])
+    mirror = np.concatenate([s.spot_mirror for s in readings])
+    place = np.concatenate([s.spot for s in readings])
     if shifts is not None:
         place = place - shifts[number, mirror]
-    spread = np.hypot(np.concatenate([s.spot_sigma for s in seen]), SPOT_FLOOR / camera.focal)
-    flux = np.concatenate([s.flux for s in seen])
+    spread = np.hypot(np.concatenate([s.spot_sigma for s in readings]), SPOT_FLOOR / camera.focal)
+    flux = np.concatenate([s.flux for s in readings])
     typical = float(np.median(flux)) if len(flux) else 0.0
     turns = as_float([p.rotation for p in photos])
     position = as_float([p.position for p in photos])
     lamp = as_float([p.led_position(camera) for p in photos])
-    ways = np.concatenate([place, np.ones((len(place), 1))], axis=-1)
-    ways = np.einsum("kij,kj->ki", turns[number], ways)
+    directions = np.concatenate([place, np.ones((len(place), 1))], axis=-1)
+    directions = np.einsum("kij,kj->ki", turns[number], directions)
     parts = []
     for row in np.unique(mirror).tolist():
         mine = np.flatnonzero(mirror == row)
         turned = stand.rotation[row]
         start = (position[number[mine]] - stand.vertex[row]) @ turned
-        facet, xy = _intersect(shape(int(row)), start, ways[mine] @ turned, beside)
+        facet, xy = _intersect(shape(int(row)), start, directions[mine] @ turned, beside)
         kept = facet >= 0
         if beside == 0.0:
             # Through a gap between facets the spot of a mirror behind shines, weakly.
@@ -80,20 +80,20 @@ def spot_reflections(
         parts.append(
             reflections(at, row, facet[kept], xy[kept], position[at], lamp[at], sigma[kept])
         )
-    found = join([p for p in parts if len(p)])
-    return found.take(np.lexsort((found.heliostat, found.photo)))
+    joined = join([p for p in parts if len(p)])
+    return joined.take(np.lexsort((joined.heliostat, joined.photo)))
 
 
 def _intersect(
-    shape: MirrorShape, start: FloatArray, ways: FloatArray, beside: float
+    shape: MirrorShape, start: FloatArray, directions: FloatArray, beside: float
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
     """Return the facet (-1 beside the mirror) and position (S, 2) where rays meet the surface."""
-    height = np.zeros(len(ways))
-    facet = np.full(len(ways), -1, dtype=np.intp)
-    xy = np.zeros((len(ways), 2))
+    height = np.zeros(len(directions))
+    facet = np.full(len(directions), -1, dtype=np.intp)
+    xy = np.zeros((len(directions), 2))
     for _ in range(3):
-        length = (height - start[:, 2]) / ways[:, 2]
-        xy = start[:, :2] + length[:, None] * ways[:, :2]
+        length = (height - start[:, 2]) / directions[:, 2]
+        xy = start[:, :2] + length[:, None] * directions[:, :2]
         facet = _nearest_facet(shape, xy, beside)
         kept = facet >= 0
         height[kept] = shape.point_at(facet[kept], xy[kept])[:, 2]
@@ -103,14 +103,14 @@ def _intersect(
 def _nearest_facet(shape: MirrorShape, xy: FloatArray, beside: float) -> npt.NDArray[np.intp]:
     """Return the facet at each position, in a gap the nearer one, or -1 beside the mirror."""
     facet = shape.facet_at(xy)
-    left = np.flatnonzero(facet < 0)
-    if len(left):
-        every = np.tile(np.arange(len(shape)), len(left))
-        uv = shape.along_facet(every, np.repeat(xy[left], len(shape), axis=0))
+    outside = np.flatnonzero(facet < 0)
+    if len(outside):
+        every = np.tile(np.arange(len(shape)), len(outside))
+        uv = shape.along_facet(every, np.repeat(xy[outside], len(shape), axis=0))
         beyond = np.maximum(np.abs(uv) - shape.half_size[every], 0.0)
-        off = np.hypot(beyond[:, 0], beyond[:, 1]).reshape(len(left), len(shape))
+        off = np.hypot(beyond[:, 0], beyond[:, 1]).reshape(len(outside), len(shape))
         nearest = np.argmin(off, axis=1)
         limit = 0.05 * shape.half_size.max(axis=1) + 0.02 + beside
-        near = off[np.arange(len(left)), nearest] < limit[nearest]
-        facet[left[near]] = nearest[near]
+        near = off[np.arange(len(outside)), nearest] < limit[nearest]
+        facet[outside[near]] = nearest[near]
     return facet

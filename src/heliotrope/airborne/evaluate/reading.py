@@ -82,7 +82,7 @@ class PhotoReading:
     name
         Name of the photograph.
     problem
-        Why nothing in it is trusted; "" if it is usable. Begins with a keyword: nothing,
+        Why nothing in it is trusted; empty if it is usable. Begins with a keyword: nothing,
         wrong_field, ambiguous, overexposed, small, unreadable.
     rotation
         Camera axes to ENU, from its mirrors alone, (3, 3).
@@ -133,7 +133,7 @@ class PhotoReading:
         return self.problem.startswith(_NAMEABLE)
 
     def why_unused(self) -> str:
-        """Return a line that says why its corners cannot be used; "" if they can."""
+        """Return a line with the reason why its corners cannot be used; empty if they can."""
         if self.has_corners:
             return ""
         if self.nameable:
@@ -149,7 +149,7 @@ class PhotoReading:
 
     @classmethod
     def load(cls, path: Path) -> "PhotoReading":
-        """Return what `save` wrote."""
+        """Return a reading from the file that `save` wrote."""
         values: dict[str, Any] = dict(
             read_arrays(path, "a stored reading", [f.name for f in fields(cls)])
         )
@@ -167,7 +167,7 @@ class PhotoReading:
 
 
 def read_photo(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> PhotoReading:
-    """Return what a photograph's file shows.
+    """Return the reading of a photograph's file.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def read_photo(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> PhotoRead
 
 
 def look(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) -> PhotoReading:
-    """Return what a decoded picture shows, as `read_photo` does."""
+    """Return the reading of a decoded picture; see `read_photo`."""
     side, near = expected_size(camera, photo, stand)
     if not near.any():
         return PhotoReading(photo.name, "wrong_field: no mirror of the field can be in it")
@@ -218,24 +218,24 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) 
         return _look_along(picture, photo, camera, stand, (wide, _OVERLAID, 2.0))
     if seen_from(stand, photo.position, camera.focal).overlapping:
         return _look_overlapping(picture, photo, camera, stand)
-    found = Identified(photo.rotation, _no_rows(), _no_rows(), "nothing: no patches")
+    identified = Identified(photo.rotation, _no_rows(), _no_rows(), "nothing: no patches")
     for patches in find_patches(picture, typical**2):
-        one = identify(camera, photo, stand, patches.center)
+        attempt = identify(camera, photo, stand, patches.center)
         # Report the attempt that got farthest: any reason but "nothing" says more.
-        if not one.reason or found.reason.startswith("nothing"):
-            found = one
-        if not found.reason:
+        if not attempt.reason or identified.reason.startswith("nothing"):
+            identified = attempt
+        if not identified.reason:
             break
-    if found.reason:
+    if identified.reason:
         if is_dark(picture):
             return _lights(picture, photo, camera, stand)
-        if found.shifted:
-            return PhotoReading(photo.name, found.reason)
+        if identified.shifted:
+            return PhotoReading(photo.name, identified.reason)
         # Clouds in mirrors or a few that touch spoil patches, but not the field as a whole.
         laid = _look_overlapping(picture, photo, camera, stand)
-        return PhotoReading(photo.name, found.reason) if laid.problem else laid
-    there = photo.moved(photo.position, found.rotation)
-    rows, expected = _in_frame(there, camera, stand)
+        return PhotoReading(photo.name, identified.reason) if laid.problem else laid
+    turned = photo.moved(photo.position, identified.rotation)
+    rows, expected = _in_frame(turned, camera, stand)
     if not len(rows):
         return _nothing_in_frame(photo)
     reach = float(np.clip(0.12 * np.median(np.sqrt(quad_area(expected))), 2.0, 6.0))
@@ -243,20 +243,20 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) 
     better = np.where(first.found[:, None, None], first.corners, expected)
     lines = find_outlines(picture, better, 2.0)
     lines = replace(lines, known=np.repeat(lines.found[:, None], 4, axis=1))
-    return _measure(picture, there, camera, stand, rows, expected, lines)
+    return _measure(picture, turned, camera, stand, rows, expected, lines)
 
 
 def _look_overlapping(
     picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses
 ) -> PhotoReading:
-    """Return what a picture shows in which mirrors hide parts of each other."""
+    """Return the reading of a picture in which mirrors hide parts of each other."""
     if is_dark(picture):
         return _lights(picture, photo, camera, stand)
-    found = overlay(picture, camera, photo, stand)
-    if found.reason:
-        return PhotoReading(photo.name, found.reason)
-    there = photo.moved(photo.position, found.rotation)
-    return _look_along(picture, there, camera, stand, (_OVERLAID, 2.0))
+    identified = overlay(picture, camera, photo, stand)
+    if identified.reason:
+        return PhotoReading(photo.name, identified.reason)
+    turned = photo.moved(photo.position, identified.rotation)
+    return _look_along(picture, turned, camera, stand, (_OVERLAID, 2.0))
 
 
 def _look_along(
@@ -266,14 +266,14 @@ def _look_along(
     stand: MirrorPoses,
     reaches: Sequence[float],
 ) -> PhotoReading:
-    """Return what a picture shows whose attitude is right to the first of ``reaches``, px."""
-    there = photo
+    """Return the reading of a picture with an attitude right to the first of ``reaches``, px."""
+    turned = photo
     # Edges against the ground correct the attitude; then they are measured where they belong.
     for reach in reaches:
-        rows, expected = _in_frame(there, camera, stand)
+        rows, expected = _in_frame(turned, camera, stand)
         if not len(rows):
             return _nothing_in_frame(photo)
-        shown = Overlap(draw_labels(*outlines(there, camera, stand), camera.size), rows + 1)
+        shown = Overlap(draw_labels(*outlines(turned, camera, stand), camera.size), rows + 1)
         lines = find_outlines(picture, expected, reach, shown=shown)
         good = _consistent(lines, expected)
         if int(good.sum()) < FEWEST:
@@ -284,8 +284,10 @@ def _look_along(
             )
         corners = np.full(lines.corners.shape, np.nan)
         corners[good] = undistort(camera, lines.corners[good])
-        there = there.moved(photo.position, _attitude(there.rotation, photo, stand, rows, corners))
-    return _measure(picture, there, camera, stand, rows, expected, lines, shown)
+        turned = turned.moved(
+            photo.position, _attitude(turned.rotation, photo, stand, rows, corners)
+        )
+    return _measure(picture, turned, camera, stand, rows, expected, lines, shown)
 
 
 def _nothing_in_frame(photo: Photo) -> PhotoReading:
@@ -301,8 +303,8 @@ def _consistent(lines: Outlines, expected: FloatArray) -> npt.NDArray[np.bool_]:
     # A turn of the camera moves the corners of a mirror together, not one by one. Of one or two
     # corners the median says nothing; then that of the photograph does.
     common = np.broadcast_to(np.nanmedian(shift, axis=(0, 1)), (len(shift), 1, 2)).copy()
-    several = lines.known.sum(axis=1) >= 3
-    common[several] = np.nanmedian(shift[several], axis=1, keepdims=True)
+    enough = lines.known.sum(axis=1) >= 3
+    common[enough] = np.nanmedian(shift[enough], axis=1, keepdims=True)
     limit = np.maximum(_SKEW, _SKEW_SHARE * size)[:, None]
     with np.errstate(invalid="ignore"):
         return np.asarray(np.linalg.norm(shift - common, axis=-1) < limit)
@@ -310,7 +312,7 @@ def _consistent(lines: Outlines, expected: FloatArray) -> npt.NDArray[np.bool_]:
 
 def _measure(
     picture: Picture,
-    there: Photo,
+    photo: Photo,
     camera: LedCamera,
     stand: MirrorPoses,
     rows: Rows,
@@ -327,7 +329,7 @@ def _measure(
     spots, reasons = find_spots(picture, outline, shown=shown)
     if all(r.startswith("overexposed") for r in reasons):
         return PhotoReading(
-            there.name,
+            photo.name,
             f"overexposed: all {len(rows)} mirrors are clipped; shorten the exposure",
         )
     notes = [
@@ -338,8 +340,8 @@ def _measure(
     corners[good] = undistort(camera, lines.corners[good])
     sigma = np.where(some & np.isfinite(lines.sigma), lines.sigma, 1.0)
     return PhotoReading(
-        name=there.name,
-        rotation=_attitude(there.rotation, there, stand, rows, corners),
+        name=photo.name,
+        rotation=_attitude(photo.rotation, photo, stand, rows, corners),
         mirror=rows,
         corners=corners,
         corner_sigma=np.hypot(sigma, CORNER_FLOOR) / camera.focal,
@@ -354,13 +356,13 @@ def _measure(
 
 def _lights(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) -> PhotoReading:
     """Return the lamp's spots in a photograph too dark to show the mirrors."""
-    found, spots = find_lights(picture, photo, camera, stand)
-    if found.reason:
-        return PhotoReading(photo.name, found.reason)
+    identified, spots = find_lights(picture, photo, camera, stand)
+    if identified.reason:
+        return PhotoReading(photo.name, identified.reason)
     rows = np.unique(spots.mirror)
     return PhotoReading(
         name=photo.name,
-        rotation=found.rotation,
+        rotation=identified.rotation,
         mirror=rows,
         corners=np.full((len(rows), 4, 2), np.nan),
         corner_sigma=np.ones(len(rows)),
@@ -390,14 +392,14 @@ def _attitude(
     start: FloatArray, photo: Photo, stand: MirrorPoses, rows: Rows, corners: FloatArray
 ) -> FloatArray:
     """Return the rotation that fits all corners best."""
-    seen = np.isfinite(corners).all(axis=-1)
-    if int(seen.sum()) < 4:
+    known = np.isfinite(corners).all(axis=-1)
+    if int(known.sum()) < 4:
         return start
-    ways = (stand.corners[rows] - photo.position)[seen]
-    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
-    rays = np.concatenate([corners[seen], np.ones((int(seen.sum()), 1))], axis=-1)
+    directions = (stand.corners[rows] - photo.position)[known]
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    rays = np.concatenate([corners[known], np.ones((int(known.sum()), 1))], axis=-1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    return nearest_rotation(ways, rays)
+    return nearest_rotation(directions, rays)
 
 
 # -- many photographs ------------------------------------------------------------------
@@ -413,7 +415,7 @@ def read_many(
     keep: Path | None = None,
     progress: Progress | None = None,
 ) -> tuple[PhotoReading, ...]:
-    """Return what photographs show, in their order.
+    """Return the readings of photographs, in their order.
 
     Parameters
     ----------
@@ -433,27 +435,27 @@ def read_many(
     progress
         Called with (done, all).
     """
-    found: dict[int, PhotoReading] = {}
+    readings: dict[int, PhotoReading] = {}
     if keep is not None:
         keep.mkdir(parents=True, exist_ok=True)
         base = _digest(camera, stand)
         marks = [_mark(photo, base) for photo in photos]
         for k, mark in enumerate(marks):
-            seen = _kept(keep / f"{mark}.npz")
-            if seen is not None:
-                found[k] = seen
+            reading = _kept(keep / f"{mark}.npz")
+            if reading is not None:
+                readings[k] = reading
     if progress is not None:
-        progress(len(found), len(photos))
-    missing = [k for k in range(len(photos)) if k not in found]
+        progress(len(readings), len(photos))
+    missing = [k for k in range(len(photos)) if k not in readings]
     tasks = [photos[k] for k in missing]
-    for j, seen in _read(tasks, camera, stand, processes, client):
+    for j, reading in _read(tasks, camera, stand, processes, client):
         k = missing[j]
-        found[k] = seen
+        readings[k] = reading
         if keep is not None:
-            seen.save(keep / f"{marks[k]}.npz")
+            reading.save(keep / f"{marks[k]}.npz")
         if progress is not None:
-            progress(len(found), len(photos))
-    return tuple(found[k] for k in range(len(photos)))
+            progress(len(readings), len(photos))
+    return tuple(readings[k] for k in range(len(photos)))
 
 
 def _read(

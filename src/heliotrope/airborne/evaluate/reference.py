@@ -65,14 +65,14 @@ def read_reference(path: str | Path) -> Reference:
     rows.refuse_bad()
     if not len(rows):
         raise FormatError(file, "no rows; give one for each heliostat")
-    found: dict[tuple[str, str], FloatArray] = {}
+    known: dict[tuple[str, str], FloatArray] = {}
     flights = rows.texts("flight") if "flight" in rows.columns else [""] * len(angles[0])
     normals = direction(*np.radians(angles))
     for flight, name, normal in zip(flights, rows.texts("heliostat"), normals, strict=True):
-        if (flight, name) in found:
+        if (flight, name) in known:
             raise FormatError(file, f"heliostat {name} is there twice; give one row for each pose")
-        found[flight, name] = normal
-    return Reference(found)
+        known[flight, name] = normal
+    return Reference(known)
 
 
 @dataclass(frozen=True)
@@ -100,19 +100,19 @@ class Compared:
 
     def offset(self, surface: str) -> FloatArray:
         """Return rotX and rotY from the reference to the result, rad, (2,); NaN without one."""
-        found: Orientation | None = getattr(self, surface)
-        if found is None:
+        orientation: Orientation | None = getattr(self, surface)
+        if orientation is None:
             return np.full(2, np.nan)
-        return offset_from(self.reference, found)
+        return offset_from(self.reference, orientation)
 
 
-def offset_from(reference: FloatArray, found: Orientation) -> FloatArray:
-    """Return rotX and rotY that turn a reference normal into the one that was found, rad, (2,)."""
-    axis = np.cross(reference, found.normal)
+def offset_from(reference: FloatArray, orientation: Orientation) -> FloatArray:
+    """Return rotX and rotY that turn a reference normal into the measured one, rad, (2,)."""
+    axis = np.cross(reference, orientation.normal)
     sine = float(np.linalg.norm(axis))
-    angle = np.arctan2(sine, float(reference @ found.normal))
+    angle = np.arctan2(sine, float(reference @ orientation.normal))
     turn = axis * (angle / sine if sine > 0.0 else 1.0)
-    return np.asarray(turn @ found.rotation[:, :2])
+    return np.asarray(turn @ orientation.rotation[:, :2])
 
 
 def compare(flights: Sequence[FlightResult], reference: Reference) -> tuple[Compared, ...]:
@@ -123,23 +123,23 @@ def compare(flights: Sequence[FlightResult], reference: Reference) -> tuple[Comp
     InputError
         If none has one.
     """
-    found = []
+    compared = []
     for flight in flights:
         ideal, measured = (_evaluated(flight, slopes=slopes) for slopes in (False, True))
         for row, name in enumerate(flight.measured.found.names):
             normal = reference.of(flight.data.name, name)
-            results = [each.of(name) for each in (ideal, measured)]
+            results = [orientations.of(name) for orientations in (ideal, measured)]
             if normal is None or results == [None, None]:
                 continue
             shape = flight.measured.shape(row)
             measured_one = None if shape.slope is None else results[1]
-            found.append(Compared(flight.label(name), normal, shape, results[0], measured_one))
-    if not found:
+            compared.append(Compared(flight.label(name), normal, shape, results[0], measured_one))
+    if not compared:
         raise InputError(
             "reference: none of its heliostats was measured; its names are those of the plant, and "
             "its flights those of the campaign's folders"
         )
-    return tuple(found)
+    return tuple(compared)
 
 
 def _evaluated(flight: FlightResult, *, slopes: bool) -> Orientations:
@@ -200,15 +200,15 @@ def offsets(compared: Sequence[Compared], surface: str) -> Offsets | None:
 def reference_rows(compared: Sequence[Compared]) -> list[dict[str, Any]]:
     """Return one record for each heliostat: offsets (table 3), azimuth and elevation (4 and 5)."""
     rows = []
-    for one in compared:
-        row: dict[str, Any] = {"heliostat": one.label}
-        angles = azimuth_elevation(one.reference)
+    for pair in compared:
+        row: dict[str, Any] = {"heliostat": pair.label}
+        angles = azimuth_elevation(pair.reference)
         for word, value in zip(("azimuth", "elevation"), angles, strict=True):
             row[f"{word}_reference_deg"] = float(np.degrees(value))
         for surface in SURFACES:
-            found: Orientation | None = getattr(one, surface)
-            offset = one.offset(surface)
-            normal = np.full(3, np.nan) if found is None else found.normal
+            orientation: Orientation | None = getattr(pair, surface)
+            offset = pair.offset(surface)
+            normal = np.full(3, np.nan) if orientation is None else orientation.normal
             for axis, turn in zip("xy", offset, strict=True):
                 row[f"rot_{axis}_{surface}_mrad"] = 1e3 * float(turn)
             for word, angle, at in zip(
@@ -227,13 +227,13 @@ def reference_document(compared: Sequence[Compared]) -> dict[str, Any]:
         return {}
     document: dict[str, Any] = {"reference": reference_rows(compared), "reference_offsets": {}}
     for surface in SURFACES:
-        found = offsets(compared, surface)
-        if found is not None:
+        summary = offsets(compared, surface)
+        if summary is not None:
             document["reference_offsets"][surface] = {
-                "mean_mrad": (1e3 * found.mean).tolist(),
-                "spread_mrad": (1e3 * found.spread).tolist(),
-                "rms_mrad": (1e3 * found.rms).tolist(),
-                "heliostats": found.count,
-                "within_90": found.within,
+                "mean_mrad": (1e3 * summary.mean).tolist(),
+                "spread_mrad": (1e3 * summary.spread).tolist(),
+                "rms_mrad": (1e3 * summary.rms).tolist(),
+                "heliostats": summary.count,
+                "within_90": summary.within,
             }
     return document

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _COLOURS = (AFTER, TESTED)
 
 
-def sampling_figure(one: Compared) -> "Figure":
+def sampling_figure(compared: Compared) -> "Figure":
     """Return the picture of one heliostat.
 
     Above, the angular differences about x (left) and y (right) by the ideal surface; in the middle
@@ -25,37 +25,37 @@ def sampling_figure(one: Compared) -> "Figure":
     and the last shows the sampling points alone.
     """
     figure, axes = figure_of(3, 2, (9.0, 10.5))
-    figure.suptitle(one.label)
-    for row, (words, found) in enumerate(
-        (("ideal surface", one.ideal), ("measured surface", one.measured))
+    figure.suptitle(compared.label)
+    for row, (words, orientation) in enumerate(
+        (("ideal surface", compared.ideal), ("measured surface", compared.measured))
     ):
         for axis in (0, 1):
-            _distribution(axes[row, axis], found, axis, words)
-    seen = one.measured or one.ideal
+            _distribution(axes[row, axis], orientation, axis, words)
+    shown = compared.measured or compared.ideal
     for k, axis in enumerate((1, 0)):
-        _slopes(figure, axes[2, k], one.shape, seen, axis)
+        _slopes(figure, axes[2, k], compared.shape, shown, axis)
     return figure
 
 
-def _distribution(ax: "Axes", found: Orientation | None, axis: int, words: str) -> None:
+def _distribution(ax: "Axes", orientation: Orientation | None, axis: int, words: str) -> None:
     name = ("rotX", "rotY")[axis]
     ax.set_title(f"{name}, {words}", fontsize=10)
-    if found is None:
+    if orientation is None:
         ax.text(0.5, 0.5, "no slope map", ha="center", transform=ax.transAxes)
         ax.set_axis_off()
         return
-    kept = 1e3 * found.difference[~found.outlier, axis]
+    kept = 1e3 * orientation.difference[~orientation.outlier, axis]
     ax.hist(kept, bins=max(5, round(np.sqrt(len(kept)))), color=_COLOURS[axis])
-    for value in 1e3 * found.difference[found.outlier, axis]:
+    for value in 1e3 * orientation.difference[orientation.outlier, axis]:
         ax.axvline(value, color=OUTLIER, lw=1.0, ls=":")
-    sigma, p = 1e3 * found.sigma_plain[axis], found.normality[axis]
+    sigma, p = 1e3 * orientation.sigma_plain[axis], orientation.normality[axis]
     ax.set_xlabel(f"difference, mrad; σ/√n {sigma:.2f}, p {p:.2f}")
     ax.set_ylabel("reflections")
     ax.grid(alpha=0.3)
 
 
 def _slopes(
-    figure: "Figure", ax: "Axes", shape: MirrorShape, found: Orientation | None, axis: int
+    figure: "Figure", ax: "Axes", shape: MirrorShape, orientation: Orientation | None, axis: int
 ) -> None:
     """Draw the slope deviations along one axis on the facets, seen from the front."""
     ax.set_aspect("equal")
@@ -79,8 +79,8 @@ def _slopes(
                 corner[..., 0], corner[..., 1], facet, cmap="RdBu", vmin=-most, vmax=most
             )
         figure.colorbar(drawn, ax=ax)
-    if found is not None:
-        point = shape.point_at(found.reflections.facet, found.reflections.xy)
-        for rows, colour in ((~found.outlier, "black"), (found.outlier, OUTLIER)):
+    if orientation is not None:
+        point = shape.point_at(orientation.reflections.facet, orientation.reflections.xy)
+        for rows, colour in ((~orientation.outlier, "black"), (orientation.outlier, OUTLIER)):
             ax.plot(point[rows, 0], point[rows, 1], "*", color=colour, ms=5, ls="none")
     ax.autoscale_view()

@@ -33,10 +33,10 @@ def write_reference(compared: Sequence[Compared], folder: Path, *, page: bool = 
         elevation=_angles(compared, "elevation"),
         sections=[
             {
-                "label": one.label,
-                "picture": picture(sampling_figure(one), f"Sampling and slopes of {one.label}"),
+                "label": pair.label,
+                "picture": picture(sampling_figure(pair), f"Sampling and slopes of {pair.label}"),
             }
-            for one in compared[:MOST_PICTURES]
+            for pair in compared[:MOST_PICTURES]
         ],
     )
     write_text(folder / "reference.html", text)
@@ -52,8 +52,8 @@ def offset_table(compared: Sequence[Compared]) -> Table:
     every = [offsets(compared, surface) for surface in SURFACES]
     for name in ("mean", "spread", "rms"):
         cells = []
-        for one in every:
-            values = [float("nan")] * 2 if one is None else getattr(one, name).tolist()
+        for summary in every:
+            values = [float("nan")] * 2 if summary is None else getattr(summary, name).tolist()
             cells += [_cell(1e3 * v, "+" if name == "mean" else "") for v in values]
         rows.append([name, *cells])
     return {"head": head, "rows": rows}

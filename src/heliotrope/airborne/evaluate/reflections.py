@@ -90,8 +90,8 @@ def reflections(
     place = as_float(xy).reshape(-1, 2)
     rows = len(place)
 
-    def index(given: npt.ArrayLike, name: str) -> npt.NDArray[np.intp]:
-        values = np.array(np.broadcast_to(np.asarray(given, dtype=np.intp), (rows,)))
+    def index(numbers: npt.ArrayLike, name: str) -> npt.NDArray[np.intp]:
+        values = np.array(np.broadcast_to(np.asarray(numbers, dtype=np.intp), (rows,)))
         if (values < 0).any():
             i = int(np.flatnonzero(values < 0)[0])
             raise InputError(f"reflection {i}: {name} {values[i]} is below 0")
@@ -100,13 +100,13 @@ def reflections(
     spread = np.array(np.broadcast_to(as_float(sigma), (rows,)))
     ends = [np.array(np.broadcast_to(as_float(end), (rows, 3))) for end in (camera, led)]
     for name, values in (("xy", place), ("camera", ends[0]), ("led", ends[1])):
-        wrong = ~np.isfinite(values).all(axis=-1)
-        if wrong.any():
-            i = int(np.flatnonzero(wrong)[0])
+        invalid = ~np.isfinite(values).all(axis=-1)
+        if invalid.any():
+            i = int(np.flatnonzero(invalid)[0])
             raise InputError(f"reflection {i}: {name} {values[i]} is not finite; leave it out")
-    wrong = ~(np.isfinite(spread) & (spread > 0.0))
-    if wrong.any():
-        i = int(np.flatnonzero(wrong)[0])
+    invalid = ~(np.isfinite(spread) & (spread > 0.0))
+    if invalid.any():
+        i = int(np.flatnonzero(invalid)[0])
         raise InputError(f"reflection {i}: sigma {spread[i]} m must be above 0")
     return Reflections(
         index(photo, "photo"),
@@ -178,11 +178,11 @@ def read_reflections(path: str | Path, names: Sequence[str]) -> tuple[Reflection
     heliostat = find_heliostats(rows, "heliostat", names)
     numbers = {name: rows.numbers(name, "a number") for name in _COLUMNS if name != "heliostat"}
     for name in ("photo", "facet"):
-        given = numbers[name]
+        column = numbers[name]
         rows.check(
             name,
-            ~((given >= 0) & (given == np.floor(given))) & np.isfinite(given),
-            given,
+            ~((column >= 0) & (column == np.floor(column))) & np.isfinite(column),
+            column,
             " is no whole number from 0",
         )
     sigma = numbers["sigma_m"]

@@ -72,13 +72,15 @@ def write_result(
         Called with (done, all) after each picture.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for one in result.flights:
-        name = f"reflections-{one.data.name}".rstrip("-")
-        write_reflections(folder / f"{name}.csv", one.evaluation.reflections, one.data.stand.names)
-    seen = result.sightings()
-    if seen is not None:
-        kinds = ["drone"] * len(seen)
-        write_sightings(folder / "sightings.csv", seen, result.plant.names, kinds)
+    for flight in result.flights:
+        name = f"reflections-{flight.data.name}".rstrip("-")
+        write_reflections(
+            folder / f"{name}.csv", flight.evaluation.reflections, flight.data.stand.names
+        )
+    sightings = result.sightings()
+    if sightings is not None:
+        kinds = ["drone"] * len(sightings)
+        write_sightings(folder / "sightings.csv", sightings, result.plant.names, kinds)
     document = flight_document(result)
     if document is not None:
         write_flight(folder / "flight.json", document)

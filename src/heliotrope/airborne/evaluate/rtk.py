@@ -112,7 +112,7 @@ def check_rtk(
 
 
 def check_rtk_by_targets(
-    photos: Sequence[Photo], seen: Sequence[SeenTargets], camera: LedCamera
+    photos: Sequence[Photo], targets: Sequence[SeenTargets], camera: LedCamera
 ) -> tuple[RtkCheck, Photogrammetry, tuple[str, ...]]:
     """Return how RTK positions scatter about those from coded targets, as appendix A does.
 
@@ -124,19 +124,19 @@ def check_rtk_by_targets(
     InputError
         If too few photographs or targets can be used.
     """
-    good, wrong = usable(seen)
-    problems = tuple(f"{photos[k].name}: {reason}" for k, reason in wrong.items())
+    good, unusable = usable(targets)
+    problems = tuple(f"{photos[k].name}: {reason}" for k, reason in unusable.items())
     recorded = [photos[k] for k in good]
     try:
-        found = locate(recorded, [seen[k] for k in good], camera)
+        located = locate(recorded, [targets[k] for k in good], camera)
     except InputError as error:
         first = f"; the first of the others: {problems[0]}" if problems else ""
         raise InputError(f"{error}{first}") from None
-    gap, _ = compared(as_float([p.position for p in recorded]), found.position)
+    gap, _ = compared(as_float([p.position for p in recorded]), located.position)
     # The similarity takes seven of the 3P degrees of freedom, not only the three of the mean.
     fair = gap * np.sqrt((len(gap) - 1.0) / (len(gap) - 7.0 / 3.0))
     unknown = np.full(3, np.nan)
-    sigma = found.position_sigma
+    sigma = located.position_sigma
     return (
         RtkCheck(
             tuple(p.name for p in recorded),
@@ -147,7 +147,7 @@ def check_rtk_by_targets(
             as_float(np.sqrt(np.mean(sigma**2, axis=0))),
             *share_of_rtk(fair, sigma),
         ),
-        found,
+        located,
         problems,
     )
 
@@ -170,16 +170,16 @@ def share_of_rtk(gap: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatA
     -------
     Standard deviation, m, (3,), and lower and upper end of the interval, m, (2, 3).
     """
-    found, ends = np.zeros(3), np.zeros((2, 3))
+    scatter, ends = np.zeros(3), np.zeros((2, 3))
     for axis in range(3):
         g, c = gap[:, axis], sigma[:, axis]
         trial = np.linspace(0.0, 6.0 * max(float(np.std(g)), 1e-6), _TRIALS)
         variance = trial[:, None] ** 2 + np.maximum(c, 1e-9) ** 2
         weight = 1.0 / variance
         mean = (weight @ g) / weight.sum(axis=1)
-        left = np.sum(weight * (g - mean[:, None]) ** 2, axis=1)
-        cost = np.log(variance).sum(axis=1) + np.log(weight.sum(axis=1)) + left
+        residual = np.sum(weight * (g - mean[:, None]) ** 2, axis=1)
+        cost = np.log(variance).sum(axis=1) + np.log(weight.sum(axis=1)) + residual
         inside = trial[cost - cost.min() <= _CHI2_95]
-        found[axis] = trial[cost.argmin()]
+        scatter[axis] = trial[cost.argmin()]
         ends[:, axis] = inside[0], inside[-1]
-    return found, ends
+    return scatter, ends

@@ -111,14 +111,15 @@ def _of_points(o: Orientation, counts: FloatArray, time: float, systematic: bool
     share = np.maximum(o.weight, 0.1 / max(o.count, 1))
     kept = np.flatnonzero(~o.outlier)
     share = share[kept] / share[kept].sum()
-    seen, point = o.reflections.take(kept), o.point[kept]
-    measured = measured_normal(point, seen.camera, seen.led)
-    wanted = np.array([turned(o.rotation, omega)[:, 2] for omega in o.difference[kept]])
-    axis = np.cross(measured, wanted)
+    reflections, point = o.reflections.take(kept), o.point[kept]
+    measured = measured_normal(point, reflections.camera, reflections.led)
+    normals = np.array([turned(o.rotation, omega)[:, 2] for omega in o.difference[kept]])
+    axis = np.cross(measured, normals)
     sine = np.linalg.norm(axis, axis=-1)
-    turn = rotation(axis, np.arctan2(sine, np.sum(measured * wanted, axis=-1)))
+    turn = rotation(axis, np.arctan2(sine, np.sum(measured * normals, axis=-1)))
     led, camera = (
-        o.vertex + np.einsum("nij,nj->ni", turn, end - point) for end in (seen.led, seen.camera)
+        o.vertex + np.einsum("nij,nj->ni", turn, end - point)
+        for end in (reflections.led, reflections.camera)
     )
     sigma = 2.0 * mean_sigma(o, systematic=systematic) / np.sqrt(share)
     return drone(
@@ -207,7 +208,7 @@ def fit_together(
         turned,
         _shared_spread(flights, count),
     )
-    found = fit_common(
+    joint = fit_common(
         mechanism,
         join([others, known]),
         model,
@@ -216,7 +217,7 @@ def fit_together(
         loss="square",
         adapt_scale=False,
     )
-    return Together(found.fitted, found.turn, found.turn_covariance, noise)
+    return Together(joint.fitted, joint.turn, joint.turn_covariance, noise)
 
 
 def _shared_spread(flights: Sightings, count: int) -> FloatArray:

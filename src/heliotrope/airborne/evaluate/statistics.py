@@ -94,18 +94,18 @@ def studentized_deviates(
     from scipy.stats import t as student
 
     data = as_float(values)
-    left = np.arange(len(data))
+    remaining = np.arange(len(data))
     which = np.empty(most, dtype=np.intp)
     extreme = np.zeros(most)
     for i in range(most):
-        part = data[left]
+        part = data[remaining]
         spread = float(part.std(ddof=1))
         away = np.abs(part - part.mean())
         k = int(np.argmax(away))
         # Equal values have no extreme one.
         extreme[i] = away[k] / spread if spread > 0.0 else 0.0
-        which[i] = left[k]
-        left = np.delete(left, k)
+        which[i] = remaining[k]
+        remaining = np.delete(remaining, k)
     rest = len(data) - np.arange(most)
     quantile = student.ppf(1.0 - alpha / (2.0 * rest), rest - 2)
     critical = (rest - 1) * quantile / np.sqrt((rest - 2 + quantile**2) * rest)
@@ -225,9 +225,9 @@ def _spread_mean(
     same = k[:, None] == k[None, :]
     apart = np.linalg.norm(place[:, None] - place[None, :], axis=-1)
     areas = _Areas.of(shape, k, place)
-    one = np.full(n, 1.0 / n)
+    uniform = np.full(n, 1.0 / n)
     fits = [
-        _Fit.of(data, np.where(same, matern(apart / ell), 0.0), *areas.at(float(ell)), one)
+        _Fit.of(data, np.where(same, matern(apart / ell), 0.0), *areas.at(float(ell)), uniform)
         for ell in lengths
     ]
     score = np.array([fit.score for fit in fits])
@@ -320,13 +320,13 @@ class _Fit:
         correlation: FloatArray,
         to_mirror: FloatArray,
         within: float,
-        one: FloatArray,
+        uniform: FloatArray,
     ) -> "_Fit":
         n = len(data)
         root, basis = np.linalg.eigh(correlation)
         root = np.maximum(root, 0.0)
         ones, values = basis.sum(axis=0), basis.T @ data
-        towards, plain_weights = basis.T @ to_mirror, basis.T @ one
+        towards, plain_weights = basis.T @ to_mirror, basis.T @ uniform
         diagonal = root[None, :] + _RATIOS[:, None]
         inverse = 1.0 / diagonal
         unit = inverse @ ones**2

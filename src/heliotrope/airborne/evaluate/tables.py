@@ -25,7 +25,7 @@ class MeasuredFlight:
     Attributes
     ----------
     name
-        Name of the flight; "" if it is the only one.
+        Name of the flight; empty if it is the only one.
     found
         Orientations of the N heliostats.
     shape
@@ -63,7 +63,7 @@ class MeasuredFlight:
 
 
 def orientation_rows(
-    found: Orientations,
+    orientations: Orientations,
     budget: Budget | None = None,
     flight: str = "",
     places: npt.ArrayLike | None = None,
@@ -72,7 +72,7 @@ def orientation_rows(
 
     Parameters
     ----------
-    found
+    orientations
         Orientations of one flight.
     budget
         If given, the systematic part is also split by cause.
@@ -83,32 +83,33 @@ def orientation_rows(
     """
     known = None if places is None else as_float(places)
     return [
-        {**_of(flight), **_row(found.names[o.heliostat], o, budget, known)} for o in found.found
+        {**_of(flight), **_row(orientations.names[o.heliostat], o, budget, known)}
+        for o in orientations.found
     ]
 
 
-def facet_rows(found: Orientations, flight: str = "") -> list[dict[str, Any]]:
+def facet_rows(orientations: Orientations, flight: str = "") -> list[dict[str, Any]]:
     """Return one record for each facet: its mean difference is its canting error, mrad."""
     return [
         {
             **_of(flight),
-            "heliostat": found.names[o.heliostat],
+            "heliostat": orientations.names[o.heliostat],
             "facet": f.facet,
             "points": f.count,
             **_pair("rot", f.mean),
             **_pair("sigma", f.sigma),
         }
-        for o in found.found
+        for o in orientations.found
         for f in o.facets
     ]
 
 
-def difference_rows(found: Orientations, flight: str = "") -> list[dict[str, Any]]:
+def difference_rows(orientations: Orientations, flight: str = "") -> list[dict[str, Any]]:
     """Return one record for each reflection: its position on the mirror, and its difference."""
     return [
         {
             **_of(flight),
-            "heliostat": found.names[o.heliostat],
+            "heliostat": orientations.names[o.heliostat],
             "photo": int(o.reflections.photo[i]),
             "facet": int(o.reflections.facet[i]),
             "x_m": float(o.reflections.x[i]),
@@ -116,22 +117,22 @@ def difference_rows(found: Orientations, flight: str = "") -> list[dict[str, Any
             **_pair("rot", o.difference[i]),
             "outlier": bool(o.outlier[i]),
         }
-        for o in found.found
+        for o in orientations.found
         for i in range(len(o.reflections))
     ]
 
 
-def flight_row(found: Orientations, flight: str = "") -> dict[str, Any]:
+def flight_row(orientations: Orientations, flight: str = "") -> dict[str, Any]:
     """Return the record of a flight: counts, and means over its heliostats, mrad.
 
     ``rot_mean`` is the mean deviation, common to all; ``rot_rms`` their size. The standard
     deviations are root mean squares.
     """
-    every = found.found
+    every = orientations.found
     row: dict[str, Any] = {
         **_of(flight),
         "heliostats": len(every),
-        "not_measured": len(found.left_out),
+        "not_measured": len(orientations.left_out),
         "photographs_with_reflections": len({int(k) for o in every for k in o.reflections.photo}),
         "points": sum(o.count for o in every),
         "outliers": sum(int(o.outlier.sum()) for o in every),
@@ -169,14 +170,14 @@ def systematic_parts(
     # A turn about x moves the normal towards −y, one about y towards x.
     axes = np.stack([-o.rotation[:, 1], o.rotation[:, 0]])
     nothing = {f.name: 0.0 for f in fields(Budget)}
-    seen, used = (o.point[~o.outlier], kept.camera, kept.led, axes), list(nothing)
+    geometry, used = (o.point[~o.outlier], kept.camera, kept.led, axes), list(nothing)
     parts = {}
     if place is not None:
         used = ["lamp"]
-        parts["place"] = _spread(Budget(**nothing).covariance(*seen, place))
+        parts["place"] = _spread(Budget(**nothing).covariance(*geometry, place))
     for name in used:
         alone = Budget(**{**nothing, name: getattr(budget, name)})
-        parts[name] = _spread(alone.covariance(*seen))
+        parts[name] = _spread(alone.covariance(*geometry))
     return parts
 
 

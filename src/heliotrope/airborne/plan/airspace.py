@@ -78,9 +78,9 @@ class KeepOut:
     @cached_property
     def shape(self) -> Geometry:
         """The point or filled polygon on the ground that `radius` is measured from."""
-        found = Point(self.corners[0]) if len(self.corners) == 1 else Polygon(self.corners)
-        shapely.prepare(found)
-        return found
+        shape = Point(self.corners[0]) if len(self.corners) == 1 else Polygon(self.corners)
+        shapely.prepare(shape)
+        return shape
 
     @cached_property
     def _box(self) -> FloatArray:
@@ -96,12 +96,12 @@ class KeepOut:
         )
 
     def free(self, a: FloatArray, b: FloatArray) -> Mask:
-        """Return which straight legs from ``a`` to ``b``, (M, 3) each, stay outside, (M,)."""
-        found = np.ones(len(a), dtype=np.bool_)
+        """Return the mask of straight legs from ``a`` to ``b``, (M, 3), that stay outside, (M,)."""
+        free = np.ones(len(a), dtype=np.bool_)
         low, high = np.minimum(a, b), np.maximum(a, b)
         near = np.flatnonzero(~((high < self._box[0]) | (low > self._box[1])).any(axis=1))
         if not len(near):
-            return found
+            return free
         a, b = a[near], b[near]
         # The part of each leg between bottom and top, as shares of its length.
         rise = b[:, 2] - a[:, 2]
@@ -111,19 +111,19 @@ class KeepOut:
         inside = (a[:, 2] >= self.bottom) & (a[:, 2] <= self.top)
         first = np.where(level, np.where(inside, 0.0, 1.0), np.clip(ends.min(axis=0), 0.0, 1.0))
         last = np.where(level, np.where(inside, 1.0, 0.0), np.clip(ends.max(axis=0), 0.0, 1.0))
-        way = b[:, :2] - a[:, :2]
-        legs = _legs(a[:, :2] + first[:, None] * way, a[:, :2] + last[:, None] * way)
-        found[near] = (first >= last) | (shapely.distance(self.shape, legs) > self.radius)
-        return found
+        path = b[:, :2] - a[:, :2]
+        legs = _legs(a[:, :2] + first[:, None] * path, a[:, :2] + last[:, None] * path)
+        free[near] = (first >= last) | (shapely.distance(self.shape, legs) > self.radius)
+        return free
 
 
 def tower(plant: Plant, clearance: float = 10.0) -> tuple[KeepOut, ...]:
     """Return a cylinder for each receiver and target, from the ground to ``clearance`` m above."""
-    found = []
+    volumes = []
     surfaces: list[Receiver | Target] = [*plant.receivers, *plant.targets]
     for surface in surfaces:
         half = 0.5 * float(np.hypot(surface.width, surface.height))
-        found.append(
+        volumes.append(
             KeepOut(
                 surface.name,
                 surface.center[None, :2],
@@ -131,7 +131,7 @@ def tower(plant: Plant, clearance: float = 10.0) -> tuple[KeepOut, ...]:
                 top=float(surface.center[2]) + 0.5 * surface.height + clearance,
             )
         )
-    return tuple(found)
+    return tuple(volumes)
 
 
 @dataclass(frozen=True)
@@ -186,9 +186,9 @@ class Airspace:
     def _fenced(self) -> Polygon | None:
         if self.fence is None:
             return None
-        found = Polygon(self.fence)
-        shapely.prepare(found)
-        return found
+        polygon = Polygon(self.fence)
+        shapely.prepare(polygon)
+        return polygon
 
     @cached_property
     def _tree(self) -> cKDTree | None:
@@ -209,35 +209,35 @@ class Airspace:
         return as_float(self.ground[self._tree.query(points[:, :2])[1], 2])
 
     def free(self, points: npt.ArrayLike) -> Mask:
-        """Return at which points (M, 3) a drone may be, (M,)."""
+        """Return the mask of points (M, 3) where a drone may be, (M,)."""
         p = as_float(points).reshape(-1, 3)
         height = p[:, 2] - self.ground_below(p)
         # Rounding must not refuse a point at the limit.
-        found = (height >= self.min_height - 1e-6) & (height <= self.max_height + 1e-6)
-        found &= self._within_fence(p, p)
+        free = (height >= self.min_height - 1e-6) & (height <= self.max_height + 1e-6)
+        free &= self._within_fence(p, p)
         for volume in self._volumes:
-            found &= volume.free(p, p + np.array([0.0, 0.0, 1e-6]))
-        return np.asarray(found)
+            free &= volume.free(p, p + np.array([0.0, 0.0, 1e-6]))
+        return np.asarray(free)
 
     def free_legs(self, a: npt.ArrayLike, b: npt.ArrayLike) -> Mask:
-        """Return which straight legs from ``a`` to ``b``, (M, 3) each, may be flown, (M,).
+        """Return the mask of free straight legs from ``a`` to ``b``, (M, 3) each, (M,).
 
         Vertical climbs and descents may start or end below the lower height limit.
         """
         p, q = as_float(a).reshape(-1, 3), as_float(b).reshape(-1, 3)
-        found = np.ones(len(p), dtype=np.bool_)
+        free = np.ones(len(p), dtype=np.bool_)
         if not len(p):
-            return found
+            return free
         steep = np.linalg.norm((q - p)[:, :2], axis=-1) < 1e-6
         share = np.linspace(0.0, 1.0, _CHECKS)[:, None, None]
         place = (p + (q - p) * share).reshape(-1, 3)
         height = (place[:, 2] - self.ground_below(place)).reshape(_CHECKS, -1)
-        found &= height.max(axis=0) <= self.max_height + 1e-6
-        found &= steep | (height.min(axis=0) >= self.min_height - 1e-6)
-        found &= self._within_fence(p, q)
+        free &= height.max(axis=0) <= self.max_height + 1e-6
+        free &= steep | (height.min(axis=0) >= self.min_height - 1e-6)
+        free &= self._within_fence(p, q)
         for volume in self._volumes:
-            found &= volume.free(p, q)
-        return np.asarray(found)
+            free &= volume.free(p, q)
+        return np.asarray(free)
 
     def _within_fence(self, a: FloatArray, b: FloatArray) -> Mask:
         fence = self._fenced
@@ -260,15 +260,15 @@ class Airspace:
         base = np.ceil(max(start[2], stop[2], floor) / _LEVEL) * _LEVEL
         levels = {max(start[2], stop[2], floor), base}
         levels |= {v.top + 1e-3 for v in self._volumes if v.top > base and np.isfinite(v.top)}
-        # Length of an unobstructed way at the base height.
+        # Length of an unobstructed route at the base height.
         climb = float(np.linalg.norm((stop - start)[:2])) + 2.0 * base - start[2] - stop[2]
         best, least = None, np.inf
         for level in sorted(levels):
-            way = self._around(start, stop, float(level))
-            if way is not None:
-                length = path_length(np.vstack([start, way, stop]))
+            path = self._around(start, stop, float(level))
+            if path is not None:
+                length = path_length(np.vstack([start, path, stop]))
                 if length < least:
-                    best, least = way, length
+                    best, least = path, length
                 if length < _SHORT * climb:
                     break
         return best
@@ -292,18 +292,18 @@ class Airspace:
         )
         if not np.isfinite(distance[0, 1]):
             return None
-        way = [1]
-        while way[-1] != 0:
-            way.append(int(before[0, way[-1]]))
-        found = points[way[::-1]]
+        order = [1]
+        while order[-1] != 0:
+            order.append(int(before[0, order[-1]]))
+        route = points[order[::-1]]
         # Climbs of zero length add no point.
         keep = [
             k
-            for k, p in enumerate(found)
+            for k, p in enumerate(route)
             if (k > 0 or not np.allclose(p, start))
-            and (k < len(found) - 1 or not np.allclose(p, stop))
+            and (k < len(route) - 1 or not np.allclose(p, stop))
         ]
-        return as_float(found[keep].reshape(-1, 3))
+        return as_float(route[keep].reshape(-1, 3))
 
     def _graph(self, level: float) -> tuple[FloatArray, FloatArray]:
         """Return detour corners at a height (M, 3) and lengths of free legs (M, M), 0 if none."""
@@ -343,17 +343,17 @@ def path_length(points: FloatArray) -> float:
 
 def _polygon(corners: FloatArray, what: str) -> None:
     """Refuse a polygon that encloses no area or whose edges cross."""
-    found = Polygon(corners)
-    if not found.is_valid or found.area <= 0.0:
+    polygon = Polygon(corners)
+    if not polygon.is_valid or polygon.area <= 0.0:
         raise InputError(
-            f"{what}: its edges cross or enclose no area ({shapely.is_valid_reason(found)}); give "
-            "the corners in order around it"
+            f"{what}: its edges cross or enclose no area ({shapely.is_valid_reason(polygon)}); "
+            "give the corners in order around it"
         )
 
 
 def _legs(a: FloatArray, b: FloatArray) -> npt.NDArray[np.object_]:
     """Return lines on the ground from ``a`` to ``b``, (M, 2); points where both are the same."""
-    found = np.atleast_1d(shapely.linestrings(np.stack([a, b], axis=1)))
+    lines = np.atleast_1d(shapely.linestrings(np.stack([a, b], axis=1)))
     same = (a == b).all(axis=1)
-    found[same] = shapely.points(a[same])
-    return found
+    lines[same] = shapely.points(a[same])
+    return lines

@@ -129,13 +129,13 @@ def directions(selection: PointSelection) -> FloatArray:
     """Return unit vectors about 12° apart, within the elevation limits, (M, 3)."""
     low, high = selection.min_elevation, selection.max_elevation
     rings = max(2, int(np.ceil((high - low) / _STEP)) + 1)
-    found = []
+    parts = []
     for k, elevation in enumerate(np.linspace(low, high, rings)):
         count = max(1, int(np.ceil(2.0 * np.pi * np.cos(elevation) / _STEP)))
         # Rings are staggered, so that columns do not line up.
         azimuth = 2.0 * np.pi * (np.arange(count) + 0.5 * (k % 2)) / count
-        found.append(direction(azimuth, np.full(count, elevation)))
-    return np.concatenate(found)
+        parts.append(direction(azimuth, np.full(count, elevation)))
+    return np.concatenate(parts)
 
 
 def calibration_points(
@@ -189,42 +189,42 @@ def calibration_points(
     some = np.unique(np.linspace(0, len(rows) - 1, _SOME).astype(np.intp))
     facing = face(Armature(armature.table[some]), Drive(drives.table[some]), points[:, None])
     able = facing.able.mean(axis=1) >= selection.share
-    there, there_points = towards[able], points[able]
+    possible, possible_points = towards[able], points[able]
     shown = prospect(
-        mirrors, rows, face(armature, drives, there_points[:, None]), there_points, sampling
+        mirrors, rows, face(armature, drives, possible_points[:, None]), possible_points, sampling
     )
     typical, side = (np.median(v, axis=1) for v in (shown.reflections, shown.side))
     sharp = (side >= SMALLEST) & (typical >= selection.least)
-    found = _candidates(
+    candidates = _candidates(
         middle,
-        there[sharp],
-        there_points[sharp],
+        possible[sharp],
+        possible_points[sharp],
         names,
         np.hypot(selection.sigma, selection.scatter / np.sqrt(np.maximum(typical[sharp], 1.0))),
     )
-    if len(found) < selection.points:
+    if len(candidates) < selection.points:
         raise InputError(
-            f"{label}: {len(found)} directions are possible for {selection.points} calibration "
-            f"points; {len(towards)} of {len(free)} lie in free air, {int(able.sum())} of them "
-            f"within the stops, and {int(sharp.sum())} of these show {selection.least:g} "
-            f"reflections on the median mirror, {SMALLEST:.0f} px or larger (at best "
-            f"{typical.max(initial=0.0):.1f}, {side.max(initial=0.0):.0f} px); lower the distance, "
-            "widen the elevations, sample more densely or ask for fewer points"
+            f"{label}: {len(candidates)} directions are possible for {selection.points} "
+            f"calibration points; {len(towards)} of {len(free)} lie in free air, "
+            f"{int(able.sum())} of them within the stops, and {int(sharp.sum())} of these show "
+            f"{selection.least:g} reflections on the median mirror, {SMALLEST:.0f} px or larger "
+            f"(at best {typical.max(initial=0.0):.1f}, {side.max(initial=0.0):.0f} px); lower the "
+            "distance, widen the elevations, sample more densely or ask for fewer points"
         )
-    there, there_points = there[sharp], there_points[sharp]
+    possible, possible_points = possible[sharp], possible_points[sharp]
     information = precision(middle, names, priors=selection.priors)[0]
     form = error_form(middle, aim, suns, names)[0]
     chosen = plan_sightings(
-        found, selection.points, information, form, criterion=selection.criterion
+        candidates, selection.points, information, form, criterion=selection.criterion
     )
     index = chosen.chosen.time.astype(np.intp)
     # A short tour of the directions is short for mirrors and drone.
     south = np.array([0.0, -1.0, 0.0])
-    index = index[tour(there[index], south)]
+    index = index[tour(possible[index], south)]
     # Start from the previous pose, so that mirrors stay on their branch.
     counts, normal, vertex, ok = [], [], [], []
     current = None
-    for point in there_points[index]:
+    for point in possible_points[index]:
         step = face(armature, drives, point, current)
         current = step.counts
         counts.append(step.counts)
@@ -232,8 +232,8 @@ def calibration_points(
         vertex.append(step.vertex)
         ok.append(step.able)
     flown = Facing(np.stack(counts), np.stack(normal), np.stack(vertex), np.stack(ok))
-    seen = shown.take(np.flatnonzero(sharp)[index])
-    return CalibrationPoints(there[index], there_points[index], flown, chosen, seen)
+    prospects = shown.take(np.flatnonzero(sharp)[index])
+    return CalibrationPoints(possible[index], possible_points[index], flown, chosen, prospects)
 
 
 def _free(
@@ -252,10 +252,10 @@ def _free(
     # Patterns are a little larger where axes are oblique to their plane.
     half = 1.2 * (wide + distance * sampling.pointing) + sampling.least_spacing
     plane = half * tangent_axes(towards)
-    found = airspace.free(points)
+    free = airspace.free(points)
     for i, j in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)):
-        found &= airspace.free(points + i * plane[:, 0] + j * plane[:, 1])
-    return found
+        free &= airspace.free(points + i * plane[:, 0] + j * plane[:, 1])
+    return free
 
 
 def _candidates(
@@ -272,8 +272,8 @@ def _candidates(
     # A normal that is off by σ turns the ray by 2 σ.
     zero = np.zeros(len(rows), dtype=np.intp)
     if len(rows):
-        seen = drone(zero, counts, points[rows], points[rows], sigma=2.0 * sigma[rows])
-        jacobian = linearise(middle[zero], seen, names).jacobian
+        observed = drone(zero, counts, points[rows], points[rows], sigma=2.0 * sigma[rows])
+        jacobian = linearise(middle[zero], observed, names).jacobian
     else:
         jacobian = np.empty((0, 2, len(names)))
     angle = np.zeros(len(rows))

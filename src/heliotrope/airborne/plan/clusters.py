@@ -90,9 +90,9 @@ def ground_areas(position: npt.ArrayLike) -> FloatArray:
     squares = np.stack(np.meshgrid(east, north), axis=-1).reshape(-1, 2)
     nearest = tree.query(squares, distance_upper_bound=_EDGE * spacing)
     distance, owner = (np.asarray(part) for part in nearest)
-    found = np.bincount(owner[np.isfinite(distance)], minlength=len(flat))
+    cells = np.bincount(owner[np.isfinite(distance)], minlength=len(flat))
     # Heliostats at one position share a cell, but none may have no weight.
-    return np.asarray(np.maximum(found, 1) * side**2)
+    return np.asarray(np.maximum(cells, 1) * side**2)
 
 
 def clusters(
@@ -124,10 +124,10 @@ def clusters(
     area = ground_areas(place)
     count = max(1, int(np.ceil(area.sum() / (0.25 * np.pi * size**2))))
     while True:
-        found = _described(_partition(place[:, :2], area, min(count, len(place))), place, area)
-        if count >= len(place) or found.radius.max() <= max_radius:
-            return found
-        count = max(count + 1, int(count * min(1.5, (found.radius.max() / max_radius) ** 2)))
+        described = _described(_partition(place[:, :2], area, min(count, len(place))), place, area)
+        if count >= len(place) or described.radius.max() <= max_radius:
+            return described
+        count = max(count + 1, int(count * min(1.5, (described.radius.max() / max_radius) ** 2)))
 
 
 def tour(center: npt.ArrayLike, start: npt.ArrayLike) -> npt.NDArray[np.intp]:
@@ -143,28 +143,28 @@ def tour(center: npt.ArrayLike, start: npt.ArrayLike) -> npt.NDArray[np.intp]:
     points = np.asarray(center, dtype=np.float64)
     gap = np.linalg.norm(points[:, None] - points[None], axis=-1)
     first = np.linalg.norm(points - np.asarray(start, dtype=np.float64), axis=-1)
-    order, left = [int(np.argmin(first))], set(range(len(points)))
-    left.discard(order[0])
-    while left:
-        rest = sorted(left)
+    order, remaining = [int(np.argmin(first))], set(range(len(points)))
+    remaining.discard(order[0])
+    while remaining:
+        rest = sorted(remaining)
         order.append(rest[int(np.argmin(gap[order[-1], rest]))])
-        left.discard(order[-1])
-    way = np.array(order, dtype=np.intp)
-    improved = len(way) > 2
+        remaining.discard(order[-1])
+    path = np.array(order, dtype=np.intp)
+    improved = len(path) > 2
     while improved:
         improved = False
-        for i in range(len(way) - 1):
-            ahead = way[i + 1 :]
-            before = first[way[0]] if i == 0 else gap[way[i - 1], way[i]]
-            enter = first[ahead] if i == 0 else gap[way[i - 1], ahead]
+        for i in range(len(path) - 1):
+            ahead = path[i + 1 :]
+            before = first[path[0]] if i == 0 else gap[path[i - 1], path[i]]
+            enter = first[ahead] if i == 0 else gap[path[i - 1], ahead]
             after = np.append(gap[ahead[:-1], ahead[1:]], 0.0)
-            leave = np.append(gap[way[i], ahead[1:]], 0.0)
+            leave = np.append(gap[path[i], ahead[1:]], 0.0)
             gain = before + after - enter - leave
             j = int(np.argmax(gain))
             if gain[j] > 1e-9:
-                way[i : i + j + 2] = way[i : i + j + 2][::-1].copy()
+                path[i : i + j + 2] = path[i : i + j + 2][::-1].copy()
                 improved = True
-    return way
+    return path
 
 
 def _flat(position: npt.ArrayLike) -> FloatArray:
@@ -179,12 +179,12 @@ def _partition(flat: FloatArray, area: FloatArray, count: int) -> npt.NDArray[np
     share = np.cumsum(area[order]) - 0.5 * area[order]
     of = np.empty(len(flat), dtype=np.intp)
     of[order] = np.minimum((share / area.sum() * count).astype(np.intp), count - 1)
-    wanted, weight = area.sum() / count, np.zeros(count)
+    target, weight = area.sum() / count, np.zeros(count)
     flat = flat - flat.mean(axis=0)
     best, worst = of, np.inf
     for k in range(_ROUNDS):
         inside = np.bincount(of, weights=area, minlength=count)
-        unequal = float(np.abs(inside / wanted - 1.0).max())
+        unequal = float(np.abs(inside / target - 1.0).max())
         # The pieces of the curve are equal from the start, but long: let them become round.
         if k >= _SETTLED and unequal < worst and inside.min() > 0.0:
             best, worst = of, unequal
@@ -198,7 +198,7 @@ def _partition(flat: FloatArray, area: FloatArray, count: int) -> npt.NDArray[np
         # A cell without heliostats restarts beside the fullest one.
         center[inside <= 0.0] = center[int(np.argmax(inside))] + 1e-3
         # A weight is a squared radius: it grows with the missing area.
-        weight += 0.5 * (wanted - inside) / np.pi
+        weight += 0.5 * (target - inside) / np.pi
         weight -= weight.mean()
         # Squared distance less weight, without the terms that all cells share.
         power = (center**2).sum(axis=-1) - weight - 2.0 * flat @ center.T

@@ -148,7 +148,7 @@ def write_dome(
     lat, lon, _ = enu_to_geodetic(dome.position, origin)
     angles = np.degrees([gimbal_of_rotation(r)[:2] for r in dome.rotation])
     count = len(dome)
-    there = tuple(float(v) for v in enu_to_geodetic(start, origin))
+    geodetic = tuple(float(v) for v in enu_to_geodetic(start, origin))
     mission = Mission(
         "dome",
         lat,
@@ -159,7 +159,7 @@ def write_dome(
         np.full(count, rest),
         np.ones(count, np.bool_),
         speed,
-        (there[0], there[1], there[2]),
+        (geodetic[0], geodetic[1], geodetic[2]),
         float(dome.position[:, 2].max() - start[2]),
     )
     written = write_missions(folder, [mission], formats=formats, aircraft=aircraft)

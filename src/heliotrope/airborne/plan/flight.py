@@ -167,14 +167,14 @@ class Sortie:
 
 
 @dataclass(frozen=True)
-class _Ways:
+class _Routes:
     """Routes between stations and homes, each found once."""
 
     airspace: Airspace
     stations: Sequence[HoverStation]
     labels: Sequence[str]
     known: dict[tuple[int, int, int], FloatArray]
-    #: Durations of the way home, by drone and station.
+    #: Durations of the route home, by drone and station.
     backs: dict[tuple[int, int], float]
 
     def between(
@@ -187,23 +187,23 @@ class _Ways:
         key = (drone, whence, whither)
         if key not in self.known:
             ends = [home if r < 0 else self.stations[r].pattern.center for r in (whence, whither)]
-            self.known[key] = self._found(ends[0], ends[1], max(whence, whither))
+            self.known[key] = self._searched(ends[0], ends[1], max(whence, whither))
         # The route between the centres will do if it can be joined and left from here.
-        way = self.known[key]
-        if len(way) and legs(np.stack([a, way[-1]]), np.stack([way[0], b])).all():
-            return way
-        return self._found(a, b, max(whence, whither))
+        route = self.known[key]
+        if len(route) and legs(np.stack([a, route[-1]]), np.stack([route[0], b])).all():
+            return route
+        return self._searched(a, b, max(whence, whither))
 
-    def _found(self, a: FloatArray, b: FloatArray, row: int) -> FloatArray:
-        way = self.airspace.route(a, b)
-        if way is None:
+    def _searched(self, a: FloatArray, b: FloatArray, row: int) -> FloatArray:
+        route = self.airspace.route(a, b)
+        if route is None:
             station = self.stations[row]
             raise InputError(
                 f"{self.labels[station.cluster]}, calibration point {station.point + 1}: there is "
                 "no free route to it and back; widen the fence, raise the upper height limit or "
                 "move the home point"
             )
-        return way
+        return route
 
 
 def fly(
@@ -244,7 +244,7 @@ def fly(
         place[station.cluster].append(row)
     load = np.array([sum(len(stations[r].pattern) for r in place[int(c)]) for c in order], float)
     share = (np.cumsum(load) - 0.5 * load) / load.sum() * craft.count
-    ways = _Ways(airspace, stations, labels, {}, {})
+    routes = _Routes(airspace, stations, labels, {}, {})
     flown: list[Sortie] = []
     for drone in range(craft.count):
         mine = [int(c) for c, s in zip(order, share, strict=True) if int(s) == drone]
@@ -253,14 +253,14 @@ def fly(
         best, rest = list[Sortie](), list[int]()
         for size in range(1, min(_GROUPS, len(mine)) + 1):
             rows = grouped(mine, place, size)
-            tried = _one(drone, rows, stations, home[drone], craft, ways)
+            tried = _sorties_of(drone, rows, stations, home[drone], craft, routes)
             if best and tried[-1].end > 0.995 * best[-1].end:
                 # Mirrors no longer cause a wait; larger groups only lengthen the flight.
                 break
             best, rest = tried, rows
         if flown:
             others = [timeline(flown, stations, craft, d) for d in range(drone)]
-            best = _one(drone, rest, stations, home[drone], craft, ways, others)
+            best = _sorties_of(drone, rest, stations, home[drone], craft, routes, others)
         flown += best
     return flown
 
@@ -272,23 +272,23 @@ def grouped(clusters: Sequence[int], place: dict[int, list[int]], size: int) -> 
     for group in np.array_split(np.array(clusters), groups):
         members = [int(c) for c in group]
         for k in range(max(len(place[c]) for c in members)):
-            # Back and forth, so that the way to the next pose is short.
-            way = members if k % 2 == 0 else members[::-1]
-            rows.extend(place[c][k] for c in way if k < len(place[c]))
+            # Back and forth, so that the route to the next pose is short.
+            order = members if k % 2 == 0 else members[::-1]
+            rows.extend(place[c][k] for c in order if k < len(place[c]))
     return rows
 
 
-def _one(
+def _sorties_of(
     drone: int,
     rows: Sequence[int],
     stations: Sequence[HoverStation],
     home: FloatArray,
     craft: Craft,
-    ways: _Ways,
+    routes: _Routes,
     others: "Sequence[Timeline]" = (),
 ) -> list[Sortie]:
     """Return the sorties of one drone that flies ``rows`` in order and avoids others."""
-    work = _Work(drone, stations, home, craft, ways, others, {}, [], [])
+    work = _Work(drone, stations, home, craft, routes, others, {}, [], [])
     for row in rows:
         work.station(row)
     work.land()
@@ -303,10 +303,10 @@ class _Work:
     stations: Sequence[HoverStation]
     home: FloatArray
     craft: Craft
-    ways: _Ways
+    routes: _Routes
     others: "Sequence[Timeline]"
     #: When each cluster's last photograph was taken.
-    seen: dict[int, float]
+    photographed: dict[int, float]
     sorties: list[Sortie]
     visits: list[StationVisit]
     now: float = 0.0
@@ -319,23 +319,23 @@ class _Work:
         station = self.stations[row]
         camera = station.pattern.camera
         step = self.craft.photo + self.craft.time(station.pattern.spacing)
-        ready = self.seen.get(station.cluster, -np.inf) + station.travel + REST
+        ready = self.photographed.get(station.cluster, -np.inf) + station.travel + REST
         first = 0
         while first < len(camera):
             at_home = self.place is None
-            here = self.home if self.place is None else self.place
-            approach = self._way(here, camera[first], -1 if at_home else self.row, row)
-            travel = self.craft.way(np.vstack([here, approach, camera[first]]))
+            origin = self.home if self.place is None else self.place
+            approach = self._route(origin, camera[first], -1 if at_home else self.row, row)
+            travel = self.craft.way(np.vstack([origin, approach, camera[first]]))
             if at_home:
                 # Wait on the ground rather than in the air.
                 self.start = self.now = max(self.now, ready - travel)
             begin = max(self.now + travel, ready)
-            left = self.start + self.craft.endurance - begin - self.back(row)
-            count = min(len(camera) - first, int(left // step))
+            remaining = self.start + self.craft.endurance - begin - self.back(row)
+            count = min(len(camera) - first, int(remaining // step))
             if count < 1:
                 if at_home:
                     raise InputError(
-                        f"{self.ways.labels[station.cluster]}: {travel:.0f} s to fly there and "
+                        f"{self.routes.labels[station.cluster]}: {travel:.0f} s to fly there and "
                         f"{self.back(row):.0f} s back leave no time for a photograph in "
                         f"{self.craft.endurance:.0f} s; take off closer to it"
                     )
@@ -346,32 +346,34 @@ class _Work:
             self.visits.append(StationVisit(row, first, first + count, approach, begin, end, wait))
             first += count
             self.now, self.place, self.row = end, camera[first - 1], row
-        self.seen[station.cluster] = self.now
+        self.photographed[station.cluster] = self.now
 
-    def _way(self, a: FloatArray, b: FloatArray, whence: int, whither: int) -> FloatArray:
-        return self.ways.between(a, b, whence, whither, self.home, self.drone)
+    def _route(self, a: FloatArray, b: FloatArray, whence: int, whither: int) -> FloatArray:
+        return self.routes.between(a, b, whence, whither, self.home, self.drone)
 
     def back(self, row: int) -> float:
-        """Return the longest way home from a station, s."""
-        known = self.ways.backs
+        """Return the longest duration home from a station, s."""
+        known = self.routes.backs
         if (self.drone, row) not in known:
             known[self.drone, row] = self._back(row)
         return known[self.drone, row]
 
     def _back(self, row: int) -> float:
         pattern = self.stations[row].pattern
-        way = self._way(pattern.center, self.home, row, -1)
+        route = self._route(pattern.center, self.home, row, -1)
         half = 0.5 * pattern.spacing * float(np.hypot(pattern.columns, pattern.rows))
-        return self.craft.way(np.vstack([pattern.center, way, self.home])) + half / self.craft.speed
+        return (
+            self.craft.way(np.vstack([pattern.center, route, self.home])) + half / self.craft.speed
+        )
 
     def land(self) -> None:
         """Fly home and change the battery."""
         if self.place is None:
             return
-        way = self._way(self.place, self.home, self.row, -1)
-        end = self.now + self.craft.way(np.vstack([self.place, way, self.home]))
+        route = self._route(self.place, self.home, self.row, -1)
+        end = self.now + self.craft.way(np.vstack([self.place, route, self.home]))
         sortie = Sortie(
-            self.drone, len(self.sorties), self.start, end, self.home, tuple(self.visits), way
+            self.drone, len(self.sorties), self.start, end, self.home, tuple(self.visits), route
         )
         late = _delay(sortie, self.stations, self.craft, self.others) if self.others else 0.0
         if late:
@@ -380,7 +382,7 @@ class _Work:
                 sortie, start=sortie.start + late, end=end + late, visits=tuple(visits)
             )
             for visit in visits:
-                self.seen[self.stations[visit.station].cluster] = visit.end
+                self.photographed[self.stations[visit.station].cluster] = visit.end
         self.sorties.append(sortie)
         self.visits, self.place = [], None
         self.now = sortie.end + self.craft.change
@@ -442,9 +444,12 @@ def timeline(
         for visit in sortie.visits:
             station = stations[visit.station]
             camera = station.pattern.camera[visit.first : visit.last]
-            moment, here = time[-1], place[-1]
+            moment, previous = time[-1], place[-1]
             for point in (*visit.approach, camera[0]):
-                moment, here = moment + craft.time(float(np.linalg.norm(point - here))), point
+                moment, previous = (
+                    moment + craft.time(float(np.linalg.norm(point - previous))),
+                    point,
+                )
                 add(moment, point)
             step = (visit.end - visit.begin) / len(camera)
             for k, point in enumerate(camera):

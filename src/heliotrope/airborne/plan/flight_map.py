@@ -33,7 +33,7 @@ def flight_map(plan: FlightPlan) -> "Figure":
     left = figure.add_subplot(1, 2, 1)
     right = figure.add_subplot(1, 2, 2, projection="polar")
     _field(left, plan)
-    _ways(left, plan)
+    _routes(left, plan)
     _limits(left, plan)
     _directions(right, plan)
     summary = plan.summary()
@@ -62,7 +62,7 @@ def _field(ax: "Axes", plan: FlightPlan) -> None:
     ax.grid(alpha=0.3)
 
 
-def _ways(ax: "Axes", plan: FlightPlan) -> None:
+def _routes(ax: "Axes", plan: FlightPlan) -> None:
     """Draw the first sorties of each drone; all of them would hide the field."""
     for drone, home in enumerate(plan.homes):
         colour = _COLOURS[drone % len(_COLOURS)]

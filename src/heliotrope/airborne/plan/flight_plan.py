@@ -147,7 +147,7 @@ class FlightPlan:
         patterns = [s.pattern for s in self.stations]
         hours = self.seconds / 3600.0
         flown = [look.plan for look in self.points]
-        seen = np.concatenate([k.prospect.reflections[k.facing.able] for k in self.points])
+        reflections = np.concatenate([k.prospect.reflections[k.facing.able] for k in self.points])
         return {
             "heliostats": len(self.mirrors),
             "clusters": len(self.clusters),
@@ -159,8 +159,8 @@ class FlightPlan:
             "hover_points_of_a_pattern": [min(map(len, patterns)), max(map(len, patterns))],
             "spacing_m": [min(p.spacing for p in patterns), max(p.spacing for p in patterns)],
             "samples_of_a_facet": min(p.samples for p in patterns),
-            "reflections_of_a_mirror": np.quantile(seen, (0.1, 0.5)).tolist(),
-            "orientations_with_few_reflections": int(np.sum(seen < FEWEST)),
+            "reflections_of_a_mirror": np.quantile(reflections, (0.1, 0.5)).tolist(),
+            "orientations_with_few_reflections": int(np.sum(reflections < FEWEST)),
             "photographs": self.photos,
             "drones": len(self.homes),
             "sorties": len(self.sorties),
@@ -208,29 +208,29 @@ def plan_flight(
         airspace = replace(airspace, ground=plant.position)
     settings = replace(settings, airspace=airspace)
     limit = settings.sampling.distance * float(np.tan(min(settings.spread, 0.5 * settings.view)))
-    found = clusters(plant.position, size=settings.size, max_radius=limit)
-    digits = len(str(len(found)))
-    labels = tuple(f"C{k + 1:0{digits}d}" for k in range(len(found)))
+    cells = clusters(plant.position, size=settings.size, max_radius=limit)
+    digits = len(str(len(cells)))
+    labels = tuple(f"C{k + 1:0{digits}d}" for k in range(len(cells)))
     suns = suns_of_year(plant.site, 2026)
     look, stations = [], list[HoverStation]()
-    for k in range(len(found)):
+    for k in range(len(cells)):
         if progress is not None:
-            progress(k, len(found))
-        rows = found.rows(k)
-        one = _look(plant, all_mirrors, found.center[k], rows, suns, settings, labels[k])
-        look.append(one)
-        stations += _stations(all_mirrors, rows, one, k, settings)
+            progress(k, len(cells))
+        rows = cells.rows(k)
+        cluster = _look(plant, all_mirrors, cells.center[k], rows, suns, settings, labels[k])
+        look.append(cluster)
+        stations += _stations(all_mirrors, rows, cluster, k, settings)
     _check_patterns(stations, labels, airspace)
     start = _home(plant, settings)
     homes = flight.homes(start, settings.craft.count)
-    order = tour(found.center[:, :2], start[:2])
+    order = tour(cells.center[:, :2], start[:2])
     sorties = flight.fly(stations, order.tolist(), airspace, homes, settings.craft, labels)
-    poses = sum(int(one.facing.able.sum()) for one in look)
+    poses = sum(int(cluster.facing.able.sum()) for cluster in look)
     return FlightPlan(
         plant,
         settings,
         all_mirrors,
-        found,
+        cells,
         labels,
         tuple(look),
         tuple(stations),

@@ -319,9 +319,9 @@ def spacing(facet_area: FloatArray, slant: FloatArray, sampling: Sampling) -> tu
             "up as a whole; change the distance"
         )
     # Drone spacing that gives the number of samples asked for.
-    wanted = float((np.sqrt(facet_area / sampling.samples) * scale).min())
-    step = max(wanted, sampling.least_spacing)
-    return step, sampling.samples * (wanted / step) ** 2
+    required = float((np.sqrt(facet_area / sampling.samples) * scale).min())
+    step = max(required, sampling.least_spacing)
+    return step, sampling.samples * (required / step) ** 2
 
 
 def pattern(

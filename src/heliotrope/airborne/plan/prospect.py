@@ -42,7 +42,7 @@ def prospect(
     points: FloatArray,
     sampling: Sampling,
 ) -> Prospect:
-    """Return what patterns around ``points`` (K, 3) will show of the mirrors ``rows``, (n,).
+    """Return the prospect of patterns around ``points`` (K, 3) for the mirrors ``rows``, (n,).
 
     ``facing`` are their poses, batch shape (K, n). Mirrors of other clusters are not considered:
     they stand in other poses, or move.
@@ -55,13 +55,13 @@ def prospect(
     outline = np.stack([both[:, pick[:, 0], 0], both[:, pick[:, 1], 1]], axis=-1)
     outline = np.pad(outline, ((0, 0), (0, 0), (0, 1)))
     names = tuple(mirrors.names[i] for i in rows.tolist())
-    found, sides = np.zeros((2, len(points), len(rows)))
+    reflections, sides = np.zeros((2, len(points), len(rows)))
     for k, point in enumerate(as_float(points)):
         normal, vertex = facing.normal[k], facing.vertex[k]
         axes = tangent_axes(normal)
         turned = np.stack([-axes[:, 0], axes[:, 1], normal], axis=-1)
-        seen = seen_from(MirrorPoses(names, vertex, turned, outline), point, sampling.camera)
+        visibility = seen_from(MirrorPoses(names, vertex, turned, outline), point, sampling.camera)
         slant = np.linalg.norm(point - vertex, axis=-1)
         _, samples = spacing(mirrors.facet_area[rows], slant, sampling)
-        found[k], sides[k] = samples * facets * seen.share, seen.side
-    return Prospect(np.where(facing.able, found, 0.0), sides)
+        reflections[k], sides[k] = samples * facets * visibility.share, visibility.side
+    return Prospect(np.where(facing.able, reflections, 0.0), sides)

@@ -138,10 +138,10 @@ def litchi(mission: Mission) -> str:
     writer.writerow(_LITCHI_HEADER)
     for k in range(len(mission)):
         actions: list[tuple[int, int]] = []
-        left = round(1e3 * float(mission.stay[k]))
-        while left > 0 and len(actions) < _LITCHI_ACTIONS - 1:
-            actions.append((0, min(left, _LITCHI_STAY)))
-            left -= _LITCHI_STAY
+        remaining = round(1e3 * float(mission.stay[k]))
+        while remaining > 0 and len(actions) < _LITCHI_ACTIONS - 1:
+            actions.append((0, min(remaining, _LITCHI_STAY)))
+            remaining -= _LITCHI_STAY
         if mission.photo[k]:
             actions.append((1, 0))
         actions += [(-1, 0)] * (_LITCHI_ACTIONS - len(actions))

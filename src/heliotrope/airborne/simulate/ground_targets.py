@@ -14,7 +14,7 @@ from heliotrope.airborne.plan.dome import Dome
 from heliotrope.airborne.simulate.rendering import Conditions, FlightScene, render, write_photo
 from heliotrope.airborne.simulate.simulation import Errors, miscalibrated
 from heliotrope.airborne.standing import MirrorPoses
-from heliotrope.geometry import FloatArray, rotation
+from heliotrope.geometry import rotation
 
 #: How targets lie: place, m, and tilt, rad (standard deviations).
 _LAID, _TILT = 0.2, 0.02
@@ -31,13 +31,6 @@ class DomeFlight:
     recorded: tuple[Photo, ...]
     targets: tuple[CodedTarget, ...]
 
-    @property
-    def rtk_error(self) -> FloatArray:
-        """Recorded less true positions, m, (P, 3)."""
-        return np.array(
-            [r.position - t.position for r, t in zip(self.recorded, self.taken, strict=True)]
-        )
-
 
 def fly_dome(
     dome: Dome, camera: LedCamera, errors: Errors | None = None, seed: int = 0
@@ -46,28 +39,28 @@ def fly_dome(
 
     The targets lie decimetres from where they are planned, a little tilted.
     """
-    wrong = errors or Errors()
+    applied = errors or Errors()
     rng = np.random.default_rng(seed)
     targets = []
-    for one in dome.targets:
-        middle = one.corners.mean(axis=0)
+    for target in dome.targets:
+        middle = target.corners.mean(axis=0)
         tilt = rotation(axis := rng.normal(0.0, _TILT, 3), float(np.linalg.norm(axis)))
         spin = rotation([0.0, 0.0, 1.0], rng.uniform(-np.pi, np.pi))
-        corners = (one.corners - middle) @ (tilt @ spin).T
+        corners = (target.corners - middle) @ (tilt @ spin).T
         targets.append(
-            CodedTarget(one.number, middle + rng.normal(0.0, _LAID, 3) * [1, 1, 0.2] + corners)
+            CodedTarget(target.number, middle + rng.normal(0.0, _LAID, 3) * [1, 1, 0.2] + corners)
         )
     taken, recorded = [], []
-    for k, (place, wanted) in enumerate(zip(dome.position, dome.rotation, strict=True)):
-        told = place + rng.normal(0.0, 1.0, 3) * wrong.hover
-        true = told - np.asarray(wrong.rtk_offset) + rng.normal(0.0, 1.0, 3) * wrong.rtk
-        lean = wrong.gimbal * rng.normal(0.0, 1.0, 3)
-        turned = rotation(lean, float(np.linalg.norm(lean))) @ wanted
+    for k, (place, attitude) in enumerate(zip(dome.position, dome.rotation, strict=True)):
+        hovered = place + rng.normal(0.0, 1.0, 3) * applied.hover
+        true = hovered - np.asarray(applied.rtk_offset) + rng.normal(0.0, 1.0, 3) * applied.rtk
+        lean = applied.gimbal * rng.normal(0.0, 1.0, 3)
+        turned = rotation(lean, float(np.linalg.norm(lean))) @ attitude
         name, time = f"DJI_{k + 1:04d}.JPG", _START + timedelta(seconds=5 * k)
         taken.append(Photo(name, time, true, turned))
-        recorded.append(Photo(name, time, told, wanted, np.maximum(wrong.rtk, 1e-4)))
+        recorded.append(Photo(name, time, hovered, attitude, np.maximum(applied.rtk, 1e-4)))
     return DomeFlight(
-        camera, miscalibrated(camera, wrong.lens), tuple(taken), tuple(recorded), tuple(targets)
+        camera, miscalibrated(camera, applied.lens), tuple(taken), tuple(recorded), tuple(targets)
     )
 
 

@@ -113,26 +113,26 @@ def compare(
     flight: Flight, exact: Reflections, result: CampaignResult, fewest: int = 1
 ) -> Compared:
     """Return the only flight of a result beside its truth."""
-    found = result.flights[0].evaluation
+    evaluation = result.flights[0].evaluation
     names = {photo.name: k for k, photo in enumerate(flight.taken)}
-    number = np.array([names[p.name] for p in found.photos])
-    rows = np.array([flight.truth.names.index(n) for n in found.stand.names])
-    mine = found.reflections
+    number = np.array([names[p.name] for p in evaluation.photos])
+    rows = np.array([flight.truth.names.index(n) for n in evaluation.stand.names])
+    mine = evaluation.reflections
     key = number[mine.photo] * len(rows) + rows[mine.heliostat]
     true = exact.photo * len(rows) + exact.heliostat
     right, explained = 0, set[int]()
     for place, k in zip(mine.xy, key.tolist(), strict=True):
-        there = np.flatnonzero(true == k)
-        apart = np.linalg.norm(exact.xy[there] - place, axis=-1)
+        candidates = np.flatnonzero(true == k)
+        apart = np.linalg.norm(exact.xy[candidates] - place, axis=-1)
         if apart.min(initial=np.inf) < _SAME:
             right += 1
-            explained.add(int(there[np.argmin(apart)]))
+            explained.add(int(candidates[np.argmin(apart)]))
     shown = visible_reflections(flight, exact)
     lost = [kind for i, kind in shown.items() if i not in explained]
     kept = [o for o in result.flights[0].measured.found.found if o.count >= fewest]
     return Compared(
         len(flight.taken),
-        len(found.photos),
+        len(evaluation.photos),
         len(shown),
         len(mine),
         right,
@@ -158,7 +158,7 @@ def visible_reflections(flight: Flight, exact: Reflections) -> dict[int, str]:
     for k, photo in enumerate(flight.taken):
         away = np.linalg.norm(stand.vertex - photo.position, axis=-1)
         labels = draw_labels(photo.pixels(camera, stand.corners), away, camera.size)
-        seen: dict[int, FloatArray] = {}
+        pixels: dict[int, FloatArray] = {}
         for i in np.flatnonzero(exact.photo == k).tolist():
             row = int(exact.heliostat[i])
             point = flight.shapes[row].point_at(exact.facet[i : i + 1], exact.xy[i : i + 1])[0]
@@ -167,21 +167,21 @@ def visible_reflections(flight: Flight, exact: Reflections) -> dict[int, str]:
                 x, y = np.round(pixel).astype(int).tolist()
                 inside = 0 <= x < camera.size[0] and 0 <= y < camera.size[1]
                 if inside and labels[y, x] == row + 1:
-                    seen[i] = pixel
-        kinds |= {i: _kind(i, seen, labels) for i in seen}
+                    pixels[i] = pixel
+        kinds |= {i: _kind(i, pixels, labels) for i in pixels}
     return kinds
 
 
-def _kind(i: int, seen: dict[int, FloatArray], labels: Labels) -> str:
-    """Return what is beside reflection ``i`` of those ``seen`` in a photograph."""
+def _kind(i: int, pixels: dict[int, FloatArray], labels: Labels) -> str:
+    """Return the kind of the surroundings of reflection ``i`` in a photograph."""
     merged, mirror, edge, clear = KINDS
-    if any(np.linalg.norm(seen[i] - pixel) < _MERGED for k, pixel in seen.items() if k != i):
+    if any(np.linalg.norm(pixels[i] - pixel) < _MERGED for k, pixel in pixels.items() if k != i):
         return merged
-    x, y = np.round(seen[i]).astype(int).tolist()
+    x, y = np.round(pixels[i]).astype(int).tolist()
     low_x, low_y = max(x - 3, 0), max(y - 3, 0)
     around = labels[low_y : y + 4, low_x : x + 4]
     rows, columns = np.indices(around.shape)
-    apart = np.hypot(columns + low_x - seen[i][0], rows + low_y - seen[i][1])
+    apart = np.hypot(columns + low_x - pixels[i][0], rows + low_y - pixels[i][1])
     other = around != labels[y, x]
     if (other & (around > 0) & (apart < MARGIN + 1)).any():
         return mirror

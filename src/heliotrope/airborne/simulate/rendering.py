@@ -168,14 +168,14 @@ def render(
     return _expose(_blurred(image, conditions), conditions, seed)
 
 
-def sky_light(way: npt.ArrayLike, conditions: Conditions) -> FloatArray:
+def sky_light(ray: npt.ArrayLike, conditions: Conditions) -> FloatArray:
     """Return the sky's light (...) in unit directions (..., 3), brighter towards the horizon."""
-    there = as_float(way)
-    up = np.clip(there[..., 2], 0.0, 1.0)
+    unit = as_float(ray)
+    up = np.clip(unit[..., 2], 0.0, 1.0)
     light = conditions.sky * (1.0 + 0.5 * (math.sqrt(0.5) - up))
     if conditions.clouds > 0.0:
         # A layer of clouds; its texture repeats every 0.5 rad overhead.
-        cell = there[..., :2] / np.maximum(up, 0.05)[..., None] * (2 * _TEXTURE)
+        cell = unit[..., :2] / np.maximum(up, 0.05)[..., None] * (2 * _TEXTURE)
         i, j = np.moveaxis(np.floor(cell).astype(np.intp) % _TEXTURE, -1, 0)
         light = light * np.clip(1.0 + conditions.clouds * _texture()[i, j], 0.2, 1.7)
     return as_float(light)
@@ -202,11 +202,11 @@ def _ground(camera: LedCamera, photo: Photo, scene: FlightScene) -> Light:
     columns, rows = width // step + 2, height // step + 2
     grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1) * float(step)
     plane = undistort(camera, grid)
-    way = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) @ photo.rotation.T
-    down = -way[..., 2] / np.linalg.norm(way, axis=-1)
+    rays = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) @ photo.rotation.T
+    down = -rays[..., 2] / np.linalg.norm(rays, axis=-1)
     # Rays to the horizon or above it see haze.
-    depth = (photo.position[2] - scene.ground) / np.maximum(-way[..., 2], 0.02)
-    place = (photo.position[:2] + depth[..., None] * way[..., :2]) / _TEXEL
+    depth = (photo.position[2] - scene.ground) / np.maximum(-rays[..., 2], 0.02)
+    place = (photo.position[:2] + depth[..., None] * rays[..., :2]) / _TEXEL
     place = np.mod(place - place.min(axis=(0, 1)), 1e7).astype(np.float32)
     matrix = np.array([[1.0 / step, 0.0, 0.0], [0.0, 1.0 / step, 0.0]])
     turned: dict[str, Any] = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP}
@@ -236,9 +236,9 @@ def _shadows(image: Light, camera: LedCamera, photo: Photo, scene: FlightScene) 
     corners = scene.stand.corners
     fall = (corners[..., 2] - scene.ground) / -ray[2]
     for outline in corners + fall[..., None] * ray:
-        seen = photo.pixels(camera, outline)
-        if np.isfinite(seen).all():
-            _cover(image, seen, np.zeros(3), 0.55)
+        pixels = photo.pixels(camera, outline)
+        if np.isfinite(pixels).all():
+            _cover(image, pixels, np.zeros(3), 0.55)
 
 
 def _target(image: Light, camera: LedCamera, photo: Photo, target: CodedTarget) -> None:
@@ -249,9 +249,9 @@ def _target(image: Light, camera: LedCamera, photo: Photo, target: CodedTarget) 
     wide = np.array([CELLS + 2.0 * SHEET_MARGIN, CELLS, *np.ones(len(rows))])
     right, down = np.array([0.0, 1.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0, 1.0])
     squares = target.at(low[:, None] + wide[:, None] * right, top[:, None] + wide[:, None] * down)
-    seen = photo.pixels(camera, squares)
-    if np.isfinite(seen).all():
-        for k, outline in enumerate(seen):
+    pixels = photo.pixels(camera, squares)
+    if np.isfinite(pixels).all():
+        for k, outline in enumerate(pixels):
             _cover(image, outline, np.full(3, INK if k == 1 else PAPER), 1.0)
 
 
@@ -263,20 +263,20 @@ def _mirror(image: Light, camera: LedCamera, photo: Photo, scene: FlightScene, r
         return
     corners = vertex + shape.corners @ turned.T
     middle = vertex + shape.center @ turned.T
-    seen = photo.pixels(camera, corners)
+    pixels = photo.pixels(camera, corners)
     width, height = camera.size
-    inside = np.isfinite(seen).all()
+    inside = np.isfinite(pixels).all()
     if (
         not inside
-        or (seen.max(axis=(0, 1)) < 0).any()
-        or (seen.min((0, 1)) > [width, height]).any()
+        or (pixels.max(axis=(0, 1)) < 0).any()
+        or (pixels.min((0, 1)) > [width, height]).any()
     ):
         return
-    way = normalize(photo.position - middle)
+    ray = normalize(photo.position - middle)
     normals = shape.axes[:, 2] @ turned.T
-    back = 2.0 * np.sum(way * normals, axis=-1, keepdims=True) * normals - way
+    back = 2.0 * np.sum(ray * normals, axis=-1, keepdims=True) * normals - ray
     light = sky_light(back, scene.conditions)
-    for outline, bright in zip(seen, light, strict=True):
+    for outline, bright in zip(pixels, light, strict=True):
         _cover(image, outline, bright * np.asarray(SKY_TINT), 1.0)
 
 
@@ -299,16 +299,16 @@ def _spot(
     row, facet = int(lamp.heliostat[k]), lamp.facet[k : k + 1]
     point = scene.shapes[row].point_at(facet, lamp.xy[k : k + 1])[0]
     place = scene.stand.vertex[row] + scene.stand.rotation[row] @ point
-    seen = photo.pixels(camera, place)
+    pixel = photo.pixels(camera, place)
     width, height = camera.size
-    if not np.isfinite(seen).all():
+    if not np.isfinite(pixel).all():
         return
     distance = float(np.linalg.norm(place - photo.position))
     # Below a third of a pixel the width no longer matters.
     sigma = max(scene.conditions.led_spread * camera.focal / distance, 0.3)
     reach = math.ceil(4.0 * sigma) + 1
-    x, y = (np.arange(round(c) - reach, round(c) + reach + 1) for c in seen.tolist())
-    spread = [_bell(axis, c, sigma) for axis, c in zip((x, y), seen, strict=True)]
+    x, y = (np.arange(round(c) - reach, round(c) + reach + 1) for c in pixel.tolist())
+    spread = [_bell(axis, c, sigma) for axis, c in zip((x, y), pixel, strict=True)]
     light = scene.conditions.led * (100.0 / distance) ** 2 * np.outer(spread[1], spread[0])
     keep_x, keep_y = (x >= 0) & (x < width), (y >= 0) & (y < height)
     if not (keep_x.any() and keep_y.any()):

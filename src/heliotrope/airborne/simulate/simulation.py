@@ -232,24 +232,24 @@ def fly(
     flight
         Number of this flight among several: its photographs have errors of their own.
     """
-    wrong = errors or Errors()
+    applied = errors or Errors()
     rng = np.random.default_rng(seed)
     if installed is None:
-        really = _installed(heliostats, wrong, rng)
-        shapes = tuple(_shape(heliostats, r, focal, wrong, rng) for r in range(len(heliostats)))
+        really = _installed(heliostats, applied, rng)
+        shapes = tuple(_shape(heliostats, r, focal, applied, rng) for r in range(len(heliostats)))
     else:
         really, shapes = installed.heliostats, installed.shapes
         rng = np.random.default_rng([seed, flight])
     places = as_vectors(positions, "positions").reshape(-1, 3)
     times = [start + timedelta(seconds=k * interval) for k in range(len(places))]
     pairs = [
-        _photograph(f"DJI_{k + 1:04d}.JPG", time, place, as_float(focus), wrong, rng)
+        _photograph(f"DJI_{k + 1:04d}.JPG", time, place, as_float(focus), applied, rng)
         for k, (time, place) in enumerate(zip(times, places, strict=True))
     ]
     # Drawn last, so that a flight without these errors is the same as before they were thought of.
     stand = standing(really, counts)
-    if wrong.kinematics > 0.0:
-        off = wrong.kinematics * rng.normal(0.0, 1.0, stand.vertex.shape)
+    if applied.kinematics > 0.0:
+        off = applied.kinematics * rng.normal(0.0, 1.0, stand.vertex.shape)
         stand = replace(stand, vertex=stand.vertex + off)
     own = np.random.default_rng([seed, 1])
     return Flight(
@@ -260,8 +260,8 @@ def fly(
         shapes,
         tuple(p[0] for p in pairs),
         tuple(p[1] for p in pairs),
-        miscalibrated(camera, wrong.lens),
-        tuple(_measured_map(shape, wrong, own) for shape in shapes),
+        miscalibrated(camera, applied.lens),
+        tuple(_measured_map(shape, applied, own) for shape in shapes),
     )
 
 
@@ -273,12 +273,14 @@ def miscalibrated(camera: LedCamera, lens: float) -> LedCamera:
     return replace(camera, distortion=distortion)
 
 
-def _measured_map(shape: MirrorShape, wrong: Errors, rng: np.random.Generator) -> FloatArray | None:
+def _measured_map(
+    shape: MirrorShape, errors: Errors, rng: np.random.Generator
+) -> FloatArray | None:
     """Return the slope map that deflectometry would find."""
-    if shape.slope is None or wrong.map_error <= 0.0:
+    if shape.slope is None or errors.map_error <= 0.0:
         return shape.slope
     off = smooth_slopes(
-        shape, rng, wrong.map_error, length=wrong.slope_length, cells=shape.slope.shape[1]
+        shape, rng, errors.map_error, length=errors.slope_length, cells=shape.slope.shape[1]
     )
     return as_float(shape.slope + off)
 
@@ -314,29 +316,29 @@ def _shape(
     heliostats: Heliostats,
     row: int,
     focal: npt.ArrayLike,
-    wrong: Errors,
+    errors: Errors,
     rng: np.random.Generator,
 ) -> MirrorShape:
     shape = ideal(heliostats, row, focal)
-    if wrong.slope <= 0.0 and wrong.canting <= 0.0:
+    if errors.slope <= 0.0 and errors.canting <= 0.0:
         return shape
     slope = np.zeros((len(shape), 2, 2, 2))
-    if wrong.slope > 0.0:
-        slope = smooth_slopes(shape, rng, wrong.slope, length=wrong.slope_length)
-    if wrong.canting > 0.0:
+    if errors.slope > 0.0:
+        slope = smooth_slopes(shape, rng, errors.slope, length=errors.slope_length)
+    if errors.canting > 0.0:
         # As a slope of the whole facet, so that a map shows it like deflectometry does.
-        turn = wrong.canting * rng.normal(0.0, 1.0, (len(shape), 2))
+        turn = errors.canting * rng.normal(0.0, 1.0, (len(shape), 2))
         area = np.prod(shape.half_size, axis=-1)
         slope = slope + (turn - (area / area.sum()) @ turn)[:, None, None, :]
     return shape.with_slopes(slope)
 
 
-def _installed(heliostats: Heliostats, wrong: Errors, rng: np.random.Generator) -> Heliostats:
+def _installed(heliostats: Heliostats, errors: Errors, rng: np.random.Generator) -> Heliostats:
     """Return the truth about the heliostats."""
     count = len(heliostats)
-    sizes = {f"position_{axis}": wrong.survey for axis in ("east", "north", "up")}
+    sizes = {f"position_{axis}": errors.survey for axis in ("east", "north", "up")}
     moved = dict(heliostats.parameters)
-    for name, sigma in {**sizes, **wrong.mechanism}.items():
+    for name, sigma in {**sizes, **errors.mechanism}.items():
         moved[name] = moved.get(name, 0.0) + sigma * rng.normal(0.0, 1.0, count)
     return heliostats.with_parameters(moved)
 
@@ -346,20 +348,20 @@ def _photograph(
     time: datetime,
     place: FloatArray,
     focus: FloatArray,
-    wrong: Errors,
+    errors: Errors,
     rng: np.random.Generator,
 ) -> tuple[Photo, Photo]:
     """Return a photograph with its true orientation, and as the drone records it."""
-    if wrong.hover > 0.0:
-        place = place + wrong.hover * rng.normal(0.0, 1.0, 3)
+    if errors.hover > 0.0:
+        place = place + errors.hover * rng.normal(0.0, 1.0, 3)
     # The drone steers by its own RTK, so it records the position that it was sent to.
-    true = place - np.asarray(wrong.rtk_offset) + rng.normal(0.0, 1.0, 3) * wrong.rtk
-    wanted = look_at(place, focus)
-    lean = wrong.gimbal * rng.normal(0.0, 1.0, 3)
-    turned = rotation(lean, np.linalg.norm(lean)) @ wanted
+    true = place - np.asarray(errors.rtk_offset) + rng.normal(0.0, 1.0, 3) * errors.rtk
+    attitude = look_at(place, focus)
+    lean = errors.gimbal * rng.normal(0.0, 1.0, 3)
+    turned = rotation(lean, np.linalg.norm(lean)) @ attitude
     return (
         Photo(name, time, true, turned),
-        Photo(name, time, place, wanted, np.maximum(wrong.rtk, 1e-4)),
+        Photo(name, time, place, attitude, np.maximum(errors.rtk, 1e-4)),
     )
 
 
@@ -373,21 +375,21 @@ def exact_reflections(flight: Flight) -> Reflections:
     parts = []
     for row, shape in enumerate(flight.shapes):
         stand = flight.truth
-        seen = reflection_points(shape, stand.rotation[row], stand.vertex[row], camera, led)
-        if len(seen):
+        points = reflection_points(shape, stand.rotation[row], stand.vertex[row], camera, led)
+        if len(points):
             parts.append(
                 reflections(
-                    seen.position,
+                    points.position,
                     row,
-                    seen.facet,
-                    seen.xy,
-                    camera[seen.position],
-                    led[seen.position],
+                    points.facet,
+                    points.xy,
+                    camera[points.position],
+                    led[points.position],
                     1e-9,
                 )
             )
-    found = join(parts)
-    return found.take(np.lexsort((found.heliostat, found.photo)))
+    joined = join(parts)
+    return joined.take(np.lexsort((joined.heliostat, joined.photo)))
 
 
 def reflections_of(
@@ -408,10 +410,10 @@ def reflections_of(
         camera's attitude, which locates the lamp, is known to 0.1 mrad from the images and taken
         as true.
     """
-    wrong = errors or Errors()
+    applied = errors or Errors()
     exact = exact_reflections(flight)
     rng = np.random.default_rng(seed)
-    noisy = exact.xy + wrong.reflection * rng.normal(0.0, 1.0, (len(exact), 2))
+    noisy = exact.xy + applied.reflection * rng.normal(0.0, 1.0, (len(exact), 2))
     recorded = as_float([p.position for p in flight.recorded]).reshape(-1, 3)
     true = as_float([p.position for p in flight.taken]).reshape(-1, 3)
     off = (recorded - true).mean(axis=0) if corrected and len(recorded) else np.zeros(3)
@@ -422,5 +424,5 @@ def reflections_of(
         y=noisy[:, 1],
         camera=camera,
         led=camera + exact.led - exact.camera,
-        sigma=np.full(len(exact), max(wrong.reflection, 1e-6)),
+        sigma=np.full(len(exact), max(applied.reflection, 1e-6)),
     )

@@ -149,20 +149,20 @@ def trial_mirror(shape: MirrorShape, conditions: TrialConditions, seed: int) -> 
     # Roughly where the mirror really points, which a first photograph shows.
     camera = expected_vertex + own @ true.T
     led = camera + c.lamp * right
-    seen = reflection_points(real, true, vertex, camera, led)
+    points = reflection_points(real, true, vertex, camera, led)
     off = c.rtk * rng.standard_normal(camera.shape) + c.budget.rtk * rng.standard_normal(3)
     lamp_off = c.budget.lamp * rng.standard_normal(3)
-    xy = seen.xy + c.reflection * rng.standard_normal(seen.xy.shape)
-    found = reflections(
-        seen.position,
+    xy = points.xy + c.reflection * rng.standard_normal(points.xy.shape)
+    measured = reflections(
+        points.position,
         0,
-        seen.facet,
+        points.facet,
         xy,
-        (camera + off)[seen.position],
-        (led + off + lamp_off)[seen.position],
+        (camera + off)[points.position],
+        (led + off + lamp_off)[points.position],
         max(c.reflection, 1e-6),
     )
-    return TrialMirror(real, true, vertex, expected, expected_vertex, found)
+    return TrialMirror(real, true, vertex, expected, expected_vertex, measured)
 
 
 def trials(

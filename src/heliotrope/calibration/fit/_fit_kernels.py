@@ -151,9 +151,9 @@ def _normal_equations(problem, y, loss, scale, curved, hessian, gradient):
         for p in range(size):
             x, z = jacobian[0, p], jacobian[1, p]
             gradient[p] += weight * (a * x + b * z)
-            one, two = w_aa * x + w_ab * z, w_ab * x + w_bb * z
+            part_a, part_b = w_aa * x + w_ab * z, w_ab * x + w_bb * z
             for q in range(p + 1):
-                hessian[p, q] += one * jacobian[0, q] + two * jacobian[1, q]
+                hessian[p, q] += part_a * jacobian[0, q] + part_b * jacobian[1, q]
     return cost
 
 

@@ -127,8 +127,8 @@ def place_mechanism(base, codes, sigma, y, scratch):
     )
     for p in range(codes.shape[0]):
         _twist(codes, p, sigma[p], driven, pose, twists, places)
-    one = driven[0]
-    first, second, third = _row(screw_axes, one), _row(screw_points, one), (0.0, 0.0, 0.0)
+    primary = driven[0]
+    first, second, third = _row(screw_axes, primary), _row(screw_points, primary), (0.0, 0.0, 0.0)
     fourth = third
     if driven.shape[0] > 1:
         third, fourth = _row(screw_axes, driven[1]), _row(screw_points, driven[1])
@@ -168,15 +168,15 @@ def _twist(codes, p, factor, driven, pose, twists, places):
 @njit(**INLINED)
 def turns(drives, counts, i):
     """Sines and cosines of both joint angles at counts ``i``."""
-    one = drive_angle(load_drive(drives, 0, 0), counts[i, 0])
+    theta_1 = drive_angle(load_drive(drives, 0, 0), counts[i, 0])
     if drives.shape[1] == 1:
-        return math.sin(one), math.cos(one), 0.0, 1.0
-    two = drive_angle(load_drive(drives, 0, 1), counts[i, 1])
-    return math.sin(one), math.cos(one), math.sin(two), math.cos(two)
+        return math.sin(theta_1), math.cos(theta_1), 0.0, 1.0
+    theta_2 = drive_angle(load_drive(drives, 0, 1), counts[i, 1])
+    return math.sin(theta_1), math.cos(theta_1), math.sin(theta_2), math.cos(theta_2)
 
 
 @njit(**INLINED)
-def _way(ends, far, i, m):
+def _direction(ends, far, i, m):
     """Unit vector from m to an end, and 1 / distance (0 for a direction)."""
     end = _row(ends, i)
     if far[i]:
@@ -192,9 +192,9 @@ def _gap_axes(data, i, inverse):
     axes, whiten = data[5], data[6]
     a = (axes[i, 0, 0], axes[i, 0, 1], axes[i, 0, 2])
     b = (axes[i, 1, 0], axes[i, 1, 1], axes[i, 1, 2])
-    one = add(times(inverse * whiten[i, 0, 0], a), times(inverse * whiten[i, 0, 1], b))
-    two = add(times(inverse * whiten[i, 1, 0], a), times(inverse * whiten[i, 1, 1], b))
-    return one, two
+    f_0 = add(times(inverse * whiten[i, 0, 0], a), times(inverse * whiten[i, 0, 1], b))
+    f_1 = add(times(inverse * whiten[i, 1, 0], a), times(inverse * whiten[i, 1, 1], b))
+    return f_0, f_1
 
 
 @njit(**INLINED)
@@ -227,15 +227,15 @@ def sighting_residual(g, drives, data, i, inverse, wrenches):
     t = turns(drives, data[0], i)
     m = place_vertex(g, t)
     n = turned(g, t, (g[15], g[16], g[17]))
-    source, near_source = _way(data[1], data[2], i, m)
-    way, near_way = _way(data[3], data[4], i, m)
-    v = add(source, way)
+    source, near_source = _direction(data[1], data[2], i, m)
+    destination, near_destination = _direction(data[3], data[4], i, m)
+    v = add(source, destination)
     size = 1.0 / math.sqrt(dot(v, v))
     v = times(size, v)
     f_0, f_1 = _gap_axes(data, i, inverse)
     gap = minus(n, v)
-    g_0 = _pull(f_0, v, source, near_source, way, near_way, size)
-    g_1 = _pull(f_1, v, source, near_source, way, near_way, size)
+    g_0 = _pull(f_0, v, source, near_source, destination, near_destination, size)
+    g_1 = _pull(f_1, v, source, near_source, destination, near_destination, size)
     q_0 = minus(cross(n, f_0), cross(m, g_0))
     q_1 = minus(cross(n, f_1), cross(m, g_1))
     _store(wrenches, 0, q_0, g_0, q_1, g_1)

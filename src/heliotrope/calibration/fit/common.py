@@ -122,13 +122,13 @@ def fit_common(
     count, shared = len(mechanism), as_float(common.mean).copy()
     turn = np.zeros((count, 2))
     spread = np.sqrt(np.diagonal(common.covariance))
-    found: dict[str, FloatArray] = {}
+    parameters: dict[str, FloatArray] = {}
     for _ in range(_ROUNDS):
-        fixed = mechanism.with_parameters(found) if found else mechanism
-        seen = _without(sightings, fixed, common, turn, shared)
-        fitted = fit(mechanism, seen, model, priors=priors, loss=loss, adapt_scale=adapt_scale)
-        found = fitted.parameters
-        step = _Step.of(mechanism, seen, fitted, common, turn, shared, robust=loss == "cauchy")
+        fixed = mechanism.with_parameters(parameters) if parameters else mechanism
+        corrected = _without(sightings, fixed, common, turn, shared)
+        fitted = fit(mechanism, corrected, model, priors=priors, loss=loss, adapt_scale=adapt_scale)
+        parameters = fitted.parameters
+        step = _Step.of(mechanism, corrected, fitted, common, turn, shared, robust=loss == "cauchy")
         turn, shared = turn + step.turn, shared + step.shared
         moved = np.abs(step.shared) / np.maximum(spread, 1e-300)
         leaned = np.abs(step.turn) / np.maximum(common.turn_sigma, _NEVER)[:, None]
@@ -144,7 +144,7 @@ def fit_common(
         step.information,
         # The gradients are those at the shared errors before the step.
         np.einsum("nkl,l->nk", step.information, shared - step.shared) + step.push,
-        seen,
+        corrected,
     )
 
 
@@ -163,7 +163,7 @@ class _Step:
     def of(
         cls,
         mechanism: Mechanism,
-        seen: Sightings,
+        sightings: Sightings,
         fitted: FieldFit,
         common: CommonErrors,
         turn: FloatArray,
@@ -171,12 +171,14 @@ class _Step:
         *,
         robust: bool,
     ) -> "_Step":
-        count, row = len(mechanism), seen.heliostat
-        here = mechanism.with_parameters(fitted.parameters)[row]
-        lines = linearise(here, seen, fitted.names)
-        by_turn = np.where(common.turned[:, None, None], derivative_by_turn(here, seen), 0.0)
+        count, row = len(mechanism), sightings.heliostat
+        mechanisms = mechanism.with_parameters(fitted.parameters)[row]
+        lines = linearise(mechanisms, sightings, fitted.names)
+        by_turn = np.where(
+            common.turned[:, None, None], derivative_by_turn(mechanisms, sightings), 0.0
+        )
         own = np.concatenate([lines.jacobian, by_turn], axis=-1)
-        by_shared = derivative_by_shared(here, seen, common.shift)
+        by_shared = derivative_by_shared(mechanisms, sightings, common.shift)
         weight = fitted.scale[row] ** -2.0
         if robust:
             weight = weight / (1.0 + (fitted.lengths / CAUCHY_WIDTH) ** 2)
@@ -219,8 +221,8 @@ def turned_back(flights: Sightings, mechanism: Mechanism, turn: FloatArray) -> S
     mechanism, turn
         Of the N heliostats; the turn about the mirror's x and y axes, rad, (N, 2).
     """
-    here = mechanism[flights.heliostat]
-    axes, vertex = _axes(here, flights.counts), here.pose(flights.counts).vertex
+    mechanisms = mechanism[flights.heliostat]
+    axes, vertex = _axes(mechanisms, flights.counts), mechanisms.pose(flights.counts).vertex
     axis = -np.einsum("mij,mi->mj", axes, turn[flights.heliostat])
     back = rotation(axis, np.linalg.norm(axis, axis=-1))
     ends = (
@@ -234,21 +236,21 @@ def turned_back(flights: Sightings, mechanism: Mechanism, turn: FloatArray) -> S
     return replace(flights, source=source, destination=destination)
 
 
-def derivative_by_turn(mechanism: Mechanism, seen: Sightings) -> FloatArray:
+def derivative_by_turn(mechanism: Mechanism, sightings: Sightings) -> FloatArray:
     """Return derivatives of whitened residuals by the turn that is removed, (M, 2, 2).
 
     Parameters
     ----------
     mechanism
         One for each sighting, batch shape (M,).
-    seen
+    sightings
         M sightings.
     """
-    vertex = mechanism.pose(seen.counts).vertex
-    axes, whiten = whitening(seen, vertex)
-    source, way = ray_directions(seen, vertex)
+    vertex = mechanism.pose(sightings.counts).vertex
+    axes, whiten = whitening(sightings, vertex)
+    source, destination = ray_directions(sightings, vertex)
     # The bisector v turns back by ω × v, and enters the residual with a minus sign.
-    moved = np.cross(_axes(mechanism, seen.counts), normalize(source + way)[:, None])
+    moved = np.cross(_axes(mechanism, sightings.counts), normalize(source + destination)[:, None])
     return as_float(np.einsum("mab,mbk,mik->mai", whiten, axes, moved))
 
 
@@ -261,33 +263,37 @@ def _axes(mechanism: Mechanism, counts: FloatArray) -> FloatArray:
     return np.stack([right, up], axis=1)
 
 
-def derivative_by_shared(mechanism: Mechanism, seen: Sightings, shift: FloatArray) -> FloatArray:
+def derivative_by_shared(
+    mechanism: Mechanism, sightings: Sightings, shift: FloatArray
+) -> FloatArray:
     """Return derivatives of whitened residuals by the shared errors removed, (M, 2, K).
 
     Parameters
     ----------
     mechanism
         One for each sighting, batch shape (M,).
-    seen, shift
+    sightings, shift
         M sightings, and the displacement of their ends by one unit of each error, (M, 3, K).
     """
-    vertex = mechanism.pose(seen.counts).vertex
-    axes, whiten = whitening(seen, vertex)
-    ways = ray_directions(seen, vertex)
-    turned = np.zeros((len(seen), 3, 3))
-    for way, end, far in (
-        (ways[0], seen.source, seen.source_at_infinity),
-        (ways[1], seen.destination, seen.destination_at_infinity),
+    vertex = mechanism.pose(sightings.counts).vertex
+    axes, whiten = whitening(sightings, vertex)
+    directions = ray_directions(sightings, vertex)
+    turned = np.zeros((len(sightings), 3, 3))
+    for direction, end, far in (
+        (directions[0], sightings.source, sightings.source_at_infinity),
+        (directions[1], sightings.destination, sightings.destination_at_infinity),
     ):
         distance = np.where(far, np.inf, np.linalg.norm(end - vertex, axis=-1))
-        turned += (np.eye(3) - way[:, :, None] * way[:, None, :]) / distance[:, None, None]
-    size = np.linalg.norm(ways[0] + ways[1], axis=-1)[:, None, None]
+        turned += (np.eye(3) - direction[:, :, None] * direction[:, None, :]) / distance[
+            :, None, None
+        ]
+    size = np.linalg.norm(directions[0] + directions[1], axis=-1)[:, None, None]
     # The ends move back by shift @ z, and the bisector enters the residual with a minus sign.
     return as_float(whiten @ axes @ (turned / size) @ shift)
 
 
 def _without(
-    seen: Sightings,
+    sightings: Sightings,
     mechanism: Mechanism,
     common: CommonErrors,
     turn: FloatArray,
@@ -296,10 +302,14 @@ def _without(
     """Return sightings without the common errors."""
     moved = common.shift @ shared
     near = replace(
-        seen,
-        source=np.where(seen.source_at_infinity[:, None], seen.source, seen.source - moved),
+        sightings,
+        source=np.where(
+            sightings.source_at_infinity[:, None], sightings.source, sightings.source - moved
+        ),
         destination=np.where(
-            seen.destination_at_infinity[:, None], seen.destination, seen.destination - moved
+            sightings.destination_at_infinity[:, None],
+            sightings.destination,
+            sightings.destination - moved,
         ),
     )
     back = turned_back(near, mechanism, turn)

@@ -190,15 +190,15 @@ class FieldFit(Value, Framed):
     def only(self, row: int) -> "FieldFit":
         """Return the fit of one heliostat with the axis N, (1,)."""
         mine = self.rows == row
-        one = {name: getattr(self, name)[row : row + 1] for name in BY_HELIOSTAT}
+        values = {name: getattr(self, name)[row : row + 1] for name in BY_HELIOSTAT}
         rows = np.zeros(int(mine.sum()), dtype=np.int64)
         names = self.heliostats[row : row + 1]
-        return replace(self, lengths=self.lengths[mine], rows=rows, heliostats=names, **one)
+        return replace(self, lengths=self.lengths[mine], rows=rows, heliostats=names, **values)
 
     def of_one(self, row: int = 0) -> "FieldFit":
         """Return the fit of one heliostat without the axis N."""
-        found = self.only(row)
-        return replace(found, **{name: getattr(found, name)[0] for name in BY_HELIOSTAT})
+        fitted = self.only(row)
+        return replace(fitted, **{name: getattr(fitted, name)[0] for name in BY_HELIOSTAT})
 
 
 #: The arrays of a fit that have the axis N.
@@ -275,10 +275,10 @@ def fit(
         If the model, one of its parameters or the loss is unknown.
     """
     _check_options(loss, max_iterations)
-    given = members(mechanism)
+    field = members(mechanism)
     fitted = _fit(
-        given.mechanism,
-        given.rows_of(sightings),
+        field.mechanism,
+        field.rows_of(sightings),
         model,
         priors or {},
         loss,
@@ -286,8 +286,8 @@ def fit(
         keep,
         max_iterations,
     )
-    fitted = replace(fitted, heliostats=given.names or sightings.names)
-    return fitted.of_one() if given.single else fitted
+    fitted = replace(fitted, heliostats=field.names or sightings.names)
+    return fitted.of_one() if field.single else fitted
 
 
 def _fit(
@@ -402,7 +402,7 @@ def names_of(model: str | Sequence[str], mechanism: Mechanism) -> tuple[str, ...
     return tuple(model)
 
 
-def mask_of(given: npt.ArrayLike | None, rows: int, name: str) -> npt.NDArray[np.bool_]:
+def mask_of(selection: npt.ArrayLike | None, rows: int, name: str) -> npt.NDArray[np.bool_]:
     """Return a mask of M sightings; None takes them all.
 
     Raises
@@ -410,9 +410,9 @@ def mask_of(given: npt.ArrayLike | None, rows: int, name: str) -> npt.NDArray[np
     InputError
         If it has another shape, or holds something else than true and false.
     """
-    if given is None:
+    if selection is None:
         return np.ones(rows, dtype=np.bool_)
-    mask = np.asarray(given)
+    mask = np.asarray(selection)
     if mask.shape != (rows,) or (mask.dtype != np.bool_ and rows):
         raise InputError(
             f"{name}: {mask.dtype} of shape {mask.shape}; give a mask of booleans, ({rows},)"
@@ -421,10 +421,10 @@ def mask_of(given: npt.ArrayLike | None, rows: int, name: str) -> npt.NDArray[np
 
 
 def _priors(
-    mechanism: Mechanism, names: tuple[str, ...], given: Mapping[str, npt.ArrayLike]
+    mechanism: Mechanism, names: tuple[str, ...], priors: Mapping[str, npt.ArrayLike]
 ) -> FloatArray:
-    require("priors", given, Mapping, "standard deviations by name of the parameter")
-    for name in given:
+    require("priors", priors, Mapping, "standard deviations by name of the parameter")
+    for name in priors:
         mechanism.parameter(name)
     for name in names:
         if name.endswith("_worm_ratio"):
@@ -434,7 +434,7 @@ def _priors(
             )
     columns = []
     for name in names:
-        value = as_numbers(given.get(name, mechanism.parameter(name).prior), f"prior of {name}")
+        value = as_numbers(priors.get(name, mechanism.parameter(name).prior), f"prior of {name}")
         if not (np.isfinite(value) & (value > 0)).all():
             raise InputError(f"prior of {name}: {value} must be above 0 and finite")
         if value.shape not in ((), (len(mechanism),)):
@@ -495,8 +495,8 @@ def _far_starts(
     places = [_start_parameters(mechanism, names, d) for d in range(len(mechanism.driven))]
     if len(places) != 2 or any(zero is None for zero, _ in places) or not len(s):
         return begin
-    source, way = ray_directions(s, pose.vertex)
-    miss = angle_between(pose.normal, bisector(source, way))
+    source, destination = ray_directions(s, pose.vertex)
+    miss = angle_between(pose.normal, bisector(source, destination))
     for i in np.unique(s.heliostat[used & (miss > FAR)]):
         part = np.flatnonzero(used & (s.heliostat == i))
         if len(part) < 3 or np.median(miss[part]) < FAR:
@@ -504,7 +504,7 @@ def _far_starts(
         far = s.destination_at_infinity[part, None]
         aim = np.where(far, pose.vertex[part] + 1e6 * s.destination[part], s.destination[part])
         solved = track(mechanism[i].armature, source[part], aim)
-        found = [
+        trials = [
             [
                 _regress(
                     Drive(mechanism.drives.table[i, d]),
@@ -517,9 +517,9 @@ def _far_starts(
             for branch in (0, 1)
         ]
         # Both joints are on the same branch; on the wrong one the zeros are off by half a turn.
-        scores = [sum(f[0] * (1.0 + abs(f[1])) for f in both) for both in found]
+        scores = [sum(f[0] * (1.0 + abs(f[1])) for f in both) for both in trials]
         for (zero, stroke), (_, shift, longer) in zip(
-            places, found[int(np.argmin(scores))], strict=True
+            places, trials[int(np.argmin(scores))], strict=True
         ):
             if zero is not None:
                 begin[i, zero] = shift
@@ -529,7 +529,7 @@ def _far_starts(
 
 
 def _regress(
-    drive: Drive, counts: FloatArray, wanted: FloatArray, jack: bool
+    drive: Drive, counts: FloatArray, angles: FloatArray, jack: bool
 ) -> tuple[float, float, float]:
     """Return (spread of the residuals, shift of the zero, added stroke) of one drive."""
     trials = [0.0]
@@ -548,7 +548,7 @@ def _regress(
     # All lengths at once: one after another they took a third of a search for the model.
     table = np.tile(drive.table, (len(trials), 1, 1))
     table[..., SLOTS["stroke_offset"]] += np.array(trials)[:, None]
-    gaps = wrap_signed(wanted - Drive(table).angles(counts))
+    gaps = wrap_signed(angles - Drive(table).angles(counts))
     # A median of angles is defined once they are cut open opposite to their mean direction.
     centre = np.arctan2(np.sin(gaps).sum(axis=-1), np.cos(gaps).sum(axis=-1))
     rest = wrap_signed(gaps - centre[:, None])
@@ -570,7 +570,7 @@ def _start_parameters(
     joint = mechanism.joints[mechanism.driven[drive]]
 
     def place(*suffixes: str) -> int | None:
-        found = [names.index(f"{joint}_{x}") for x in suffixes if f"{joint}_{x}" in names]
-        return found[0] if found else None
+        rows = [names.index(f"{joint}_{x}") for x in suffixes if f"{joint}_{x}" in names]
+        return rows[0] if rows else None
 
     return place("initial_angle", "bias"), place("stroke_offset")

@@ -42,29 +42,29 @@ def linearise(mechanism: Mechanism, s: Sightings, names: tuple[str, ...]) -> Lin
     names
         P parameters of the table.
     """
-    found = mechanism.jacobian(s.counts, names)
-    n, m = found.pose.normal, found.pose.vertex
+    jacobian = mechanism.jacobian(s.counts, names)
+    n, m = jacobian.pose.normal, jacobian.pose.vertex
     axes, whiten = whitening(s, m)
-    source, way = ray_directions(s, m)
-    total = source + way
+    source, destination = ray_directions(s, m)
+    total = source + destination
     size = np.linalg.norm(total, axis=-1, keepdims=True)
     v = total / size
-    db = np.zeros_like(found.normal)
+    db = np.zeros_like(jacobian.normal)
     for ends, far, unit in (
         (s.source, s.source_at_infinity, source),
-        (s.destination, s.destination_at_infinity, way),
+        (s.destination, s.destination_at_infinity, destination),
     ):
         distance = np.where(far, np.inf, np.linalg.norm(ends - m, axis=-1))[:, None, None]
-        along = np.sum(found.vertex * unit[:, None], axis=-1, keepdims=True)
-        db -= (found.vertex - along * unit[:, None]) / distance
+        along = np.sum(jacobian.vertex * unit[:, None], axis=-1, keepdims=True)
+        db -= (jacobian.vertex - along * unit[:, None]) / distance
     db -= np.sum(db * v[:, None], axis=-1, keepdims=True) * v[:, None]
     db /= size[:, :, None]
     gap = np.einsum("mak,mk->ma", axes, n - v)
-    slope = np.einsum("mak,mpk->map", axes, found.normal - db)
+    slope = np.einsum("mak,mpk->map", axes, jacobian.normal - db)
     return Linearised(
         residual=np.einsum("mab,mb->ma", whiten, gap),
         jacobian=np.einsum("mab,mbp->map", whiten, slope),
-        beam=_beam_map(axes, v, source, way) @ np.linalg.inv(whiten),
+        beam=_beam_map(axes, v, source, destination) @ np.linalg.inv(whiten),
     )
 
 
@@ -83,25 +83,27 @@ def whitening(s: Sightings, vertex: FloatArray) -> tuple[FloatArray, FloatArray]
     Axes (M, 2, 3) across the bisector, and W (M, 2, 2) with W C Wᵀ = 1 for the
     covariance C of the bisector along the axes.
     """
-    source, way = ray_directions(s, vertex)
-    total = source + way
+    source, destination = ray_directions(s, vertex)
+    total = source + destination
     axes = tangent_axes(total / np.linalg.norm(total, axis=-1, keepdims=True))
     whiten = np.linalg.inv(np.linalg.cholesky(bisector_covariance(s, vertex, axes)))
     return axes, whiten
 
 
-def frame(way: FloatArray) -> FloatArray:
+def frame(direction: FloatArray) -> FloatArray:
     """Return unit vectors to the right and up as seen along directions (M, 3), (M, 2, 3)."""
-    right = np.stack([way[:, 1], -way[:, 0], np.zeros(len(way))], axis=-1)
+    right = np.stack([direction[:, 1], -direction[:, 0], np.zeros(len(direction))], axis=-1)
     right /= np.maximum(np.linalg.norm(right, axis=-1, keepdims=True), 1e-12)
-    return np.stack([right, np.cross(right, way)], axis=1)
+    return np.stack([right, np.cross(right, direction)], axis=1)
 
 
-def _beam_map(axes: FloatArray, v: FloatArray, source: FloatArray, way: FloatArray) -> FloatArray:
+def _beam_map(
+    axes: FloatArray, v: FloatArray, source: FloatArray, destination: FloatArray
+) -> FloatArray:
     """Change of the reflected ray by a change of the normal along the tangent axes, (M, 2, 2)."""
     # d(2 (n·s) n − s) = 2 ((dn·s) n + (n·s) dn)
-    seen = frame(way)
+    across = frame(destination)
     along = np.einsum("mak,mk->ma", axes, source)
     cosine = np.sum(v * source, axis=-1)[:, None, None]
-    first = np.einsum("mck,mk->mc", seen, v)[:, :, None] * along[:, None, :]
-    return np.asarray(2.0 * (first + cosine * np.einsum("mck,mak->mca", seen, axes)))
+    first = np.einsum("mck,mk->mc", across, v)[:, :, None] * along[:, None, :]
+    return np.asarray(2.0 * (first + cosine * np.einsum("mck,mak->mca", across, axes)))

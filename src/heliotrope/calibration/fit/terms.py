@@ -169,13 +169,17 @@ class TermFit(Value, Framed):
         counts
             Counts at which ``mechanism`` has the pose, (D,) or (M, D), as `track` gives them.
         """
-        wanted = np.atleast_2d(as_float(counts))
-        row = np.broadcast_to(np.asarray(heliostat, dtype=np.intp), wanted.shape[:-1])
-        here, nominal, values = self.mechanism[row], self.given.mechanism[row], self.values[row]
-        sent = wanted.copy()
+        goal = np.atleast_2d(as_float(counts))
+        row = np.broadcast_to(np.asarray(heliostat, dtype=np.intp), goal.shape[:-1])
+        mechanism, nominal, values = (
+            self.mechanism[row],
+            self.given.mechanism[row],
+            self.values[row],
+        )
+        sent = goal.copy()
         for _ in range(_INVERSION):
             shapes = _shapes(self.terms, nominal, sent)
-            sent = sent + wanted - _moved(here, sent, shapes, self.terms, values)
+            sent = sent + goal - _moved(mechanism, sent, shapes, self.terms, values)
         return sent
 
 
@@ -209,19 +213,19 @@ def fit_terms(
     UnknownNameError
         If a joint is not driven; for the rest see `heliotrope.calibration.fit.estimator.fit`.
     """
-    given = members(mechanism)
-    nominal, recorded = given.mechanism, given.rows_of(sightings)
+    field = members(mechanism)
+    nominal, recorded = field.mechanism, field.rows_of(sightings)
     _check(nominal, terms)
     row, values = recorded.heliostat, np.zeros((len(nominal), len(terms)))
     shapes = _shapes(terms, nominal[row], recorded.counts)
     prior = np.array([term.prior for term in terms])
-    here = nominal
+    moved = nominal
     for _ in range(_ROUNDS):
-        counts = _moved(here[row], recorded.counts, shapes, terms, values[row])
-        seen = replace(recorded, counts=counts, names=())
-        fitted = fit(nominal, seen, model, priors=priors, loss=loss, adapt_scale=adapt_scale)
-        here = nominal.with_parameters(fitted.parameters)
-        step, covariance = _step(here, seen, fitted, terms, shapes, values, loss)
+        counts = _moved(moved[row], recorded.counts, shapes, terms, values[row])
+        corrected = replace(recorded, counts=counts, names=())
+        fitted = fit(nominal, corrected, model, priors=priors, loss=loss, adapt_scale=adapt_scale)
+        moved = nominal.with_parameters(fitted.parameters)
+        step, covariance = _step(moved, corrected, fitted, terms, shapes, values, loss)
         values = values + step
         if (np.abs(step) < _SETTLED * prior).all():
             break
@@ -231,8 +235,8 @@ def fit_terms(
         tuple(terms),
         values,
         covariance[:, p:, p:],
-        here,
-        given,
+        moved,
+        field,
     )
 
 
@@ -290,7 +294,7 @@ def _moved(
 
 def _step(
     mechanism: Mechanism,
-    seen: Sightings,
+    sightings: Sightings,
     fitted: FieldFit,
     terms: Sequence[DriveTerm],
     shapes: FloatArray,
@@ -298,9 +302,9 @@ def _step(
     loss: Loss,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the Gauss-Newton step of the coefficients and the covariance of all unknowns."""
-    count, row, p = len(mechanism), seen.heliostat, len(fitted.names)
+    count, row, p = len(mechanism), sightings.heliostat, len(fitted.names)
     biases = tuple(f"{term.joint}_bias" for term in terms)
-    lines = linearise(mechanism[row], seen, (*fitted.names, *biases))
+    lines = linearise(mechanism[row], sightings, (*fitted.names, *biases))
     slopes = lines.jacobian.copy()
     slopes[..., p:] *= shapes[:, None, :]
     weight = fitted.scale[row] ** -2.0

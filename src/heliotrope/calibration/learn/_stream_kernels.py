@@ -91,9 +91,16 @@ def _compare(mean, covariance, rows, value, noise, far):
 
 
 @njit(**INNER)
-def _condition(mean, covariance, found):
+def _condition(mean, covariance, gap):
     """Update one hypothesis by the sighting that it was compared with, in place."""
-    gain, x, y, a, b, c = found[0], found[1], found[2], found[3], found[4], found[5]
+    gain, x, y, a, b, c = (
+        gap[0],
+        gap[1],
+        gap[2],
+        gap[3],
+        gap[4],
+        gap[5],
+    )
     determinant = a * c - b * b
     p, q, r = c / determinant, -b / determinant, a / determinant
     size = mean.shape[0]
@@ -239,14 +246,14 @@ def update(
                 elif what == RETURN:
                     reset(new_mean[used], new_cov[used], offsets[z], 0.0)
                     new_regime[used] = False
-            found = _compare(new_mean[used], new_cov[used], rows, value, noise, far)
-            _condition(new_mean[used], new_cov[used], found)
-            log_weight[used] = base + prior + found[6]
+            gap = _compare(new_mean[used], new_cov[used], rows, value, noise, far)
+            _condition(new_mean[used], new_cov[used], gap)
+            log_weight[used] = base + prior + gap[6]
             used += 1
             if what == NOTHING and event == UNKNOWN and chance[BLUNDER] > 0.0:
                 _copy(m, p, new_mean[used], new_cov[used])
                 new_regime[used], blunder[used] = regime[k], True
-                log_weight[used] = base + math.log(chance[BLUNDER]) + found[7]
+                log_weight[used] = base + math.log(chance[BLUNDER]) + gap[7]
                 used += 1
     top, mistaken = -np.inf, 0.0
     for k in range(used):

@@ -78,9 +78,9 @@ def default_processes(mechanism: Mechanism) -> tuple[Process, ...]:
     A process over weeks is possible too; on the measurements of Jülich it improves nothing
     beyond the steps.
     """
-    found = [Process(name, "slow") for name in zeros(mechanism)]
+    processes = [Process(name, "slow") for name in zeros(mechanism)]
     normal = [n for n in ("canting", "canting_secondary") if n in mechanism.parameters]
-    return tuple(found + [Process(name, "hours") for name in normal])
+    return tuple(processes + [Process(name, "hours") for name in normal])
 
 
 @dataclass(frozen=True)
@@ -240,8 +240,8 @@ class Linear:
 
     def epoch_at(self, time: FloatArray) -> npt.NDArray[np.int64]:
         """Return the number of steps before times (m,) in days; 0 where it is NaN."""
-        found = np.searchsorted(self.steps, time, side="right")
-        return np.asarray(np.where(np.isfinite(time), found, 0), dtype=np.int64)
+        number = np.searchsorted(self.steps, time, side="right")
+        return np.asarray(np.where(np.isfinite(time), number, 0), dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -281,7 +281,7 @@ class Linear:
 def _gram(hyper: Hyperparameters, a: Linear, b: Linear | None = None) -> FloatArray:
     other = a if b is None else b
     tau = hyper.tau[hyper.group]
-    found: FloatArray = kernels.gram(
+    gram: FloatArray = kernels.gram(
         a.jacobian,
         a.time,
         a.regime,
@@ -298,7 +298,7 @@ def _gram(hyper: Hyperparameters, a: Linear, b: Linear | None = None) -> FloatAr
         hyper.amplitude,
         tau,
     )
-    return found
+    return gram
 
 
 def covariance(hyper: Hyperparameters, data: Linear) -> FloatArray:
@@ -337,8 +337,8 @@ def typical(
     rows = [d for d in field if len(d)]
     if len(rows) < 4:
         return rows
-    each = [-posterior(hyper, d).log_evidence() / len(d) for d in rows]
-    best = np.argsort(each, kind="stable")[: int(np.ceil(share * len(rows)))]
+    losses = [-posterior(hyper, d).log_evidence() / len(d) for d in rows]
+    best = np.argsort(losses, kind="stable")[: int(np.ceil(share * len(rows)))]
     return [rows[k] for k in sorted(best)]
 
 
@@ -409,13 +409,13 @@ def _search(
 
     bounds = [(c - 4.0 * s, c + 4.0 * s) for c, s in zip(centre, spread, strict=True)]
     begin = np.clip(hyper.vector, centre - 4.0 * spread, centre + 4.0 * spread)
-    found = minimize(
+    solution = minimize(
         cost, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations}
     )
-    return hyper.with_vector(found.x), float(found.fun)
+    return hyper.with_vector(solution.x), float(solution.fun)
 
 
-def _no_less_than_nothing(found: FloatArray, before: FloatArray) -> FloatArray:
+def _no_less_than_nothing(covariances: FloatArray, before: FloatArray) -> FloatArray:
     """Covariances (m, P, P) without negative eigenvalues from rounding.
 
     Directions that the data determine almost exactly are differences of nearly equal numbers. In
@@ -424,7 +424,7 @@ def _no_less_than_nothing(found: FloatArray, before: FloatArray) -> FloatArray:
     """
     scale = np.sqrt(before)
     both = scale[:, :, None] * scale[:, None, :]
-    ratio = np.divide(found, both, out=np.zeros_like(found), where=both > 0)
+    ratio = np.divide(covariances, both, out=np.zeros_like(covariances), where=both > 0)
     values, vectors = np.linalg.eigh(0.5 * (ratio + np.swapaxes(ratio, -1, -2)))
     better = (vectors * np.maximum(values, 1e-12)[:, None, :]) @ np.swapaxes(vectors, -1, -2)
     return np.asarray(both * better)
@@ -480,10 +480,10 @@ class Posterior:
         # Covariance of each parameter with each component of each sighting, (m, P, 2 n).
         cross = np.einsum("mnp,nap->mpna", share, data.jacobian).reshape(m, size, 2 * len(data))
         values = base + cross @ self.alpha
-        found = -(cross @ self.inverse) @ np.swapaxes(cross, -1, -2)
+        covariances = -(cross @ self.inverse) @ np.swapaxes(cross, -1, -2)
         diagonal = np.arange(size)
-        found[:, diagonal, diagonal] += own
-        return values, _no_less_than_nothing(found, own)
+        covariances[:, diagonal, diagonal] += own
+        return values, _no_less_than_nothing(covariances, own)
 
     def left_out(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return z² (n,), error (n, 2), covariance (n, 2, 2) of each as the others predict it."""

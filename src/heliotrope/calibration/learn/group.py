@@ -62,7 +62,7 @@ class GroupTask:
 
 @dataclass(frozen=True)
 class LearntGroup:
-    """What was learnt of a group.
+    """The hyperparameters of a group.
 
     Attributes
     ----------
@@ -87,17 +87,17 @@ def defaults(mechanism: Mechanism, model: tuple[str, ...]) -> Hyperparameters:
 
 
 def able(histories: Sequence[Sightings | None]) -> npt.NDArray[np.intp]:
-    """Return which mirrors can teach: enough sightings, on two days or more."""
-    found = []
-    for row, seen in enumerate(histories):
-        known = np.zeros(0) if seen is None else seen.time[np.isfinite(seen.time)]
+    """Return the rows of mirrors with enough sightings to teach, on two days or more."""
+    rows = []
+    for row, sightings in enumerate(histories):
+        known = np.zeros(0) if sightings is None else sightings.time[np.isfinite(sightings.time)]
         if len(known) >= learning.FEWEST and np.ptp(known) >= DAY:
-            found.append(row)
-    return np.array(found, dtype=np.intp)
+            rows.append(row)
+    return np.array(rows, dtype=np.intp)
 
 
 def gathered(group: GroupHistory) -> GroupTask:
-    """Return what a group is learnt from.
+    """Return the task of learning a group.
 
     Raises
     ------
@@ -114,38 +114,38 @@ def gathered(group: GroupHistory) -> GroupTask:
         rows = rows[np.linspace(0, len(rows) - 1, learning.SAMPLE).round().astype(np.intp)]
     parts = []
     for place, row in enumerate(rows):
-        seen = thinned(cast("Sightings", group.sightings[row]))
-        parts.append(seen.renumbered(np.full(len(seen), place)))
+        sightings = thinned(cast("Sightings", group.sightings[row]))
+        parts.append(sightings.renumbered(np.full(len(sightings), place)))
     return GroupTask(group.mechanism[rows], join(parts), group.model, group.before)
 
 
-def thinned(seen: Sightings, most: int = MOST) -> Sightings:
+def thinned(sightings: Sightings, most: int = MOST) -> Sightings:
     """Return some of a mirror's sightings in order of time: whole visits, the last one among them.
 
     Visits are kept whole, for what moves within hours, and spread over the years, for what moves
     within months.
     """
-    order = np.flatnonzero(np.isfinite(seen.time))
-    seen = seen.take(order[np.argsort(seen.time[order], kind="stable")])
-    if len(seen) <= most:
-        return seen
-    visit = np.concatenate([[0], np.cumsum(np.diff(seen.time) > APART)])
+    order = np.flatnonzero(np.isfinite(sightings.time))
+    sightings = sightings.take(order[np.argsort(sightings.time[order], kind="stable")])
+    if len(sightings) <= most:
+        return sightings
+    visit = np.concatenate([[0], np.cumsum(np.diff(sightings.time) > APART)])
     count = int(visit[-1]) + 1
-    share = max(1, int(most * count / len(seen)))
+    share = max(1, int(most * count / len(sightings)))
     kept = np.linspace(count - 1, 0, share).round().astype(np.intp)
-    return seen.take(np.flatnonzero(np.isin(visit, kept))[-most:])
+    return sightings.take(np.flatnonzero(np.isin(visit, kept))[-most:])
 
 
 def learn_group(task: GroupTask) -> LearntGroup:
-    """Return what a group's sightings teach, beside what was in force."""
+    """Return the hyperparameters of a group from its sightings, and their gain."""
     every = np.ones(len(task.sightings), np.bool_)
     with threadpool_limits(1, "blas"):
         hyper = learning.field_of(
             task.mechanism, task.sightings, every, learning.Task(task.model, {})
         )
         fitted = fit(task.mechanism, task.sightings, task.model)
-        told = [density(task, fitted, each) for each in (task.before, hyper)]
-    gain = (told[1] - told[0]) / len(task.sightings)
+        densities = [density(task, fitted, choice) for choice in (task.before, hyper)]
+    gain = (densities[1] - densities[0]) / len(task.sightings)
     return LearntGroup(hyper, len(task.mechanism), len(task.sightings), gain)
 
 
@@ -154,10 +154,10 @@ def density(task: GroupTask, fitted: FieldFit, hyper: Hyperparameters) -> float:
     total = 0.0
     for row in range(len(task.mechanism)):
         if int(fitted.outcome[row]) == FitOutcome.CONVERGED:
-            one, seen = fitted.only(row), task.sightings.of(row)
+            single, sightings = fitted.only(row), task.sightings.of(row)
             mechanism = task.mechanism[row : row + 1]
-            own = present.hyper_of(mechanism, one, hyper)
-            total += present.replayed(mechanism, seen, one, own).density
+            own = present.hyper_of(mechanism, single, hyper)
+            total += present.replayed(mechanism, sightings, single, own).density
     return total
 
 
@@ -205,19 +205,19 @@ def read_hyperparameters(document: dict[str, Any]) -> Hyperparameters:
     try:
         arrays: dict[str, Any] = {n: np.array(document[n], dtype=np.float64) for n in _ARRAYS}
         numbers: dict[str, Any] = {n: float(document[n]) for n in ("noise", "rate", "heavy")}
-        found = Hyperparameters(
+        hyper = Hyperparameters(
             names=tuple(document["names"]),
             processes=tuple(Process(*pair) for pair in document["processes"]),
             **arrays,
             **numbers,
         )
-        count = len(found.names)
-        sizes = [getattr(found, name).shape == (count,) for name in _ARRAYS[:5]]
-        sizes += [found.amplitude.shape == (len(found.processes),)]
-        sizes += [found.tau.shape == (len(found.groups),), len(found.part) == len(found.processes)]
+        count = len(hyper.names)
+        sizes = [getattr(hyper, name).shape == (count,) for name in _ARRAYS[:5]]
+        sizes += [hyper.amplitude.shape == (len(hyper.processes),)]
+        sizes += [hyper.tau.shape == (len(hyper.groups),), len(hyper.part) == len(hyper.processes)]
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"hyperparameters: {error!r}; learn the group again") from error
     figures = np.concatenate([*arrays.values(), list(numbers.values())])
-    if not (all(sizes) and np.isfinite(figures).all() and found.noise > 0.0):
+    if not (all(sizes) and np.isfinite(figures).all() and hyper.noise > 0.0):
         raise InputError("hyperparameters: shapes or figures do not fit; learn the group again")
-    return found
+    return hyper

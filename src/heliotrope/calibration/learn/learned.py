@@ -1,4 +1,4 @@
-"""What was learnt of a field, and what it predicts: parameters at any time, beams, forecasts."""
+"""The learned model of a field and its predictions: parameters at any time, beams, forecasts."""
 
 from dataclasses import dataclass, replace
 
@@ -199,9 +199,9 @@ class Learned(Value, Framed):
 
     def _card(self) -> Card:
         model, all_names = len(self.model), len(self.names)
-        seen = amount(int(self.used.sum()), "sighting")
+        count = amount(int(self.used.sum()), "sighting")
         parts = [
-            f"{amount(len(self.members), 'heliostat')} from {seen}",
+            f"{amount(len(self.members), 'heliostat')} from {count}",
             amount(int(self.outlier.sum()), "outlier"),
             f"{self.unusable.sum()} unusable",
             amount(model, "constant parameter"),
@@ -237,7 +237,7 @@ class Learned(Value, Framed):
         site
             Place, if it was learnt from mechanisms alone.
         steered
-            The mechanism by which the heliostat is steered, batch shape (); default: as learnt, at
+            The mechanism that steers the heliostat, batch shape (); default: as learned, at
             the time of its last sighting used. With the nominal one the error is that before
             calibration.
         sigma
@@ -307,10 +307,10 @@ class Learned(Value, Framed):
             Something that is not a time, or has no time zone.
         """
         rows = np.asarray(heliostat, dtype=np.intp)
-        wrong = (rows < 0) | (rows >= len(self.members))
-        if wrong.any():
+        invalid = (rows < 0) | (rows >= len(self.members))
+        if invalid.any():
             raise InputError(
-                f"heliostat: row {rows[wrong].flat[0]} is not learnt; rows go from 0 to "
+                f"heliostat: row {rows[invalid].flat[0]} is not learnt; rows go from 0 to "
                 f"{len(self.members) - 1}"
             )
         when = np.broadcast_to(unix_seconds(time, unknown=True), rows.shape)
@@ -318,8 +318,8 @@ class Learned(Value, Framed):
         values, spread = np.empty((len(rows), size)), np.empty((len(rows), size, size))
         with threadpool_limits(1, "blas"):
             order = np.argsort(rows, kind="stable")
-            each, first = np.unique(rows[order], return_index=True)
-            for i, part in zip(each, np.split(order, first)[1:], strict=True):
+            heliostats, first = np.unique(rows[order], return_index=True)
+            for i, part in zip(heliostats, np.split(order, first)[1:], strict=True):
                 # In parts, because memory grows with sightings × times × parameters.
                 for some in np.array_split(part, 1 + len(part) // 500):
                     label = self.regimes(int(i), when[some])
@@ -365,7 +365,7 @@ def predict_with(
     rows = sightings.heliostat
     moved = moved_by(learned.mechanism, rows, learned.names, values)
     alone = sightings.renumbered(np.arange(len(rows)))
-    found = beam_errors(moved, alone)
+    errors = beam_errors(moved, alone)
     line = linearise(moved, sightings, learned.names)
     noise = np.array([m.hyper.noise**2 * m.hyper.heavy for m in learned.members])[rows]
     usable = is_usable(line)
@@ -374,8 +374,8 @@ def predict_with(
     white += noise[:, None, None] * np.eye(2)
     covariance = line.beam @ white @ np.swapaxes(line.beam, -1, -2)
     covariance[~usable] = np.nan
-    inside = squared_distance(found.offset, covariance) <= CHI_SQUARE_90
-    return Prediction(found, found.offset, covariance, inside, line.beam, values, usable)
+    inside = squared_distance(errors.offset, covariance) <= CHI_SQUARE_90
+    return Prediction(errors, errors.offset, covariance, inside, line.beam, values, usable)
 
 
 def squared_distance(error: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -403,12 +403,12 @@ def left_out_errors(learned: Learned) -> FloatArray:
     sightings that were not used are predicted from all that were.
     """
     known = predict(learned, learned.sightings)
-    found = known.plane.copy()
+    errors = known.plane.copy()
     for i, member in enumerate(learned.members):
         part = learned.rows[i][~learned.outlier[learned.rows[i]]]
         if len(part):
-            found[part] = -np.einsum("mab,mb->ma", known.beam[part], member.left_out()[1])
-    return found
+            errors[part] = -np.einsum("mab,mb->ma", known.beam[part], member.left_out()[1])
+    return errors
 
 
 def _forecast(
@@ -433,16 +433,16 @@ def _forecast(
     light, aim = solar.vector(when, place), point_of(target, learned.around.targets)
     mine = learned.sightings.heliostat == row
     if steered is None:
-        seen = learned.sightings.time[mine & learned.used]
-        last = float(np.nanmax(seen)) if np.isfinite(seen).any() else np.nan
+        dated = learned.sightings.time[mine & learned.used]
+        last = float(np.nanmax(dated)) if np.isfinite(dated).any() else np.nan
         steered = learned.mechanism_at([row], last)[0]
-    found = track(steered, light, aim)
-    good = np.asarray(found.reachable & (light[:, 2] > 0.0))
+    tracking = track(steered, light, aim)
+    good = np.asarray(tracking.reachable & (light[:, 2] > 0.0))
     if sigma is None:
         sigma = float(np.median(learned.sightings.sigma[mine])) if mine.any() else USUAL_SIGMA
     made = make_sightings(
         np.full(int(good.sum()), row),
-        found.best_counts[good].reshape(-1, found.counts.shape[-1]),
+        tracking.best_counts[good].reshape(-1, tracking.counts.shape[-1]),
         light[good],
         aim,
         time=when[good],

@@ -142,8 +142,8 @@ def _without_unusable(prepared: Prepared, usable: npt.NDArray[np.bool_]) -> Prep
     if usable.all():
         return prepared
     regime, unusable = prepared.regime.copy(), prepared.unusable.copy()
-    gone = np.concatenate(prepared.rows)[~usable]
-    regime[gone], unusable[gone] = -1, True
+    removed = np.concatenate(prepared.rows)[~usable]
+    regime[removed], unusable[removed] = -1, True
     cuts = np.cumsum([len(d) for d in prepared.field])[:-1]
     parts = np.split(usable, cuts)
     return Prepared(
@@ -173,8 +173,8 @@ def relinearise(
     most = np.array([mechanism.most(name) for name in names])
     lost = (np.abs(values) > most).any(axis=1)
     values[lost] = 0.0
-    seen = sightings.take(rows)
-    line = linearise(moved_by(mechanism, seen.heliostat, names, values), seen, names)
+    observed = sightings.take(rows)
+    line = linearise(moved_by(mechanism, observed.heliostat, names, values), observed, names)
     offsets = np.concatenate([[0], np.cumsum([len(d) for d in prepared.field])])
     field = []
     for k, d in enumerate(prepared.field):
@@ -238,8 +238,8 @@ def learn_field(
         members = [drift.posterior(hyper, d) for d in clean]
         hyper = drift.fit_population(hyper, table, members)
     final = [finish(hyper, d)[0] for d in everything]
-    gone = sum(len(d) for d in everything) - sum(len(m.data) for m in final)
-    return replace(hyper, rate=drift.step_rate(final), heavy=drift.heavy_tails(final, gone))
+    removed = sum(len(d) for d in everything) - sum(len(m.data) for m in final)
+    return replace(hyper, rate=drift.step_rate(final), heavy=drift.heavy_tails(final, removed))
 
 
 def _without_outliers(hyper: Hyperparameters, data: Linear) -> Linear:
@@ -320,8 +320,8 @@ def learn(
     InputError
         As for `heliotrope.calibration.fit.fit`.
     """
-    given = members(mechanism)
-    nominal, sightings = given.mechanism, given.rows_of(sightings)
+    field = members(mechanism)
+    nominal, sightings = field.mechanism, field.rows_of(sightings)
     constant = names_of(model, nominal)
     keep = mask_of(used, len(sightings), "used")
     if misfits is None:
@@ -339,7 +339,7 @@ def learn(
         pieces = np.array_split(whole, max(1, -(-len(whole) // chunk)))
         cut = [_cut(nominal, sightings, keep, task, piece) for piece in pieces]
         parts = runner([(*c[:4], hyper) for c in cut], progress)
-    return _join(given, sightings, keep, constant, hyper, misfits, pieces, parts)
+    return _join(field, sightings, keep, constant, hyper, misfits, pieces, parts)
 
 
 @dataclass(frozen=True)
@@ -416,7 +416,7 @@ def _cut(
 
 
 def _join(
-    given: Members,
+    field: Members,
     sightings: Sightings,
     used: npt.NDArray[np.bool_],
     model: tuple[str, ...],
@@ -437,7 +437,7 @@ def _join(
         lengths[mine] = part.prepared.static.lengths
         rows += [mine[r] for r in part.prepared.rows]
     fits = [part.prepared.static for part in parts]
-    names = given.names or sightings.names
+    names = field.names or sightings.names
     static = FieldFit(
         names=model,
         lengths=lengths,
@@ -449,7 +449,7 @@ def _join(
         static.outcome[misfit.row] = misfit.outcome
     members = tuple(m for part in parts for m in part.members)
     return Learned(
-        given.mechanism,
+        field.mechanism,
         sightings,
         model,
         used,
@@ -461,7 +461,7 @@ def _join(
         unusable,
         tuple(rows),
         names,
-        given.around,
+        field.around,
         misfits,
     )
 
@@ -490,10 +490,10 @@ def field_of(
 
 
 def _prior_row(
-    model: tuple[str, ...], mechanism: Mechanism, given: Mapping[str, npt.ArrayLike] | None
+    model: tuple[str, ...], mechanism: Mechanism, priors: Mapping[str, npt.ArrayLike] | None
 ) -> FloatArray:
     """One standard deviation for each parameter: the median where heliostats have their own."""
-    table = [as_float((given or {}).get(n, mechanism.parameter(n).prior)) for n in model]
+    table = [as_float((priors or {}).get(n, mechanism.parameter(n).prior)) for n in model]
     return np.array([np.median(t) for t in table], dtype=np.float64)
 
 
@@ -503,8 +503,8 @@ def _finish_all(
     outlier = np.zeros(rows, dtype=np.bool_)
     members = []
     with ThreadPoolExecutor(threads(), thread_name_prefix="heliotrope-learn") as pool:
-        found = pool.map(lambda data: finish(hyper, data, own), prepared.field)
-        for k, (member, mine) in enumerate(found):
+        results = pool.map(lambda data: finish(hyper, data, own), prepared.field)
+        for k, (member, mine) in enumerate(results):
             members.append(member)
             outlier[prepared.rows[k]] = mine
             if progress:

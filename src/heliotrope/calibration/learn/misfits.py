@@ -80,20 +80,20 @@ def find_misfits(
     used
         Mask of the sightings to judge by, (M,).
     """
-    given = sightings if used is None else sightings.take(used)
+    chosen = sightings if used is None else sightings.take(used)
     names = parameter_table.model("full", mechanism.parameters)
-    usable = is_usable(linearise(mechanism[given.heliostat], given, names))
-    seen = given.take(usable)
-    unmoved = tuple(_unmoved(mechanism, seen))
-    moved = seen.take(~np.isin(seen.heliostat, [misfit.row for misfit in unmoved]))
+    usable = is_usable(linearise(mechanism[chosen.heliostat], chosen, names))
+    reachable = chosen.take(usable)
+    unmoved = tuple(_unmoved(mechanism, reachable))
+    moved = reachable.take(~np.isin(reachable.heliostat, [misfit.row for misfit in unmoved]))
     fitted = fit(mechanism, moved, names, adapt_scale=False)
     error = _median_errors(mechanism, moved, fitted)
-    found = list(unmoved)
+    misfits = list(unmoved)
     # Counts beyond the reach of its drives are named as such, unless a mistake explains them.
-    for row in np.setdiff1d(given.heliostat, seen.heliostat):
-        reason = _mistake(mechanism, given.take(given.heliostat == row), int(row), names)
+    for row in np.setdiff1d(chosen.heliostat, reachable.heliostat):
+        reason = _mistake(mechanism, chosen.take(chosen.heliostat == row), int(row), names)
         if reason is not None:
-            found.append(Misfit(int(row), FitOutcome.MISFIT, reason))
+            misfits.append(Misfit(int(row), FitOutcome.MISFIT, reason))
     for row in np.flatnonzero(fitted.count):
         outcome = FitOutcome(int(fitted.outcome[row]))
         strain = float(((fitted.values[row] / fitted.prior[row]) ** 2).sum())
@@ -103,13 +103,13 @@ def find_misfits(
             and error[row] < ELSEWHERE
         ):
             continue
-        one = moved.take(moved.heliostat == row)
-        reason = _mistake(mechanism, one, int(row), names)
+        own = moved.take(moved.heliostat == row)
+        reason = _mistake(mechanism, own, int(row), names)
         if reason is None:
-            reason = _hopeless(mechanism, one, outcome, strain, float(error[row]))
+            reason = _hopeless(mechanism, own, outcome, strain, float(error[row]))
         if reason is not None:
-            found.append(Misfit(int(row), FitOutcome.MISFIT, reason))
-    return tuple(sorted(found, key=lambda misfit: misfit.row))
+            misfits.append(Misfit(int(row), FitOutcome.MISFIT, reason))
+    return tuple(sorted(misfits, key=lambda misfit: misfit.row))
 
 
 def costs(fitted: FieldFit, mechanism: Mechanism) -> FloatArray:
@@ -123,12 +123,12 @@ def costs(fitted: FieldFit, mechanism: Mechanism) -> FloatArray:
     return np.asarray(np.where(broken & (fitted.count > 0), np.inf, cost))
 
 
-def _unmoved(mechanism: Mechanism, seen: Sightings) -> Iterator[Misfit]:
-    pose = mechanism[seen.heliostat].pose(seen.counts)
-    wanted = bisector(*ray_directions(seen, pose.vertex))
-    for row in np.unique(seen.heliostat):
-        mine = np.flatnonzero(seen.heliostat == row)
-        if _span(pose.normal[mine]) < STILL and _span(wanted[mine]) > TURNED:
+def _unmoved(mechanism: Mechanism, sightings: Sightings) -> Iterator[Misfit]:
+    pose = mechanism[sightings.heliostat].pose(sightings.counts)
+    bisectors = bisector(*ray_directions(sightings, pose.vertex))
+    for row in np.unique(sightings.heliostat):
+        mine = np.flatnonzero(sightings.heliostat == row)
+        if _span(pose.normal[mine]) < STILL and _span(bisectors[mine]) > TURNED:
             yield Misfit(
                 int(row),
                 FitOutcome.UNMOVED,
@@ -142,60 +142,64 @@ def _span(directions: FloatArray) -> float:
     return float(angle_between(directions, directions[:1]).max(initial=0.0))
 
 
-def _median_errors(mechanism: Mechanism, seen: Sightings, fitted: FieldFit) -> FloatArray:
-    beam = beam_errors(mechanism.with_parameters(fitted.parameters), seen).beam
-    found = np.zeros(len(mechanism))
+def _median_errors(mechanism: Mechanism, sightings: Sightings, fitted: FieldFit) -> FloatArray:
+    beam = beam_errors(mechanism.with_parameters(fitted.parameters), sightings).beam
+    errors = np.zeros(len(mechanism))
     for row in np.flatnonzero(fitted.count):
-        found[row] = np.median(beam[seen.heliostat == row])
-    return found
+        errors[row] = np.median(beam[sightings.heliostat == row])
+    return errors
 
 
 def _hopeless(
-    mechanism: Mechanism, one: Sightings, outcome: FitOutcome, strain: float, error: float
+    mechanism: Mechanism, sightings: Sightings, outcome: FitOutcome, strain: float, error: float
 ) -> str | None:
-    """Return why the fit of a mirror cannot hold, though no mistake explains it; None if it can."""
+    """Return the reason to reject a fit that no mistake explains; None if it may hold."""
     still = [
         mechanism.joints[joint]
         for d, joint in enumerate(mechanism.driven)
-        if len(one) > 1 and np.ptp(one.counts[:, d]) == 0.0
+        if len(sightings) > 1 and np.ptp(sightings.counts[:, d]) == 0.0
     ]
     broken = outcome not in (FitOutcome.CONVERGED, FitOutcome.NOT_CONVERGED)
     if broken or error > HOPELESS:
         if still:
             return f"the counts of {' and '.join(still)} did not change; check motor and log"
-        left = "" if broken else f", the best leave {1e3 * error:.0f} mrad of beam"
+        rest = "" if broken else f", the best leave {1e3 * error:.0f} mrad of beam"
         return (
-            f"no plausible parameters explain its {amount(len(one), 'sighting')}{left}; check the "
-            "counts, the heliostat's name and its entry in the plant file"
+            f"no plausible parameters explain its {amount(len(sightings), 'sighting')}{rest}; "
+            "check the counts, the heliostat's name and its entry in the plant file"
         )
-    if len(one) < WITNESSES and strain > DOUBTFUL:
+    if len(sightings) < WITNESSES and strain > DOUBTFUL:
         return (
-            f"{amount(len(one), 'sighting')} would need parameters {np.sqrt(strain):.0f} standard "
-            f"deviations from the nominal ones; make at least {WITNESSES}"
+            f"{amount(len(sightings), 'sighting')} would need parameters {np.sqrt(strain):.0f} "
+            f"standard deviations from the nominal ones; make at least {WITNESSES}"
         )
     return None
 
 
-def _mistake(mechanism: Mechanism, one: Sightings, row: int, names: tuple[str, ...]) -> str | None:
+def _mistake(
+    mechanism: Mechanism, sightings: Sightings, row: int, names: tuple[str, ...]
+) -> str | None:
     """Return the mistake that explains the sightings of a mirror, None if there is none."""
-    part = one.take(np.linspace(0, len(one) - 1, min(MOST, len(one))).round().astype(np.intp))
+    part = sightings.take(
+        np.linspace(0, len(sightings) - 1, min(MOST, len(sightings))).round().astype(np.intp)
+    )
     trials = list(_hypotheses(mechanism, part, row))
     rows = np.array([trial[1] for trial in trials])
     machines = mechanism[rows]
     parts = [trial[2].renumbered(np.full(len(part), k)) for k, trial in enumerate(trials)]
-    seen = join(parts)
-    fitted = fit(machines, seen, names, adapt_scale=False)
-    error, each = _median_errors(machines, seen, fitted), costs(fitted, machines)
-    # The first trial is the sightings as they are given. A mistake explains them no worse: a zero
+    joined = join(parts)
+    fitted = fit(machines, joined, names, adapt_scale=False)
+    error, cost = _median_errors(machines, joined, fitted), costs(fitted, machines)
+    # The first trial is the unchanged sightings. A mistake explains them no worse: a zero
     # that is far off strains the priors too, but leaves smaller errors than another mirror does.
     least = 2.0 * float(np.median(part.sigma))
     enough = np.clip(np.nan_to_num(ALIKE * error[0], nan=np.inf), least, ELSEWHERE)
-    each = np.where(error <= enough, each, np.inf)
-    given, best = costs(fitted, machines)[0], int(np.argmin(each))
-    if best == 0 or not (each[best] < given - GAIN and each[best] < SHARE * given):
+    cost = np.where(error <= enough, cost, np.inf)
+    unchanged, best = costs(fitted, machines)[0], int(np.argmin(cost))
+    if best == 0 or not (cost[best] < unchanged - GAIN and cost[best] < SHARE * unchanged):
         return None
     return (
-        f"{trials[best][0]}; read like that, its {amount(len(one), 'sighting')} fit to "
+        f"{trials[best][0]}; read like that, its {amount(len(sightings), 'sighting')} fit to "
         f"{1e3 * error[best]:.2f} mrad of beam"
     )
 
@@ -259,9 +263,9 @@ def _likely(mechanism: Mechanism, part: Sightings, row: int) -> list[int]:
     some = part.take(np.unique(np.linspace(0, len(part) - 1, FEW).round().astype(np.intp)))
     count = len(some)
     every = np.repeat(np.arange(len(mechanism)), count)
-    seen = some.take(np.tile(np.arange(count), len(mechanism)))
-    pose = mechanism[every].pose(seen.counts)
-    miss = angle_between(pose.normal, bisector(*ray_directions(seen, pose.vertex)))
+    repeated = some.take(np.tile(np.arange(count), len(mechanism)))
+    pose = mechanism[every].pose(repeated.counts)
+    miss = angle_between(pose.normal, bisector(*ray_directions(repeated, pose.vertex)))
     middle = np.median(miss.reshape(-1, count), axis=1)
     middle[row] = np.inf
     return [int(k) for k in np.argsort(middle)[:OTHERS] if np.isfinite(middle[k])]

@@ -70,25 +70,25 @@ class ScoredModel:
 def candidate_models(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
     """Return the models that fit this kind of mechanism, by name, the simplest first."""
     known = mechanism.parameters
-    found: dict[str, tuple[str, ...]] = {}
+    candidates: dict[str, tuple[str, ...]] = {}
     for name in ("guo6", "jacks", "khalsa8", "malan8"):
         with contextlib.suppress(UnknownNameError):
-            found[name] = parameter_table.model(name, known)
-    if "jacks" in found:
-        found = {"jacks": found["jacks"]}
-        found["jacks8"] = tuple(p for p in found["jacks"] if not p.endswith("_offset")) + tuple(
-            p for p in found["jacks"] if p.endswith("stroke_offset")
-        )
-    for name in [n for n in found if n != "jacks8"]:
+            candidates[name] = parameter_table.model(name, known)
+    if "jacks" in candidates:
+        candidates = {"jacks": candidates["jacks"]}
+        candidates["jacks8"] = tuple(
+            p for p in candidates["jacks"] if not p.endswith("_offset")
+        ) + tuple(p for p in candidates["jacks"] if p.endswith("stroke_offset"))
+    for name in [n for n in candidates if n != "jacks8"]:
         for extra in _extras(mechanism):
             label = f"{name}+{extra[0]}"
-            if all(p in known and p not in found[name] for p in extra[1]):
-                found[label] = found[name] + extra[1]
-    found["full"] = parameter_table.model("full", known)
+            if all(p in known and p not in candidates[name] for p in extra[1]):
+                candidates[label] = candidates[name] + extra[1]
+    candidates["full"] = parameter_table.model("full", known)
     worms = tuple(name for names in _worms(mechanism).values() for name in names)
     if worms:
-        found["full+worm"] = found["full"] + worms
-    return dict(sorted(found.items(), key=lambda item: len(item[1])))
+        candidates["full+worm"] = candidates["full"] + worms
+    return dict(sorted(candidates.items(), key=lambda item: len(item[1])))
 
 
 def _extras(mechanism: Mechanism) -> list[tuple[str, tuple[str, ...]]]:
@@ -145,8 +145,8 @@ def compare_models(
     UnknownNameError
         If there is no such model or parameter.
     """
-    given = members(mechanism)
-    nominal, sightings = given.mechanism, given.rows_of(sightings)
+    field = members(mechanism)
+    nominal, sightings = field.mechanism, field.rows_of(sightings)
     candidates = candidate_models(nominal) if models is None else models
     trials = {name: names_of(model, nominal) for name, model in candidates.items()}
     keep = np.ones(len(sightings), np.bool_) if used is None else np.asarray(used, np.bool_)
@@ -167,10 +167,10 @@ def compare_models(
     for name, names in trials.items():
         if progress:
             progress(name)
-        found = learning.learn(nominal[chosen], part, names, own=False, rounds=2, misfits=())
-        score, mask = _scores(found)
+        learned = learning.learn(nominal[chosen], part, names, own=False, rounds=2, misfits=())
+        score, mask = _scores(learned)
         scores[name], good = score, good & ~mask
-        evidence[name] = float(sum(m.log_evidence() for m in found.members))
+        evidence[name] = float(sum(m.log_evidence() for m in learned.members))
     means = {name: float(score[good].mean()) for name, score in scores.items()}
     best = max(means, key=lambda name: means[name])
     result = []
@@ -198,10 +198,10 @@ def describe(scored: tuple[ScoredModel, ...]) -> tuple[str, ...]:
     return (f"{line}predictive density below the best: {listed}.",)
 
 
-def _scores(found: Learned) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+def _scores(learned: Learned) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """Log predictive density of each sighting, and the mask of outliers."""
-    score = np.full(len(found.sightings), WORST)
-    for i, member in enumerate(found.members):
-        rows = found.rows[i][~found.outlier[found.rows[i]]]
+    score = np.full(len(learned.sightings), WORST)
+    for i, member in enumerate(learned.members):
+        rows = learned.rows[i][~learned.outlier[learned.rows[i]]]
         score[rows] = np.maximum(member.log_predictive(), WORST)
-    return score, found.outlier
+    return score, learned.outlier

@@ -59,8 +59,8 @@ def runner(client: "Client") -> Runner:
             done += len(tasks[futures.index(future)][0])
             if progress:
                 progress(done, sum(len(task[0]) for task in tasks))
-        found: list[Part] = client.gather(futures)  # type: ignore[no-untyped-call]
-        return found
+        parts: list[Part] = client.gather(futures)  # type: ignore[no-untyped-call]
+        return parts
 
     return run
 

@@ -85,12 +85,12 @@ def _remove_farthest(
     """Remove the sighting farthest from the others ``most`` times: (which, their z²), in order."""
     inverse, flat = inverse.copy(), residual.ravel().copy()
     which, squares = np.empty(most, dtype=np.intp), np.empty(most)
-    gone = np.zeros(len(residual), dtype=np.bool_)
+    removed = np.zeros(len(residual), dtype=np.bool_)
     for step in range(most):
         square, _, spread = left_out(inverse, inverse @ flat)
-        best = int(np.argmax(np.where(gone, -np.inf, square)))
+        best = int(np.argmax(np.where(removed, -np.inf, square)))
         which[step], squares[step] = best, square[best]
-        gone[best] = True
+        removed[best] = True
         # Schur: the inverse without rows and columns of ``best``.
         rows = slice(2 * best, 2 * best + 2)
         pair = inverse[:, rows].copy()

@@ -78,10 +78,10 @@ class OwnModel:
         flown: Sequence[Flown] = (),
     ) -> FieldFit:
         """Return the fit that follows the drift, beside a fit of constants; see `present`."""
-        found = fitting_present(
+        fitted = fitting_present(
             self.start(nominal), sightings, self._searched(constants), group, flown
         )
-        return self.completed(found)
+        return self.completed(fitted)
 
     def _searched(self, fitted: FieldFit) -> FieldFit:
         """Return a fit without the ratios; the reverse of `completed`."""
@@ -167,13 +167,13 @@ def _scored(
     trials: Mapping[str, tuple[str, ...]], scores: Mapping[str, FloatArray]
 ) -> tuple[models.ScoredModel, ...]:
     best = max(scores, key=lambda name: float(scores[name].mean()))
-    found = []
+    scored = []
     for name, names in trials.items():
         gap = scores[best] - scores[name]
         error = float(gap.std() / np.sqrt(len(gap)))
         mean = float(scores[name].mean())
-        found.append(models.ScoredModel(name, names, mean, float(gap.mean()), error, float("nan")))
-    return tuple(found)
+        scored.append(models.ScoredModel(name, names, mean, float(gap.mean()), error, float("nan")))
+    return tuple(scored)
 
 
 def _left_out(

@@ -120,11 +120,11 @@ class PeriodicError:
     def __str__(self) -> str:
         """Return one line for people."""
         size = 1e3 * float(np.nanmedian(self.amplitude))
-        seen = int(np.isfinite(self.amplitude).sum())
+        count = int(np.isfinite(self.amplitude).sum())
         phase = f", phase {np.degrees(self.phase[0]):.0f}°" if len(self.phase) == 1 else ""
         return (
             f"Periodic error on {self.joint}: ratio {self._ratio}, amplitude {size:.2f} mrad"
-            f"{phase}, from {seen} heliostat{'s' if seen != 1 else ''}, false-alarm probability "
+            f"{phase}, from {count} heliostat{'s' if count != 1 else ''}, false-alarm probability "
             f"{max(self.false_alarm, 1e-99):.0e}"
         )
 
@@ -169,10 +169,10 @@ class _Member:
         # A wave that the constants can imitate has next to no columns left; it gains nothing.
         size = np.trace(normal, axis1=1, axis2=2)
         normal = normal + (1e-9 * size + 1e-30)[:, None, None] * np.eye(2)
-        found = np.linalg.solve(normal, right[..., None])[..., 0]
-        share = np.sum(found * right, axis=-1) / float(self.rest @ self.rest)
+        coefficients = np.linalg.solve(normal, right[..., None])[..., 0]
+        share = np.sum(coefficients * right, axis=-1) / float(self.rest @ self.rest)
         share = np.clip(share, 0.0, 1.0 - 1e-12)
-        return found, -0.5 * (self.freedom - 2) * np.log1p(-share)
+        return coefficients, -0.5 * (self.freedom - 2) * np.log1p(-share)
 
 
 def search_periodic_errors(
@@ -197,14 +197,14 @@ def search_periodic_errors(
     """
     keep = np.ones(len(sightings), np.bool_) if used is None else np.asarray(used, np.bool_)
     s = sightings.take(np.flatnonzero(keep))
-    drives, found = _known_ratios(mechanism), list[PeriodicError]()
-    while drives and (best := _strongest(mechanism, s, drives, tuple(found))) is not None:
+    drives, errors = _known_ratios(mechanism), list[PeriodicError]()
+    while drives and (best := _strongest(mechanism, s, drives, tuple(errors))) is not None:
         drive, error = best
-        found.append(error)
+        errors.append(error)
         del drives[drive]
         if not error.found:
             break
-    return tuple(e for e in found if not e.known or (e.found and e.ratio != e.known))
+    return tuple(e for e in errors if not e.known or (e.found and e.ratio != e.known))
 
 
 def with_ratios(mechanism: Mechanism, errors: tuple[PeriodicError, ...]) -> Mechanism:
@@ -312,9 +312,9 @@ def _visit_means(time: FloatArray, x: FloatArray) -> FloatArray:
         ):
             first, number = int(k), number + 1
         visit[k] = number
-    found = np.zeros((number + 1, len(time)))
-    found[visit, np.arange(len(time))] = 1.0
-    return as_float(found / found.sum(axis=1, keepdims=True))
+    weights = np.zeros((number + 1, len(time)))
+    weights[visit, np.arange(len(time))] = 1.0
+    return as_float(weights / weights.sum(axis=1, keepdims=True))
 
 
 def _without(member: _Member, drive: int, ratio: float) -> _Member:
@@ -351,8 +351,8 @@ def _peak(
         return -float(_power(members, drive, np.array([ratio]))[0])
 
     bounds = (near - step, near + step)
-    found = minimize_scalar(lost, bounds=bounds, method="bounded")
-    ratio, height = float(found.x), -float(found.fun)
+    solution = minimize_scalar(lost, bounds=bounds, method="bounded")
+    ratio, height = float(solution.x), -float(solution.fun)
     # −ln P is a log likelihood ratio but for terms of order 1/ν: its curvature gives the variance.
     far = 0.25 * step
     curvature = (lost(ratio + far) + 2.0 * height + lost(ratio - far)) / far**2

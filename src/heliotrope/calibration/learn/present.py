@@ -1,7 +1,7 @@
 """One mirror's parameters now, from all of its photographs in the order in which they came.
 
 A fit of constants lets a photograph of last year count as much as today's. Here the fit only says
-where each sighting is linearised and who is suspect; the values come from the state that follows
+where each sighting is linearised and which is suspect; the values come from the state that follows
 the drift (`stream`): it forgets what the drive has lost since, and weighs steps, regimes and
 mistakes. The whole history is replayed, so nothing but the sightings has to be kept.
 """
@@ -99,7 +99,7 @@ def replayed(
     place = np.concatenate([np.arange(len(part.time)) for part in parts])
     belief = stream.begin(hyper, centre, centre != 0.0)
     if flown:
-        turn = np.full(2, max(*(each.turn_sigma for each in flown), NO_TURN))
+        turn = np.full(2, max(*(flight.turn_sigma for flight in flown), NO_TURN))
         belief = stream.with_constants(belief, TURN, turn)
     # Unknown times first: they say nothing about drift, and a belief does not go back.
     order = np.argsort(np.nan_to_num(time, nan=-np.inf), kind="stable")
@@ -119,12 +119,12 @@ class _Rows:
 
     @classmethod
     def of(
-        cls, moved: Mechanism, seen: Sightings, names: tuple[str, ...], off: FloatArray
+        cls, moved: Mechanism, sightings: Sightings, names: tuple[str, ...], off: FloatArray
     ) -> "_Rows":
-        line = linearise(moved[seen.heliostat], seen, names)
+        line = linearise(moved[sightings.heliostat], sightings, names)
         good = is_usable(line)
         value = line.jacobian @ off - line.residual
-        return cls(line.jacobian[good], value[good], seen.time[good] / DAY)
+        return cls(line.jacobian[good], value[good], sightings.time[good] / DAY)
 
     @classmethod
     def joined(cls, parts: Sequence["_Rows"]) -> "_Rows":
@@ -141,17 +141,22 @@ class _Rows:
         cls, moved: Mechanism, flown: Flown, hyper: Hyperparameters, off: FloatArray
     ) -> "_Rows":
         """Return a flight's rows; their sigma is their noise, whatever photographs have."""
-        seen = flown.sightings
-        here = moved[seen.heliostat]
-        line = linearise(here, seen, hyper.names)
+        sightings = flown.sightings
+        placed = moved[sightings.heliostat]
+        line = linearise(placed, sightings, hyper.names)
         value = line.jacobian @ off - line.residual
         unit = flown.shift @ np.linalg.cholesky(flown.covariance)
-        more = [derivative_by_turn(here, seen), derivative_by_shared(here, seen, unit)]
+        more = [
+            derivative_by_turn(placed, sightings),
+            derivative_by_shared(placed, sightings, unit),
+        ]
         whole = np.concatenate([line.jacobian, *more], axis=-1)
-        order = np.argsort(seen.time, kind="stable")
+        order = np.argsort(sightings.time, kind="stable")
         good = order[is_usable(line)[order]]
         scale = hyper.noise
-        return cls(scale * whole[good], scale * value[good], seen.time[good] / DAY, unit.shape[-1])
+        return cls(
+            scale * whole[good], scale * value[good], sightings.time[good] / DAY, unit.shape[-1]
+        )
 
     def names(self, number: int) -> tuple[str, ...]:
         return tuple(f"flight {number}: {k}" for k in range(self.shared))
@@ -184,7 +189,7 @@ def hyper_of(
     mechanism, fitted
         The mirror, and its fit.
     group
-        What was learnt of its group; parameters and processes that it does not know, and all
+        Hyperparameters of its group; parameters and processes that it lacks, and all
         without it, have the defaults.
     """
     hyper = drift.start(mechanism, tuple(fitted.names), priors=fitted.prior[0])
@@ -242,11 +247,11 @@ def fitting_present(
     fitted
         A robust fit of them, (1,). One that has failed is returned as it is.
     group
-        What was learnt of its group; default: nothing.
+        Hyperparameters of its group; default: none.
     flown
         Its rows of flights.
     """
-    times = np.concatenate([sightings.time, *(each.sightings.time for each in flown)])
+    times = np.concatenate([sightings.time, *(flight.sightings.time for flight in flown)])
     known = times[np.isfinite(times)]
     if int(fitted.outcome[0]) != FitOutcome.CONVERGED or not len(known):
         return fitted

@@ -33,16 +33,16 @@ def beliefs_of(learned: Learned) -> tuple[Belief, ...]:
     the past come from the batch, each sighting linearised about the posterior at its time; steps,
     regimes and mistakes are weighed again as the sightings come. ``stream.observe`` goes on.
     """
-    seen = learned.sightings
-    found = []
+    sightings = learned.sightings
+    beliefs = []
     for i, member in enumerate(learned.members):
-        rows = np.flatnonzero((seen.heliostat == i) & learned.used & ~learned.unusable)
+        rows = np.flatnonzero((sightings.heliostat == i) & learned.used & ~learned.unusable)
         # Unknown times first: they say nothing about drift, and a belief does not go back.
-        when = np.nan_to_num(seen.time[rows], nan=-np.inf)
+        when = np.nan_to_num(sightings.time[rows], nan=-np.inf)
         rows = rows[np.argsort(when, kind="stable")]
         belief = stream.begin(member.hyper, member.data.centre, member.data.own)
         if len(rows):
-            mine = seen.take(rows)
+            mine = sightings.take(rows)
             at, _ = learned.parameters_at(mine.heliostat, mine.time)
             moved = moved_by(learned.mechanism, mine.heliostat, learned.names, at)
             line = linearise(moved, mine, learned.names)
@@ -50,8 +50,8 @@ def beliefs_of(learned: Learned) -> tuple[Belief, ...]:
             value = np.einsum("nap,np->na", line.jacobian, gap) - line.residual
             for k in np.flatnonzero(is_usable(line)):
                 belief = stream.update(belief, line.jacobian[k], value[k], mine.time[k] / DAY)
-        found.append(belief)
-    return tuple(found)
+        beliefs.append(belief)
+    return tuple(beliefs)
 
 
 def predict_by_stream(learned: Learned, progress: Progress | None = None) -> Prediction:
@@ -64,21 +64,21 @@ def predict_by_stream(learned: Learned, progress: Progress | None = None) -> Pre
     progress
         Called with (done, all) held-out sightings.
     """
-    seen, size = learned.sightings, len(learned.names)
+    sightings, size = learned.sightings, len(learned.names)
     beliefs = list(beliefs_of(learned))
     asked = np.flatnonzero(~learned.used)
     values, spread = np.empty((len(asked), size)), np.empty((len(asked), size, size))
-    order = np.argsort(seen.time[asked], kind="stable")
+    order = np.argsort(sightings.time[asked], kind="stable")
     for done, place in enumerate(order):
         row = asked[place]
-        i = int(seen.heliostat[row])
-        values[place], spread[place] = beliefs[i].at(seen.time[row] / DAY)
+        i = int(sightings.heliostat[row])
+        values[place], spread[place] = beliefs[i].at(sightings.time[row] / DAY)
         beliefs[i] = stream.observe(
-            beliefs[i], learned.mechanism[i : i + 1], seen.take([row]).of(i)
+            beliefs[i], learned.mechanism[i : i + 1], sightings.take([row]).of(i)
         )
         if progress:
             progress(done + 1, len(asked))
-    return predict_with(learned, seen.take(asked), values, spread)
+    return predict_with(learned, sightings.take(asked), values, spread)
 
 
 def predict_in_turn(
@@ -120,14 +120,14 @@ def _predict(
     runner: Runner | None,
 ) -> Prediction:
     """Predict some sightings, each by a copy of its heliostat that has seen the earlier ones."""
-    seen = learned.sightings
+    sightings = learned.sightings
     histories = [_before(learned, int(row)) for row in asked]
     owner = np.repeat(np.arange(len(asked)), [len(h) for h in histories])
-    past = seen.take(np.concatenate([np.empty(0, np.intp), *histories]))
-    copies = seen.heliostat[asked]
+    past = sightings.take(np.concatenate([np.empty(0, np.intp), *histories]))
+    copies = sightings.heliostat[asked]
     count = len(learned.mechanism)
     cut = {n: np.asarray(v)[copies] if np.shape(v) == (count,) else v for n, v in priors.items()}
-    found = learn(
+    relearned = learn(
         learned.mechanism[copies],
         past.renumbered(owner),
         learned.model,
@@ -135,16 +135,16 @@ def _predict(
         hyper=learned.hyper,
         runner=runner,
     )
-    wanted = seen.take(asked).renumbered(np.arange(len(asked)))
-    return predict(found, wanted)
+    future = sightings.take(asked).renumbered(np.arange(len(asked)))
+    return predict(relearned, future)
 
 
 def _before(learned: Learned, row: int) -> npt.NDArray[np.intp]:
     """Rows of the same heliostat measured before ``row``; with an unknown time: those learnt."""
-    seen: Sightings = learned.sightings
-    mine = seen.heliostat == seen.heliostat[row]
-    when = seen.time[row]
-    return np.flatnonzero(mine & (seen.time < when if np.isfinite(when) else learned.used))
+    sightings: Sightings = learned.sightings
+    mine = sightings.heliostat == sightings.heliostat[row]
+    when = sightings.time[row]
+    return np.flatnonzero(mine & (sightings.time < when if np.isfinite(when) else learned.used))
 
 
 def _join(parts: list[Prediction]) -> Prediction:

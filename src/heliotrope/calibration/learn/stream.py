@@ -267,24 +267,24 @@ def with_constants(belief: Belief, names: tuple[str, ...], spread: FloatArray) -
 def without_constants(belief: Belief, names: tuple[str, ...]) -> Belief:
     """Return the belief without some of its constants, whatever their values."""
     h = belief.hyper
-    gone = np.array([h.names.index(name) for name in names], dtype=np.intp)
-    left = np.delete(np.arange(belief.mean.shape[1]), gone)
+    removed = np.array([h.names.index(name) for name in names], dtype=np.intp)
+    kept = np.delete(np.arange(belief.mean.shape[1]), removed)
     hyper = replace(
         h,
-        names=tuple(np.delete(np.array(h.names, dtype=object), gone)),
-        mean=np.delete(h.mean, gone),
-        spread=np.delete(h.spread, gone),
-        regime=np.delete(h.regime, gone),
-        step=np.delete(h.step, gone),
-        wide=np.delete(h.wide, gone),
+        names=tuple(np.delete(np.array(h.names, dtype=object), removed)),
+        mean=np.delete(h.mean, removed),
+        spread=np.delete(h.spread, removed),
+        regime=np.delete(h.regime, removed),
+        step=np.delete(h.step, removed),
+        wide=np.delete(h.wide, removed),
     )
     return replace(
         belief,
         hyper=hyper,
         layout=layout_of(hyper),
-        centre=np.delete(belief.centre, gone),
-        mean=np.ascontiguousarray(belief.mean[:, left]),
-        covariance=np.ascontiguousarray(belief.covariance[:, left[:, None], left]),
+        centre=np.delete(belief.centre, removed),
+        mean=np.ascontiguousarray(belief.mean[:, kept]),
+        covariance=np.ascontiguousarray(belief.covariance[:, kept[:, None], kept]),
     )
 
 
@@ -318,12 +318,12 @@ def update(
         noise += drift @ drift.T
         rows[:, state.first :] = 0.0
         days = 0.0
-    found = kernels.update(
+    updated = kernels.update(
         belief.weight, belief.mean, belief.covariance, belief.regime, rows, value, noise, days,
         int(event), state.zeros, state.offsets, state.first, state.step, state.lost,
         h.amplitude, state.tau, _chances(h.rate, days), FAR**2,
     )  # fmt: skip
-    weight, mean, covariance, regime, density, mistaken = found
+    weight, mean, covariance, regime, density, mistaken = updated
     return replace(
         belief,
         weight=weight,

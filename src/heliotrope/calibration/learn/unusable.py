@@ -25,11 +25,11 @@ def is_usable(line: Linearised) -> npt.NDArray[np.bool_]:
 
 
 def find_unusable(
-    mechanism: Mechanism, sightings: Sightings, found: FieldFit
+    mechanism: Mechanism, sightings: Sightings, fitted: FieldFit
 ) -> npt.NDArray[np.bool_]:
     """Return the mask of sightings beyond the reach at the start of a fit or at its end, (M,).
 
-    Where a fit found no parameters that a mechanism can have, no sighting of it can be used.
+    Where a fit gave no parameters that a mechanism can have, none of its sightings is usable.
 
     Parameters
     ----------
@@ -37,14 +37,14 @@ def find_unusable(
         Nominal, (N,).
     sightings
         M of these heliostats.
-    found
+    fitted
         Fit of them.
     """
-    lost = np.isin(found.outcome, (FitOutcome.FAILED, FitOutcome.MISFIT))
+    lost = np.isin(fitted.outcome, (FitOutcome.FAILED, FitOutcome.MISFIT))
     bad = lost[sightings.heliostat]
-    ended = np.where(np.isfinite(found.values), found.values, found.centre)
-    for values in (found.centre, ended):
-        moved = mechanism.with_parameters({n: values[:, p] for p, n in enumerate(found.names)})
-        line = linearise(moved[sightings.heliostat], sightings, found.names)
+    ended = np.where(np.isfinite(fitted.values), fitted.values, fitted.centre)
+    for values in (fitted.centre, ended):
+        moved = mechanism.with_parameters({n: values[:, p] for p, n in enumerate(fitted.names)})
+        line = linearise(moved[sightings.heliostat], sightings, fitted.names)
         bad |= ~is_usable(line)
     return bad

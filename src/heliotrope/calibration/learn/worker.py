@@ -30,7 +30,7 @@ def asked(task: GroupTask) -> bytes:
 
 
 def answered(text: bytes) -> LearntGroup:
-    """Return what the process has answered.
+    """Return the result of the process that learns.
 
     Raises
     ------
@@ -38,14 +38,14 @@ def answered(text: bytes) -> LearntGroup:
         If it is no such answer, or names an error.
     """
     try:
-        found: dict[str, Any] = dict(json.loads(text))
+        answer: dict[str, Any] = dict(json.loads(text))
     except (TypeError, ValueError) as error:
         raise InputError(f"the process that learns gave no result ({error})") from error
-    if told := found.get("error"):
-        raise InputError(str(told))
+    if problem := answer.get("error"):
+        raise InputError(str(problem))
     try:
-        counts = int(found["heliostats"]), int(found["sightings"])
-        return LearntGroup(read_hyperparameters(found["hyper"]), *counts, float(found["gain"]))
+        counts = int(answer["heliostats"]), int(answer["sightings"])
+        return LearntGroup(read_hyperparameters(answer["hyper"]), *counts, float(answer["gain"]))
     except (KeyError, TypeError) as error:
         raise InputError(f"the process that learns gave half a result ({error!r})") from error
 
@@ -53,14 +53,14 @@ def answered(text: bytes) -> LearntGroup:
 def _answer(data: bytes) -> dict[str, Any]:
     try:
         task = pickle.loads(data)  # noqa: S301  # from the process that has started this one
-        found = learn_group(task)
+        group = learn_group(task)
     except Exception as error:  # noqa: BLE001  # whatever it is, the plant says it in one line
         return {"error": f"{type(error).__name__}: {error}"}
     return {
-        "hyper": document_of(found.hyper),
-        "heliostats": found.heliostats,
-        "sightings": found.sightings,
-        "gain": found.gain,
+        "hyper": document_of(group.hyper),
+        "heliostats": group.heliostats,
+        "sightings": group.sightings,
+        "gain": group.gain,
     }
 
 

@@ -48,12 +48,12 @@ class Option:
 
 def gains(covariance: FloatArray, form: FloatArray, option: Option) -> FloatArray:
     """Fall of the expected squared error by one sighting of each heliostat, rad², (n,)."""
-    found = np.empty(len(option.rows))
-    for a in range(0, len(found), CHUNK):
+    falls = np.empty(len(option.rows))
+    for a in range(0, len(falls), CHUNK):
         part = option.rows[a : a + CHUNK]
         slope = option.slope[a : a + CHUNK]
-        found[a : a + CHUNK] = _gain.variance_gain(covariance[part], slope, form[part])
-    return found
+        falls[a : a + CHUNK] = _gain.variance_gain(covariance[part], slope, form[part])
+    return falls
 
 
 def allocate(
@@ -81,9 +81,9 @@ def allocate(
     version = np.zeros(len(known), dtype=np.int64)
     heap: list[tuple[float, int, int, int]] = []
     for o, option in enumerate(options):
-        found = gains(known, form, option)
-        able = (found > worth * square[option.rows]) & (option.most > 0)
-        heap += [(-float(found[k]), 0, o, int(k)) for k in np.flatnonzero(able)]
+        falls = gains(known, form, option)
+        able = (falls > worth * square[option.rows]) & (option.most > 0)
+        heap += [(-float(falls[k]), 0, o, int(k)) for k in np.flatnonzero(able)]
     heapify(heap)
     chosen: list[list[int]] = [[] for _ in options]
     often: dict[tuple[int, int], int] = {}
@@ -186,10 +186,12 @@ class _Exchange:
         rows = rows[:: max(1, -(-len(rows) // PARTNERS))]
         if not rows:
             return None
-        here, there = self.slope(p, rows), self.slope(o, rows)
-        rest = as_float(np.linalg.inv(self.information[rows] - np.swapaxes(here, 1, 2) @ here))
+        slope_p, slope_o = self.slope(p, rows), self.slope(o, rows)
+        rest = as_float(
+            np.linalg.inv(self.information[rows] - np.swapaxes(slope_p, 1, 2) @ slope_p)
+        )
         form = self.form[rows]
-        change = _gain.variance_gain(rest, there, form) - _gain.variance_gain(rest, here, form)
+        change = _gain.variance_gain(rest, slope_o, form) - _gain.variance_gain(rest, slope_p, form)
         best = int(np.argmax(change))
         # The margin keeps rounding from exchanging two beams for ever.
         return rows[best] if change[best] > -gain * (1.0 - 1e-6) else None

@@ -273,16 +273,16 @@ class _Schedule:
             options = [
                 self._option(v, len(c)) for c, row in zip(some, views, strict=True) for v in row
             ]
-            wanted: list[list[int] | None] = [None] * len(options)
+            choices: list[list[int] | None] = [None] * len(options)
             if self.ahead:
-                left = None if self.limit is None else self.limit - len(self.rows)
+                remaining = None if self.limit is None else self.limit - len(self.rows)
                 known, form = self.covariance, self.form
-                first_choice = _allocation.allocate(known, form, options, self.worth, left)
-                wanted[:] = _allocation.exchanged(known, form, options, first_choice)
+                first_choice = _allocation.allocate(known, form, options, self.worth, remaining)
+                choices[:] = _allocation.exchanged(known, form, options, first_choice)
             for n, arrivals in enumerate(some):
                 places = range(n * len(self.targets), (n + 1) * len(self.targets))
                 queues = [
-                    _Queue(self, views[n][o - places[0]], options[o], wanted[o]) for o in places
+                    _Queue(self, views[n][o - places[0]], options[o], choices[o]) for o in places
                 ]
                 self._cell(begin, arrivals, suns[n], queues)
                 yield arrivals
@@ -321,7 +321,7 @@ class _Schedule:
             if arrive - queue.view.seconds[i] < ready:
                 waiting.append(entry)
                 continue
-            own = self.field.one(i, sun, self.targets[j])
+            own = self.field.single(i, sun, self.targets[j])
             # The queue is of the middle of the interval; the slot itself may be out of reach.
             if not own.able[0]:
                 continue
@@ -335,19 +335,19 @@ class _Schedule:
             heappush(queue.heap, entry)
 
     def _take(self, i: int, j: int, arrive: float, own: TargetView) -> None:
-        way, done = float(own.seconds[0]), arrive + self.timing.slot
+        travel, done = float(own.seconds[0]), arrive + self.timing.slot
         self.covariance[i] = _gain.updated(self.covariance[i], own.slope[0])
         self.square[i] = max(0.0, float(np.sum(self.form[i] * self.covariance[i])))
         self.version[i] += 1
-        self.free[i] = done + way
+        self.free[i] = done + travel
         time = arrive + self._shift
         self.rows.append(
             (
-                arrive - way,
+                arrive - travel,
                 arrive,
                 time,
                 done,
-                done + way,
+                done + travel,
                 i,
                 j,
                 own.counts[0],
@@ -393,17 +393,17 @@ class _Queue:
         schedule: _Schedule,
         view: TargetView,
         option: _allocation.Option,
-        wanted: list[int] | None,
+        choice: list[int] | None,
     ) -> None:
-        self.schedule, self.view, self.settled = schedule, view, wanted is not None
+        self.schedule, self.view, self.settled = schedule, view, choice is not None
         self.heap: list[tuple[float, int, int]]
-        if wanted is not None:
-            self.heap = [(float(n), 0, i) for n, i in enumerate(wanted)]
+        if choice is not None:
+            self.heap = [(float(n), 0, i) for n, i in enumerate(choice)]
             return
-        found = _allocation.gains(schedule.covariance, schedule.form, option)
+        falls = _allocation.gains(schedule.covariance, schedule.form, option)
         self.heap = [
             (-float(g), int(schedule.version[i]), int(i))
-            for g, i in zip(found, option.rows, strict=True)
+            for g, i in zip(falls, option.rows, strict=True)
             if g > schedule.worth * schedule.square[i]
         ]
         heapify(self.heap)

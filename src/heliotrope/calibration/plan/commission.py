@@ -117,8 +117,8 @@ class CommissionTerms:
             Whether it is a joint stack, and one of mirrors in production.
         """
         terms = self.receiver if produces else self.joint if together else None
-        seen = self.sigma / np.sqrt(self.shots) if terms is None else terms.sigma
-        return float(np.hypot(seen, self.repeat))
+        noise = self.sigma / np.sqrt(self.shots) if terms is None else terms.sigma
+        return float(np.hypot(noise, self.repeat))
 
     @property
     def floor(self) -> float:
@@ -207,7 +207,7 @@ class CommissionPlan:
 
     @property
     def limit(self) -> str:
-        """What keeps the plan from its goal, in one clause; "" if it is reached."""
+        """The obstacle to the goal, in one clause; empty once the goal is reached."""
         if self.reached is not None:
             return ""
         total = sum(self.seconds.values())
@@ -283,9 +283,9 @@ def plan_commission(
     """
     if not fleets or not sum(len(f) for f in fleets) or not targets:
         raise InputError("commission: give heliostats and at least one target")
-    given = terms or CommissionTerms()
-    days, cells = _cells(site, start, stop, given)
-    work = _Commissioning(fleets, targets, given, np.asarray(size, dtype=np.float64), measured)
+    chosen = terms or CommissionTerms()
+    days, cells = _cells(site, start, stop, chosen)
+    work = _Commissioning(fleets, targets, chosen, np.asarray(size, dtype=np.float64), measured)
     work.missed += np.asarray(missed, dtype=np.int64)
     work.visited = work.counted & ~np.asarray(held, dtype=np.bool_)
     work.note(cells[0][0])
@@ -294,7 +294,7 @@ def plan_commission(
             progress(done, len(cells))
         work.fill(begin, end, solar.vector(0.5 * (begin + end), site))
         work.note(end)
-        if work.curve[-1][1] <= given.goal:
+        if work.curve[-1][1] <= chosen.goal:
             break
     if progress:
         progress(len(cells), len(cells))
@@ -306,7 +306,7 @@ def plan_commission(
         table[:, 2],
         work.seconds,
         tuple(days),
-        given,
+        chosen,
         int(np.sum(~work.measured & work.counted)),
     )
 
@@ -343,9 +343,9 @@ class _Queue:
         """Return the best that are free, at most so many."""
         reach = max(4 * most, 256)
         while True:
-            found = self.rows[:reach][free[self.rows[:reach]]]
-            if len(found) >= most or reach >= len(self.rows):
-                return found[:most]
+            free_rows = self.rows[:reach][free[self.rows[:reach]]]
+            if len(free_rows) >= most or reach >= len(self.rows):
+                return free_rows[:most]
             # Most at the front have been taken.
             self.rows = self.rows[free[self.rows]]
             reach *= 4
@@ -398,7 +398,7 @@ class _Commissioning:
         self._last_joint: Mask = np.zeros(len(targets) + 1, dtype=np.bool_)
         places = len(targets) + (terms.receiver is not None)
         #: End of the last interval, and what each place had left of it, s.
-        self._until, self._left = -np.inf, np.zeros(places)
+        self._until, self._unused = -np.inf, np.zeros(places)
         #: When each mirror's last visit ended, and the last one on the receiver.
         self._home, self._shone = np.full((2, count), -np.inf)
         self._shines: Mask = np.zeros(count, dtype=np.bool_)
@@ -417,8 +417,8 @@ class _Commissioning:
     def fill(self, begin: float, end: float, sun: FloatArray) -> None:
         """Give the time of all targets, and of the receiver, in an interval to visits."""
         # What the interval before left over, too short for a visit, is used now.
-        left = self._left if begin == self._until else np.zeros_like(self._left)
-        carried = begin - left
+        unused = self._unused if begin == self._until else np.zeros_like(self._unused)
+        carried = begin - unused
         choices = [self._choices(sun, target) for target in self.targets]
         if (terms := self.terms.receiver) is not None:
             choices.append(self._in_production(sun, terms, float(carried[-1])))
@@ -436,7 +436,7 @@ class _Commissioning:
             if not rows.size or until > stop:
                 opened[j] = False
                 # Where nobody is left to be visited, nothing is carried on.
-                self._left[j] = max(0.0, stop - now) if rows.size else 0.0
+                self._unused[j] = max(0.0, stop - now) if rows.size else 0.0
                 self._use(j, {"idle": max(0.0, stop - now) - (begin - carried[j])})
                 continue
             free[rows] = False
@@ -455,14 +455,14 @@ class _Commissioning:
     def _choices(self, sun: FloatArray, target: Target) -> _Choices:
         terms = self.terms
         view, spread = self._seen_on(target, sun)
-        seen = chance_on_target(target, self.position, self.size, spread)
-        at_once = seen
+        chance = chance_on_target(target, self.position, self.size, spread)
+        at_once = chance
         if terms.joint is not None:
-            found = chance_by_try(target, self.position, spread, terms.joint.tries)
+            chances = chance_by_try(target, self.position, spread, terms.joint.tries)
             row = np.arange(len(self.missed))
-            at_once = found[np.minimum(self.missed, terms.joint.tries - 1), row]
+            at_once = chances[np.minimum(self.missed, terms.joint.tries - 1), row]
         travel = np.where(view.able, view.seconds, 0.0)
-        looks = np.minimum(1.0 / np.maximum(seen, 1e-9), LOOKS)
+        looks = np.minimum(1.0 / np.maximum(chance, 1e-9), LOOKS)
         span = terms.alone + terms.look * (looks - 1.0) + 2.0 * travel
         value = self._gains(view, terms.accuracy(together=False)) / span
         nobody = np.zeros_like(value)
@@ -475,11 +475,11 @@ class _Commissioning:
             late = np.where(self.measured & ~vague, both, 0.0)
         slant = np.linalg.norm(target.center - self.position, axis=1)
         lost = np.where(self.measured, 0.0, value)
-        queues = (_Queue(_descending(one)) for one in (value, lost, new, late))
+        queues = (_Queue(_descending(priority)) for priority in (value, lost, new, late))
         return _Choices(view, slant, spread, at_once, looks, *queues)
 
     def _seen_on(self, target: Target, sun: FloatArray) -> tuple[TargetView, FloatArray]:
-        """Return what a target shows, and the expected squared errors of beams there, rad²."""
+        """Return the view of a target, and the expected squared errors of beams on it, rad²."""
         view, known = self.field.view(sun, target), self.field.covariance
         spread = np.einsum("nip,npq,niq->n", view.slope, known, view.slope) * self.sigma**2
         return view, spread
@@ -487,9 +487,9 @@ class _Commissioning:
     def _gains(self, view: TargetView, accuracy: float) -> FloatArray:
         """Return the fall of each expected squared error, 0 where it is not worth it, rad²."""
         slope = view.slope * (self.sigma / accuracy)[:, None, None]
-        found = _gain.variance_gain(self.field.covariance, slope, self.field.form)
-        worthy = view.able & self.counted & (found > self.terms.worth * self.field.squares())
-        return np.where(worthy, found, 0.0)
+        falls = _gain.variance_gain(self.field.covariance, slope, self.field.form)
+        worthy = view.able & self.counted & (falls > self.terms.worth * self.field.squares())
+        return np.where(worthy, falls, 0.0)
 
     def _in_production(self, sun: FloatArray, terms: ReceiverTerms, now: float) -> _Choices:
         """Return the visits on the receiver: those of mirrors that are known well enough."""
@@ -504,14 +504,14 @@ class _Commissioning:
         return _Choices(view, slant, spread, certain, certain, *queues)
 
     @property
-    def _lit(self) -> int:
+    def _shining(self) -> int:
         """Number of mirrors in production."""
         return int((self._shines & self.visited & self.measured).sum())
 
     def _best(self, j: int, choices: _Choices, free: Mask) -> tuple[Rows, bool]:
         """Return the heliostats of the next visit to a place, and whether it is a joint one."""
         if j == len(self.targets) and (shining := self.terms.receiver) is not None:
-            many = choices.known.first(free, shining.party(self._lit))
+            many = choices.known.first(free, shining.party(self._shining))
             return (many if len(many) >= shining.settings.least else many[:0]), True
         alone, terms = choices.alone.first(free, 1), self.terms.joint
         if terms is None:
@@ -535,7 +535,7 @@ class _Commissioning:
         On the receiver they do not drive either.
         """
         if j == len(self.targets) and (shining := self.terms.receiver) is not None:
-            return {"photographs": shining.span(len(rows), self._lit)}
+            return {"photographs": shining.span(len(rows), self._shining)}
         travel = 2.0 * float(choices.view.seconds[rows].max())
         if not joint or self.terms.joint is None:
             search = self.terms.look * (float(choices.looks[rows].max()) - 1.0)
@@ -573,9 +573,9 @@ class _Commissioning:
             self._shone[rows] = end
         self.visits.append(Visit(begin, end, j, rows, joint, own, first, missed, after))
 
-    def _misses(self, seen: FloatArray) -> Mask:
-        """Return which beams miss: as many as their chances say, spread evenly, (n,)."""
-        due = self._owed + np.cumsum(1.0 - seen)
+    def _misses(self, chance: FloatArray) -> Mask:
+        """Return the mask of beams that miss, (n,): as many as their chances say, spread evenly."""
+        due = self._owed + np.cumsum(1.0 - chance)
         self._owed = float(due[-1]) % 1.0
         return np.asarray(np.diff(np.floor(due), prepend=0.0) > 0.0)
 

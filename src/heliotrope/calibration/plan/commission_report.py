@@ -21,14 +21,14 @@ _HOUR = 3600.0
 
 def hour_rows(plan: CommissionPlan, targets: Sequence[str]) -> list[dict[str, Any]]:
     """Return one record for each hour and place, with the field's prediction at its end."""
-    found, places = [], _places(plan, targets)
+    rows, places = [], _places(plan, targets)
     order = sorted(plan.visits, key=lambda visit: (visit.begin // _HOUR, visit.target))
     for (hour, target), group in groupby(order, key=lambda v: (v.begin // _HOUR, v.target)):
         visits = list(group)
         first = mirrors_of(v for v in visits if v.first)
         after = np.concatenate([v.after for v in visits])
         middle, high = at(plan, (hour + 1.0) * _HOUR)
-        found.append(
+        rows.append(
             {
                 "hour": iso(hour * _HOUR),
                 "target": places[target],
@@ -40,7 +40,7 @@ def hour_rows(plan: CommissionPlan, targets: Sequence[str]) -> list[dict[str, An
                 "field_90_mrad": 1e3 * high,
             }
         )
-    return found
+    return rows
 
 
 def _places(plan: CommissionPlan, targets: Sequence[str]) -> list[str]:

@@ -117,7 +117,7 @@ def fleets_of(
         plant.find(name)
     suns = suns_of_year(plant.site, year)
     place = {name: i for i, name in enumerate(plant.names)}
-    found = []
+    fleets = []
     for done, group in enumerate(plant.groups.values()):
         if progress:
             progress(done, len(plant.groups))
@@ -128,14 +128,14 @@ def fleets_of(
         mechanism, aim = group.calibrated[rows], _aims(plant, group)[rows]
         kind = _usual_model(mechanism) if model == "auto" else model
         names = parameter_table.model(kind, mechanism.parameters)
-        seen = None if made is None else _of(made, [place[n] for n in labels], len(place))
-        known = precision(mechanism, names, seen)
+        observed = None if made is None else _of(made, [place[n] for n in labels], len(place))
+        known = precision(mechanism, names, observed)
         form = error_form(mechanism, aim, suns, names)
         if installed is not None:
             prior = precision(mechanism, names)
             known = known + (_mean_square(prior, form) / installed**2 - 1.0) * prior
-        found.append(Fleet(mechanism, names, known, form, aim, sigma, labels))
-    return found
+        fleets.append(Fleet(mechanism, names, known, form, aim, sigma, labels))
+    return fleets
 
 
 def _mean_square(information: FloatArray, form: FloatArray) -> float:
@@ -216,22 +216,22 @@ def plan_each(
     possible = None
     for number, (fleet, i) in enumerate(rows):
         shift = slot * (number % max(1, int(every // slot)))
-        found = candidate_sightings(
+        candidates = candidate_sightings(
             fleet.mechanism[i : i + 1], site, targets, times + shift, fleet.names, sigma=fleet.sigma
         )
-        found = found.take(_free(found, taken, stop - slot))
+        candidates = candidates.take(_free(candidates, taken, stop - slot))
         name = fleet.labels[i]
-        if not len(found):
+        if not len(candidates):
             raise InputError(
                 f"heliostat {name}: no measurement is possible; the sun, the stops, the limits "
                 "or the turns of other heliostats leave no time; widen the span"
             )
         plans[name] = plan_sightings(
-            found, count, fleet.information[i], fleet.form[i], criterion=criterion
+            candidates, count, fleet.information[i], fleet.form[i], criterion=criterion
         )
         chosen = plans[name].chosen
         taken |= {(int(k), float(t)) for k, t in zip(chosen.target, chosen.time, strict=True)}
-        possible = possible or found
+        possible = possible or candidates
         if progress:
             progress(number + 1, len(rows))
     if possible is None:
@@ -240,10 +240,10 @@ def plan_each(
 
 
 def _free(
-    found: CandidateSightings, taken: set[tuple[int, float]], latest: float
+    candidates: CandidateSightings, taken: set[tuple[int, float]], latest: float
 ) -> npt.NDArray[np.bool_]:
     """Which candidates end in the span and are not on a target that is taken then."""
-    pairs = zip(found.target, found.time, strict=True)
+    pairs = zip(candidates.target, candidates.time, strict=True)
     return np.array(
         [t <= latest and (int(k), float(t)) not in taken for k, t in pairs], dtype=np.bool_
     )

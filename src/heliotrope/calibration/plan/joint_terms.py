@@ -143,7 +143,8 @@ class JointTerms:
         Notes
         -----
         The surer a mirror is, the farther from the middle its place may be. The light is random
-        while nobody knows where beams are: its expectation and twice its standard deviation count.
+        while the places of beams are unknown: its expectation and twice its standard deviation
+        count.
         """
         power = _REFLECTED * size**2
         beam = beam_sigma(slant, slope=_SLOPE) ** 2 + (0.5 * size) ** 2 / 12.0

@@ -1,4 +1,4 @@
-"""The chance that a beam is on a target, at the first look and where it is looked for next."""
+"""The chance that a beam is on a target, at the first try and at the places searched next."""
 
 import numpy as np
 from scipy.special import erf
@@ -56,14 +56,14 @@ def chance_by_try(
     )
     chance = chances[0][:, :, None] * chances[1][:, None]
     free = np.ones(chance.shape, dtype=np.bool_)
-    found, left = np.empty((tries, len(position))), np.ones(len(position))
+    by_try, remaining = np.empty((tries, len(position))), np.ones(len(position))
     for k, place in enumerate(places):
         right, above = (np.abs(middles[i] - place[i]) <= room[:, i, None] for i in (0, 1))
-        here = free & right[:, :, None] & above[:, None]
-        share = np.where(here, chance, 0.0).sum(axis=(1, 2))
-        found[k] = share / np.maximum(left, 1e-12)
-        left, free = left - share, free & ~here
-    return np.clip(found, 0.0, 1.0)
+        inside = free & right[:, :, None] & above[:, None]
+        share = np.where(inside, chance, 0.0).sum(axis=(1, 2))
+        by_try[k] = share / np.maximum(remaining, 1e-12)
+        remaining, free = remaining - share, free & ~inside
+    return np.clip(by_try, 0.0, 1.0)
 
 
 def _cut(places: FloatArray, room: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -93,8 +93,8 @@ def reach_of(target: Target) -> FloatArray:
 
 def _deviation(target: Target, position: FloatArray, spread: FloatArray) -> FloatArray:
     """Return the standard deviation of the place of a beam, right and up, m, (N, 2)."""
-    way = target.center - position
-    distance = np.linalg.norm(way, axis=1)
-    facing = np.abs(way @ target.normal) / distance
+    path = target.center - position
+    distance = np.linalg.norm(path, axis=1)
+    facing = np.abs(path @ target.normal) / distance
     sigma = np.sqrt(0.5 * np.maximum(spread, 1e-18)) * distance
     return np.stack([sigma / np.maximum(facing, 0.1), sigma], axis=1)

@@ -2,7 +2,7 @@
 
 The true squared error of a mirror, averaged over the suns of the year, is eᵀ F e with e ~ N(0, C):
 a sum of squares with mean tr(F C) and variance 2 tr((F C)²). A gamma distribution of this mean and
-variance stands for it (Satterthwaite 1946, for sums of mean squares); the field is their mixture.
+variance replaces it (Satterthwaite 1946, for sums of mean squares); the field is their mixture.
 """
 
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ def error_percentiles(
     if not counts.any():
         return np.full(len(shares), np.sqrt(common))
     shape, scale = mean[counts] ** 2 / spread[counts], spread[counts] / mean[counts]
-    found = []
+    percentiles = []
     for share in shares:
         low, high = 0.0, float(mean.max()) * 100.0
         # The errors of a field span decades: halve the root of the interval, not the interval.
@@ -52,5 +52,5 @@ def error_percentiles(
                 low = middle
             else:
                 high = middle
-        found.append(np.sqrt(high + common))
-    return np.array(found)
+        percentiles.append(np.sqrt(high + common))
+    return np.array(percentiles)

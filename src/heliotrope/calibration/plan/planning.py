@@ -294,8 +294,8 @@ def sighting_jacobian(
     rows = len(counts)
     if not rows:
         return np.empty((0, 2, len(names)))
-    seen = sightings(np.arange(rows), counts, sun, target.center, sigma=sigma)
-    return linearise(mechanism, seen, names).jacobian
+    observed = sightings(np.arange(rows), counts, sun, target.center, sigma=sigma)
+    return linearise(mechanism, observed, names).jacobian
 
 
 def time_grid(start: float, stop: float, every: float) -> FloatArray:

@@ -104,14 +104,14 @@ class ReceiverTerms:
         return self.pace * (_BESIDE + step * self.photographs(mirrors) + _AWAY * turns)
 
     def shining(self, position: FloatArray, aim: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return which mirrors would stay on the receiver with every movement, (N,).
+        """Return the mask of mirrors that stay on the receiver with every movement, (N,).
 
         Parameters
         ----------
         position, aim
             Feet of the heliostats, and their aims in operation, ENU, m, (N, 3).
         """
-        way = aim - position
-        size = self.settings.movement * np.linalg.norm(way, axis=1)
+        path = aim - position
+        size = self.settings.movement * np.linalg.norm(path, axis=1)
         ends = aim[:, None] + size[:, None, None] * (_ENDS @ self.face.axes)
-        return np.asarray((way @ self.face.normal < 0.0) & self.face.holds(ends).all(axis=1))
+        return np.asarray((path @ self.face.normal < 0.0) & self.face.holds(ends).all(axis=1))

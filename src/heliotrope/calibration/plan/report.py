@@ -51,23 +51,23 @@ def plan_rows(heliostat: str, plan: SightingPlan) -> list[dict[str, Any]]:
 
 
 def campaign_rows(
-    found: CalibrationCampaign, heliostats: Sequence[str], targets: Sequence[str]
+    campaign: CalibrationCampaign, heliostats: Sequence[str], targets: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Return one record for each measurement, in order of time."""
     return [
         {
-            "time": iso(found.time[k]),
-            "target": targets[found.target[k]],
-            "heliostat": heliostats[found.heliostat[k]],
-            "leave": iso(found.leave[k]),
-            "arrive": iso(found.arrive[k]),
-            "done": iso(found.done[k]),
-            "back": iso(found.back[k]),
-            **_counts(found.counts[k]),
-            "heliostat_expected_beam_rms_mrad": float(1e3 * found.heliostat_error[k]),
-            "field_expected_beam_rms_mrad": float(1e3 * found.error[k]),
+            "time": iso(campaign.time[k]),
+            "target": targets[campaign.target[k]],
+            "heliostat": heliostats[campaign.heliostat[k]],
+            "leave": iso(campaign.leave[k]),
+            "arrive": iso(campaign.arrive[k]),
+            "done": iso(campaign.done[k]),
+            "back": iso(campaign.back[k]),
+            **_counts(campaign.counts[k]),
+            "heliostat_expected_beam_rms_mrad": float(1e3 * campaign.heliostat_error[k]),
+            "field_expected_beam_rms_mrad": float(1e3 * campaign.error[k]),
         }
-        for k in range(len(found))
+        for k in range(len(campaign))
     ]
 
 
@@ -89,16 +89,16 @@ def plans_document(
 
 
 def campaign_document(
-    found: CalibrationCampaign, fleets: Sequence[Fleet], targets: Sequence[str]
+    campaign: CalibrationCampaign, fleets: Sequence[Fleet], targets: Sequence[str]
 ) -> dict[str, Any]:
     """Return a campaign for JSON."""
     labels = [name for fleet in fleets for name in fleet.labels]
     return {
         **_head(fleets, targets),
-        "slots": found.slots,
-        "before_expected_beam_rms_mrad": 1e3 * found.before,
-        "after_expected_beam_rms_mrad": 1e3 * found.after,
-        "measurements": campaign_rows(found, labels, targets),
+        "slots": campaign.slots,
+        "before_expected_beam_rms_mrad": 1e3 * campaign.before,
+        "after_expected_beam_rms_mrad": 1e3 * campaign.after,
+        "measurements": campaign_rows(campaign, labels, targets),
     }
 
 
@@ -232,12 +232,12 @@ def _sun_paths(ax: "Axes", possible: CandidateSightings, centre: float) -> None:
 
 def _ranks(ax: "Axes", azimuth: FloatArray, elevation: FloatArray, plan: SightingPlan) -> None:
     """Write ranks beside the points, one text for points close together."""
-    left = list(range(len(plan)))
-    while left:
-        first = left[0]
+    remaining = list(range(len(plan)))
+    while remaining:
+        first = remaining[0]
         near = [
             k
-            for k in left
+            for k in remaining
             if np.hypot(azimuth[k] - azimuth[first], elevation[k] - elevation[first]) < 4.0
         ]
         text = ", ".join(str(r) for r in sorted(plan.rank[near]))
@@ -248,17 +248,17 @@ def _ranks(ax: "Axes", azimuth: FloatArray, elevation: FloatArray, plan: Sightin
             textcoords="offset points",
             fontsize=8,
         )
-        left = [k for k in left if k not in near]
+        remaining = [k for k in remaining if k not in near]
 
 
 def campaign_picture(
-    found: CalibrationCampaign, position: FloatArray, targets: Sequence[str]
+    campaign: CalibrationCampaign, position: FloatArray, targets: Sequence[str]
 ) -> "Figure":
     """Return a map of the field by expected error after the campaign, and the error over time.
 
     Parameters
     ----------
-    found
+    campaign
         The campaign.
     position
         Positions of the heliostats, ENU metres, (N, 3).
@@ -269,24 +269,28 @@ def campaign_picture(
 
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
-    order = np.argsort(-found.expected, kind="stable")
+    order = np.argsort(-campaign.expected, kind="stable")
     dots = left.scatter(
-        position[order, 0], position[order, 1], c=1e3 * found.expected[order], s=8, cmap="viridis_r"
+        position[order, 0],
+        position[order, 1],
+        c=1e3 * campaign.expected[order],
+        s=8,
+        cmap="viridis_r",
     )
     figure.colorbar(dots, ax=left, label="expected beam error after, mrad RMS")
     left.set_aspect("equal", adjustable="datalim")
     left.set_xlabel("east, m")
     left.set_ylabel("north, m")
-    hours = (found.time - found.time[0]) / 3600.0 if len(found) else np.empty(0)
+    hours = (campaign.time - campaign.time[0]) / 3600.0 if len(campaign) else np.empty(0)
     right.plot(
         hours,
-        1e3 * found.error,
+        1e3 * campaign.error,
         color=_COLOURS[0],
-        label=f"{len(found):,} measurements on {', '.join(targets)}",
+        label=f"{len(campaign):,} measurements on {', '.join(targets)}",
     )
     right.set_xlabel("hours since the first measurement")
     right.set_ylabel("expected beam error of the field, mrad RMS")
-    if len(found) and found.before > 10.0 * found.error[-1]:
+    if len(campaign) and campaign.before > 10.0 * campaign.error[-1]:
         right.set_yscale("log")
     _finish((left, right), legend=False)
     right.legend(frameon=False, fontsize=8)

@@ -112,7 +112,7 @@ class ScaledField:
         mine = slice(self.offsets[k] + rows.start, self.offsets[k] + rows.stop)
         return TargetView(able, slope * self._scale[mine, None], seconds, aimed.counts)
 
-    def one(self, i: int, sun: FloatArray, target: Target) -> TargetView:
+    def single(self, i: int, sun: FloatArray, target: Target) -> TargetView:
         """Return heliostat ``i`` alone, (1,)."""
         k = int(np.searchsorted(self.offsets, i, side="right")) - 1
         row = i - int(self.offsets[k])

@@ -114,8 +114,8 @@ class CalibrationReport:
     def distance(self) -> FloatArray:
         """From mirror to destination, m; 1 where that is at infinity, (M,)."""
         s = self.learned.sightings
-        way = s.destination - self.learned.mechanism[s.heliostat].pose(s.counts).vertex
-        return np.where(s.destination_at_infinity, 1.0, np.linalg.norm(way, axis=-1))
+        path = s.destination - self.learned.mechanism[s.heliostat].pose(s.counts).vertex
+        return np.where(s.destination_at_infinity, 1.0, np.linalg.norm(path, axis=-1))
 
     @property
     def targets(self) -> FloatArray:
@@ -136,7 +136,7 @@ class CalibrationReport:
         held = {h.name: h.beam for h in self.assessment.heliostats} if self.assessment else {}
         size = np.linalg.norm(self.after, axis=-1)
         nothing = summarise(np.empty(0))
-        found = []
+        rows = []
         for i, name in enumerate(self.names):
             mine = self.learned.sightings.heliostat == i
             if mine.any():
@@ -149,8 +149,8 @@ class CalibrationReport:
                     int(self.learned.outlier[mine].sum()),
                     FitOutcome(int(self.learned.static.outcome[i])),
                 )
-                found.append(row)
-        return tuple(found)
+                rows.append(row)
+        return tuple(rows)
 
     def blind_spots(self, i: int) -> tuple[BlindSpot, ...]:
         """Return the combinations of parameters that heliostat ``i``'s sightings do not show."""
@@ -173,18 +173,20 @@ class CalibrationReport:
             {name: r.values[:, r.names.index(name)] for name in r.model}
         )
         try:
-            found = in_his_names(of_mechanism(moved, zeros=True)[0])
+            parameters = in_his_names(of_mechanism(moved, zeros=True)[0])
         except InputError:
             return None
         return {
-            row.name: {f"{n}_deg": float(found[n][row.index]) for n in found if n != "H_z"}
+            row.name: {
+                f"{n}_deg": float(parameters[n][row.index]) for n in parameters if n != "H_z"
+            }
             for row in self.rows
             if r.learnt[row.index]
         }
 
     def document(self) -> dict[str, Any]:
         """Return the figures for JSON."""
-        found = self.results
+        results = self.results
         tested = {h.name: h for h in self.assessment.heliostats} if self.assessment else {}
         heliostats = {
             row.name: {
@@ -199,8 +201,10 @@ class CalibrationReport:
                 "held_out_p95_beam_mrad": 1e3 * row.held.p95,
                 "held_out_coverage_90": tested[row.name].coverage if row.name in tested else None,
                 "outcome": row.outcome.name.lower(),
-                "parameters": dict(zip(found.names, found.values[row.index].tolist(), strict=True)),
-                "sigma": dict(zip(found.names, found.sigma[row.index].tolist(), strict=True)),
+                "parameters": dict(
+                    zip(results.names, results.values[row.index].tolist(), strict=True)
+                ),
+                "sigma": dict(zip(results.names, results.sigma[row.index].tolist(), strict=True)),
             }
             for row in self.rows
         }

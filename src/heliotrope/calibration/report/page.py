@@ -150,10 +150,10 @@ def _notes(report: CalibrationReport, i: int) -> list[str]:
 def _parameters(report: CalibrationReport, i: int) -> list[dict[str, Any]]:
     """Rows of the table of parameters, in mrad, mm or ‰."""
     r = report.results
-    found = []
+    rows = []
     for p, name in enumerate(r.names):
         row = report.learned.mechanism.parameter(name)
-        found.append(
+        rows.append(
             {
                 "name": name,
                 "value": 1e3 * r.values[i, p],
@@ -163,4 +163,4 @@ def _parameters(report: CalibrationReport, i: int) -> list[dict[str, Any]]:
                 "cause": row.cause,
             }
         )
-    return found
+    return rows

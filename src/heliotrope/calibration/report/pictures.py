@@ -93,9 +93,9 @@ def heliostat_figure(result: CalibrationReport, i: int) -> "Figure":
     distance = result.distance[mine]
     everything = [plot.Group(np.ones(len(mine), np.bool_), BEFORE, "before")]
     before, after = result.before.plane[mine], result.after[mine] * distance[:, None]
-    seen = "predicted minus seen"
-    plot.ellipses(before, groups=everything, title=f"{seen}, before", ax=axes[0, 0])
-    title = f"{seen}, after, each predicted from the others"
+    quantity = "predicted minus seen"
+    plot.ellipses(before, groups=everything, title=f"{quantity}, before", ax=axes[0, 0])
+    title = f"{quantity}, after, each predicted from the others"
     plot.ellipses(after, groups=groups, title=title, ax=axes[0, 1])
     _year(axes[0, 2], result, i)
     azimuth, elevation = azimuth_elevation(learned.sightings.source[mine])
@@ -113,16 +113,16 @@ def heliostat_figure(result: CalibrationReport, i: int) -> "Figure":
 
 def _groups(result: CalibrationReport, mine: npt.NDArray[np.intp]) -> list[plot.Group]:
     label, out = result.learned.regime[mine], result.learned.outlier[mine]
-    found = []
+    groups = []
     for k in np.unique(label[label >= 0]):
         name = "common zeros" if k == 0 else f"regime {k}"
         colour = REGIMES[int(k) % len(REGIMES)]
-        found.append(plot.Group((label == k) & ~out, colour, name))
+        groups.append(plot.Group((label == k) & ~out, colour, name))
     if out.any():
-        found.append(plot.Group(out, OUTLIER, "outliers", odd=True))
+        groups.append(plot.Group(out, OUTLIER, "outliers", odd=True))
     if (label < 0).any():
-        found.append(plot.Group(label < 0, TESTED, "not used"))
-    return found
+        groups.append(plot.Group(label < 0, TESTED, "not used"))
+    return groups
 
 
 def _in_time(
@@ -150,8 +150,8 @@ def _year(ax: "Axes", result: CalibrationReport, i: int) -> None:
     machine = result.learned.mechanism[i].with_parameters(
         {n: r.values[i, p] for p, n in enumerate(r.names)}
     )
-    found = year_map(machine, r.names, r.covariance[i], result.aim, result.plant.site.latitude_deg)
-    plot.year_map(found.hour, found.declination, found.rms, ax=ax)
+    year = year_map(machine, r.names, r.covariance[i], result.aim, result.plant.site.latitude_deg)
+    plot.year_map(year.hour, year.declination, year.rms, ax=ax)
     ax.set_title("over the year, without new sightings", fontsize=10)
 
 

@@ -136,13 +136,13 @@ def at_moment(
         when = time
     rows = np.arange(len(names))
     values, spread = learned.parameters_at(rows, np.full(len(names), when))
-    learnt = np.isin(learned.static.outcome, (FitOutcome.CONVERGED, FitOutcome.NOT_CONVERGED))
+    own = np.isin(learned.static.outcome, (FitOutcome.CONVERGED, FitOutcome.NOT_CONVERGED))
     used = np.array([len(m.data) for m in learned.members])
     hyper, teachers = learned.hyper, int((used >= FEWEST).sum())
     shared = np.abs(hyper.mean) > SUPPORTED * hyper.spread / np.sqrt(max(teachers, 1))
     shared &= teachers >= TEACHERS
-    values[~learnt] = np.where(shared & (used[~learnt, None] == 0), hyper.mean, 0.0)
-    for i in np.flatnonzero(~learnt):
+    values[~own] = np.where(shared & (used[~own, None] == 0), hyper.mean, 0.0)
+    for i in np.flatnonzero(~own):
         data = learned.members[i].data
         unknown = posterior(hyper, data.take(np.zeros(len(data), np.bool_)))
         spread[i] = unknown.at(np.array([when / DAY]), np.zeros(1, np.int64))[1][0]
@@ -155,7 +155,7 @@ def at_moment(
         spread,
         np.array([m.hyper.noise for m in learned.members]),
         used,
-        learnt,
+        own,
         shared,
     )
 
@@ -290,10 +290,10 @@ def read_json(path: str | Path) -> FieldParameters:
 
 
 def _numbers(node: _json.JsonNode, size: int) -> list[float]:
-    found = [part.number() for part in node.elements()]
-    if len(found) != size:
-        raise node.fail(f"{len(found)} numbers for {size} parameters")
-    return found
+    numbers = [part.number() for part in node.elements()]
+    if len(numbers) != size:
+        raise node.fail(f"{len(numbers)} numbers for {size} parameters")
+    return numbers
 
 
 def _seconds(node: _json.JsonNode) -> float:
@@ -351,8 +351,8 @@ def write_paint(
     """
     from heliotrope.field.formats import paint
 
-    given = _given(plant, learned, time, "write_paint")
-    groups = {name: given.find(name)[0] for name in learned.heliostats}
+    calibrated = _calibrated(plant, learned, time, "write_paint")
+    groups = {name: calibrated.find(name)[0] for name in learned.heliostats}
     for name, group in groups.items():
         paint.written(group, name)
     place = Path(folder)
@@ -360,13 +360,13 @@ def write_paint(
         (place / "properties").mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{place}: cannot be made ({error.strerror}); give a folder") from None
-    left: dict[str, tuple[str, ...]] = {}
+    omitted: dict[str, tuple[str, ...]] = {}
     for name, group in groups.items():
         file = place / "properties" / f"{name}.json"
-        left[name] = paint.write_heliostat(group, name, plant.site.origin, file)
-    lines = [f"{name}: {', '.join(lost)}" for name, lost in left.items() if lost]
+        omitted[name] = paint.write_heliostat(group, name, plant.site.origin, file)
+    lines = [f"{name}: {', '.join(lost)}" for name, lost in omitted.items() if lost]
     write_text(place / "left-out.txt", "".join(f"{line}\n" for line in lines))
-    return left
+    return omitted
 
 
 def write_artist(
@@ -376,7 +376,7 @@ def write_artist(
     learned: Learned,
     time: float | None = None,
 ) -> dict[str, tuple[str, ...]]:
-    """Write a copy of a scenario of ARTIST with what was learnt of its heliostats.
+    """Write a copy of a scenario of ARTIST with the learned parameters of its heliostats.
 
     Parameters
     ----------
@@ -403,8 +403,8 @@ def write_artist(
     """
     from heliotrope.field.formats import artist
 
-    given = _given(plant, learned, time, "write_artist")
-    groups = {name: given.find(name)[0] for name in learned.heliostats}
+    calibrated = _calibrated(plant, learned, time, "write_artist")
+    groups = {name: calibrated.find(name)[0] for name in learned.heliostats}
     return artist.write_scenario(path, scenario, groups, plant.site.origin)
 
 
@@ -438,8 +438,8 @@ def write_opencsp(
     from heliotrope.field.formats import opencsp
 
     old = opencsp.read_field(table)
-    given = _given(plant, learned, time, "write_opencsp")
-    moved, lost = _moved(given, learned.heliostats, old.names, old.location, table)
+    calibrated = _calibrated(plant, learned, time, "write_opencsp")
+    moved, lost = _moved(calibrated, learned.heliostats, old.names, old.location, table)
     opencsp.write_field(path, replace(old, location=moved))
     return lost
 
@@ -465,21 +465,21 @@ def write_solarpilot(
     from heliotrope.field.formats import solarpilot
 
     old = solarpilot.read_layout(layout, plant.site)
-    given = _given(plant, learned, time, "write_solarpilot")
-    moved, lost = _moved(given, learned.heliostats, old.names, old.location, layout)
+    calibrated = _calibrated(plant, learned, time, "write_solarpilot")
+    moved, lost = _moved(calibrated, learned.heliostats, old.names, old.location, layout)
     solarpilot.write_layout(path, replace(old, location=moved))
     return lost
 
 
 def _moved(
-    given: Plant,
+    plant: Plant,
     heliostats: Sequence[str],
     names: Sequence[str],
     location: FloatArray,
     source: str | Path,
 ) -> tuple[FloatArray, dict[str, tuple[str, ...]]]:
     """Return locations (N, 3) moved as was learnt, and what has no place beside them, by name."""
-    rows, found = {name: i for i, name in enumerate(names)}, location.copy()
+    rows, moved = {name: i for i, name in enumerate(names)}, location.copy()
     lost: dict[str, tuple[str, ...]] = {}
     for name in heliostats:
         if name not in rows:
@@ -487,19 +487,19 @@ def _moved(
                 f"heliostat {name}: {source} has no heliostat of that name; give the file that "
                 "the plant was read from"
             )
-        group, i = given.find(name)
-        values = {key: float(each[i]) for key, each in group.parameters.items()}
-        found[rows[name]] += [values.pop(f"position_{axis}", 0.0) for axis in _AXES]
+        group, i = plant.find(name)
+        values = {key: float(column[i]) for key, column in group.parameters.items()}
+        moved[rows[name]] += [values.pop(f"position_{axis}", 0.0) for axis in _AXES]
         mechanism = group.mechanism
         lost[name] = tuple(
             f"{key} {value:.4g} {mechanism.parameter(key).unit}"
             for key, value in values.items()
             if value
         )
-    return found, lost
+    return moved, lost
 
 
-def _given(plant: Plant, learned: Learned, time: float | None, what: str) -> Plant:
+def _calibrated(plant: Plant, learned: Learned, time: float | None, what: str) -> Plant:
     """Return the plant with what was learnt, for ``what`` to write."""
     if not learned.heliostats:
         raise InputError(

@@ -55,7 +55,7 @@ class FileRecord:
     Attributes
     ----------
     etag, modified
-        ETag and Last-Modified, "" if absent.
+        ETag and Last-Modified; empty without.
     size
         Bytes of the whole file; −1 if not known.
     done

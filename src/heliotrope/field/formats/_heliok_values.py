@@ -57,14 +57,14 @@ class Values:
 
     def child(self, element: XmlElement, tag: str) -> XmlElement:
         """Return the only child element of that name."""
-        found = list(element.elements(tag))
-        if len(found) != 1:
+        children = list(element.elements(tag))
+        if len(children) != 1:
             raise self.error(
                 element,
-                f"<{element.tag}> {element.get('name') or ''} has {len(found)} elements "
+                f"<{element.tag}> {element.get('name') or ''} has {len(children)} elements "
                 f"<{tag}>; it needs one",
             )
-        return found[0]
+        return children[0]
 
     def lengths(self, element: XmlElement, attribute: str, count: int) -> FloatArray:
         """Return ``count`` lengths in m."""

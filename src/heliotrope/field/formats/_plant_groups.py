@@ -116,15 +116,15 @@ class _Reader:
             )
         return column
 
-    def number(self, key: str, given: float | None) -> FloatArray | None:
+    def number(self, key: str, value: float | None) -> FloatArray | None:
         column = self.column(key)
         if column is not None:
             return column
-        return None if given is None else np.asarray(given, dtype=np.float64)
+        return None if value is None else np.asarray(value, dtype=np.float64)
 
-    def array(self, key: str, given: Any) -> FloatArray:
+    def array(self, key: str, value: Any) -> FloatArray:
         """Return an array of numbers (N, …); columns ``key.i.j`` replace single elements."""
-        base = np.asarray(given, dtype=np.float64)
+        base = np.asarray(value, dtype=np.float64)
         full = np.array(np.broadcast_to(base, (len(self.rows), *base.shape)))
         for index in np.ndindex(base.shape):
             column = self.column(".".join([key, *map(str, index)]))
@@ -142,10 +142,10 @@ class _Reader:
                 raise self.fail(f"{key} does not belong to kind {group.kind}; remove it", key)
         arguments: dict[str, Any] = {}
         for key in KINDS[group.kind]:
-            given = getattr(group, key)
-            if isinstance(given, list):
-                arguments[key.removesuffix("_m")] = self.array(key, given)
-            elif (value := self.number(key, given)) is not None:
+            setting = getattr(group, key)
+            if isinstance(setting, list):
+                arguments[key.removesuffix("_m")] = self.array(key, setting)
+            elif (value := self.number(key, setting)) is not None:
                 arguments[key.removesuffix("_m")] = value
         if group.kind == "polar":
             degrees = arguments.pop("latitude_deg", np.asarray(site.latitude_deg))
@@ -263,7 +263,7 @@ class _Reader:
         return Facets(array[:, :, 0], array[:, :, 1], array[:, :, 2])
 
     def parameters(self, mechanism: Mechanism) -> dict[str, FloatArray]:
-        found = {}
+        parameters = {}
         for column in self.table.numbers:
             if not column.startswith("parameters."):
                 continue
@@ -276,8 +276,8 @@ class _Reader:
             if name is None:
                 known = [_column(mechanism, n) for n in mechanism.parameters]
                 raise UnknownNameError(f"parameter (column {column})", key, known)
-            found[name] = values
-        return found
+            parameters[name] = values
+        return parameters
 
     def machines(self, mechanism: Mechanism) -> tuple[Machine, ...]:
         """Return the machine of each heliostat; () if the group has no such table."""
@@ -288,9 +288,9 @@ class _Reader:
             return ()
         joints = [mechanism.joints[d] for d in mechanism.driven]
         if sorted(table.axes) != sorted(joints):
-            given = ", ".join(table.axes) or "none"
+            listed = ", ".join(table.axes) or "none"
             raise self.fail(
-                f"axes of {given}; give those of {' and '.join(joints)}", "machine.axes"
+                f"axes of {listed}; give those of {' and '.join(joints)}", "machine.axes"
             )
         first = table.leaves_stow_first or joints[0]
         if first not in joints:
@@ -309,13 +309,13 @@ class _Reader:
         standby = (
             None if table.standby_m is None else self.array("machine.standby_m", table.standby_m)
         )
-        way = tuple((x, y, z) for x, y, z in table.way_m)
+        points = tuple((x, y, z) for x, y, z in table.way_m)
         stepping = None
         if table.stepping is not None:
-            one, two = table.stepping.microsteps
-            stepping = Stepping((one, two), table.stepping.rests)
+            primary, secondary = table.stepping.microsteps
+            stepping = Stepping((primary, secondary), table.stepping.rests)
         made: dict[tuple[Any, ...], Machine] = {}
-        found = []
+        machines = []
         for k in range(len(self.rows)):
             numbers = (
                 tuple(axes[0][k].tolist()),
@@ -330,14 +330,14 @@ class _Reader:
                     limits,
                     *numbers[2:],
                     joints.index(first),
-                    way,
+                    points,
                     stepping,
                     table.stow_lights,
                     table.tilt_sensor,
                 )
-            found.append(made[numbers])
+            machines.append(made[numbers])
         self.check_defocus(drives, axes, defocus, joints)
-        return tuple(found)
+        return tuple(machines)
 
     def axis(self, drive: Drive, where: str, table: AxisTable) -> npt.NDArray[np.int64]:
         """Return low, high, rate, acceleration and backlash of one axis, (N, 5)."""
@@ -366,12 +366,12 @@ class _Reader:
         self, drive: Drive, where: str, steps: int | None, deg: float | None, stop: int
     ) -> FloatArray:
         """Return one end of an axis, steps, (N,): as given, or the stop of its drive."""
-        given = self.number(f"{where}_steps", steps)
+        counts = self.number(f"{where}_steps", steps)
         angle = self.number(f"{where}_deg", deg)
-        if given is not None and angle is not None:
+        if counts is not None and angle is not None:
             raise self.fail("it is given in steps and in deg; keep one", where)
-        if given is not None:
-            return np.broadcast_to(given, self.rows.shape)
+        if counts is not None:
+            return np.broadcast_to(counts, self.rows.shape)
         radians = drive.table[:, stop] if angle is None else np.radians(angle)
         if not np.isfinite(radians).all():
             raise self.fail("it is missing in _steps and _deg, and the drive has no stop", where)
@@ -412,9 +412,9 @@ class _Reader:
         if len(units) != 1:
             raise self.fail("give one of defocus_deg, defocus_mrad, defocus_rad", "machine")
         key = f"defocus_{units[0]}"
-        given = self.array(f"machine.{key}", getattr(table, key))
+        angles = self.array(f"machine.{key}", getattr(table, key))
         names = [self.table.name[row] for row in self.rows]
-        return spread_defocus(given * ANGLE_UNITS[units[0]], names, table.defocus_spread)
+        return spread_defocus(angles * ANGLE_UNITS[units[0]], names, table.defocus_spread)
 
 
 def _joint_names(kind: str) -> tuple[str, ...]:
@@ -479,10 +479,10 @@ def group_document(name: str, heliostats: Heliostats) -> tuple[dict[str, Any], d
         document["facets"] = first(
             "facets", np.stack([f.center, f.half_width, f.half_height], axis=2)
         )
-    strange = [row.name for row in m.own if row.name in heliostats.parameters]
-    if strange:
+    own = [row.name for row in m.own if row.name in heliostats.parameters]
+    if own:
         raise InputError(
-            f"group {name}: parameter {strange[0]} belongs to an own joint, which a plant file "
+            f"group {name}: parameter {own[0]} belongs to an own joint, which a plant file "
             "cannot hold; write the plant without it"
         )
     for parameter, values in heliostats.parameters.items():
@@ -507,17 +507,21 @@ def _machine_document(
     for i, joint in enumerate(joints):
         where = f"machine.axes.{joint}"
         axes[joint] = {
-            key: first(f"{where}.{key}", np.array([getattr(one.axes[i], name) for one in machines]))
+            key: first(
+                f"{where}.{key}", np.array([getattr(machine.axes[i], name) for machine in machines])
+            )
             for key, name in keys.items()
         }
     document: dict[str, Any] = {
-        "stow_steps": first("machine.stow_steps", np.array([one.stow for one in machines])),
-        "defocus_rad": first("machine.defocus_rad", np.array([one.defocus for one in machines])),
+        "stow_steps": first("machine.stow_steps", np.array([machine.stow for machine in machines])),
+        "defocus_rad": first(
+            "machine.defocus_rad", np.array([machine.defocus for machine in machines])
+        ),
         "defocus_spread": 0.0,  # the angles of each mirror are written
         "leaves_stow_first": joints[machines[0].azimuth_axis],
     }
     if machines[0].standby is not None:
-        standby = np.array([one.standby for one in machines])
+        standby = np.array([machine.standby for machine in machines])
         document["standby_m"] = first("machine.standby_m", standby)
     if machines[0].way:
         document["way_m"] = [list(point) for point in machines[0].way]

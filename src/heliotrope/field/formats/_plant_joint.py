@@ -61,8 +61,8 @@ def receiver_visits_document(settings: ReceiverSettings | None) -> dict[str, Any
 def _values(table: StrictTable | None, who: str) -> dict[str, Any]:
     """Return the settings that a table gives, by name, in the program's own units."""
     values: dict[str, Any] = {}
-    given = {} if table is None else table.model_dump(exclude_none=True, exclude={"allowed"})
-    for key, value in given.items():
+    settings = {} if table is None else table.model_dump(exclude_none=True, exclude={"allowed"})
+    for key, value in settings.items():
         unit = next((unit for unit in _UNITS if key.endswith(unit)), "")
         name = key.removesuffix(unit)
         if name in values:

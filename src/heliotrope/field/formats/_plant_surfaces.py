@@ -22,17 +22,17 @@ _SIZES = ("width_m", "height_m", "radius_m")
 def surface_values(table: Any) -> dict[str, str]:
     """Return the values of a target or a receiver that can be set, by name."""
     facing, tilt = _angles(table)
-    found = {
+    values = {
         RENAMED: str(table["name"]),
         "center_m": _text(_center(table)),
         "facing_deg": f"{facing:.6g}",
         "tilt_deg": f"{tilt:.6g}",
     }
-    found |= {key: f"{float(table[key]):.9g}" for key in _SIZES if key in table}
-    return found | {name: _text(point) for name, point in _points(table)}
+    values |= {key: f"{float(table[key]):.9g}" for key in _SIZES if key in table}
+    return values | {name: _text(point) for name, point in _points(table)}
 
 
-def set_surface(table: Any, given: Mapping[str, str]) -> tuple[str, ...]:
+def set_surface(table: Any, changes: Mapping[str, str]) -> tuple[str, ...]:
     """Set values of a target or a receiver; return warnings.
 
     Raises
@@ -43,11 +43,11 @@ def set_surface(table: Any, given: Mapping[str, str]) -> tuple[str, ...]:
         A name that is not a value of it.
     """
     known = surface_values(table)
-    for name in given:
+    for name in changes:
         if name not in known:
             raise UnknownNameError(f"value of {table['name']}", name, known)
     # Single points first: the surface then moves and turns with them.
-    for name, text in given.items():
+    for name, text in changes.items():
         if name == RENAMED:
             table["name"] = text.strip()
         elif name in _SIZES:
@@ -55,21 +55,21 @@ def set_surface(table: Any, given: Mapping[str, str]) -> tuple[str, ...]:
         elif name not in ("center_m", "facing_deg", "tilt_deg"):
             point = _place(table, name)
             _put(point, np.array(_numbers(table, name, text, 3)))
-    if "facing_deg" in given or "tilt_deg" in given:
-        _turn(table, given)
-    if "center_m" in given:
-        shift = np.array(_numbers(table, "center_m", given["center_m"], 3)) - _center(table)
+    if "facing_deg" in changes or "tilt_deg" in changes:
+        _turn(table, changes)
+    if "center_m" in changes:
+        shift = np.array(_numbers(table, "center_m", changes["center_m"], 3)) - _center(table)
         _move(table, lambda point: point + shift)
-    if RENAMED in given or set(given) <= set(_SIZES) - {"width_m", "height_m"}:
+    if RENAMED in changes or set(changes) <= set(_SIZES) - {"width_m", "height_m"}:
         return ()
     kept = "sightings that were taken on it before count as they were measured then"
     return (f"{table['name']}: {kept}; if it was moved, rename it too (name=…)",)
 
 
-def _turn(table: Any, given: Mapping[str, str]) -> None:
+def _turn(table: Any, changes: Mapping[str, str]) -> None:
     facing, tilt = _angles(table)
-    new = _numbers(table, "facing_deg", given.get("facing_deg", f"{facing!r}"), 1)[0]
-    lean = _numbers(table, "tilt_deg", given.get("tilt_deg", f"{tilt!r}"), 1)[0]
+    new = _numbers(table, "facing_deg", changes.get("facing_deg", f"{facing!r}"), 1)[0]
+    lean = _numbers(table, "tilt_deg", changes.get("tilt_deg", f"{tilt!r}"), 1)[0]
     if abs(lean) >= 90.0:
         raise InputError(f"{table['name']}: tilt_deg={lean:g}: give less than 90° either way")
     R_enu_new, R_enu_old = _axes(new, lean), _axes(facing, tilt)
@@ -173,10 +173,10 @@ def _text(point: FloatArray) -> str:
 
 def _numbers(table: Any, name: str, text: str, count: int) -> list[float]:
     try:
-        found = [float(part) for part in text.split(",")]
+        numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        found = []
-    if len(found) != count or not np.isfinite(found).all():
-        wanted = "a number" if count == 1 else "three numbers in metres, east,north,up"
-        raise InputError(f"{table['name']}: {name}={text}: give {wanted}")
-    return found
+        numbers = []
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        expected = "a number" if count == 1 else "three numbers in metres, east,north,up"
+        raise InputError(f"{table['name']}: {name}={text}: give {expected}")
+    return numbers

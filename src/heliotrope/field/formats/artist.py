@@ -81,13 +81,13 @@ def write_scenario(
                         f"heliostat {name}: {file} has {len(known)} heliostats, and none of that "
                         "name; make the scenario with it"
                     )
-                one = written(group, name)
-                foot = enu_to_geodetic(one.position, origin)
+                mechanism = written(group, name)
+                foot = enu_to_geodetic(mechanism.position, origin)
                 latitude, longitude, height = (float(v) for v in tower)
                 local = geodetic_to_enu(*foot, (latitude, longitude, height))
                 _write(known[name], "position", np.append(local, 1.0))
-                _mechanism(root, known[name], kinematics_properties(one))
-                lost[name] = without_place(one)
+                _mechanism(root, known[name], kinematics_properties(mechanism))
+                lost[name] = without_place(mechanism)
     except (OSError, RuntimeError, KeyError) as error:
         raise FormatError(file, f"{str(error)[:80]}; it should be {_WHAT}") from None
     write_file(path, lambda stream: stream.write(held.getvalue()))
@@ -100,12 +100,12 @@ def _mechanism(root: "h5py.File", own: "h5py.Group", properties: dict[str, Any])
             root.copy(f"prototypes/{part}", own, part)
     for ours, theirs in _DEVIATIONS.items():
         _write(own, f"kinematics/deviations/{theirs}", properties[ours])
-    for k, given in enumerate(properties["actuators"]):
+    for k, actuator in enumerate(properties["actuators"]):
         axis = own[f"actuator/actuator_{k}"]
         for name in _PARAMETERS:
-            _write(axis, f"parameters/{name}", given[name])
-        _write(axis, "clockwise_axis_movement", bool(given["clockwise_axis_movement"]))
-        limits = [given["min_increment"], given["max_increment"]]
+            _write(axis, f"parameters/{name}", actuator[name])
+        _write(axis, "clockwise_axis_movement", bool(actuator["clockwise_axis_movement"]))
+        limits = [actuator["min_increment"], actuator["max_increment"]]
         if np.isfinite(limits).all():
             _write(axis, "min_max_motor_positions", np.round(limits).astype(np.int64))
         del axis["type"]
@@ -114,7 +114,7 @@ def _mechanism(root: "h5py.File", own: "h5py.Group", properties: dict[str, Any])
 
 def _write(place: "h5py.Group", name: str, value: npt.ArrayLike) -> None:
     """Replace a value, in single precision as ARTIST has it."""
-    given = np.asarray(value)
+    array = np.asarray(value)
     if name in place:
         del place[name]
-    place[name] = given.astype(np.float32) if given.dtype.kind == "f" else given
+    place[name] = array.astype(np.float32) if array.dtype.kind == "f" else array

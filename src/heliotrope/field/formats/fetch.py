@@ -69,7 +69,7 @@ class FetchState:
     received
         Bytes of files received.
     name
-        Document or file just completed, "" if none.
+        Document or file just completed; empty at first.
     """
 
     stage: str
@@ -189,10 +189,10 @@ def fetch_heliostats(
     for name in names:
         if not _HELIOSTAT.fullmatch(name):
             raise InputError(f"heliostat {name!r}: give a name of letters and digits, such as AA39")
-    for what, given, known in (("kind", kinds, KINDS), ("image", images, IMAGES)):
-        for one in given:
-            if one not in known:
-                raise UnknownNameError(what, one, known)
+    for what, chosen, known in (("kind", kinds, KINDS), ("image", images, IMAGES)):
+        for choice in chosen:
+            if choice not in known:
+                raise UnknownNameError(what, choice, known)
     return _run(
         lambda run: run.heliostats(names, kinds, images),
         into,
@@ -246,10 +246,10 @@ class _Document:
         links = self.content.get("links")
         if not isinstance(links, list) or not all(isinstance(link, dict) for link in links):
             raise FetchError(f"{self.url}: not a STAC catalogue: it has no list of links")
-        found = [link.get("href") for link in links if link.get("rel") in relations]
-        if not all(isinstance(href, str) for href in found):
+        addresses = [link.get("href") for link in links if link.get("rel") in relations]
+        if not all(isinstance(href, str) for href in addresses):
             raise FetchError(f"{self.url}: not a STAC catalogue: a link has no address")
-        return [self.address(str(href)) for href in found]
+        return [self.address(str(href)) for href in addresses]
 
     def address(self, href: str) -> str:
         """Return an address that may be relative to the document.
@@ -329,7 +329,7 @@ class _Run:
     def fetch(self, jobs: list[RemoteFile]) -> list[bool]:
         """Fetch the files; return for each whether it was downloaded now."""
         self._done = self._total = 0
-        return self._each("fetching", self._download, jobs)
+        return self._map("fetching", self._download, jobs)
 
     def heliostats(
         self, names: Sequence[str], kinds: Sequence[str], images: Sequence[str]
@@ -340,21 +340,21 @@ class _Run:
             for name in names
         ]
         collections = []
-        for catalogue in self._each("looking", self._catalogue, catalogues):
+        for catalogue in self._map("looking", self._catalogue, catalogues):
             children, name = catalogue.hrefs("child"), catalogue.link.heliostat
             for kind in kinds:
-                found = [url for url in children if f"{kind}-collection" in url.split("/")[-1]]
-                collections += [_Link(name, kind, url) for url in found]
-                if not found:
+                urls = [url for url in children if f"{kind}-collection" in url.split("/")[-1]]
+                collections += [_Link(name, kind, url) for url in urls]
+                if not urls:
                     self.missing.append(f"heliostat {name}: the database has no {kind} data")
         items = [
             _Link(collection.link.heliostat, collection.link.kind, url)
-            for collection in self._each("looking", self._document, collections)
+            for collection in self._map("looking", self._document, collections)
             for url in collection.hrefs("item")
         ]
         return [
             job
-            for item in self._each("looking", self._document, items)
+            for item in self._map("looking", self._document, items)
             for asset, entry in item.assets().items()
             if asset in images or not _is_image(asset, entry)
             for job in [self._job(item, entry)]
@@ -364,7 +364,7 @@ class _Run:
         """Return the files of the tower."""
         plant = DEFAULT_BASE_URL.rsplit("/", 1)[-1]
         link = _Link("", "", f"{self.base}/{plant}-tower-measurements-item-stac.json")
-        (item,) = self._each("looking", self._document, [link])
+        (item,) = self._map("looking", self._document, [link])
         return [self._job(item, entry) for entry in item.assets().values()]
 
     def _catalogue(self, link: _Link) -> _Document:
@@ -381,10 +381,10 @@ class _Run:
         plant = DEFAULT_BASE_URL.rsplit("/", 1)[-1]
         try:
             root = self._document(_Link("", "", f"{self.base}/{plant}-catalog-stac.json"))
-            found = [_CATALOGUE.search(url) for url in root.hrefs("child")]
+            matches = [_CATALOGUE.search(url) for url in root.hrefs("child")]
         except FetchError:
             return "; look at its catalogue"
-        close = get_close_matches(name, [match[1] for match in found if match])
+        close = get_close_matches(name, [match[1] for match in matches if match])
         return f"; did you mean {', '.join(close)}?" if close else "; look at its catalogue"
 
     def _document(self, link: _Link) -> _Document:
@@ -440,19 +440,19 @@ class _Run:
             heliostat = job.name.split("/")[0] if "/" in job.name else ""
             raise FetchError(_of(heliostat, error)) from None
 
-    def _each(
+    def _map(
         self, stage: str, work: Callable[[Task], Result], tasks: Sequence[Task]
     ) -> list[Result]:
         """Return the result of ``work`` for each task, in order; the first failure ends all."""
 
-        def one(task: Task) -> Result:
+        def run_task(task: Task) -> Result:
             result = work(task)
             self._tell(stage, getattr(task, "url", "").split("/")[-1])
             return result
 
         self._total += len(tasks)
         with ThreadPoolExecutor(self._workers, thread_name_prefix="fetch") as pool:
-            futures = [pool.submit(one, task) for task in tasks]
+            futures = [pool.submit(run_task, task) for task in tasks]
             try:
                 for future in as_completed(futures):
                     future.result()
@@ -491,9 +491,9 @@ def _distinct(jobs: Iterable[RemoteFile]) -> list[RemoteFile]:
     FetchError
         If two different files would go to one place.
     """
-    found: dict[Path, RemoteFile] = {}
+    distinct: dict[Path, RemoteFile] = {}
     for job in jobs:
-        first = found.setdefault(job.path, job)
+        first = distinct.setdefault(job.path, job)
         if first.url != job.url:
             raise FetchError(f"{job.url}: would be stored where {first.url} is; refused")
-    return list(found.values())
+    return list(distinct.values())

@@ -202,14 +202,14 @@ def models(document: Document) -> dict[str, Model]:
         If a name occurs twice, or an element or a number is missing or wrong.
     """
     values = Values(document)
-    found: dict[str, Model] = {}
+    by_name: dict[str, Model] = {}
     for factory in document.root.elements("Factory"):
         for element in factory.elements("HeliostatKit"):
             name = values.text(element, "name")
-            if name in found:
+            if name in by_name:
                 raise values.error(element, f"HeliostatKit {name}: the name occurs twice")
-            found[name] = _model(values, element, name)
-    return found
+            by_name[name] = _model(values, element, name)
+    return by_name
 
 
 def _model(values: Values, element: XmlElement, name: str) -> Model:
@@ -347,20 +347,20 @@ def heliostats(document: Document) -> list[PlacedModel]:
         not known.
     """
     values, known = Values(document), models(document)
-    found: dict[str, PlacedModel] = {}
+    by_name: dict[str, PlacedModel] = {}
     for kit in _scene(document, values, "HeliostatKit"):
         name = kit.path[-1] if kit.path else ""
         if not name:
             raise values.error(kit.element, "a heliostat whose node has no name; give it one")
-        if name in found:
+        if name in by_name:
             raise values.error(
                 kit.element, f"heliostat {name}: the name occurs twice; names are unique"
             )
         ref = values.text(kit.element, "ref")
         if ref not in known:
             raise values.error(kit.element, str(UnknownNameError("HeliostatKit", ref, known)))
-        found[name] = PlacedModel(name, known[ref], kit.position, kit.axes)
-    return list(found.values())
+        by_name[name] = PlacedModel(name, known[ref], kit.position, kit.axes)
+    return list(by_name.values())
 
 
 def surfaces(document: Document) -> list[PlacedSurface]:
@@ -449,9 +449,9 @@ def to_plant(document: Document, site: Site) -> Plant:
         upright = int(np.argmax(np.abs(model.primary.direction)))
         key = (upright, len(model.facets), len(model.axes))
         members.setdefault(key, []).append(placed)
-    several = len(members) > 1
+    numbered = len(members) > 1
     groups = {
-        f"heliostats-{k}" if several else "heliostats": _group(same, upright)
+        f"heliostats-{k}" if numbered else "heliostats": _group(same, upright)
         for k, ((upright, *_), same) in enumerate(members.items(), start=1)
     }
     targets: list[Target] = []
@@ -467,14 +467,14 @@ def to_plant(document: Document, site: Site) -> Plant:
 def _named(placed: list[PlacedSurface]) -> Iterator[tuple[PlacedSurface, str]]:
     """Name each surface uniquely: a node may hold several surfaces, or have no name."""
     taken: set[str] = set()
-    for one in placed:
-        wanted = name = (one.path[-1] if one.path else "") or "surface"
+    for surface in placed:
+        base = name = (surface.path[-1] if surface.path else "") or "surface"
         count = 1
         while name in taken:
             count += 1
-            name = f"{wanted}-{count}"
+            name = f"{base}-{count}"
         taken.add(name)
-        yield one, name
+        yield surface, name
 
 
 def _corners(surface: Surface) -> FloatArray:
@@ -503,15 +503,15 @@ def _receiver(surface: Surface, name: str) -> Receiver:
 
 def _group(placed: list[PlacedModel], upright: int) -> Heliostats:
     """Return heliostats whose primary axes all lie nearest to axis ``upright`` of their frame."""
-    models_ = [one.model for one in placed]
+    models_ = [heliostat.model for heliostat in placed]
     normal, point = np.array([m.normal for m in models_]), np.array([m.point for m in models_])
     first, second = (name for k, name in enumerate(_LEANS) if k != upright)
-    position = np.array([one.position for one in placed])
-    orientation = np.array([one.orientation for one in placed])
+    position = np.array([heliostat.position for heliostat in placed])
+    orientation = np.array([heliostat.orientation for heliostat in placed])
     axes = list(zip(*(m.axes for m in models_), strict=True))
-    along = [np.array([axis.direction for axis in each]) for each in axes]
-    origin = [np.array([axis.origin for axis in each]) for each in axes]
-    drives = [_drive(each) for each in axes]
+    along = [np.array([axis.direction for axis in joint]) for joint in axes]
+    origin = [np.array([axis.origin for axis in joint]) for joint in axes]
+    drives = [_drive(joint) for joint in axes]
     if len(axes) == 1:
         mechanism = single_axis(
             position,
@@ -543,7 +543,7 @@ def _group(placed: list[PlacedModel], upright: int) -> Heliostats:
     size = np.ptp(corners.reshape(len(placed), -1, 3), axis=1)
     aims = [np.full(3, np.nan) if m.aim is None else m.aim for m in models_]
     return Heliostats(
-        names=tuple(one.name for one in placed),
+        names=tuple(heliostat.name for heliostat in placed),
         mechanism=mechanism,
         width=size[:, 0],
         height=size[:, 1],
@@ -555,8 +555,8 @@ def _group(placed: list[PlacedModel], upright: int) -> Heliostats:
 def _drive(axes: tuple[DrivenAxis, ...]) -> Drive:
     """Return drives whose counts are radians, one an axis, with its stops."""
     stops = np.array([axis.stops for axis in axes])
-    each = Drive(np.tile(direct().table, (len(axes), 1)))
-    return each.replace(min_angle=stops[:, 0], max_angle=stops[:, 1])
+    drives = Drive(np.tile(direct().table, (len(axes), 1)))
+    return drives.replace(min_angle=stops[:, 0], max_angle=stops[:, 1])
 
 
 def _facets(models_: list[Model], frame: FloatArray, point: FloatArray) -> Facets:

@@ -101,12 +101,12 @@ def _read_table(path: Path, centroid: Centroid) -> "tuple[pd.DataFrame, list[str
     """Return the rows of a table, and a line for each that has another length than the header."""
     import pandas as pd
 
-    wanted = [*_COLUMNS, *(f"{centroid}_{c}" for c in ("lat", "lon", "alt"))]
-    rows = read_rows(path, "a table of measurements", wanted)
-    rows.need(wanted)
+    needed = [*_COLUMNS, *(f"{centroid}_{c}" for c in ("lat", "lon", "alt"))]
+    rows = read_rows(path, "a table of measurements", needed)
+    rows.need(needed)
     kept = rows.take(rows.good)
-    frame = pd.DataFrame({name: kept.columns[name] for name in wanted})
-    for column in wanted:
+    frame = pd.DataFrame({name: kept.columns[name] for name in needed})
+    for column in needed:
         if column not in ("heliostat", "id", "timestamp", "target"):
             frame[column] = pd.to_numeric(frame[column], errors="coerce")
     return frame, rows.left_out
@@ -123,12 +123,12 @@ def _read_files(place: Path, centroid: Centroid) -> "pd.DataFrame":
         )
     rows = []
     for file in files:
-        found = read_calibration_properties(file)
+        record = read_calibration_properties(file)
         key = {"utis": "UTIS", "helios": "HeliOS"}[centroid]
-        spot = found.focal_spots.get(key, (np.nan, np.nan, np.nan))
+        spot = record.focal_spots.get(key, (np.nan, np.nan, np.nan))
         name = heliostat_of(file) or file.parent.name
-        numbers = (found.sun_azimuth_deg, found.sun_elevation_deg, *found.motors)
-        rows.append((name, file.name.split("-")[0], "", found.target, *numbers, *spot))
+        numbers = (record.sun_azimuth_deg, record.sun_elevation_deg, *record.motors)
+        rows.append((name, file.name.split("-")[0], "", record.target, *numbers, *spot))
     spots = [f"{centroid}_{c}" for c in ("lat", "lon", "alt")]
     return pd.DataFrame(rows, columns=[*_COLUMNS, *spots])
 
@@ -162,12 +162,12 @@ def _keep_good(
     ]
     good = np.ones(len(frame), dtype=np.bool_)
     left_out = list(left_out)
-    for wrong, reason in reasons:
+    for invalid, reason in reasons:
         left_out += [
             f"{frame['heliostat'][i]} {frame['id'][i]}: {reason}"
-            for i in np.flatnonzero(wrong & good)
+            for i in np.flatnonzero(invalid & good)
         ]
-        good &= ~wrong
+        good &= ~invalid
     rows = np.flatnonzero(good)
     # 0 is south and east is positive: the angle from north, clockwise, is 180° minus it.
     suns = direction(np.pi - np.radians(azimuth[rows]), np.radians(elevation[rows]))

@@ -162,8 +162,8 @@ def _location(rows: Rows) -> FloatArray:
 
 def _count(rows: Rows, column: str) -> FloatArray:
     values = rows.numbers(column, "a number of pieces")
-    wrong = ~((values >= 1) & (values == np.floor(values)) & (values <= 1e6))
-    rows.check(column, wrong & np.isfinite(values), values, " is not a number of pieces")
+    invalid = ~((values >= 1) & (values == np.floor(values)) & (values <= 1e6))
+    rows.check(column, invalid & np.isfinite(values), values, " is not a number of pieces")
     return values
 
 
@@ -173,9 +173,9 @@ def write_field(path: str | Path, table: FieldTable) -> None:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*COLUMNS, *table.extra])
     for i, name in enumerate(table.names):
-        counts = [int(each[i]) for each in (table.facets, table.rows, table.columns)]
+        counts = [int(values[i]) for values in (table.facets, table.rows, table.columns)]
         sizes = (table.pivot_height, table.pivot_offset, table.facet_width, table.facet_height)
-        numbers = [float(each[i]) for each in sizes]
+        numbers = [float(values[i]) for values in sizes]
         more = [column[i] for column in table.extra.values()]
         writer.writerow([name, *table.location[i].tolist(), *counts, *numbers, *more])
     write_text(path, text.getvalue())

@@ -65,7 +65,7 @@ class Properties:
     facets
         Centre and half edges in the mirror's frame, (F, 3) each; empty if not given.
     renovation
-        Date of the last renovation, "" if not given.
+        Date of the last renovation; empty if unknown.
     """
 
     name: str
@@ -295,7 +295,7 @@ def find_properties(folder: str | Path) -> list[Path]:
 
 
 def heliostat_of(file: Path) -> str:
-    """Return the heliostat whose folder holds a file of PAINT or ARTIST; "" if there is none."""
+    """Return the heliostat of a file of PAINT or ARTIST from its folder; empty if unknown."""
     if file.parent.name in ("Properties", "Calibration"):
         return file.parent.parent.name
     own = (file.parent / "heliostat-properties.json").exists()
@@ -442,15 +442,15 @@ def write_heliostat(
     InputError
         If its mechanism is not of kind ``two_jacks``.
     """
-    one = written(heliostats, name)
+    mechanism = written(heliostats, name)
     i = heliostats.index(name)
-    latitude, longitude, height = (float(v) for v in enu_to_geodetic(one.position, origin))
+    latitude, longitude, height = (float(v) for v in enu_to_geodetic(mechanism.position, origin))
     document: dict[str, object] = {
         "heliostat_position": [latitude, longitude, height],
         "height": float(heliostats.height[i]),
         "width": float(heliostats.width[i]),
         "initial_orientation": [0.0, -1.0, 0.0],
-        "kinematics_properties": kinematics_properties(one),
+        "kinematics_properties": kinematics_properties(mechanism),
     }
     if heliostats.facets is not None:
         f = heliostats.facets
@@ -462,7 +462,7 @@ def write_heliostat(
             ],
         }
     write_text(path, json.dumps(document, indent=1) + "\n")
-    return without_place(one)
+    return without_place(mechanism)
 
 
 def written(heliostats: Heliostats, name: str) -> Mechanism:
@@ -481,37 +481,43 @@ def written(heliostats: Heliostats, name: str) -> Mechanism:
     return heliostats.calibrated[heliostats.index(name)]
 
 
-def kinematics_properties(one: Mechanism) -> dict[str, object]:
-    """Return what PAINT's file says of a mechanism: translations, tilts, and two actuators."""
-    joints = dict(zip(one.joints, one.angles, strict=True))
-    chain: dict[str, object] = {"actuators": [_actuator(one.drives.table[k], k) for k in (0, 1)]}
+def kinematics_properties(mechanism: Mechanism) -> dict[str, object]:
+    """Return a mechanism as PAINT's file states it: translations, tilts, and two actuators."""
+    joints = dict(zip(mechanism.joints, mechanism.angles, strict=True))
+    chain: dict[str, object] = {
+        "actuators": [_actuator(mechanism.drives.table[k], k) for k in (0, 1)]
+    }
     for part, joint in (
         ("joint_translation_{}_1", 2),
         ("joint_translation_{}_2", 3),
         ("concentrator_translation_{}", 5),
     ):
-        row = one.origins[joint] + (one.origins[0] if joint == 2 else 0.0)
+        row = mechanism.origins[joint] + (mechanism.origins[0] if joint == 2 else 0.0)
         chain |= {part.format(axis): float(row[k]) for k, axis in enumerate("enu")}
     return chain | {
         "joint_tilt_n_1": float(joints["tilt_up"]),
         "joint_tilt_u_1": float(joints["tilt_north"]),
         "joint_tilt_n_2": float(-joints["non_orthogonality"]),
-        "joint_tilt_e_2": float(one.drives.table[0, 7]),
+        "joint_tilt_e_2": float(mechanism.drives.table[0, 7]),
     }
 
 
-def without_place(one: Mechanism) -> tuple[str, ...]:
+def without_place(mechanism: Mechanism) -> tuple[str, ...]:
     """Return the parameters of a mechanism that PAINT has no place for, with their values."""
-    joints = dict(zip(one.joints, one.angles, strict=True))
+    joints = dict(zip(mechanism.joints, mechanism.angles, strict=True))
     lost = {name: float(joints[name]) for name in ("canting", "canting_secondary")}
-    for k, d in enumerate(one.driven):
-        drive = dict(zip(_LOST, one.drives.table[k, [SLOTS[name] for name in _LOST]], strict=True))
+    for k, d in enumerate(mechanism.driven):
+        drive = dict(
+            zip(_LOST, mechanism.drives.table[k, [SLOTS[name] for name in _LOST]], strict=True)
+        )
         lost |= {
-            name if name == "sag" else f"{one.joints[d]}_{name}": float(value)
+            name if name == "sag" else f"{mechanism.joints[d]}_{name}": float(value)
             for name, value in drive.items()
         }
     return tuple(
-        f"{name} {value:.4g} {one.parameter(name).unit}" for name, value in lost.items() if value
+        f"{name} {value:.4g} {mechanism.parameter(name).unit}"
+        for name, value in lost.items()
+        if value
     )
 
 

@@ -54,7 +54,7 @@ class Edited:
     warnings
         Of the changed file, those that the old one had not.
     version
-        Stored version of the file as it was before; "" if nothing was written.
+        Stored version of the file before the change; empty if nothing was written.
     """
 
     changes: tuple[Change, ...]
@@ -86,7 +86,7 @@ def values(path: str | Path, who: str) -> dict[str, str]:
 def edit(
     path: str | Path,
     who: str,
-    given: Mapping[str, str],
+    changes: Mapping[str, str],
     *,
     note: str = "",
     now: datetime | None = None,
@@ -100,7 +100,7 @@ def edit(
         Plant file (TOML).
     who
         Name of the heliostat, target or receiver.
-    given
+    changes
         Texts by the names of `values`; an angle may be given in ``_mrad`` or ``_deg``, and a length
         in ``_mm``, where the name ends in ``_rad`` or ``_m``.
     note
@@ -120,8 +120,8 @@ def edit(
     files = _Files(Path(path))
     before, surface = files.values(who), who not in files.plant.names
     warned = {finding.text for finding in check_plant(files.place)}
-    strange = files.set(who, given)
-    after = files.values(given[RENAMED].strip() if surface and RENAMED in given else who)
+    warnings = files.set(who, changes)
+    after = files.values(changes[RENAMED].strip() if surface and RENAMED in changes else who)
     shown = [
         Change(name, before.get(name, ""), after.get(name, ""), _unit(name))
         for name in dict.fromkeys((*before, *after))
@@ -129,14 +129,14 @@ def edit(
     ]
     if not shown:
         raise InputError(f"{who}: it has these values already; nothing was changed")
-    with files.trial() as found:
-        new = tuple(text for text in found if text not in warned)
+    with files.trial() as findings:
+        new = tuple(text for text in findings if text not in warned)
     if dry:
-        return Edited(tuple(shown), (*strange, *new))
+        return Edited(tuple(shown), (*warnings, *new))
     said = "; ".join(f"{c.name} {c.old or 'none'} -> {c.new or 'none'}" for c in shown)
     version = _keep(files.place, files.table, f"{who}: {said}", note, now)
     files.write(files.place.parent)
-    return Edited(tuple(shown), (*strange, *new), version)
+    return Edited(tuple(shown), (*warnings, *new), version)
 
 
 def keep_version(path: str | Path, change: str, *, now: datetime | None = None) -> str:
@@ -155,14 +155,14 @@ def keep_version(path: str | Path, change: str, *, now: datetime | None = None) 
 
 def versions(path: str | Path) -> list[Version]:
     """Return the stored versions of a plant file, oldest first."""
-    found = []
+    stored = []
     folder = _versions(Path(path))
     for place in sorted(folder.iterdir()) if folder.is_dir() else ():
         if (place / Path(path).name).is_file():
             file = place / _NOTE
             text = read_text(file, "a note") if file.is_file() else ""
-            found.append(Version(place.name, text.strip()))
-    return found
+            stored.append(Version(place.name, text.strip()))
+    return stored
 
 
 def restore(path: str | Path, version: str, *, note: str = "", now: datetime | None = None) -> str:
@@ -175,15 +175,15 @@ def restore(path: str | Path, version: str, *, note: str = "", now: datetime | N
     UnknownNameError
         If there is no such version.
     """
-    here = Path(path)
-    known = [each.name for each in versions(here)]
+    place = Path(path)
+    known = [stored.name for stored in versions(place)]
     if version not in known:
         raise UnknownNameError("stored version", version, known)
-    old = _Files(_versions(here) / version / here.name)
+    old = _Files(_versions(place) / version / place.name)
     # The present file may be the one that cannot be read.
-    kept = _keep(here, old.table, f"version {version} was brought back", note, now)
-    _copy(old.place.parent, here.parent, old.table)
-    _copy(old.place.parent, here.parent, here.name)
+    kept = _keep(place, old.table, f"version {version} was brought back", note, now)
+    _copy(old.place.parent, place.parent, old.table)
+    _copy(old.place.parent, place.parent, place.name)
     return kept
 
 
@@ -233,15 +233,15 @@ class _Files:
 
     # -- changes ---------------------------------------------------------------------------
 
-    def set(self, who: str, given: Mapping[str, str]) -> tuple[str, ...]:
+    def set(self, who: str, changes: Mapping[str, str]) -> tuple[str, ...]:
         """Set values; return warnings."""
         if who not in self.plant.names:
-            said = set_surface(self._surface(who), given)
-            if RENAMED in given:
-                self._rename(who, given[RENAMED].strip())
+            said = set_surface(self._surface(who), changes)
+            if RENAMED in changes:
+                self._rename(who, changes[RENAMED].strip())
             return said
         warnings = []
-        for name, text in given.items():
+        for name, text in changes.items():
             column, factor = self._column(who, name)
             if column in _TEXTS:
                 self.cells.loc[self._row(who), column] = text.strip()
@@ -253,7 +253,7 @@ class _Files:
             self._fill(who, column)
             cell = value if self.table.suffix == ".parquet" else repr(float(value))
             self.cells.loc[self._row(who), column] = cell
-            warnings += self._strange(who, column, value)
+            warnings += self._warnings(who, column, value)
         return tuple(warnings)
 
     def _column(self, who: str, name: str) -> tuple[str, float]:
@@ -278,7 +278,7 @@ class _Files:
             zero = 0.0 if self.table.suffix == ".parquet" else "0.0"
             self.cells.loc[empty & mine, column] = zero
 
-    def _strange(self, who: str, column: str, value: float) -> list[str]:
+    def _warnings(self, who: str, column: str, value: float) -> list[str]:
         group, _ = self.plant.find(who)
         prior = {name: sigma for name, (sigma, _) in _parameters(group).items()}.get(column)
         if not prior or abs(value) <= _STRANGE * prior:
@@ -304,7 +304,7 @@ class _Files:
         with tempfile.TemporaryDirectory(dir=self.place.parent, prefix=".plant-") as folder:
             self.write(Path(folder))
             findings = check_plant(Path(folder) / self.place.name)
-        texts = [each.text.replace(f"{folder}/", f"{self.place.parent}/") for each in findings]
+        texts = [entry.text.replace(f"{folder}/", f"{self.place.parent}/") for entry in findings]
         for finding, text in zip(findings, texts, strict=True):
             if finding.severity == "error":
                 raise InputError(f"{text} (nothing was changed)")
@@ -329,11 +329,11 @@ def _parameters(group: Heliostats) -> dict[str, tuple[float, str]]:
     """Return the columns of a group's parameters: standard deviation of the prior, and unit."""
     known = [group.mechanism.parameter(name) for name in group.mechanism.parameters]
     return {
-        f"parameters.{one.name}" + ("" if one.unit == "1" else f"_{one.unit}"): (
-            one.prior,
-            one.unit,
+        f"parameters.{parameter.name}" + ("" if parameter.unit == "1" else f"_{parameter.unit}"): (
+            parameter.prior,
+            parameter.unit,
         )
-        for one in known
+        for parameter in known
     }
 
 
@@ -360,7 +360,7 @@ def _keep(place: Path, table: PurePath, change: str, note: str, now: datetime | 
     """Store the files as they are on the disk; return the name of the version."""
     at = (now or datetime.now(UTC)).astimezone(UTC)
     stem, home = at.strftime("%Y-%m-%dT%H%M%SZ"), _versions(place)
-    taken = [each.name for each in home.iterdir()] if home.is_dir() else []
+    taken = [version.name for version in home.iterdir()] if home.is_dir() else []
     name = next(n for n in (stem, *(f"{stem}-{k}" for k in range(2, 1000))) if n not in taken)
     for part in (table, place.name):
         if (place.parent / part).is_file():

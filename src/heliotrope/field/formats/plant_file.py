@@ -136,16 +136,22 @@ def _assemble(
             problems.append(error)
         except InputError as error:
             problems.append(FormatError(path, str(error), f"groups.{name}"))
-    targets = _each(path, "targets", document.targets, _target, problems)
-    receivers = _each(path, "receivers", document.receivers, _receiver, problems)
-    cameras = _each(path, "cameras", document.cameras, build_camera, problems)
-    keep_outs = _each(path, "keep_out", document.keep_out, build_volume, problems)
+    targets = _all_built(path, "targets", document.targets, _target, problems)
+    receivers = _all_built(path, "receivers", document.receivers, _receiver, problems)
+    cameras = _all_built(path, "cameras", document.cameras, build_camera, problems)
+    keep_outs = _all_built(path, "keep_out", document.keep_out, build_volume, problems)
     eyes = {name: np.array(point) for name, point in document.eyes_m.items()}
-    joint = _one(path, "joint_visits", document.joint_visits, build_joint, problems)
-    given = document.receiver_visits
-    receiver_visits = _one(path, "receiver_visits", given, build_receiver_visits, problems)
-    timetable = _each(path, "timetable", document.timetable, _timetable_entry, problems)
-    _one(path, "safety", document.safety, lambda given: limited(CONDITIONS, given or {}), problems)
+    joint = _built(path, "joint_visits", document.joint_visits, build_joint, problems)
+    settings = document.receiver_visits
+    receiver_visits = _built(path, "receiver_visits", settings, build_receiver_visits, problems)
+    timetable = _all_built(path, "timetable", document.timetable, _timetable_entry, problems)
+    _built(
+        path,
+        "safety",
+        document.safety,
+        lambda settings: limited(CONDITIONS, settings or {}),
+        problems,
+    )
     if problems:
         return None
     try:
@@ -168,7 +174,7 @@ def _assemble(
         return None
 
 
-def _one(
+def _built(
     path: Path,
     key: str,
     table: Table | None,
@@ -183,7 +189,7 @@ def _one(
         return None
 
 
-def _each(
+def _all_built(
     path: Path,
     key: str,
     tables: Sequence[Table],
@@ -345,32 +351,35 @@ def check_plant(path: str | Path) -> list[Finding]:
         return [Finding("error", str(error))]
     problems = list(table.problems)
     plant = None if problems else _assemble(place, document, table, problems)
-    found = [Finding("error", str(problem)) for problem in problems]
-    return found if plant is None else found + [Finding("warning", w) for w in _warnings(plant)]
+    findings = [Finding("error", str(problem)) for problem in problems]
+    return (
+        findings if plant is None else findings + [Finding("warning", w) for w in _warnings(plant)]
+    )
 
 
 def _warnings(plant: Plant) -> list[str]:
-    found = []
+    texts = []
     if not plant.targets:
-        found.append("there is no target: calibration with a camera is not possible")
+        texts.append("there is no target: calibration with a camera is not possible")
     if not plant.receivers:
-        found.append("there is no receiver")
+        texts.append("there is no receiver")
     if len(plant) == 0:
-        return [*found, "there are no heliostats"]
-    found += _crowding(plant)
-    for surface in (*plant.targets, *plant.receivers):
-        found += _placing(plant, surface)
-    return found + _coinciding((*plant.targets, *plant.receivers))
+        return [*texts, "there are no heliostats"]
+    texts += _crowding(plant)
+    surfaces: tuple[Target | Receiver, ...] = (*plant.targets, *plant.receivers)
+    for surface in surfaces:
+        texts += _placing(plant, surface)
+    return texts + _coinciding(surfaces)
 
 
 def _placing(plant: Plant, surface: Target | Receiver) -> list[str]:
     """Return what is odd about where a surface stands and looks."""
     what = f"{'target' if isinstance(surface, Target) else 'receiver'} {surface.name}"
-    found, lines = [], plant.position - surface.center
+    texts, lines = [], plant.position - surface.center
     behind = lines @ surface.normal <= 0.0
     if behind.any() and getattr(surface, "kind", "planar") == "planar":
         example = plant.names[int(np.flatnonzero(behind)[0])]
-        found.append(
+        texts.append(
             f"{what}: {int(behind.sum())} of {len(plant)} heliostats stand behind its plane "
             f"and cannot light it (for example {example})"
         )
@@ -378,21 +387,21 @@ def _placing(plant: Plant, surface: Target | Receiver) -> list[str]:
     size = np.concatenate([np.hypot(g.width, g.height) for g in plant.groups.values()])
     reach = 0.5 * (size[nearest] + np.hypot(surface.width, surface.height))
     if np.linalg.norm(lines[nearest]) < reach:
-        found.append(
+        texts.append(
             f"{what}: its centre is {np.linalg.norm(lines[nearest]):.2f} m from heliostat "
             f"{plant.names[nearest]}, so that they touch; correct its center_m"
         )
     if surface.center[2] < plant.position[:, 2].min():
-        found.append(
+        texts.append(
             f"{what}: its centre, {surface.center[2]:.2f} m up, is below every heliostat; "
             "correct its center_m (metres above the site's height)"
         )
     if isinstance(surface, Target) and surface.upside_down:
-        found.append(
+        texts.append(
             f"{what}: its upper corners lie below its lower ones, so photographs are read turned "
             "by 180°; give upper left, upper right, lower right, lower left as seen from the front"
         )
-    return found
+    return texts
 
 
 def _coinciding(surfaces: Sequence[Target | Receiver]) -> list[str]:

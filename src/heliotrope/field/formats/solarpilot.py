@@ -235,11 +235,11 @@ def _by_header(file: Path, place: str, head: list[list[str]]) -> tuple[list[str]
     names, units = ([*row, *[""] * width][:width] for row in (head[0], (*head[1:2], [])[0]))
     if len(head) > 2 or not all(_UNIT.fullmatch(unit) for unit in units if unit):
         cell = next((cell for cells in head[1:] for cell in cells if _NUMBERED.match(cell)), "")
-        units = f" ({cell!r:.30} has more than a number: give metres without their unit)"
-        text = f"no number below the header{units if cell else ''}; {_EXAMPLE}"
+        advice = f" ({cell!r:.30} has more than a number: give metres without their unit)"
+        text = f"no number below the header{advice if cell else ''}; {_EXAMPLE}"
         raise FormatError(file, text, place)
     header: list[str] = []
-    found: dict[str, list[tuple[int, str]]] = {}
+    by_meaning: dict[str, list[tuple[int, str]]] = {}
     for cell, below in zip(names, units, strict=True):
         unit = _UNIT.search(below or cell)
         form = _form(cell if below else _UNIT.sub("", cell))
@@ -250,23 +250,23 @@ def _by_header(file: Path, place: str, head: list[list[str]]) -> tuple[list[str]
         else:
             header.append(cell)
         meaning, rank = _KNOWN.get(form, ("", 0))
-        wanted = "deg" if meaning in _DEGREES[:2] else "m"
-        given = "" if unit is None else (unit[1] or unit[2] or "").lower()
-        if meaning in (*_METRES, *_DEGREES) and given not in ("", "°", "degrees", wanted):
-            raise FormatError(file, f"column {cell} is in {given}; give {wanted}", place)
-        found.setdefault(meaning, []).append((rank, header[-1]))
-    unknown = {_form(name) for _, name in found.pop("", ())}
+        expected = "deg" if meaning in _DEGREES[:2] else "m"
+        stated = "" if unit is None else (unit[1] or unit[2] or "").lower()
+        if meaning in (*_METRES, *_DEGREES) and stated not in ("", "°", "degrees", expected):
+            raise FormatError(file, f"column {cell} is in {stated}; give {expected}", place)
+        by_meaning.setdefault(meaning, []).append((rank, header[-1]))
+    unknown = {_form(name) for _, name in by_meaning.pop("", ())}
     if {"group", "eastm"} <= {_form(name) for name in names} | unknown:
         text = "this is the table of a plant file; open the plant file (.toml) that names it"
         raise FormatError(file, text, place)
     if unknown & {"unit", "units"}:
         text = "a column of units is not read; give metres, or degrees and metres, and leave it out"
         raise FormatError(file, text, place)
-    for meaning, all_ in found.items():
+    for meaning, all_ in by_meaning.items():
         all_.sort()
         if len(all_) > 1 and (meaning != "name" or all_[0][0] == all_[1][0]):
             raise FormatError(file, f"two columns give {meaning}; keep one", place)
-    columns = {meaning: given[0][1] for meaning, given in found.items()}
+    columns = {meaning: entries[0][1] for meaning, entries in by_meaning.items()}
     if not any(all(axis in columns for axis in axes) for axes in (_METRES, _DEGREES)):
         shown = ", ".join(name[:30] for name in names[:8])
         raise FormatError(file, f"the header ({shown}) gives no positions; {_EXAMPLE}", place)
@@ -284,13 +284,13 @@ def _form(name: str) -> str:
 
 
 def _templates(rows: Rows, column: str | None) -> npt.NDArray[np.int64]:
-    found = np.zeros(len(rows), dtype=np.int64)
+    numbers = np.zeros(len(rows), dtype=np.int64)
     for i, cell in enumerate(rows.texts(column) if column else ()):
         if cell.isascii() and cell.isdigit() and len(cell) < 10:
-            found[i] = int(cell)
+            numbers[i] = int(cell)
         else:
             rows.refuse(i, column or "", f"{cell!r:.60} is not a template's number (0, 1, …)")
-    return found
+    return numbers
 
 
 def _flags(rows: Rows, column: str | None) -> npt.NDArray[np.bool_]:
@@ -419,5 +419,5 @@ def to_plant(layout: Layout, site: Site, templates: Mapping[int, Template]) -> P
         )
     left_out = [layout.names[i] for i in np.flatnonzero(~used)]
     lists = {"left out": left_out, "columns not read": layout.unread}
-    notes = {subject: ", ".join(found) for subject, found in lists.items() if found}
+    notes = {subject: ", ".join(names) for subject, names in lists.items() if names}
     return Plant(site.name, site, groups, notes=notes)

@@ -52,7 +52,7 @@ def moved(
 
     Codes have few values, and equal movements are drawn once.
     """
-    each, which = np.unique(moves, axis=0, return_inverse=True)
+    distinct, which = np.unique(moves, axis=0, return_inverse=True)
     rest = bell(points, place, moments)
-    drawn = np.stack([bell(points, place + move, moments) - rest for move in each])
+    drawn = np.stack([bell(points, place + move, moments) - rest for move in distinct])
     return np.asarray(drawn[which.reshape(-1)])

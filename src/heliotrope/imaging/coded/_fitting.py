@@ -170,8 +170,8 @@ def fitted(
             elif last:
                 used = light.weights > 0.0
                 own = rows.reshape(len(fits), len(axes), -1)[i][:, used]
-                left = rest[used][:, window]
-                fits[i] = _measured(points[window], left, own, fit, stack, axes)
+                remaining = rest[used][:, window]
+                fits[i] = _measured(points[window], remaining, own, fit, stack, axes)
             else:
                 fits[i] = _improved(points[window], pictures[i][:, window], fit, first, axes)
     return Fitted(tuple(fits), light, mean)

@@ -50,10 +50,10 @@ def judged(
     """
     usual = float(np.percentile([fit.power for fit in fits if fit is not None] or [0.0], 75.0))
     strong = [None if fit is None or fit.power < _WEAK * usual else fit for fit in fits]
-    return tuple(_one(i, expected, tops, strong, still) for i in range(len(expected)))
+    return tuple(_judged(i, expected, tops, strong, still) for i in range(len(expected)))
 
 
-def _one(
+def _judged(
     index: int,
     expected: Sequence[ExpectedBeam],
     tops: Sequence[Top],
@@ -68,12 +68,12 @@ def _one(
     verdict, other = Verdict.PROVEN, ""
     if not _within(fit, beam):
         verdict = Verdict.ELSEWHERE
-        for j, (candidate, found) in enumerate(zip(expected, fits, strict=True)):
-            missing = found is None or not _within(found, candidate)
+        for j, (candidate, own) in enumerate(zip(expected, fits, strict=True)):
+            missing = own is None or not _within(own, candidate)
             if j != index and missing and _within(fit, candidate):
                 verdict, other = Verdict.EXCHANGED, candidate.heliostat
                 break
-    elif tops[index].second > _SECOND or _wrong(gain, sigma):
+    elif tops[index].second > _SECOND or _disagrees(gain, sigma):
         verdict = Verdict.JOINED
     return SeparatedBeam(
         beam.heliostat,
@@ -88,8 +88,8 @@ def _one(
     )
 
 
-def _wrong(gain: float, sigma: float) -> bool:
-    """Return whether light rests at a beam's place, or more of it moves than is there."""
+def _disagrees(gain: float, sigma: float) -> bool:
+    """Return whether light rests at a beam's place, or more light moves than the beam has."""
     return bool(abs(gain - 1.0) > max(_GAIN, _GAIN_SIGMAS * sigma))
 
 
@@ -104,16 +104,16 @@ def _stands(beam: ExpectedBeam, power: float, still: StillLight) -> bool:
 def _gain(
     index: int, fit: Fit, beam: ExpectedBeam, still: StillLight | None
 ) -> tuple[float, float]:
-    """Return the light that moves over the light that is there, and its standard deviation."""
+    """Return the moving light over the light at the place, and its standard deviation."""
     if still is None:
-        there, share = beam.power, beam.power_sigma
+        light, share = beam.power, beam.power_sigma
     else:
-        there = float(still.powers[index])
-        share = float(still.sigmas[index]) / max(there, 1e-300)
-    if not there > 0.0:
+        light = float(still.powers[index])
+        share = float(still.sigmas[index]) / max(light, 1e-300)
+    if not light > 0.0:
         # Unknown without a picture of the empty surface; with one, nothing is there that moves.
         return (np.nan, np.nan) if still is None else (np.inf, 0.0)
-    gain = fit.power / there
+    gain = fit.power / light
     return gain, gain * float(np.sqrt(share**2 + (fit.power_sigma / fit.power) ** 2 + _SHAPE**2))
 
 

@@ -76,7 +76,7 @@ def coded_movements(
 def shared_codes(
     places: npt.ArrayLike, moments: npt.ArrayLike, groups: int, apart: float = APART
 ) -> npt.NDArray[np.intp] | None:
-    """Return which of a few codes each beam takes, (M,): those of one code are far apart.
+    """Return the code of each beam, (M,); beams that share a code are far apart.
 
     Parameters
     ----------
@@ -91,19 +91,19 @@ def shared_codes(
 
     Returns
     -------
-        None if some beam finds no code.
+        None if no code is free for a beam.
     """
     at, spread = np.asarray(places, dtype=np.float64), np.asarray(moments, dtype=np.float64)
     away = distances(at, spread)
-    found = np.full(len(at), -1, dtype=np.intp)
+    codes = np.full(len(at), -1, dtype=np.intp)
     for i in range(len(at)):
-        near = set(found[:i][away[i, :i] < apart].tolist())
+        near = set(codes[:i][away[i, :i] < apart].tolist())
         free = [code for code in range(groups) if code not in near]
         if not free:
             return None
         # The code that was used least: light and noise are spread over all of them.
-        found[i] = min(free, key=lambda code: int((found[:i] == code).sum()))
-    return found
+        codes[i] = min(free, key=lambda code: int((codes[:i] == code).sum()))
+    return codes
 
 
 def distances(places: FloatArray, moments: FloatArray) -> FloatArray:

@@ -126,19 +126,19 @@ def _tops(
 
     code, axes = code_of(moves), axes_of(moves)
     size = np.sqrt((moves[..., axes] ** 2).sum(axis=0)).mean(axis=-1)
-    seen = np.stack(np.meshgrid(*stack.axes), axis=-1)[stack.seen]
-    found: dict[int, Top] = {}
+    points = np.stack(np.meshgrid(*stack.axes), axis=-1)[stack.seen]
+    assigned: dict[int, Top] = {}
     for first in np.unique(code):
         members = [int(i) for i in np.flatnonzero(code == first)]
         shape = np.mean([expected[i].second_moments for i in members], axis=0)
         usual = float(size[members].mean())
-        left = pictures[members[0]] * (size[members[0]] / usual)
+        remaining = pictures[members[0]] * (size[members[0]] / usual)
         tops: list[Top] = []
         for _ in members:
-            tops.append(find_top(stack, left, shape, axes))
-            left = left - tops[-1].power * slopes(seen, tops[-1].place, shape)[axes]
+            tops.append(find_top(stack, remaining, shape, axes))
+            remaining = remaining - tops[-1].power * slopes(points, tops[-1].place, shape)[axes]
         found_at = [top.place for top in tops]
-        rest = find_top(stack, left, shape, axes, found_at) if len(tops) > 1 else None
+        rest = find_top(stack, remaining, shape, axes, found_at) if len(tops) > 1 else None
         places = np.array([expected[i].place for i in members])
         away = np.linalg.norm(places[:, None] - found_at, axis=-1)
         for i, k in zip(*linear_sum_assignment(away**2), strict=True):
@@ -146,8 +146,8 @@ def _tops(
             if rest is not None:
                 noise, share = rest.power / rest.significance, rest.power / max(top.power, 1e-300)
                 top = replace(top, significance=top.power / noise, second=share)
-            found[members[i]] = replace(top, power=top.power * usual / size[members[i]])
-    return [found[i] for i in range(len(expected))]
+            assigned[members[i]] = replace(top, power=top.power * usual / size[members[i]])
+    return [assigned[i] for i in range(len(expected))]
 
 
 def _check(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) -> None:
@@ -166,8 +166,8 @@ def _check(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) ->
     away = distances(places, np.array([b.second_moments + b.covariance for b in expected]))
     near = np.argwhere((code[:, None] == code) & (away < 0.99 * APART) & ~np.eye(count, dtype=bool))
     if len(near):
-        one, other = (expected[int(i)].heliostat for i in near[0])
+        first, other = (expected[int(i)].heliostat for i in near[0])
         raise InputError(
-            f"separation: {one} and {other} have the same code, {away[tuple(near[0])]:.1f} "
+            f"separation: {first} and {other} have the same code, {away[tuple(near[0])]:.1f} "
             f"standard deviations apart; give them places {APART:g} apart, or codes of their own"
         )

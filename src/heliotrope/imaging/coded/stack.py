@@ -47,14 +47,14 @@ class Stack:
         shape = self.values.shape
         if len(shape) != 3 or min(shape) < 2:
             raise InputError(f"stack: values of shape {shape}; give (photographs, rows, columns)")
-        for name, array, wanted in (
+        for name, array, expected in (
             ("seen", self.seen, shape[1:]),
             ("empty", self.empty, shape[1:]),
             ("exposures", self.exposures, shape[:1]),
             ("first", self.first, (2,)),
         ):
-            if array is not None and np.shape(array) != wanted:
-                raise InputError(f"stack: {name} has shape {np.shape(array)}; give {wanted}")
+            if array is not None and np.shape(array) != expected:
+                raise InputError(f"stack: {name} has shape {np.shape(array)}; give {expected}")
         if not (np.isfinite(self.step) and self.step > 0.0):
             raise InputError(f"stack: step {self.step} m must be above 0")
         if not np.isfinite(self.values[:, self.seen]).all():
@@ -168,7 +168,7 @@ def light_of(values: FloatArray, empty: FloatArray | None, moved: FloatArray | N
         if not weights.any():
             weights = np.ones(count)
         safe = np.where(weights > 0.0, factors, 1.0)
-        lit = values if empty is None else values - day[:, None] * empty
-        pictures = lit / safe[:, None]
+        excess = values if empty is None else values - day[:, None] * empty
+        pictures = excess / safe[:, None]
         mean = weights @ (pictures - change) / weights.sum()
     return Light(pictures, factors, weights)

@@ -79,8 +79,8 @@ class FolderSource(Source):
                 state = _state(path)
                 if self.stop.is_set() or (self.watch and state in ((), done.get(path))):
                     continue
-                seen, times = looks.get(path, (state, 0))
-                looks[path] = state, times + 1 if seen == state else 1
+                last, times = looks.get(path, (state, 0))
+                looks[path] = state, times + 1 if last == state else 1
                 if looks[path][1] < needed:
                     continue
                 try:
@@ -101,7 +101,7 @@ class FolderSource(Source):
 def _state(path: Path) -> tuple[int, ...]:
     """Return inode, size and time of change of a file; () if it does not exist."""
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return ()
-    return found.st_ino, found.st_size, found.st_mtime_ns
+    return status.st_ino, status.st_size, status.st_mtime_ns

@@ -284,22 +284,22 @@ class UsbSource(CameraSource):
         import cv2
 
         if not Path(str(self.device)).exists():
-            there = ", ".join(sorted(map(str, Path("/dev").glob("video*")))) or "none"
-            raise InputError(f"source {self.name}: there is no such device; present: {there}")
+            present = ", ".join(sorted(map(str, Path("/dev").glob("video*")))) or "none"
+            raise InputError(f"source {self.name}: there is no such device; present: {present}")
         capture = _capture(str(self.device), cv2.CAP_V4L2)
         if capture is None:
             text = "cannot be opened: another program uses it, or you lack the right (group video)"
             raise InputError(f"source {self.name}: {text}")
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         # Video4Linux counts exposures in 100 µs; entry 1 of its menu is "manual".
-        wanted = [
+        settings = [
             (cv2.CAP_PROP_FRAME_WIDTH, "width", self.width or math.nan, " px"),
             (cv2.CAP_PROP_FRAME_HEIGHT, "height", self.height or math.nan, " px"),
             (cv2.CAP_PROP_AUTO_EXPOSURE, "mode", math.nan if math.isnan(self.exposure) else 1, ""),
             (cv2.CAP_PROP_EXPOSURE, "exposure", np.rint(1e4 * self.exposure), " × 100 µs"),
             (cv2.CAP_PROP_GAIN, "gain", self.gain, ""),
         ]
-        for key, what, value, unit in wanted:
+        for key, what, value, unit in settings:
             if math.isnan(value) or (capture.set(key, value) and capture.get(key) == value):
                 continue
             got = capture.get(key)

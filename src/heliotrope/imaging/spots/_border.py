@@ -107,16 +107,16 @@ def _at_border(
     r = picture.step * np.arange(1, int(np.hypot(*picture.shape)))
     pixel = np.round(picture.pixels(centroid + r[:, None, None] * ray)).astype(int)
     column, row = pixel[..., 0], pixel[..., 1]
-    there = (row >= 0) & (column >= 0) & (row < picture.shape[0]) & (column < picture.shape[1])
-    row, column = np.where(there, row, 0), np.where(there, column, 0)
-    inside = there & region[row, column]
-    surface = there & picture.surface[row, column]
-    each = np.arange(ray.shape[0])
+    valid = (row >= 0) & (column >= 0) & (row < picture.shape[0]) & (column < picture.shape[1])
+    row, column = np.where(valid, row, 0), np.where(valid, column, 0)
+    inside = valid & region[row, column]
+    surface = valid & picture.surface[row, column]
+    index = np.arange(ray.shape[0])
     last = len(r) - 1 - inside[::-1].argmax(axis=0)
-    cut = inside.any(axis=0) & ~surface[np.minimum(last + 2, len(r) - 1), each]
+    cut = inside.any(axis=0) & ~surface[np.minimum(last + 2, len(r) - 1), index]
     before = np.maximum(last - round(_SLOPE / picture.step), 0)
-    light = soft[row[last, each], column[last, each]].astype(np.float64)
-    earlier = soft[row[before, each], column[before, each]].astype(np.float64)
+    light = soft[row[last, index], column[last, index]].astype(np.float64)
+    earlier = soft[row[before, index], column[before, index]].astype(np.float64)
     light = np.where(cut, np.maximum(light, 0.0), 0.0)
     steep = np.log(np.maximum(earlier, 1e-6) / np.maximum(light, 1e-6)) / _SLOPE
     return r[last], light, steep

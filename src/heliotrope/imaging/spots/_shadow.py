@@ -148,16 +148,16 @@ def find_edges(soft: FloatArray, paint: Mask, most: int = 3) -> list[Edge]:
     level = max(float(np.median(soft[paint])), 1e-6)
     size = np.abs(_changes(soft, paint, angles, offsets, 2.0))
     limit = max(_CHANGE * level, _ABOVE * float(np.median(size)))
-    found: list[Edge] = []
-    while len(found) < most and size.max() > limit:
+    edges: list[Edge] = []
+    while len(edges) < most and size.max() > limit:
         a, o = np.unravel_index(int(np.argmax(size)), size.shape)
-        found.append(_nearer(soft, paint, float(angles[a]), float(offsets[o])))
+        edges.append(_nearer(soft, paint, float(angles[a]), float(offsets[o])))
         turn = np.abs((angles - angles[a] + 0.5 * np.pi) % np.pi - 0.5 * np.pi)[:, None]
         # Beyond half a turn, the offset of a line changes sign.
         same = np.where(np.abs(angles - angles[a]) < 0.5 * np.pi, 1.0, -1.0)[:, None]
         shift = np.abs(same * offsets[None, :] - offsets[o])
         size = np.where((turn < 4.5 * _TURN) & (shift < 8.0), 0.0, size)
-    return found
+    return edges
 
 
 def _nearer(soft: FloatArray, paint: Mask, angle: float, offset: float) -> Edge:
@@ -177,13 +177,13 @@ def _changes(
     the range, reduced for short lines.
     """
     difference = _differences(soft, paint, angles, offsets, apart)
-    there = np.isfinite(difference)
-    count, samples = there.sum(axis=1), difference.shape[1]
-    each = np.arange(len(count))
-    first, last = there.argmax(axis=1), samples - 1 - there[:, ::-1].argmax(axis=1)
+    known = np.isfinite(difference)
+    count, samples = known.sum(axis=1), difference.shape[1]
+    rows = np.arange(len(count))
+    first, last = known.argmax(axis=1), samples - 1 - known[:, ::-1].argmax(axis=1)
     three = np.arange(3)
     ends = [
-        np.median(difference[each[:, None], np.clip(at, 0, samples - 1)], axis=1)
+        np.median(difference[rows[:, None], np.clip(at, 0, samples - 1)], axis=1)
         for at in (first[:, None] + three, last[:, None] - three)
     ]
     difference.sort(axis=1)  # NaN last
@@ -192,8 +192,8 @@ def _changes(
     ranges = np.take_along_axis(difference, upper, axis=1) - difference
     ranges[np.arange(samples) + half[:, None] >= count[:, None]] = np.inf
     best = ranges.argmin(axis=1)
-    width = ranges[each, best]
-    middle = 0.5 * (difference[each, best] + difference[each, upper[each, best]])
+    width = ranges[rows, best]
+    middle = 0.5 * (difference[rows, best] + difference[rows, upper[rows, best]])
     size = np.abs(middle)
     # A beam's flank ends before the face does; one end of a shadow at least is free of beams.
     even = np.zeros(len(count), dtype=bool)
@@ -202,8 +202,8 @@ def _changes(
     even &= (count * apart >= _LENGTH) & np.isfinite(width)
     length = np.minimum(count * apart / min(soft.shape), 1.0)
     score = np.sign(middle) * np.maximum(size - width, 0.0) * length
-    found = np.where(even, score, 0.0)
-    return np.asarray(found, dtype=np.float64).reshape(len(angles), len(offsets))
+    changes = np.where(even, score, 0.0)
+    return np.asarray(changes, dtype=np.float64).reshape(len(angles), len(offsets))
 
 
 def _differences(
@@ -223,7 +223,7 @@ def _differences(
         far = offsets[None, :, None] + shift
         x = far * cos - along * sin + 0.5 * (columns - 1)
         y = far * sin + along * cos + 0.5 * (rows - 1)
-        seen = cv2.remap(
+        sampled = cv2.remap(
             known,
             x.reshape(flat).astype(np.float32),
             y.reshape(flat).astype(np.float32),
@@ -231,6 +231,6 @@ def _differences(
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=float("nan"),
         )
-        return np.asarray(seen)
+        return np.asarray(sampled)
 
     return np.asarray(at(_ARM) - at(-_ARM))

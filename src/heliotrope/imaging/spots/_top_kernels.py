@@ -41,8 +41,8 @@ def number_tops(values, inside, foot, seed, dip, least, owner):
     """
     rows, columns = values.shape
     flat = values.ravel()
-    lit = np.flatnonzero(inside.ravel() & (flat > foot))
-    order = lit[np.argsort(-flat[lit])]
+    bright = np.flatnonzero(inside.ravel() & (flat > foot))
+    order = bright[np.argsort(-flat[bright])]
     label = np.zeros(rows * columns, dtype=np.int32)
     parent = np.zeros(len(order) + 1, dtype=np.int32)
     peak = np.zeros(len(order) + 1, dtype=np.float64)
@@ -77,12 +77,12 @@ def number_tops(values, inside, foot, seed, dip, least, owner):
                     parent[top] = high
         label[place] = nearest
     names = np.zeros(count + 1, dtype=np.int32)
-    found = 0
+    kept = 0
     for number in range(1, count + 1):
         if parent[number] == number and peak[number] >= seed:
-            found += 1
-            names[number] = found
+            kept += 1
+            names[number] = kept
     out = owner.ravel()
     for place in order:
         out[place] = names[_root(parent, label[place])]
-    return found
+    return kept

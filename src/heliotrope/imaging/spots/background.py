@@ -18,7 +18,7 @@ from heliotrope.imaging.spots._shadow import prior as edge_prior
 from heliotrope.imaging.targets.rectify import Mask, Rectified
 
 #: How a background is found; "auto" takes the best that is available.
-Way = Literal["auto", "frame", "model", "difference"]
+Method = Literal["auto", "frame", "model", "difference"]
 #: The fit uses every sixth pixel each way.
 _STRIDE = 6
 #: Order of the polynomial across a target; higher along a longer face.
@@ -168,8 +168,8 @@ class EmptyTarget:
         known = self.ready
         background = from_model(picture, self) if known else from_frame(picture)
         light = background.values / self.reflectance if known else background.values
-        lit = beams(picture, background) if spots is None else spots
-        good = picture.surface & ~lit & (light > 0.02)
+        covered = beams(picture, background) if spots is None else spots
+        good = picture.surface & ~covered & (light > 0.02)
         ratio = np.where(good, picture.values / np.maximum(light, 0.02), 1.0)
         kept = self.weight * np.float32(np.exp(-1.0 / self.memory))
         weight = np.where(good, kept + 1.0, self.weight)
@@ -274,17 +274,17 @@ def from_model(picture: Rectified, model: EmptyTarget) -> Background:
 
 def of_face(
     picture: Rectified,
-    way: Way,
+    method: Method,
     models: Iterable[EmptyTarget] = (),
     empty: Rectified | None = None,
 ) -> Background:
-    """Return the background of a face in the way asked for.
+    """Return the background of a face by the chosen method.
 
     Parameters
     ----------
     picture
         The face with its beams.
-    way
+    method
         "frame", "model", "difference", or "auto" for the best that is available.
     models
         Models of empty faces; the one that fits is taken.
@@ -294,17 +294,17 @@ def of_face(
     Raises
     ------
     InputError
-        If the way needs a model or an empty face that is not given.
+        If the method needs a model or an empty face that is missing.
     """
     model = next((m for m in models if m.fits(picture)), None)
-    if way == "auto":
+    if method == "auto":
         ready = model is not None and model.ready
-        way = "difference" if empty is not None else "model" if ready else "frame"
-    if way == "difference":
+        method = "difference" if empty is not None else "model" if ready else "frame"
+    if method == "difference":
         if empty is None:
             raise InputError("background by difference needs a frame without the beam; give one")
         return from_difference(picture, empty)
-    if way == "model":
+    if method == "model":
         if model is None:
             raise InputError(
                 f"background by model: target {picture.face.targets[0].name} has no model; learn "
@@ -338,9 +338,9 @@ def unexplained(picture: Rectified, background: Background, spots: Sequence[Mask
         beside &= cv2.dilate(region.astype(np.uint8), np.ones((reach, reach), np.uint8)) == 0
     if not beside.any():
         return 0.0
-    left = np.abs(smooth(picture, picture.values - background.values, 2.0))
+    residual = np.abs(smooth(picture, picture.values - background.values, 2.0))
     level = float(np.median(background.values[picture.paint]))
-    odd = beside & (left > max(_PLAIN * background.deviation, _PLAIN_PART * level))
+    odd = beside & (residual > max(_PLAIN * background.deviation, _PLAIN_PART * level))
     size = max(round(BROAD / picture.step), 1)
     broad = cv2.morphologyEx(odd.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
     return float((broad[beside] > 0).sum() / picture.paint.sum())
@@ -377,13 +377,13 @@ def _orders(picture: Rectified) -> tuple[int, int]:
 def _terms(orders: tuple[int, int]) -> list[tuple[int, int, float]]:
     """Return the fitted products of polynomials: order across, order up, and total order."""
     top = min(order for order in orders if order > 0)
-    found = []
+    terms = []
     for i in range(orders[0] + 1):
         for j in range(orders[1] + 1):
             share = i / max(orders[0], 1) + j / max(orders[1], 1)
             if share <= 1.0 + 1e-9:
-                found.append((i, j, share * top))
-    return found
+                terms.append((i, j, share * top))
+    return terms
 
 
 @lru_cache(maxsize=16)
@@ -454,7 +454,7 @@ class _Fit:
     free: Mask
     edge: Edge | None
 
-    def left(self, grid: _Grid) -> FloatArray:
+    def residuals(self, grid: _Grid) -> FloatArray:
         return np.asarray(grid.soft - self.basis @ self.numbers)
 
 
@@ -467,27 +467,27 @@ def _fit(
 ) -> Background:
     """Fit pattern × polynomial, and the edge of a shadow if any, to paint without beams."""
     grid = _grid(picture, pattern, orders)
-    found = _converged(grid, None)
-    even, odd = grid.soft / np.maximum(grid.multiplier, 0.05), _odd(found, grid)
+    fit = _converged(grid, None)
+    even, odd = grid.soft / np.maximum(grid.multiplier, 0.05), _odd(fit, grid)
     # The edge of a shadow leaves unexplained places where it meets the face's border.
     for edge in find_edges(even, grid.paint) if odd[border(grid.paint)].sum() > _BORDER else []:
         if not edge.crosses(odd, grid.paint):
             continue
         other = _converged(grid, edge)
-        if _better(other, found, grid):
-            found = other
-    left = found.left(grid)
+        if _better(other, fit, grid):
+            fit = other
+    residuals = fit.residuals(grid)
     area = (picture.step * _STRIDE) ** 2
-    patch = _patch(np.where(grid.paint, left, 0.0), found.free)
-    deviation = max(found.spread, float(np.sqrt(np.mean(left[found.free] ** 2))))
+    patch = _patch(np.where(grid.paint, residuals, 0.0), fit.free)
+    deviation = max(fit.spread, float(np.sqrt(np.mean(residuals[fit.free] ** 2))))
     numbers, covariance, _ = _ridge(
-        found.basis[found.free],
-        grid.soft[found.free],
+        fit.basis[fit.free],
+        grid.soft[fit.free],
         patch * deviation**2,
-        found.prior,
+        fit.prior,
         grid.basis.shape[-1],
     )
-    values = _upscaled(picture.shape, orders, numbers, found.edge) * pattern
+    values = _upscaled(picture.shape, orders, numbers, fit.edge) * pattern
     rough = picture.values - smooth(picture, picture.values, 1.0)
     noise = 1.4826 * float(np.median(np.abs(rough[picture.paint]))) * 1.05
     return Background(
@@ -495,11 +495,11 @@ def _fit(
         deviation,
         noise,
         patch * area,
-        found.basis,
+        fit.basis,
         covariance,
         _STRIDE,
         method,
-        float(found.free.sum() / grid.paint.sum()),
+        float(fit.free.sum() / grid.paint.sum()),
         reflectance,
     )
 
@@ -523,14 +523,16 @@ def _grid(picture: Rectified, pattern: Image, orders: tuple[int, int]) -> _Grid:
     return _Grid(soft, paint, multiplier, table * multiplier[..., None], prior, patch)
 
 
-def _better(other: _Fit, found: _Fit, grid: _Grid) -> bool:
+def _better(other: _Fit, fit: _Fit, grid: _Grid) -> bool:
     """Return whether a fit with an edge is better than one without, or with another.
 
     It must explain more of the paint to the same accuracy, and the height of its edge must be
     significant in paint without beams.
     """
-    limit = _HOT * min(found.spread, other.spread)
-    explained = [float((np.abs(f.left(grid))[grid.paint] < limit).mean()) for f in (found, other)]
+    limit = _HOT * min(fit.spread, other.spread)
+    explained = [
+        float((np.abs(f.residuals(grid))[grid.paint] < limit).mean()) for f in (fit, other)
+    ]
     if other.edge is None or explained[1] < explained[0] + _GAIN:
         return False
     variance = 3.0 * other.spread**2
@@ -541,12 +543,12 @@ def _better(other: _Fit, found: _Fit, grid: _Grid) -> bool:
     return bool(abs(other.numbers[size]) > _CERTAIN * np.sqrt(covariance[size, size]))
 
 
-def _odd(found: _Fit, grid: _Grid) -> Mask:
+def _odd(fit: _Fit, grid: _Grid) -> Mask:
     """Return where smooth light does not explain the paint, ignoring single places."""
     import cv2
 
-    limit = float(np.clip(_HOT * found.spread, _ODD[0] * grid.level, _ODD[1] * grid.level))
-    odd = (np.abs(found.left(grid)) > limit) & grid.paint
+    limit = float(np.clip(_HOT * fit.spread, _ODD[0] * grid.level, _ODD[1] * grid.level))
+    odd = (np.abs(fit.residuals(grid)) > limit) & grid.paint
     return cv2.morphologyEx(odd.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
 
 
@@ -571,10 +573,10 @@ def _converged(grid: _Grid, edge: Edge | None) -> _Fit:
         numbers, _, scale = _ridge(
             basis[free], soft[free], grid.patch * spread**2, prior, grid.basis.shape[-1], scale, 1
         )
-        left = soft - basis @ numbers
-        middle = np.median(left[free])
-        spread = 1.4826 * float(np.median(np.abs(left[free] - middle))) + 0.15 / 255.0
-        hot = paint & (left > max(_HOT * spread, _HOT_PART * grid.level))
+        residuals = soft - basis @ numbers
+        middle = np.median(residuals[free])
+        spread = 1.4826 * float(np.median(np.abs(residuals[free] - middle))) + 0.15 / 255.0
+        hot = paint & (residuals > max(_HOT * spread, _HOT_PART * grid.level))
         if edge is not None and turn < _SETTLING:
             # Until the edge has settled, residuals near it are not a beam.
             hot &= np.abs(edge.distance(x, y)) > 2.0 * edge.breadth + 2.0
@@ -618,7 +620,7 @@ def _upscaled(
     return np.asarray(light + step * (height + (right * u[None, :] + down * v[:, None]) / half))
 
 
-def _patch(left: FloatArray, held: Mask) -> float:
+def _patch(residuals: FloatArray, held: Mask) -> float:
     """Return the number of grid places over which residuals are correlated.
 
     This is the integral of the correlation, which for an irregular region is that of its values
@@ -630,7 +632,9 @@ def _patch(left: FloatArray, held: Mask) -> float:
         return 1.0
     rows, columns = held.shape
     shape = (2 * rows, 2 * columns)
-    value = np.abs(np.fft.rfft2(np.where(held, left - left[held].mean(), 0.0), shape)) ** 2
+    value = (
+        np.abs(np.fft.rfft2(np.where(held, residuals - residuals[held].mean(), 0.0), shape)) ** 2
+    )
     mask = np.abs(np.fft.rfft2(held.astype(np.float64), shape)) ** 2
     covered = np.fft.irfft2(mask, shape)
     product = np.fft.irfft2(value, shape) / np.maximum(covered, 1.0)

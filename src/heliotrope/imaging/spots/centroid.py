@@ -87,7 +87,7 @@ def with_centroid(
     across, upwards = np.meshgrid(*picture.axes)
     points = picture.face.point(np.stack([across, upwards], axis=-1))
     at = target.plane_coordinates(points)
-    given = own(
+    result = own(
         BeamPicture(
             target,
             picture.values,
@@ -101,7 +101,7 @@ def with_centroid(
             float(np.sqrt(pixel_variance(picture, background))),
         )
     )
-    plane, covariance = _checked(given, target)
+    plane, covariance = _checked(result, target)
     centroid = picture.face.plane(target.point(plane))
     moved = place(picture, replace(placed.spot, centroid=centroid, covariance=covariance))
     if moved.target is None or moved.target.name != target.name:
@@ -112,15 +112,15 @@ def with_centroid(
     return replace(moved, flux=placed.flux)
 
 
-def _checked(given: object, target: Target) -> tuple[FloatArray, FloatArray]:
+def _checked(result: object, target: Target) -> tuple[FloatArray, FloatArray]:
     """Return place and covariance as arrays."""
-    if not (isinstance(given, tuple | list) and len(given) == 2):
+    if not (isinstance(result, tuple | list) and len(result) == 2):
         raise InputError(
-            f"own centroid: it gave {kind_of(given)} for target {target.name}; return a place (2,) "
-            "in metres and its covariance (2, 2) in m²"
+            f"own centroid: it gave {kind_of(result)} for target {target.name}; return a place "
+            "(2,) in metres and its covariance (2, 2) in m²"
         )
     try:
-        plane, covariance = as_float(given[0]), as_float(given[1])
+        plane, covariance = as_float(result[0]), as_float(result[1])
     except (TypeError, ValueError):
         raise InputError(
             f"own centroid: place or covariance on target {target.name} is no array of numbers; "

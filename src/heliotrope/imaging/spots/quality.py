@@ -50,8 +50,7 @@ class Limits:
     power
         Least power over the expected.
     surprise
-        Standard deviations of an expectation by which a beam may exceed it in power, length
-        or width.
+        Standard deviations that a beam may exceed its expectation in power, length or width.
     skewness
         Two overlapping beams are more skewed than the beam of one heliostat (98 % of the
         measured beams of Jülich are below 0.28).
@@ -237,9 +236,9 @@ def _of_power(spot: Spot, flux: float, limits: Limits, expectation: Expectation)
     return []
 
 
-def _of_frame(found: FoundTarget, limits: Limits) -> list[Reason]:
+def _of_frame(target: FoundTarget, limits: Limits) -> list[Reason]:
     """Judge the frame by its marks: stray light, focus, shake."""
-    used = [m for m in found.marks if m.used and np.isfinite(m.contrast)]
+    used = [m for m in target.marks if m.used and np.isfinite(m.contrast)]
     if not used:
         return []
     reasons = []

@@ -317,7 +317,7 @@ def _edge(picture: Rectified, soft: Image, region: Mask) -> float:
     """Return the greatest brightness of a beam at the border of the visible target."""
     import cv2
 
-    seen = picture.surface.astype(np.uint8)
-    inner = cv2.erode(seen, np.ones((5, 5), np.uint8), borderValue=0)
+    visible = picture.surface.astype(np.uint8)
+    inner = cv2.erode(visible, np.ones((5, 5), np.uint8), borderValue=0)
     rim = region & (inner == 0) & picture.surface
     return float(soft[rim].max(initial=0.0))

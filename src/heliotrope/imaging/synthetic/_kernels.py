@@ -98,7 +98,7 @@ def ambient_field(u, v, share, terms, out):
     unit normal into the shadow, the breadth of the ramp (m) and the light left in the shadow
     (1: no shadow).
     """
-    gx, gy, px, py, nx, ny, soft, left = terms
+    gx, gy, px, py, nx, ny, soft, remaining = terms
     height, width = out.shape
     for i in range(height):
         for j in range(width):
@@ -107,12 +107,12 @@ def ambient_field(u, v, share, terms, out):
                 continue
             x, y = float(u[i, j]), float(v[i, j])
             value = max(0.0, 1.0 + gx * x + gy * y)
-            if left != 1.0:
+            if remaining != 1.0:
                 k = j + 1 if j + 1 < width else j - 1
                 # Averaged over a pixel, a hard edge is a ramp of one pixel's breadth.
                 breadth = max(soft, math.hypot(u[i, k] - x, v[i, k] - y))
                 depth = min(max(((x - px) * nx + (y - py) * ny) / breadth + 0.5, 0.0), 1.0)
-                value *= 1.0 + (left - 1.0) * depth
+                value *= 1.0 + (remaining - 1.0) * depth
             out[i, j] = value
 
 

@@ -105,12 +105,12 @@ def _areas(
     # Targets hide walls, and earlier targets hide later ones.
     for target in view.targets:
         _check_seen(camera, target)
-        border = _seen(camera, target, target.plane_coordinates(target.corners))
+        border = _projected(camera, target, target.plane_coordinates(target.corners))
         areas.append(np.minimum(soft_coverage([border], shape, blur), free))
         free -= areas[-1]
     for target in view.targets:
         # A wall gets the share that everything in front of it leaves.
-        outline = _seen(camera, target, _wall(target, wall))
+        outline = _projected(camera, target, _wall(target, wall))
         behind = soft_coverage([outline], shape, blur) - (1.0 - free)
         walls.append(np.maximum(behind, np.float32(0.0)))
         free -= walls[-1]
@@ -185,7 +185,7 @@ def _plane_map(view: SceneKey) -> tuple[Image, Image]:
     return u.astype(np.float32), v.astype(np.float32)
 
 
-def _seen(camera: Camera, target: Target, polygon: FloatArray) -> FloatArray:
+def _projected(camera: Camera, target: Target, polygon: FloatArray) -> FloatArray:
     """Return the pixels (L, 2) of a polygon (K, 2) in the plane, m, as the lens shows it."""
     ends = np.roll(polygon, -1, axis=0)
     rough = project(camera, target.point(np.stack([polygon, ends])))
@@ -230,8 +230,8 @@ class _Brush:
 
     def lay(self, reflectance: Image, shapes: list[FloatArray], value: float) -> None:
         """Paint polygons of the plane (m) over the picture."""
-        seen = [_seen(self.camera, self.target, shape) for shape in shapes]
-        corners = np.concatenate(seen)
+        outlines = [_projected(self.camera, self.target, shape) for shape in shapes]
+        corners = np.concatenate(outlines)
         size = np.array(reflectance.shape[::-1])
         margin = 1 + int(np.ceil(4.0 * self.blur))
         low = np.clip(np.floor(corners.min(axis=0)).astype(int) - margin, 0, size)
@@ -240,7 +240,7 @@ class _Brush:
             return
         window = reflectance[low[1] : high[1], low[0] : high[0]]
         extent = (window.shape[0], window.shape[1])
-        share = soft_coverage([shape - low for shape in seen], extent, self.blur)
+        share = soft_coverage([shape - low for shape in outlines], extent, self.blur)
         window += share * (np.float32(value) - window)
 
 

@@ -175,21 +175,21 @@ def render(
     """
     static = painted_scene(scene)
     ambient = static.sky * np.float32(scene.surroundings.sky)
-    seen: list[tuple[slice, slice, Image]] = []
+    images: list[tuple[slice, slice, Image]] = []
     thrown = [replace(t, beam=t.beam.swept(t.motion)) for t in scene.beams]
     beams = np.zeros_like(ambient)
     for plane in static.planes:
         _add_ambient(scene, plane, ambient)
-    for one in thrown:
-        index = [t.name for t in scene.targets].index(one.target)
-        rows, columns, light = _beam_image(scene, static.planes[index], index, one)
+    for throw in thrown:
+        index = [t.name for t in scene.targets].index(throw.target)
+        rows, columns, light = _beam_image(scene, static.planes[index], index, throw)
         beams[rows, columns] += light
-        seen.append((rows, columns, light))
+        images.append((rows, columns, light))
     readings = _through_lens(scene, ambient, beams)
     pixels, clipped = _expose(scene.sensor, readings, seed)
     highest = readings if readings.ndim == 2 else readings.max(axis=2)
     truths = tuple(
-        _beam_truth(scene, t, image, highest) for t, image in zip(thrown, seen, strict=True)
+        _beam_truth(scene, t, image, highest) for t, image in zip(thrown, images, strict=True)
     )
     sensor = scene.sensor
     return Rendered(
@@ -225,11 +225,11 @@ def _beam_image(
     outline = thrown.beam.corners
     ends = np.roll(outline, -1, axis=0)
     part = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None, None]
-    seen = project(
+    border = project(
         scene.camera, scene.targets[index].point(outline + part * (ends - outline))
     ).reshape(-1, 2)
-    if np.isfinite(seen).all():
-        low, high = np.floor(seen.min(axis=0)) - 3, np.ceil(seen.max(axis=0)) + 4
+    if np.isfinite(border).all():
+        low, high = np.floor(border.min(axis=0)) - 3, np.ceil(border.max(axis=0)) + 4
     else:
         low, high = np.zeros(2), np.array([width, height])
     left, top = np.clip(low, 0, [width, height]).astype(int).tolist()
@@ -393,9 +393,9 @@ def _mark_truths(scene: Scene, thrown: list[Thrown]) -> tuple[MarkTruth, ...]:
             places = low + np.stack(np.meshgrid(part, part), axis=-1) * (high - low)
             ambient = scene.ambient * _relative_ambient(scene, places)
             flux = np.zeros(places.shape[:-1])
-            for one in thrown:
-                if one.target == target.name:
-                    flux += one.strength * scene.cloud * one.beam.at(places)
+            for throw in thrown:
+                if throw.target == target.name:
+                    flux += throw.strength * scene.cloud * throw.beam.at(places)
             truths.append(_mark_truth(scene, target, mark, ambient, flux, tints))
     return tuple(truths)
 

@@ -294,8 +294,8 @@ class Scene:
         names = [target.name for target in self.targets]
         if len(set(names)) < len(names):
             raise InputError(f"scene: targets {', '.join(names)}: a name occurs twice")
-        given: tuple[Any, ...] = self.beams
-        thrown = tuple(b if isinstance(b, Thrown) else Thrown(*b) for b in given)
+        beams: tuple[Any, ...] = self.beams
+        thrown = tuple(b if isinstance(b, Thrown) else Thrown(*b) for b in beams)
         for beam in thrown:
             if beam.target not in names:
                 raise UnknownNameError("target", beam.target, names)

@@ -100,18 +100,18 @@ class FrameSearch:
         return self._outlines[key]
 
     def tags(self, marks: list[Mark]) -> dict[int, FloatArray]:
-        """Return the corners (4, 2) of tags that are seen exactly once, by the mark's index."""
-        found = {}
+        """Return the corners (4, 2) of tags that appear exactly once, by the mark's index."""
+        corners = {}
         for k, mark in enumerate(marks):
             if mark.kind != "tag":
                 continue
             key = detection.tag_number(mark)
             if key[0] not in self._tags:
                 self._tags[key[0]] = detection.find_tags(self.eight, [key[0]])
-            seen = self._tags[key[0]].get(key, [])
-            if len(seen) == 1:
-                found[k] = seen[0]
-        return found
+            places = self._tags[key[0]].get(key, [])
+            if len(places) == 1:
+                corners[k] = places[0]
+        return corners
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class Attempt:
     ----------
     view
         None if no view can be trusted.
-    seen
+    observed
         Pixel and covariance of recognised marks, by index.
     used
         Marks that fit together.
@@ -139,7 +139,7 @@ class Attempt:
     """
 
     view: FaceView | None
-    seen: dict[int, tuple[FloatArray, FloatArray]]
+    observed: dict[int, tuple[FloatArray, FloatArray]]
     used: tuple[int, ...]
     reasons: dict[int, str]
     text: str
@@ -149,7 +149,7 @@ class Attempt:
 
 
 @dataclass
-class _Seen:
+class _Observed:
     """Marks found so far."""
 
     places: dict[int, tuple[FloatArray, FloatArray]]
@@ -200,50 +200,52 @@ class Search:
             vague,
         )
 
-    def _locate(self, pixels: FloatArray, scales: FloatArray, search: float) -> _Seen:
-        seen = _Seen({}, {}, {}, {})
+    def _locate(self, pixels: FloatArray, scales: FloatArray, search: float) -> _Observed:
+        observed = _Observed({}, {}, {}, {})
         for k, mark in enumerate(self.marks):
             if k in self.tags:
-                seen.corners[k] = self.tags[k]
-                seen.places[k] = _crossing(self.tags[k]), 0.3**2 * np.eye(2)
+                observed.corners[k] = self.tags[k]
+                observed.places[k] = _crossing(self.tags[k]), 0.3**2 * np.eye(2)
                 continue
             picture = self._picture(mark)
             if mark.kind == "picture" and picture is None:
-                seen.reasons[k] = f"its picture {mark.code} is missing"
+                observed.reasons[k] = f"its picture {mark.code} is missing"
                 continue
-            found = locate(self.look.grey, mark, pixels[k], scales[k], search, picture)
-            if found is None:
-                seen.reasons[k] = "outside the frame or too small"
-            elif found[2] < LIKE:
-                seen.reasons[k] = f"covered or absent: correlation {found[2]:.2f}"
+            located = locate(self.look.grey, mark, pixels[k], scales[k], search, picture)
+            if located is None:
+                observed.reasons[k] = "outside the frame or too small"
+            elif located[2] < LIKE:
+                observed.reasons[k] = f"covered or absent: correlation {located[2]:.2f}"
             else:
-                seen.places[k] = found[0], found[1] ** 2 * np.eye(2)
+                observed.places[k] = located[0], located[1] ** 2 * np.eye(2)
                 if mark.kind == "tag":
-                    seen.corners[k] = found[0] + _square(mark) @ scales[k].T
-        return seen
+                    observed.corners[k] = located[0] + _square(mark) @ scales[k].T
+        return observed
 
-    def _refine(self, view: FaceView, used: list[int]) -> _Seen:
-        seen = _Seen({}, {}, {}, {})
+    def _refine(self, view: FaceView, used: list[int]) -> _Observed:
+        observed = _Observed({}, {}, {}, {})
         pixels, scales = view.to_pixels(self.plane), view.scale(self.plane)
         for k, mark in enumerate(self.marks):
             picture = self._picture(mark)
             if mark.kind == "picture" and picture is None:
-                seen.reasons[k] = f"its picture {mark.code} is missing"
+                observed.reasons[k] = f"its picture {mark.code} is missing"
                 continue
             search = 0.0 if k in used else 0.2
             around = self.face.span - self.plane[k]
             refined = refine(self.look.grey, mark, pixels[k], scales[k], search, picture, around)
             problem = _problem(refined, mark, k in self.tags)
             if refined is None or problem:
-                seen.reasons[k] = problem
+                observed.reasons[k] = problem
                 continue
-            seen.places[k] = refined.pixel, refined.covariance
-            seen.looks[k] = refined
+            observed.places[k] = refined.pixel, refined.covariance
+            observed.looks[k] = refined
             if mark.kind == "tag":
                 # The view holds perspective and lens; the rest is affine.
                 box = _square(mark) @ (np.eye(2) + refined.shape).T
-                seen.corners[k] = view.to_pixels(self.plane[k] + box) + refined.pixel - pixels[k]
-        return seen
+                observed.corners[k] = (
+                    view.to_pixels(self.plane[k] + box) + refined.pixel - pixels[k]
+                )
+        return observed
 
     def _picture(self, mark: Mark) -> FloatArray | None:
         return self.look.pictures.get(mark.code) if mark.kind == "picture" else None
@@ -260,40 +262,46 @@ class Search:
 
     # -- fitting -----------------------------------------------------------------------
 
-    def _fit(self, seen: _Seen, known: FloatArray | None) -> tuple[FaceView | None, list[int]]:
-        """Fit a view to the marks seen, leaving out strays, the worst first."""
-        used = list(seen.places)
+    def _fit(
+        self, observed: _Observed, known: FloatArray | None
+    ) -> tuple[FaceView | None, list[int]]:
+        """Fit a view to the observed marks, leaving out strays, the worst first."""
+        used = list(observed.places)
         while True:
-            points = self._points(used, seen, known)
+            points = self._points(used, observed, known)
             if points is None:
                 return None, used
             camera = self.look.camera
             view = fit_view(self.face, *points, self.look.lens, camera is not None)
             if not np.isfinite(view.H_norm_plane).all():
                 return None, used
-            miss = view.to_pixels(self.plane[used]) - np.array([seen.places[k][0] for k in used])
+            miss = view.to_pixels(self.plane[used]) - np.array(
+                [observed.places[k][0] for k in used]
+            )
             per_metre = np.abs(np.linalg.det(view.scale(self.plane[used])))
-            image = np.array([0.5 * np.trace(seen.places[k][1]) for k in used])
+            image = np.array([0.5 * np.trace(observed.places[k][1]) for k in used])
             spread = np.sqrt(image + per_metre * SURVEY**2 + 0.3**2)
             apart = np.linalg.norm(miss, axis=-1)
             worst = int(np.argmax(apart / spread))
             if apart[worst] < STRAY * spread[worst] or len(used) <= 4:
                 return view, used
-            seen.reasons[used[worst]] = f"{apart[worst]:.1f} px from the place given by the others"
+            observed.reasons[used[worst]] = (
+                f"{apart[worst]:.1f} px from the place given by the others"
+            )
             del used[worst]
 
     def _points(
-        self, used: list[int], seen: _Seen, known: FloatArray | None
+        self, used: list[int], observed: _Observed, known: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """Return points, pixels, covariance: four corners of a tag, four points for three marks."""
         plane, pixels, covariance = [], [], []
-        per_metre = self._per_metre(used, seen)
+        per_metre = self._per_metre(used, observed)
         for k in used:
-            mark, (pixel, spread) = self.marks[k], seen.places[k]
+            mark, (pixel, spread) = self.marks[k], observed.places[k]
             common = spread + (per_metre * SURVEY) ** 2 * np.eye(2)
             if mark.kind == "tag":
                 plane += list(self.plane[k] + _square(mark))
-                pixels += list(seen.corners[k])
+                pixels += list(observed.corners[k])
                 # Its corners share the errors of survey and place.
                 own = (per_metre * PRINT) ** 2 + 2.0 * np.trace(spread)
                 covariance.append(np.kron(np.ones((4, 4)), common) + own * np.eye(8))
@@ -345,19 +353,21 @@ class Search:
         spread = 0.5 * slant * extent**2 / float(self.look.lens.matrix[0, 0])
         return fourth, np.append(fourth, 1.0) @ affine, max(spread, 0.005 * extent)
 
-    def _per_metre(self, used: list[int], seen: _Seen) -> float:
+    def _per_metre(self, used: list[int], observed: _Observed) -> float:
         if len(used) < 2:
             return 0.0
         plane = self.plane[used] - self.plane[used].mean(axis=0)
-        pixels = np.array([seen.places[k][0] for k in used])
+        pixels = np.array([observed.places[k][0] for k in used])
         pixels = pixels - pixels.mean(axis=0)
         return float(np.sqrt(np.sum(pixels**2) / max(np.sum(plane**2), 1e-12)))
 
     # -- judging -----------------------------------------------------------------------
 
-    def _failed(self, seen: _Seen, used: list[int], known: bool) -> Attempt:
+    def _failed(self, observed: _Observed, used: list[int], known: bool) -> Attempt:
         text = self._too_few(used, FEWEST if known else min(ALONE, len(self.marks)))
-        return Attempt(None, seen.places, tuple(used), seen.reasons, text, seen.looks, known)
+        return Attempt(
+            None, observed.places, tuple(used), observed.reasons, text, observed.looks, known
+        )
 
     def _too_few(self, used: list[int], needed: int) -> str:
         total = len(self.marks)
@@ -366,8 +376,8 @@ class Search:
         names = ", ".join(self.marks[k].name for k in used)
         return f"only {len(used)} of its {total} marks were seen: {names}; {needed} are needed"
 
-    def _problem(self, view: FaceView, used: list[int], seen: _Seen, known: bool) -> str:
-        """Return why a view cannot be trusted; empty if it can."""
+    def _problem(self, view: FaceView, used: list[int], observed: _Observed, known: bool) -> str:
+        """Return the reason not to trust a view; empty if there is none."""
         needed = self._needed(view, known)
         if self._points_of(used) < needed:
             return self._too_few(used, needed)
@@ -380,7 +390,7 @@ class Search:
             )
         if self._impossible(view):
             return "no camera can see a plane with its marks in these places"
-        return self._misshapen(used, seen, known) or self._dark(view, used, seen)
+        return self._misshapen(used, observed, known) or self._dark(view, used, observed)
 
     def _points_of(self, used: list[int]) -> int:
         return sum(4 if self.marks[k].kind == "tag" else 1 for k in used)
@@ -410,12 +420,12 @@ class Search:
             return True
         return bool(np.abs(depth).max() > NEAREST * np.abs(depth).min())
 
-    def _misshapen(self, used: list[int], seen: _Seen, known: bool) -> str:
-        """Return why the marks' sizes and shapes are wrong; empty if they are not."""
-        drawn = [k for k in used if k in seen.looks and self.marks[k].kind != "picture"]
+    def _misshapen(self, used: list[int], observed: _Observed, known: bool) -> str:
+        """Return the fault in the marks' sizes and shapes; empty if there is none."""
+        drawn = [k for k in used if k in observed.looks and self.marks[k].kind != "picture"]
         if not drawn:
             return ""
-        shapes = np.array([seen.looks[k].shape for k in drawn])
+        shapes = np.array([observed.looks[k].shape for k in drawn])
         middle = np.median(shapes, axis=0)
         size = 0.5 * float(np.trace(middle))
         if abs(size) > WRONG_SIZE:
@@ -430,7 +440,9 @@ class Search:
                 "places of the marks"
             )
         unlike = np.abs(shapes - size * np.eye(2)).max(axis=(1, 2))
-        explained = min((seen.looks[k].explained for k in drawn if k not in self.tags), default=1.0)
+        explained = min(
+            (observed.looks[k].explained for k in drawn if k not in self.tags), default=1.0
+        )
         few = len(used) <= ALONE and not known
         if float(np.median(unlike)) > ALIKE or (few and float(unlike.max()) > ALIKE_EACH):
             return f"shapes that lie like its marks differ from them by up to {unlike.max():.0%}"
@@ -438,13 +450,13 @@ class Search:
             return f"other shapes lie where its marks should: one is explained to {explained:.0%}"
         return ""
 
-    def _dark(self, view: FaceView, used: list[int], seen: _Seen) -> str:
-        """Return why the space between the marks is not paint, which is lighter; empty if it is."""
+    def _dark(self, view: FaceView, used: list[int], observed: _Observed) -> str:
+        """Return the reason why the space between marks is not bright paint; empty if it is."""
         flat = ("corner", "tee", "square", "disc")
-        shown = [k for k in used if k in seen.looks and self.marks[k].kind in flat]
+        shown = [k for k in used if k in observed.looks and self.marks[k].kind in flat]
         if not shown:
             return ""
-        print_, bare = self._levels(view, shown, seen)
+        print_, bare = self._levels(view, shown, observed)
         low, high = self.plane[used].min(axis=0), self.plane[used].max(axis=0)
         part = (np.arange(14) + 0.5) / 14
         places = low + np.stack(np.meshgrid(part, part), axis=-1).reshape(-1, 2) * (high - low)
@@ -464,7 +476,7 @@ class Search:
         return f"only {lighter:.0%} of the area between its marks is lighter than the marks"
 
     def _levels(
-        self, view: FaceView, shown: list[int], seen: _Seen
+        self, view: FaceView, shown: list[int], observed: _Observed
     ) -> tuple[FloatArray, FloatArray]:
         """Return the brightness of marks and of their surroundings, (K,) each."""
         inner = []
@@ -476,7 +488,7 @@ class Search:
             turn = np.array([[cos, -sin], [sin, cos]])
             inner.append(self.plane[k] + turn @ [across, -0.5 * mark.stroke])
         dark = self._at(view.to_pixels(np.array(inner)))
-        contrast = np.array([seen.looks[k].contrast for k in shown])
+        contrast = np.array([observed.looks[k].contrast for k in shown])
         dark = np.where(np.isfinite(dark), dark, 0.0)
         return dark, dark / np.clip(contrast, 0.05, 1.0)
 
@@ -489,7 +501,7 @@ class Search:
         return np.where(inside, values.astype(np.float64), np.nan)
 
     def _vague(self, view: FaceView, used: list[int]) -> dict[str, str]:
-        """Return by name why the marks seen do not determine some targets."""
+        """Return the targets that the visible marks do not determine, with their reasons."""
         parts = [
             self.plane[k] + (_square(self.marks[k]) if self.marks[k].kind == "tag" else 0.0)
             for k in used
@@ -497,22 +509,22 @@ class Search:
         places = np.concatenate([np.reshape(part, (-1, 2)) for part in parts])
         middle = places.mean(axis=0)
         moments = np.cov((places - middle).T, bias=True) + 1e-6 * np.eye(2)
-        found = {}
+        reasons = {}
         for target in self.face.targets:
             center, limit = self.face.plane(target.center), VAGUE * max(target.width, target.height)
             off = center - middle
             deviation = float(np.sqrt(np.linalg.eigvalsh(view.covariance_at(center))[-1]))
             if not self._shown(view, target):
-                found[target.name] = "it lies outside the frame"
+                reasons[target.name] = "it lies outside the frame"
             elif float(off @ np.linalg.solve(moments, off)) > FAR**2:
                 names = ", ".join(self.marks[k].name for k in used)
-                found[target.name] = f"all marks seen lie on one side of it: {names}"
+                reasons[target.name] = f"all marks seen lie on one side of it: {names}"
             elif not deviation <= limit:
-                found[target.name] = (
+                reasons[target.name] = (
                     f"the marks seen determine its place only to {deviation:.3f} m; "
                     f"{limit:.3f} m is needed"
                 )
-        return found
+        return reasons
 
     def _shown(self, view: FaceView, target: Target) -> bool:
         """Return whether the frame shows any part of a target."""
@@ -523,7 +535,7 @@ class Search:
 
 
 def _problem(refined: Refined | None, mark: Mark, read: bool) -> str:
-    """Return why what was found near a mark's place is not the mark; empty if it is.
+    """Return the reason why a match is not the mark; empty if it is.
 
     A tag whose code was ``read`` may be explained less well: its cells may be small.
     """

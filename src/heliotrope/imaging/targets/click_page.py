@@ -68,10 +68,10 @@ class _Handler(BaseHTTPRequestHandler):
     def _allowed(self) -> str | None:
         """Return the path after the random word; None if the request is not for this page."""
         # A foreign page may resolve its own name to this machine, but then sends that name.
-        here = self.headers.get("Host") in (f"127.0.0.1:{self._port}", f"localhost:{self._port}")
+        local = self.headers.get("Host") in (f"127.0.0.1:{self._port}", f"localhost:{self._port}")
         _, word, *rest = (self.path.split("/") + ["", ""])[:4]
         known = secrets.compare_digest(word.encode(), self._state.token.encode())
-        if here and known:
+        if local and known:
             return rest[0]
         self._send(404, b"not here\n")
         return None
@@ -94,23 +94,23 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def do_GET(self) -> None:
-        wanted = self._allowed()
-        if wanted == "":
+        path = self._allowed()
+        if path == "":
             self._send(200, self._state.page, "text/html; charset=utf-8")
-        elif wanted == "picture.png":
+        elif path == "picture.png":
             self._send(200, self._state.picture, "image/png")
-        elif wanted is not None:
+        elif path is not None:
             self._send(404, b"not here\n")
 
     def do_POST(self) -> None:
-        wanted = self._allowed()
-        if wanted is None:
+        path = self._allowed()
+        if path is None:
             return
-        if wanted == "cancel":
+        if path == "cancel":
             self._send(200, b"cancelled\n")
             self._state.over.set()
             return
-        if wanted != "points":
+        if path != "points":
             self._send(404, b"not here\n")
             return
         try:
@@ -155,7 +155,7 @@ class _Handler(BaseHTTPRequestHandler):
 def ask(
     picture: npt.NDArray[np.uint8],
     places: Mapping[str, Pixel],
-    given: Mapping[str, Pixel],
+    known: Mapping[str, Pixel],
     title: str,
     announce: Callable[[str], None],
     fewest: int = 4,
@@ -170,7 +170,7 @@ def ask(
     places
         Points to ask for, in this order, with their places on the target from the left and
         from above, 0 to 1.
-    given
+    known
         Points already known; the page shows them.
     title
         Title of the page.
@@ -194,7 +194,7 @@ def ask(
         raise InputError(f"{title}: the picture {picture.shape} cannot be shown")
     token, nonce = secrets.token_urlsafe(16), secrets.token_urlsafe(16)
     size = picture.shape[1], picture.shape[0]
-    page = _page(nonce, title, places, given, size, fewest, aspect)
+    page = _page(nonce, title, places, known, size, fewest, aspect)
     state = _State(token, nonce, page, encoded.tobytes(), size, frozenset(places))
     with _Server(state) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
@@ -215,7 +215,7 @@ def ask(
 def click_points(
     target: Target,
     frame: Frame,
-    given: Mapping[str, Pixel],
+    known: Mapping[str, Pixel],
     title: str,
     announce: Callable[[str], None],
 ) -> dict[str, Pixel]:
@@ -229,9 +229,9 @@ def click_points(
         If the person cancels.
     """
     places, aspect = places_of(target)
-    asked = {name: place for name, place in places.items() if name not in given}
+    asked = {name: place for name, place in places.items() if name not in known}
     return ask(
-        shown_pixels(frame), asked, given, f"{title}: target {target.name}", announce, aspect=aspect
+        shown_pixels(frame), asked, known, f"{title}: target {target.name}", announce, aspect=aspect
     )
 
 
@@ -239,7 +239,7 @@ def _page(
     nonce: str,
     title: str,
     places: Mapping[str, Pixel],
-    given: Mapping[str, Pixel],
+    known: Mapping[str, Pixel],
     size: Sequence[int],
     fewest: int,
     aspect: float,
@@ -248,7 +248,7 @@ def _page(
         "title": title,
         "size": list(size),
         "points": [{"name": name, "place": list(place)} for name, place in places.items()],
-        "given": [{"name": name, "at": list(at)} for name, at in given.items()],
+        "given": [{"name": name, "at": list(at)} for name, at in known.items()],
         "fewest": fewest,
         "aspect": aspect,
     }

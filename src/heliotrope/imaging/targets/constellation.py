@@ -95,7 +95,9 @@ def constellation(
     )
 
 
-def match(seen: Candidates, marks: Constellation, up: FloatArray, upright: bool) -> Match | None:
+def match(
+    candidates: Candidates, marks: Constellation, up: FloatArray, upright: bool
+) -> Match | None:
     """Return the assignment that explains most marks, or None if no three agree.
 
     Each candidate, taken for each mark that it may be, predicts the places of all marks.
@@ -103,7 +105,7 @@ def match(seen: Candidates, marks: Constellation, up: FloatArray, upright: bool)
 
     Parameters
     ----------
-    seen
+    candidates
         Candidates of a frame.
     marks
         The marks.
@@ -112,15 +114,15 @@ def match(seen: Candidates, marks: Constellation, up: FloatArray, upright: bool)
     upright
         Consider only guesses that agree with it.
     """
-    linear, mark, part = _guesses(seen, marks, up, upright)
+    linear, mark, part = _guesses(candidates, marks, up, upright)
     if len(linear) == 0:
         return None
     apart = marks.middle[None] - marks.middle[mark][:, None]
     offset = (linear[:, None] @ apart[..., None])[..., 0]
-    guess = seen.middle[part][:, None] + offset
-    size = np.sqrt(np.trace(seen.covariance[part], axis1=1, axis2=2))
+    guess = candidates.middle[part][:, None] + offset
+    size = np.sqrt(np.trace(candidates.covariance[part], axis1=1, axis2=2))
     slack = _LOOSE * np.linalg.norm(offset, axis=-1) + size[:, None]
-    taken = _gather(seen, marks, guess, linear, slack)
+    taken = _gather(candidates, marks, guess, linear, slack)
     count = (taken >= 0).sum(axis=1)
     least = min(3, len(marks.which))
     order = np.argsort(-count, kind="stable")
@@ -133,48 +135,48 @@ def match(seen: Candidates, marks: Constellation, up: FloatArray, upright: bool)
         if key in tried:
             continue
         tried.add(key)
-        found = _settle(seen, marks, taken[g], up)
-        if found is not None and (best is None or found.score > best.score):
-            best = found
+        settled = _settle(candidates, marks, taken[g], up)
+        if settled is not None and (best is None or settled.score > best.score):
+            best = settled
     return best
 
 
 def _guesses(
-    seen: Candidates, marks: Constellation, up: FloatArray, upright: bool
+    candidates: Candidates, marks: Constellation, up: FloatArray, upright: bool
 ) -> tuple[FloatArray, Places, Places]:
     """Return linear maps plane to pixels (G, 2, 2), and the mark and candidate of each (G,)."""
-    way, mark = np.nonzero(seen.drawing[:, None] == marks.which[None])
+    pair, mark = np.nonzero(candidates.drawing[:, None] == marks.which[None])
     # A drawing is turned first, then laid in the plane: B = A · turn.
-    linear = seen.linear[way] @ np.swapaxes(marks.turn[mark], 1, 2)
+    linear = candidates.linear[pair] @ np.swapaxes(marks.turn[mark], 1, 2)
     if upright:
         kept = np.flatnonzero(_lean(linear, up) < _UPRIGHT)
     else:
-        likeness = seen.likeness[seen.part[way], seen.drawing[way]]
+        likeness = candidates.likeness[candidates.part[pair], candidates.drawing[pair]]
         kept = np.argsort(-likeness, kind="stable")[:_GUESSES]
-    return linear[kept], mark[kept], seen.part[way[kept]]
+    return linear[kept], mark[kept], candidates.part[pair[kept]]
 
 
 def _lean(linear: FloatArray, up: FloatArray) -> FloatArray:
     """Return angles (G,), rad, between the upward direction of maps (G, 2, 2) and the expected."""
-    seen = linear[:, :, 1]
-    along, across = seen @ up, seen[:, 0] * up[1] - seen[:, 1] * up[0]
+    upward = linear[:, :, 1]
+    along, across = upward @ up, upward[:, 0] * up[1] - upward[:, 1] * up[0]
     return np.asarray(np.abs(np.arctan2(across, along)))
 
 
 def _gather(
-    seen: Candidates,
+    candidates: Candidates,
     marks: Constellation,
     guess: FloatArray,
     linear: FloatArray,
     slack: FloatArray,
 ) -> Places:
     """Return the nearest fitting candidate of each guess and mark, or −1, (G, M)."""
-    apart = np.linalg.norm(seen.middle[None, None] - guess[:, :, None], axis=-1)
-    alike = seen.likeness.T[marks.which] > _RESEMBLES
+    apart = np.linalg.norm(candidates.middle[None, None] - guess[:, :, None], axis=-1)
+    alike = candidates.likeness.T[marks.which] > _RESEMBLES
     g, m, p = np.nonzero((apart < slack[..., None]) & alike[None])
     A = linear[g] if linear.ndim == 3 else linear[g, m]
-    wanted = A @ marks.covariance[m] @ np.swapaxes(A, 1, 2)
-    ratio = np.linalg.solve(wanted, seen.covariance[p])
+    expected = A @ marks.covariance[m] @ np.swapaxes(A, 1, 2)
+    ratio = np.linalg.solve(expected, candidates.covariance[p])
     trace = 0.5 * np.trace(ratio, axis1=1, axis2=2)
     area = np.sqrt(np.maximum(np.linalg.det(ratio), 1e-12))
     fits = (trace < _SPREAD) & (area > 1.0 / _SPREAD) & (area < _SPREAD)
@@ -183,14 +185,16 @@ def _gather(
     # The nearest is written last. A candidate of two marks then belongs to the nearer one.
     order = np.argsort(-apart[g, m, p], kind="stable")
     taken[g[order], m[order]] = p[order]
-    owner = np.full((len(guess), len(seen.middle)), -1)
+    owner = np.full((len(guess), len(candidates.middle)), -1)
     owner[g[order], p[order]] = m[order]
     rows = np.arange(len(guess))[:, None]
     own = owner[rows, np.maximum(taken, 0)] == np.arange(guess.shape[1])
     return np.where(own, taken, -1)
 
 
-def _settle(seen: Candidates, marks: Constellation, taken: Places, up: FloatArray) -> Match | None:
+def _settle(
+    candidates: Candidates, marks: Constellation, taken: Places, up: FloatArray
+) -> Match | None:
     """Fit and gather in turn until nothing changes."""
     H = np.eye(3)
     for _ in range(5):
@@ -198,9 +202,9 @@ def _settle(seen: Candidates, marks: Constellation, taken: Places, up: FloatArra
         middle = marks.middle[held]
         if len(held) < 3 or np.linalg.matrix_rank(middle - middle[0], tol=0.1) < 2:
             return None
-        H = _affine(middle, seen.middle[taken[held]])
+        H = _affine(middle, candidates.middle[taken[held]])
         if len(held) >= 5:
-            H = homography(middle, seen.middle[taken[held]])
+            H = homography(middle, candidates.middle[taken[held]])
         if not _front(H, marks.plane):
             return None
         guess = mapped(H, marks.middle)
@@ -210,29 +214,31 @@ def _settle(seen: Candidates, marks: Constellation, taken: Places, up: FloatArra
         )
         # An affine map lacks perspective.
         loose = 0.04 * float(np.ptp(guess, axis=0).max()) if len(held) < 5 else 0.0
-        again = _gather(seen, marks, guess[None], linear[None], (_TIGHT * size + loose)[None])[0]
+        again = _gather(
+            candidates, marks, guess[None], linear[None], (_TIGHT * size + loose)[None]
+        )[0]
         if (again == taken).all():
             break
         taken = again
     held = np.flatnonzero(taken >= 0)
-    if len(held) < 3 or not _in_shape(seen, marks, H, held, taken[held]):
+    if len(held) < 3 or not _in_shape(candidates, marks, H, held, taken[held]):
         return None
     lean = float(_lean(scales(H, marks.plane.mean(axis=0)[None]), up)[0])
-    likeness = float(seen.likeness[taken[held], marks.which[held]].sum())
+    likeness = float(candidates.likeness[taken[held], marks.which[held]].sum())
     return Match(held, taken[held], H, (len(held), -round(lean, 1), likeness))
 
 
 def _in_shape(
-    seen: Candidates, marks: Constellation, H: FloatArray, held: Places, taken: Places
+    candidates: Candidates, marks: Constellation, H: FloatArray, held: Places, taken: Places
 ) -> bool:
     """Return whether sizes of marks agree with the distances between them.
 
     They disagree for another target with other distances: no map fits both.
     """
     back = np.linalg.inv(scales(H, marks.middle[held]))
-    found = (back @ seen.covariance[taken] @ np.swapaxes(back, 1, 2)).sum(axis=0)
+    observed = (back @ candidates.covariance[taken] @ np.swapaxes(back, 1, 2)).sum(axis=0)
     root = np.linalg.inv(np.linalg.cholesky(marks.covariance[held].sum(axis=0)))
-    least, most = np.linalg.eigvalsh(root @ found @ root.T)
+    least, most = np.linalg.eigvalsh(root @ observed @ root.T)
     return bool(most < _ASKEW * least and 1.0 / _SIZED < np.sqrt(least * most) < _SIZED)
 
 

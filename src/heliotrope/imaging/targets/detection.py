@@ -107,15 +107,15 @@ class DarkParts:
 def drawings(marks: Sequence[Mark]) -> tuple[list[Drawing], npt.NDArray[np.intp]]:
     """Return the distinct drawings of marks (no tags or pictures), and each mark's index (M,)."""
     known: dict[tuple[str, float, float], int] = {}
-    found: list[Drawing] = []
+    distinct: list[Drawing] = []
     which = []
     for mark in marks:
         key = (mark.kind, mark.size, mark.stroke)
         if key not in known:
-            known[key] = len(found)
-            found.append(_drawing(*key))
+            known[key] = len(distinct)
+            distinct.append(_drawing(*key))
         which.append(known[key])
-    return found, np.array(which, dtype=np.intp)
+    return distinct, np.array(which, dtype=np.intp)
 
 
 @lru_cache(maxsize=256)
@@ -157,7 +157,7 @@ def _profiles(
     circle = np.stack([np.cos(angle), np.sin(angle)])
     rays = (_RADII[:, None, None] * circle[None]).transpose(1, 0, 2).reshape(2, -1)
     places = (middle[:, :, None] + _roots(covariance) @ rays).astype(np.float32)
-    seen = cv2.remap(
+    sampled = cv2.remap(
         mask,
         np.ascontiguousarray(places[:, 0]),
         np.ascontiguousarray(places[:, 1]),
@@ -167,7 +167,7 @@ def _profiles(
     )
     # Weight a ring by its area.
     weight = np.repeat(np.sqrt(_RADII), _TURNS)
-    values = np.asarray(seen, dtype=np.float64).reshape(len(middle), -1)
+    values = np.asarray(sampled, dtype=np.float64).reshape(len(middle), -1)
     values = (values - values @ weight[:, None] ** 2 / np.sum(weight**2)) * weight
     values /= np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)
     return np.asarray(np.fft.rfft(values.reshape(-1, len(_RADII), _TURNS), axis=2))
@@ -278,16 +278,16 @@ def _moments(
     return center, np.stack(rows, axis=-2)
 
 
-def candidates(seen: DarkParts, drawn: Sequence[Drawing]) -> Candidates:
+def candidates(parts: DarkParts, drawn: Sequence[Drawing]) -> Candidates:
     """Return at most 60 outlines that look like one of the drawings, the best first."""
     profiles = np.stack([d.profile for d in drawn])
-    spectrum = np.einsum("prk,drk->pdk", seen.profile, profiles.conj())
+    spectrum = np.einsum("prk,drk->pdk", parts.profile, profiles.conj())
     alike = np.fft.irfft(spectrum, n=_TURNS, axis=2)
     best = alike.max(axis=2, initial=-1.0)
     order = np.argsort(-best.max(axis=1, initial=-1.0), kind="stable")[:_KEPT]
     order = order[best[order].max(axis=1, initial=-1.0) > _ALIKE]
     alike, best = alike[order], best[order]
-    middle, covariance = seen.middle[order], seen.covariance[order]
+    middle, covariance = parts.middle[order], parts.covariance[order]
     peaks = (alike >= np.roll(alike, 1, axis=2)) & (alike > np.roll(alike, -1, axis=2))
     turning = np.array([d.turning for d in drawn], dtype=bool)
     peaks[:, ~turning] = True
@@ -320,18 +320,18 @@ def find_tags(grey: Image, numbers: Sequence[int]) -> dict[tuple[int, int], list
     """
     import cv2
 
-    found: dict[tuple[int, int], list[FloatArray]] = {}
+    tags: dict[tuple[int, int], list[FloatArray]] = {}
     for number in numbers:
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         dictionary = cv2.aruco.getPredefinedDictionary(number)
         detector = cv2.aruco.ArucoDetector(dictionary, parameters)
         corners, identities, _ = detector.detectMarkers(grey)
-        seen = [] if len(corners) == 0 else np.ravel(np.asarray(identities)).tolist()
-        for place, identity in zip(corners, seen, strict=True):
+        labels = [] if len(corners) == 0 else np.ravel(np.asarray(identities)).tolist()
+        for place, identity in zip(corners, labels, strict=True):
             corner = np.asarray(place).reshape(4, 2).astype(np.float64)
-            found.setdefault((number, int(identity)), []).append(corner)
-    return found
+            tags.setdefault((number, int(identity)), []).append(corner)
+    return tags
 
 
 def tag_number(mark: Mark) -> tuple[int, int]:

@@ -143,16 +143,16 @@ def find_targets(
         searches.append(_Face(Search(look, face, marks, plane), _earlier(face, previous, look)))
     # A camera that sees one face upright is not turned for another.
     for turned in (False, True):
-        for each in searches:
-            each.look(turned)
-        if any(each.best is not None and each.best.view is not None for each in searches):
+        for search in searches:
+            search.look(turned)
+        if any(search.best is not None and search.best.view is not None for search in searches):
             break
     _one_place_each(searches)
     if camera is not None and camera.position is not None:
-        for each in searches:
-            each.compare(camera)
-    found = {r.target.name: r for each in searches for r in each.results()}
-    return [found[target.name] for target in targets]
+        for search in searches:
+            search.compare(camera)
+    results = {r.target.name: r for search in searches for r in search.results()}
+    return [results[target.name] for target in targets]
 
 
 def _earlier(face: Face, previous: Sequence[FaceView], look: FrameSearch) -> FaceView | None:
@@ -271,7 +271,7 @@ class _Face:
         return replace(settled, view=None, text=text) if text else settled
 
     def _elsewhere(self, attempt: Attempt, view: FaceView) -> str:
-        """Return why what was seen may be another target of the face; empty if it cannot."""
+        """Return the reason why the view may show another target; empty if it cannot."""
         search = self.search
         marks, plane, targets = search.marks, search.plane, search.face.targets
         near = 0.05 * search.extent
@@ -301,8 +301,8 @@ class _Face:
         scale = view.scale(middle)
 
         def lean(turn: FloatArray) -> float:
-            seen = scale @ turn[:, 1]
-            return -float(seen @ up) / float(np.linalg.norm(seen))
+            upward = scale @ turn[:, 1]
+            return -float(upward @ up) / float(np.linalg.norm(upward))
 
         best, least = attempt, lean(np.eye(2))
         whole = len(attempt.used) == len(search.expected(view))
@@ -325,8 +325,8 @@ class _Face:
         if len(kept) < FEWEST:
             return
         drawn, which = detection.drawings([search.marks[k] for k in kept])
-        seen = detection.candidates(search.look.outlines(reduction, ratio), drawn)
-        yield from self._matched(seen, kept, drawn, which, upright)
+        candidates = detection.candidates(search.look.outlines(reduction, ratio), drawn)
+        yield from self._matched(candidates, kept, drawn, which, upright)
 
     def _pictured(self) -> Iterator[Attempt]:
         """Yield an attempt from taught pictures anywhere in an upright frame."""
@@ -335,35 +335,37 @@ class _Face:
         if len(kept) < FEWEST:
             return
         marks = [search.marks[k] for k in kept]
-        seen = detection.find_pictures(search.look.eight, marks, search.look.pictures)
+        candidates = detection.find_pictures(search.look.eight, marks, search.look.pictures)
         yield from self._matched(
-            seen, kept, detection.picture_drawings(marks), np.arange(len(kept)), True
+            candidates, kept, detection.picture_drawings(marks), np.arange(len(kept)), True
         )
 
     def _matched(
         self,
-        seen: detection.Candidates,
+        candidates: detection.Candidates,
         kept: list[int],
         drawn: list[detection.Drawing],
         which: constellation.Places,
         upright: bool,
     ) -> Iterator[Attempt]:
         search = self.search
-        self.shapes = max(self.shapes, len(seen.middle))
+        self.shapes = max(self.shapes, len(candidates.middle))
         marks = constellation.constellation(
             [search.marks[k] for k in kept], drawn, which, search.plane[kept]
         )
-        found = constellation.match(seen, marks, self._up(), upright)
-        if found is not None:
-            yield self._mapped(found.H_pixel_plane, 0.4)
+        matched = constellation.match(candidates, marks, self._up(), upright)
+        if matched is not None:
+            yield self._mapped(matched.H_pixel_plane, 0.4)
 
     def compare(self, camera: Camera) -> None:
         """Reject a view that agrees with the camera's pose only if the frame is turned back."""
         if self.best is None or self.best.view is None:
             return
         search = self.search
-        seen = self.best.view.to_pixels(search.plane)
-        turn = turn_of(seen, project(camera, search.face.point(search.plane)), camera, search.look)
+        pixels = self.best.view.to_pixels(search.plane)
+        turn = turn_of(
+            pixels, project(camera, search.face.point(search.plane)), camera, search.look
+        )
         if turn:
             text = (
                 f"the frame is {turn} against the pose of camera {camera.name}; undo that in the "
@@ -402,14 +404,14 @@ def _rank(attempt: Attempt) -> tuple[bool, int]:
     return attempt.view is not None, len(attempt.used)
 
 
-def turn_of(seen: FloatArray, expected: FloatArray, camera: Camera, look: FrameSearch) -> str:
-    """Return which turn of the frame takes marks to where they are seen; empty if none is needed.
+def turn_of(observed: FloatArray, expected: FloatArray, camera: Camera, look: FrameSearch) -> str:
+    """Return the turn of the frame that explains the observed marks; empty if none is needed.
 
     Marks are compared as sets: those of a turned frame may look like each other's.
 
     Parameters
     ----------
-    seen, expected
+    observed, expected
         Pixels of marks in the frame and by the camera's pose, (M, 2).
     camera, look
         The camera, and the search in the frame.
@@ -423,7 +425,7 @@ def turn_of(seen: FloatArray, expected: FloatArray, camera: Camera, look: FrameS
         if tuple(np.abs(np.array(turn) @ camera.size)) != look.size:
             return np.inf
         places = frame + (expected - middle) @ np.array(turn).T
-        gaps = np.linalg.norm(seen[:, None] - places[None], axis=-1)
+        gaps = np.linalg.norm(observed[:, None] - places[None], axis=-1)
         return float(np.sqrt(np.mean(gaps.min(axis=1) ** 2)))
 
     unturned = apart(np.eye(2, dtype=int))
@@ -445,7 +447,7 @@ def symmetries(marks: Sequence[Mark], plane: FloatArray) -> list[tuple[FloatArra
     plane
         Their places, m, (M, 2).
     """
-    found = []
+    turns = []
     middle = plane.mean(axis=0)
     extent = float(np.ptp(plane, axis=0).max())
     for quarter, (cos, sin) in enumerate(((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)), start=1):
@@ -460,8 +462,8 @@ def symmetries(marks: Sequence[Mark], plane: FloatArray) -> list[tuple[FloatArra
         ]
         share = float(np.mean(same))
         if share >= 0.5:
-            found.append((turn, share))
-    return found
+            turns.append((turn, share))
+    return turns
 
 
 def _alike(a: Mark, b: Mark, turned: float) -> bool:
@@ -475,10 +477,10 @@ def _alike(a: Mark, b: Mark, turned: float) -> bool:
     return bool(abs(rest - np.round(rest)) * period < 0.1)
 
 
-def _one_place_each(found: Sequence[_Face]) -> None:
-    """Reject at least one of two faces that were found in one place of the frame."""
-    for k, first in enumerate(found):
-        for second in found[k + 1 :]:
+def _one_place_each(searches: Sequence[_Face]) -> None:
+    """Reject at least one of two faces that share a place in the frame."""
+    for k, first in enumerate(searches):
+        for second in searches[k + 1 :]:
             a, b = first.best, second.best
             if a is None or b is None or a.view is None or b.view is None:
                 continue
@@ -487,7 +489,7 @@ def _one_place_each(found: Sequence[_Face]) -> None:
             clear = _share(first, a) - _share(second, b)
             if a.known != b.known:
                 clear = 1.0 if a.known else -1.0
-            names = [each.search.face.targets[0].name for each in (first, second)]
+            names = [face.search.face.targets[0].name for face in (first, second)]
             lost = [f"the frame shows {name} there" for name in reversed(names)]
             if abs(clear) < _CLEARER:
                 lost = [
@@ -500,8 +502,8 @@ def _one_place_each(found: Sequence[_Face]) -> None:
                 second.best = replace(b, view=None, text=lost[1])
 
 
-def _share(each: _Face, attempt: Attempt) -> float:
-    return len(attempt.used) / len(each.search.marks)
+def _share(face: _Face, attempt: Attempt) -> float:
+    return len(attempt.used) / len(face.search.marks)
 
 
 def _covers(a: FaceView, b: FaceView) -> bool:
@@ -512,14 +514,14 @@ def _covers(a: FaceView, b: FaceView) -> bool:
 
 
 def _found_mark(search: Search, best: Attempt, k: int) -> FoundMark:
-    if k in best.seen:
-        pixel, covariance = best.seen[k]
+    if k in best.observed:
+        pixel, covariance = best.observed[k]
     else:
         pixel = np.full(2, np.nan) if best.view is None else best.view.to_pixels(search.plane[k])
         covariance = np.full((2, 2), np.nan)
     used = best.view is not None and k in best.used
     look = best.looks.get(k)
-    found = FoundMark(search.marks[k], pixel, covariance, used, best.reasons.get(k, ""))
+    mark = FoundMark(search.marks[k], pixel, covariance, used, best.reasons.get(k, ""))
     if look is None or search.marks[k].kind == "tag":
-        return found
-    return replace(found, contrast=look.contrast, blur=look.blur)
+        return mark
+    return replace(mark, contrast=look.contrast, blur=look.blur)

@@ -95,7 +95,7 @@ def tag_dictionary(mark: Mark) -> tuple[int, int]:
 
 
 def tag_cells(mark: Mark) -> FloatArray:
-    """Return which cells of a tag are dark, border included, (N, N) of booleans."""
+    """Return the mask of dark cells of a tag, border included, (N, N)."""
     import cv2
 
     number, identity = tag_dictionary(mark)

@@ -100,12 +100,12 @@ class Rectified:
         return x.astype(np.float32), y.astype(np.float32)
 
 
-def rim_of(found: Sequence[FoundTarget]) -> int:
+def rim_of(results: Sequence[FoundTarget]) -> int:
     """Return the width of the rim that shows what lies beyond the targets of a face, pixels."""
-    soft = [m.blur.max() for f in found for m in f.marks if m.used and np.isfinite(m.blur).all()]
+    soft = [m.blur.max() for f in results for m in f.marks if m.used and np.isfinite(m.blur).all()]
     if not soft:
         return LEAST_RIM
-    side = min(min(f.target.width, f.target.height) for f in found)
+    side = min(min(f.target.width, f.target.height) for f in results)
     return int(np.clip(np.ceil(_SOFT_RIM * np.median(soft) / side * ACROSS), LEAST_RIM, _MOST_RIM))
 
 

@@ -147,12 +147,12 @@ def refine(
         return None
     template = _template(mark, count, picture)
     paint = _paint(template, within)
-    found = _adjust(grey, template, start, scale, paint, relit=False)
-    if found is not None and found.explained < _CLEAR and picture is None:
+    best = _adjust(grey, template, start, scale, paint, relit=False)
+    if best is not None and best.explained < _CLEAR and picture is None:
         other = _adjust(grey, template, start, scale, paint, relit=True)
-        if other is not None and other.explained > found.explained:
+        if other is not None and other.explained > best.explained:
             return other
-    return found
+    return best
 
 
 def locate(
@@ -199,8 +199,8 @@ def _peak(values: Image, at: int) -> float:
     """Return where the parabola through a maximum and its neighbours peaks."""
     if not 0 < at < len(values) - 1:
         return 0.0
-    before, here, after = (float(v) for v in values[at - 1 : at + 2])
-    bend = before - 2.0 * here + after
+    before, middle, after = (float(v) for v in values[at - 1 : at + 2])
+    bend = before - 2.0 * middle + after
     return 0.5 * (before - after) / bend if bend < 0.0 else 0.0
 
 
@@ -360,9 +360,9 @@ def _adjust(
         taken = _sample(grey, pixel + scale @ shift, scale, template.first, step, shape)
         if taken is None:
             return None
-        seen = np.asarray(cv2.GaussianBlur(taken[0], (0, 0), _SMOOTH), dtype=np.float32)
-        shown = seen.ravel()
-        samples = _relit(seen, template.stroke).ravel() if relit else shown
+        smooth = np.asarray(cv2.GaussianBlur(taken[0], (0, 0), _SMOOTH), dtype=np.float32)
+        shown = smooth.ravel()
+        samples = _relit(smooth, template.stroke).ravel() if relit else shown
         inside = paint if taken[1] is None else paint * taken[1].ravel()
         _, numbers = _solve(basis[:, :10], weight * inside, samples)
         residual = samples - basis[:, :10] @ numbers.astype(np.float32)
@@ -376,11 +376,11 @@ def _adjust(
         if float(np.abs(move).max()) < _STILL * step:
             break
     place = pixel + scale @ shift
-    found = _judged(template, samples, weight, inside, residual, numbers, place, scale)
-    if found.contrast > _PALE:
-        contrast, blur = _softer(template, shown, inside, found.contrast, found.blur)
-        found = replace(found, contrast=contrast, blur=blur)
-    return found
+    refined = _judged(template, samples, weight, inside, residual, numbers, place, scale)
+    if refined.contrast > _PALE:
+        contrast, blur = _softer(template, shown, inside, refined.contrast, refined.blur)
+        refined = replace(refined, contrast=contrast, blur=blur)
+    return refined
 
 
 def _quantile(values: Values, share: float) -> float:
@@ -423,7 +423,7 @@ def _judged(
     even = template.basis[:, :3]
     plain = samples - even @ _solve(even, inside, samples)[1].astype(np.float32)
     shown = inside > 0.0
-    left = float(np.var(residual[shown])) / max(float(np.var(plain[shown])), 1e-9)
+    unexplained = float(np.var(residual[shown])) / max(float(np.var(plain[shown])), 1e-9)
     # A soft step of height d has the slope d/(√2π σ) at its middle.
     down, right = np.gradient(samples.reshape(template.values.shape))
     steepest = np.array([_quantile(np.abs(slope), 0.985) for slope in (right, down)])
@@ -434,7 +434,7 @@ def _judged(
         pixel=place,
         covariance=scale @ plane @ scale.T + _FLOOR**2 * np.eye(2),
         contrast=float((numbers[0] + depth) / max(float(numbers[0]), 1e-9)),
-        explained=1.0 - left,
+        explained=1.0 - unexplained,
         blur=blur,
         shape=shape,
     )
@@ -452,19 +452,19 @@ def _softer(
 
     even, root = template.basis[:, :3], np.sqrt(weight)[:, None]
     widest = 0.5 * max(template.values.shape)
-    ways = [(a, b) for a in _SOFTNESS for b in _SOFTNESS]
-    found, least = (contrast, blur), np.inf
-    for way in ways:
-        wide = np.maximum(template.stroke * np.array(way), 1e-3)
+    blurs = [(a, b) for a in _SOFTNESS for b in _SOFTNESS]
+    best, least = (contrast, blur), np.inf
+    for pair in blurs:
+        wide = np.maximum(template.stroke * np.array(pair), 1e-3)
         if wide.max() > widest:
             continue
         drawn = cv2.GaussianBlur(template.values, (0, 0), wide[0], sigmaY=wide[1])
         parts = np.column_stack([even, drawn.ravel().astype(np.float32)])
-        numbers, left, _, _ = np.linalg.lstsq(parts * root, samples * root[:, 0], rcond=None)
-        if not left.size or float(left[0]) >= least:
+        numbers, rest, _, _ = np.linalg.lstsq(parts * root, samples * root[:, 0], rcond=None)
+        if not rest.size or float(rest[0]) >= least:
             continue
-        least = float(left[0])
-        if any(way):
+        least = float(rest[0])
+        if any(pair):
             pale = float((numbers[0] + numbers[3]) / max(float(numbers[0]), 1e-9))
-            found = pale, np.maximum(blur, template.step * wide)
-    return found
+            best = pale, np.maximum(blur, template.step * wide)
+    return best

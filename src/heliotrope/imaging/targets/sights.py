@@ -43,7 +43,7 @@ def sights(camera: Camera, targets: Sequence[Target]) -> list[TargetView]:
     """Return the views of a camera's targets, or of all, that face it and are in its frame."""
     if camera.position is None:
         return []
-    found = []
+    views = []
     for target in targets:
         ray = camera.position - target.center
         distance = float(np.linalg.norm(ray))
@@ -63,10 +63,10 @@ def sights(camera: Camera, targets: Sequence[Target]) -> list[TargetView]:
         if area > 0.0:
             oblique = float(np.arccos(min(facing, 1.0)))
             count = int(_held(camera, project(camera, marks)).sum())
-            found.append(
+            views.append(
                 TargetView(target.name, distance, area**-0.5, oblique, float(share), count)
             )
-    return found
+    return views
 
 
 def _held(camera: Camera, pixels: FloatArray) -> npt.NDArray[np.bool_]:

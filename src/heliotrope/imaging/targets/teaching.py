@@ -213,27 +213,27 @@ def teach(
     old = {mark.name: mark for mark in surface.marks}
     asked = {n: (wishes or {}).get(n, wish or Wish()) for n in named}
     drawn = [_drawing(name, point, asked[name], old.get(name)) for name, point in named.items()]
-    found = [
+    points = [
         TaughtPoint(n, x, sigma**2 * np.eye(2), None, False)
         for n, x in zip(named, pixels, strict=True)
     ]
-    # A second pass with the scale and turn found, since those given by hand err by some per cent.
+    # A second pass with the scale and turn of the first, since points by hand err by some per cent.
     for search in (REACH, 0.25 * REACH):
         for k, mark in enumerate(drawn):
             if mark is not None:
-                found[k] = _refine(frame, found[k], mark, (H, plane[k]), search)
-        H = _homography(surface, plane, np.array([p.pixel for p in found]), list(named))
+                points[k] = _refine(frame, points[k], mark, (H, plane[k]), search)
+        H = _homography(surface, plane, np.array([p.pixel for p in points]), list(named))
     pictures: dict[str, npt.NDArray[np.uint8]] = {}
     for k, (name, point) in enumerate(named.items()):
-        if found[k].mark is None:
+        if points[k].mark is None:
             size = SHARE * min(surface.width, surface.height)
             if asked[name].kind in (None, "picture"):
                 size = asked[name].size or size
-            found[k] = _picture(frame, found[k], point, size, (H, plane[k]), prefix, pictures)
-    fit = _fit(frame, known, camera, anew, np.array(list(named.values())), found, H, plane)
+            points[k] = _picture(frame, points[k], point, size, (H, plane[k]), prefix, pictures)
+    fit = _fit(frame, known, camera, anew, np.array(list(named.values())), points, H, plane)
     solved = _with_target(fit.camera, target, known)
-    plant = _with_marks(plant, surface, [p.mark for p in found if p.mark is not None], solved)
-    return Taught(plant, target, camera, fit, tuple(found), pictures)
+    plant = _with_marks(plant, surface, [p.mark for p in points if p.mark is not None], solved)
+    return Taught(plant, target, camera, fit, tuple(points), pictures)
 
 
 def write_taught(taught: Taught, path: str | Path, folder: str | Path | None = None) -> None:
@@ -284,7 +284,7 @@ def read_pictures(folder: str | Path, targets: Sequence[Target]) -> dict[str, Fl
     """
     from heliotrope.imaging.files import read_image
 
-    found = {}
+    pictures = {}
     for mark in (mark for target in targets for mark in target.marks if mark.kind == "picture"):
         file = Path(folder) / mark.code
         if not file.is_file():
@@ -298,36 +298,36 @@ def read_pictures(folder: str | Path, targets: Sequence[Target]) -> dict[str, Fl
             raise FormatError(
                 file, f"{grey.shape[1]} × {grey.shape[0]} px; a mark's picture is square"
             )
-        found[mark.code] = as_float(grey)
-    return found
+        pictures[mark.code] = as_float(grey)
+    return pictures
 
 
 # -- points ----------------------------------------------------------------------------
 
 
 def _check_points(
-    target: Target, frame: Frame, given: Mapping[str, Pixel]
+    target: Target, frame: Frame, pixels: Mapping[str, Pixel]
 ) -> dict[str, FloatArray]:
-    """Return the ENU points that were given, in their order."""
+    """Return the ENU points of the pixels, in their order."""
     known = known_points(target)
     width, height = frame.size
-    for name, (x, y) in given.items():
+    for name, (x, y) in pixels.items():
         if name not in known:
             raise UnknownNameError(f"point of target {target.name}", name, list(known))
         if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
             raise InputError(
                 f"point {name}: {x}, {y} is not in the picture of {width} × {height} px"
             )
-    if len(given) < 4:
+    if len(pixels) < 4:
         raise InputError(
-            f"target {target.name}: {len(given)} points given; four or more are needed to locate "
+            f"target {target.name}: {len(pixels)} points given; four or more are needed to locate "
             f"the camera (it has {', '.join(known)})"
         )
-    names = list(given)
+    names = list(pixels)
     for k, name in enumerate(names):
         for other in names[:k]:
-            if np.hypot(*np.subtract(given[name], given[other])) < 3.0:
-                raise InputError(f"points {other} and {name} are at the same place, {given[name]}")
+            if np.hypot(*np.subtract(pixels[name], pixels[other])) < 3.0:
+                raise InputError(f"points {other} and {name} are at the same place, {pixels[name]}")
     return {name: known[name] for name in names}
 
 
@@ -341,25 +341,25 @@ def _homography(
     if np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)[1] < 0.02 * np.ptp(plane):
         raise InputError(f"{what} lie on one line; give some that span an area")
     # None, where there is no solution, becomes a NaN.
-    found = as_float(cv2.findHomography(plane, pixels)[0])
-    if not np.isfinite(found).all():
+    H = as_float(cv2.findHomography(plane, pixels)[0])
+    if not np.isfinite(H).all():
         raise InputError(f"{what} cannot be a view of it; are names swapped?")
-    depth = np.column_stack([plane, np.ones(len(plane))]) @ found[2]
-    turned = [float(np.linalg.det(_scale(found, p))) for p in plane]
+    depth = np.column_stack([plane, np.ones(len(plane))]) @ H[2]
+    turned = [float(np.linalg.det(_scale(H, p))) for p in plane]
     # Rows run downwards, so the determinant of a front view is negative.
     if (depth * depth[0] > 0.0).all() and min(turned) > 0.0:
         raise InputError(f"{what} are mirrored in the picture; are left and right swapped?")
-    miss = _mapped(found, plane) - pixels
+    miss = _mapped(H, plane) - pixels
     if not ((depth * depth[0] > 0.0).all() and max(turned) < 0.0) or (
         np.sqrt(np.mean(miss**2)) > 0.05 * np.ptp(pixels, axis=0).max()
     ):
         raise InputError(f"{what} are not arranged as on the target; are two swapped?")
-    return found
+    return H
 
 
 def _mapped(H: FloatArray, plane: FloatArray) -> FloatArray:
-    seen = np.column_stack([plane, np.ones(len(plane))]) @ H.T
-    return as_float(seen[:, :2] / seen[:, 2:])
+    homogeneous = np.column_stack([plane, np.ones(len(plane))]) @ H.T
+    return as_float(homogeneous[:, :2] / homogeneous[:, 2:])
 
 
 def _scale(H: FloatArray, place: FloatArray) -> FloatArray:
@@ -389,7 +389,7 @@ def _drawing(name: str, point: FloatArray, wish: Wish, old: Mark | None) -> Mark
 
 
 def _refine(
-    frame: Frame, here: TaughtPoint, mark: Mark, view: tuple[FloatArray, FloatArray], reach: float
+    frame: Frame, taught: TaughtPoint, mark: Mark, view: tuple[FloatArray, FloatArray], reach: float
 ) -> TaughtPoint:
     """Refine a point by the mark's drawing, at the quarter turn that explains most."""
     from heliotrope.imaging.targets.refinement import Refined, refine
@@ -401,25 +401,25 @@ def _refine(
         turned += [replace(mark, turn=mark.turn + k * 0.5 * np.pi) for k in (1, -1, 2)]
     best: tuple[Refined, Mark] | None = None
     for trial in turned:
-        found = refine(frame.grey, trial, here.pixel, scale, search)
+        refined = refine(frame.grey, trial, taught.pixel, scale, search)
         # A mark is darker than its surroundings.
         if (
-            found is not None
-            and found.contrast <= CONTRAST
-            and (best is None or found.explained > best[0].explained)
+            refined is not None
+            and refined.contrast <= CONTRAST
+            and (best is None or refined.explained > best[0].explained)
         ):
-            best = found, trial
+            best = refined, trial
     if best is None or best[0].explained < EXPLAINED:
         share = "nothing" if best is None else f"{100 * max(best[0].explained, 0.0):.0f} %"
         what = f"no {mark.kind} of {mark.size:g} m was recognised: its drawing explains {share}"
-        return replace(here, note=what)
-    found, trial = best
-    return TaughtPoint(here.name, found.pixel, found.covariance, trial, refined=True)
+        return replace(taught, note=what)
+    refined, trial = best
+    return TaughtPoint(taught.name, refined.pixel, refined.covariance, trial, refined=True)
 
 
 def _picture(
     frame: Frame,
-    here: TaughtPoint,
+    taught: TaughtPoint,
     point: FloatArray,
     size: float,
     view: tuple[FloatArray, FloatArray],
@@ -431,32 +431,34 @@ def _picture(
 
     (H, place), side = view, size * _per_metre(*view)
     if side < SMALLEST:
-        return _nothing(here, f"a picture of {size:.2f} m has {side:.0f} px, below {SMALLEST} px")
+        return _nothing(taught, f"a picture of {size:.2f} m has {side:.0f} px, below {SMALLEST} px")
     # Odd, so that one pixel's centre is the point.
     count = min(int(side), LARGEST) // 2 * 2 + 1
     offset = (np.arange(count) - count // 2) * (size / count)
     right, up = np.meshgrid(offset, -offset)
     grid = place + np.stack([right, up], axis=-1).reshape(-1, 2)
     # The point is where the hand put it; the view gives the plane around it.
-    spots = _mapped(H, grid) + here.pixel - _mapped(H, place[None])[0]
+    spots = _mapped(H, grid) + taught.pixel - _mapped(H, place[None])[0]
     width, height = frame.size
     if (spots.min(axis=0) < -0.5).any() or (spots.max(axis=0) > [width - 0.5, height - 0.5]).any():
-        return _nothing(here, f"a picture of {size:.2f} m about it leaves the frame; reduce --size")
+        return _nothing(
+            taught, f"a picture of {size:.2f} m about it leaves the frame; reduce --size"
+        )
     maps = spots.reshape(count, count, 2).astype(np.float32)
     grey: Any = _eight_bit(frame)
     patch = cv2.remap(grey, maps[..., 0], maps[..., 1], cv2.INTER_CUBIC)
     picture = np.asarray(patch, dtype=np.uint8)
     vague = _vagueness(picture) * side / count
     if not vague < VAGUE:
-        return _nothing(here, "only an edge, or nothing, is visible there")
-    code = _file_name(prefix, here.name, picture)
+        return _nothing(taught, "only an edge, or nothing, is visible there")
+    code = _file_name(prefix, taught.name, picture)
     pictures[code] = picture
-    return replace(here, mark=Mark(here.name, "picture", point, size, code=code))
+    return replace(taught, mark=Mark(taught.name, "picture", point, size, code=code))
 
 
-def _nothing(here: TaughtPoint, why: str) -> TaughtPoint:
-    before = f"{here.note}; " if here.note else ""
-    return replace(here, note=f"{before}{why}: the point locates the camera only")
+def _nothing(taught: TaughtPoint, why: str) -> TaughtPoint:
+    before = f"{taught.note}; " if taught.note else ""
+    return replace(taught, note=f"{before}{why}: the point locates the camera only")
 
 
 def _vagueness(picture: npt.NDArray[np.uint8]) -> float:
@@ -501,15 +503,15 @@ def _fit(
     name: str,
     anew: bool,
     points: FloatArray,
-    found: Sequence[TaughtPoint],
+    taught: Sequence[TaughtPoint],
     H: FloatArray,
     plane: FloatArray,
 ) -> CameraFit:
     from heliotrope.imaging.targets.attempt import SURVEY
 
-    pixels = np.array([p.pixel for p in found])
+    pixels = np.array([p.pixel for p in taught])
     survey = np.array([(SURVEY * _per_metre(H, place)) ** 2 for place in plane])
-    covariance = np.array([p.covariance for p in found]) + survey[:, None, None] * np.eye(2)
+    covariance = np.array([p.covariance for p in taught]) + survey[:, None, None] * np.eye(2)
     if known is not None and not anew:
         return resection(known, points, pixels, covariance)
     return calibrate_marks(frame.size, [points], [pixels], [covariance], name)
@@ -519,10 +521,10 @@ def _with_target(camera: Camera, target: str, known: Camera | None) -> Camera:
     """Return the camera with the target added to its targets."""
     if known is None:
         return replace(camera, targets=(target,))
-    seen = known.targets
-    if seen and target not in seen:
-        seen = (*seen, target)
-    return replace(camera, targets=seen, source=known.source)
+    targets = known.targets
+    if targets and target not in targets:
+        targets = (*targets, target)
+    return replace(camera, targets=targets, source=known.source)
 
 
 def _with_marks(plant: Plant, target: Target, marks: Sequence[Mark], camera: Camera) -> Plant:
@@ -593,19 +595,21 @@ def see_marks(
     points, pixels, covariances, names, reasons = [], [], [], [], []
     for frame in frames:
         marks: list[tuple[FoundMark, FloatArray]] = []
-        for found in find_targets(frame, targets, camera, pictures=pictures):
-            if not found.found or found.view is None:
-                reasons.append(f"{frame.name}: target {found.target.name}: {found.reason}")
+        for result in find_targets(frame, targets, camera, pictures=pictures):
+            if not result.found or result.view is None:
+                reasons.append(f"{frame.name}: target {result.target.name}: {result.reason}")
                 continue
-            names.append(found.target.name)
-            for seen in found.marks:
-                if seen.used and not any(seen.mark == other.mark for other, _ in marks):
-                    place = found.view.face.plane(seen.mark.point)
-                    per_metre = abs(np.linalg.det(found.view.scale(place)))
-                    marks.append((seen, seen.covariance + per_metre * SURVEY**2 * np.eye(2)))
+            names.append(result.target.name)
+            for found_mark in result.marks:
+                if found_mark.used and not any(found_mark.mark == other.mark for other, _ in marks):
+                    place = result.view.face.plane(found_mark.mark.point)
+                    per_metre = abs(np.linalg.det(result.view.scale(place)))
+                    marks.append(
+                        (found_mark, found_mark.covariance + per_metre * SURVEY**2 * np.eye(2))
+                    )
         if marks:
-            points.append(np.array([seen.mark.point for seen, _ in marks]))
-            pixels.append(np.array([seen.pixel for seen, _ in marks]))
+            points.append(np.array([found_mark.mark.point for found_mark, _ in marks]))
+            pixels.append(np.array([found_mark.pixel for found_mark, _ in marks]))
             covariances.append(np.array([covariance for _, covariance in marks]))
     if not points:
         raise InputError("no target was found: " + "; ".join(reasons))
@@ -619,11 +623,11 @@ def see_marks(
 
 
 def fit_marks(
-    size: tuple[int, int], seen: SeenMarks, known: Camera | None, name: str, anew: bool
+    size: tuple[int, int], marks: SeenMarks, known: Camera | None, name: str, anew: bool
 ) -> CameraFit:
     """Return the camera that saw marks; a known lens is kept unless ``anew``."""
     if known is None or anew:
-        return calibrate_marks(size, seen.points, seen.pixels, seen.covariances, name)
-    parts = seen.points, seen.pixels, seen.covariances
+        return calibrate_marks(size, marks.points, marks.pixels, marks.covariances, name)
+    parts = marks.points, marks.pixels, marks.covariances
     points, pixels, covariances = (np.concatenate(part) for part in parts)
     return resection(known, points, pixels, covariances)

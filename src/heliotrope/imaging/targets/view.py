@@ -73,11 +73,11 @@ def faces(targets: tuple[Target, ...], apart: float = 0.25) -> list[Face]:
                 break
         else:
             groups.append([target])
-    found = []
+    result = []
     for group in groups:
         origin = np.mean([t.center for t in group], axis=0)
-        found.append(Face(tuple(group), origin, group[0].axes))
-    return found
+        result.append(Face(tuple(group), origin, group[0].axes))
+    return result
 
 
 def _meet(a: Target, b: Target) -> bool:
@@ -161,11 +161,11 @@ def homography(plane: FloatArray, norm: FloatArray) -> FloatArray:
     middle, scale = plane.mean(axis=0), np.ptp(plane, axis=0).max()
     x, y = ((plane - middle) / scale).T
     u, v = norm.T
-    zero, one = np.zeros_like(x), np.ones_like(x)
+    zeros, ones = np.zeros_like(x), np.ones_like(x)
     rows = np.concatenate(
         [
-            np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=-1),
-            np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=-1),
+            np.stack([x, y, ones, zeros, zeros, zeros, -u * x, -u * y, -u], axis=-1),
+            np.stack([zeros, zeros, zeros, x, y, ones, -v * x, -v * y, -v], axis=-1),
         ]
     )
     H = np.linalg.svd(rows)[2][-1].reshape(3, 3)
@@ -309,6 +309,6 @@ def _predict(face: Face, lens: Camera, numbers: FloatArray, plane: FloatArray) -
     """Return pixels (..., N, 2) of places (N, 2) for unknowns (..., 9)."""
     H, k1 = _unpack(face, numbers)
     homogeneous = np.column_stack([plane, np.ones(len(plane))])
-    seen = homogeneous @ np.swapaxes(H, -1, -2)
-    norm = seen[..., :2] / seen[..., 2:]
+    image = homogeneous @ np.swapaxes(H, -1, -2)
+    norm = image[..., :2] / image[..., 2:]
     return distort(lens, norm, (k1[..., None], *lens.distortion[1:]))

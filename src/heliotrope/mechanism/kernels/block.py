@@ -134,34 +134,34 @@ def _along_stop(g, s, p, u, v, local, axis, held, stops, near):
     """Nearest pose with joint ``axis`` held at a stop; returns (residual, θ₁, θ₂)."""
     other = 1 - axis
     free, v_here = 0.0, v
-    one, two, t = held, 0.0, _turn(held, 0.0)
+    theta_1, theta_2, t = held, 0.0, _turn(held, 0.0)
     for _ in range(20):
         before = free
         if not is_single(g):
             free = _free_angle(g, axis, held, u, v_here, stops[other], near[other])
-        one, two = (held, free) if axis == 0 else (free, held)
-        t = _turn(one, two)
+        theta_1, theta_2 = (held, free) if axis == 0 else (free, held)
+        t = _turn(theta_1, theta_2)
         if not local:
             v_new, _, distance = wanted_normal(g, s, p, place_vertex(g, t))
             if distance > 0.0:
                 v_here = v_new
         if abs(free - before) < 1e-13:
             break
-    return residual_angle(g, t, u, v_here), one, two
+    return residual_angle(g, t, u, v_here), theta_1, theta_2
 
 
 @njit(**INNER)
 def _nearest_at_stops(g, s, p, u, v, local, stops, near):
     """Nearest pose on the border of the stops' rectangle: (residual, θ₁, θ₂)."""
-    best, one, two = np.inf, 0.0, 0.0
+    best, theta_1, theta_2 = np.inf, 0.0, 0.0
     for axis in range(1 if is_single(g) else 2):
         for side in range(2):
             held = stops[axis][side]
             if math.isfinite(held):
                 rest, first, second = _along_stop(g, s, p, u, v, local, axis, held, stops, near)
                 if rest < best:
-                    best, one, two = rest, first, second
-    return best, one, two
+                    best, theta_1, theta_2 = rest, first, second
+    return best, theta_1, theta_2
 
 
 @njit(**INLINED)
@@ -183,17 +183,17 @@ def solve_branch(g, s, p, m, sign, local, tolerance, limit, newton, stops, near)
         status, iterations, t, m, v, rest = solve_aim(g, s, p, m, sign, tolerance, limit, newton)
         if status == DEGENERATE or s == (0.0, 0.0, 0.0):
             return DEGENERATE, iterations, np.nan, np.nan, np.nan, nothing, nothing
-    one, inside_1 = into_stops(math.atan2(t[0], t[1]), stops[0], near[0])
-    two, inside_2 = into_stops(math.atan2(t[2], t[3]), stops[1], near[1])
+    theta_1, inside_1 = into_stops(math.atan2(t[0], t[1]), stops[0], near[0])
+    theta_2, inside_2 = into_stops(math.atan2(t[2], t[3]), stops[1], near[1])
     if inside_1 and inside_2:
         if status == OK and not local and not is_single(g):
-            return status, iterations, rest, one, two, v, m
+            return status, iterations, rest, theta_1, theta_2, v, m
         if not local:
             v, _, _ = wanted_normal(g, s, p, m)
-        return status, iterations, residual_angle(g, t, u, v), one, two, turned(g, t, n), m
-    rest, one, two = _nearest_at_stops(g, s, p, u, v, local, stops, near)
-    t = _turn(one, two)
-    return STOPPED, iterations, rest, one, two, turned(g, t, n), place_vertex(g, t)
+        return status, iterations, residual_angle(g, t, u, v), theta_1, theta_2, turned(g, t, n), m
+    rest, theta_1, theta_2 = _nearest_at_stops(g, s, p, u, v, local, stops, near)
+    t = _turn(theta_1, theta_2)
+    return STOPPED, iterations, rest, theta_1, theta_2, turned(g, t, n), place_vertex(g, t)
 
 
 @njit(**INLINED)
@@ -270,20 +270,20 @@ def track_block(
             m, done = (g[12], g[13], g[14]), 0
             if warm:
                 m, done = (begin[b, lane, 0], begin[b, lane, 1], begin[b, lane, 2]), STEPS
-            state, steps, rest, one, two, n, m = solve_branch(
+            state, steps, rest, theta_1, theta_2, n, m = solve_branch(
                 g, s, p, m, sign, local, tolerance, limit - done, newton, stops, near
             )
             steps += done
             status[i, b], iterations[i, b], residual[i, b] = state, steps, rest
             for k in range(3):
                 normals[i, b, k], vertices[i, b, k] = n[k], m[k]
-            angles[i, b, 0], counts[i, b, 0] = one, _counts(d1, one)
-            seconds[b], radians[b] = 0.0, abs(one - near[0])
+            angles[i, b, 0], counts[i, b, 0] = theta_1, _counts(d1, theta_1)
+            seconds[b], radians[b] = 0.0, abs(theta_1 - near[0])
             if now >= 0 and math.isfinite(d1[SPEED]):
                 seconds[b] = abs(counts[i, b, 0] - here_1) / d1[SPEED]
             if axes == 2:
-                angles[i, b, 1], counts[i, b, 1] = two, _counts(d2, two)
-                radians[b] = max(radians[b], abs(two - near[1]))
+                angles[i, b, 1], counts[i, b, 1] = theta_2, _counts(d2, theta_2)
+                radians[b] = max(radians[b], abs(theta_2 - near[1]))
                 if now >= 0 and math.isfinite(d2[SPEED]):
                     seconds[b] = max(seconds[b], abs(counts[i, b, 1] - here_2) / d2[SPEED])
         best[i] = 0

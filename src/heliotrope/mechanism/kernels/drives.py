@@ -173,7 +173,7 @@ def _counts_of_ideal(d, phi):
 
 @njit(**INNER)
 def drive_counts(d, theta):
-    """Counts at which drive row ``d`` stands at joint angle ``theta``.
+    """Counts of drive row ``d`` at joint angle ``theta``.
 
     Closed form without periodic terms; with them a bracketed Newton iteration in
     counts, which cannot leave the bracket that the size of the terms gives.

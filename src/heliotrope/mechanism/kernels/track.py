@@ -115,7 +115,7 @@ def solve_direction(g, k, u, v, sign):
         return True, (sine, cosine, 0.0, 1.0)
     ab, ub, inverse = k[0], k[1], k[2]
     va, vb, vc = dot(v, a), dot(v, b), dot(v, cross(a, b))
-    wanted = va
+    component = va
     along_a, along_b = (va - ab * ub) * inverse, (ub - ab * va) * inverse
     square = 1.0 - along_a * along_a - along_b * along_b - 2.0 * along_a * along_b * ab
     # Rounding below zero is the edge of the reachable band itself.
@@ -123,13 +123,13 @@ def solve_direction(g, k, u, v, sign):
     if not reached:
         # The nearest direction on the edge has the largest |z·a| on the circle z·b = u·b.
         edge = math.sqrt(max(0.0, 1.0 - ub * ub) / inverse)
-        wanted = ab * ub + math.copysign(edge, va - ab * ub)
-        along_a, along_b = (wanted - ab * ub) * inverse, (ub - ab * wanted) * inverse
+        component = ab * ub + math.copysign(edge, va - ab * ub)
+        along_a, along_b = (component - ab * ub) * inverse, (ub - ab * component) * inverse
     away = sign * math.sqrt(max(0.0, square) * inverse)
     sine_2, cosine_2 = along_a * k[3] + away * k[4], along_a * k[5] + away * k[6]
     # a·(z × v) and z·v − (z·a)(v·a), written in the components of z.
     sine_1 = along_b * vc + away * (ab * va - vb)
-    cosine_1 = along_a * va + along_b * vb + away * vc - wanted * va
+    cosine_1 = along_a * va + along_b * vb + away * vc - component * va
     size = math.sqrt(sine_1 * sine_1 + cosine_1 * cosine_1)
     if size < 1e-15:
         return reached, (0.0, 1.0, sine_2, cosine_2)
@@ -172,23 +172,23 @@ def served(g, s):
 
 @njit(**INLINED)
 def wanted_normal(g, s, p, m):
-    """(bisector of s and the way from m to p, that way, its length); length 0 if none.
+    """(bisector of s and the path from m to p, the path's direction, its length); 0 if none.
 
-    For a single axis the way is projected on the plane across it; s must be
+    For a single axis the path is projected on the plane across it; s must be
     `served` already.
     """
-    way = minus(p, m)
+    path = minus(p, m)
     if is_single(g):
-        way = across(way, axis_1(g))
-    distance = norm(way)
+        path = across(path, axis_1(g))
+    distance = norm(path)
     if not distance > DEGENERATE_LIMIT:
-        return way, way, 0.0
-    way = times(1.0 / distance, way)
-    v = add(s, way)
+        return path, path, 0.0
+    path = times(1.0 / distance, path)
+    v = add(s, path)
     size = norm(v)
     if not size > DEGENERATE_LIMIT:
-        return way, way, 0.0
-    return times(1.0 / size, v), way, distance
+        return path, path, 0.0
+    return times(1.0 / size, v), path, distance
 
 
 @njit(**INLINED)
@@ -202,10 +202,10 @@ def mirror_normal(g, t):
 
 
 @njit(**INLINED)
-def beam_miss(s, way, distance, n):
-    """Distance (m) by which the ray reflected with normal n passes the aim."""
+def beam_miss(s, path, distance, n):
+    """Distance (m) between the aim and the ray reflected with normal n."""
     ray = minus(times(2.0 * dot(n, s), n), s)
-    return distance * norm(cross(way, ray))
+    return distance * norm(cross(path, ray))
 
 
 @njit(**INLINED)
@@ -231,43 +231,43 @@ def _columns(g, t, n, m, k):
 
 
 @njit(**INNER)
-def _difference_column(g, t, n, m, v, way, distance, k):
+def _difference_column(g, t, n, m, v, path, distance, k):
     """d(n − v) by joint angle k; the bisector v moves with the vertex."""
     dn, dm = _columns(g, t, n, m, k)
     if is_single(g):
         dm = across(dm, axis_1(g))
-    dway = times(-1.0 / distance, across(dm, way))
+    dpath = times(-1.0 / distance, across(dm, path))
     # |s + t| = 2 v·t for unit vectors.
-    return minus(dn, times(0.5 / dot(v, way), across(dway, v)))
+    return minus(dn, times(0.5 / dot(v, path), across(dpath, v)))
 
 
 @njit(**INNER)
-def _gradient(g, s, p, one, two):
+def _gradient(g, s, p, theta_1, theta_2):
     """Half the gradient of |n − v|² by the two joint angles."""
-    t = (math.sin(one), math.cos(one), math.sin(two), math.cos(two))
+    t = (math.sin(theta_1), math.cos(theta_1), math.sin(theta_2), math.cos(theta_2))
     m = place_vertex(g, t)
-    v, way, distance = wanted_normal(g, s, p, m)
+    v, path, distance = wanted_normal(g, s, p, m)
     if distance == 0.0:
         return np.nan, np.nan
     n = mirror_normal(g, t)
     gap = minus(n, v)
-    first = _difference_column(g, t, n, m, v, way, distance, plain(0))
-    second = _difference_column(g, t, n, m, v, way, distance, plain(1))
+    first = _difference_column(g, t, n, m, v, path, distance, plain(0))
+    second = _difference_column(g, t, n, m, v, path, distance, plain(1))
     return dot(first, gap), dot(second, gap)
 
 
 @njit(**INNER)
-def _curvature(g, s, p, one, two):
+def _curvature(g, s, p, theta_1, theta_2):
     """Half the second derivatives of |n − v|², by differences of its gradient.
 
     Where the gap cannot close, its own curvature counts as much as the squared first
     derivatives, and Gauss-Newton creeps.
     """
     h = 1e-5
-    up_0, up_1 = _gradient(g, s, p, one + h, two)
-    down_0, down_1 = _gradient(g, s, p, one - h, two)
-    right_0, right_1 = _gradient(g, s, p, one, two + h)
-    left_0, left_1 = _gradient(g, s, p, one, two - h)
+    up_0, up_1 = _gradient(g, s, p, theta_1 + h, theta_2)
+    down_0, down_1 = _gradient(g, s, p, theta_1 - h, theta_2)
+    right_0, right_1 = _gradient(g, s, p, theta_1, theta_2 + h)
+    left_0, left_1 = _gradient(g, s, p, theta_1, theta_2 - h)
     mixed = 0.25 * (up_1 - down_1 + right_0 - left_0) / h
     return 0.5 * (up_0 - down_0) / h, mixed, 0.5 * (right_1 - left_1) / h
 
@@ -278,15 +278,15 @@ def _newton(g, s, p, t, tolerance):
     theta_1, theta_2 = math.atan2(t[0], t[1]), math.atan2(t[2], t[3])
     damping = 1e-12
     m = place_vertex(g, t)
-    v, way, distance = wanted_normal(g, s, p, m)
+    v, path, distance = wanted_normal(g, s, p, m)
     n = mirror_normal(g, t)
     gap = minus(n, v)
     cost = dot(gap, gap)
     for iteration in range(NEWTON_LIMIT):
-        if beam_miss(s, way, distance, n) <= tolerance:
+        if beam_miss(s, path, distance, n) <= tolerance:
             return OK, iteration, t
-        first = _difference_column(g, t, n, m, v, way, distance, plain(0))
-        second = _difference_column(g, t, n, m, v, way, distance, plain(1))
+        first = _difference_column(g, t, n, m, v, path, distance, plain(0))
+        second = _difference_column(g, t, n, m, v, path, distance, plain(1))
         h00, h01, h11 = dot(first, first), dot(first, second), dot(second, second)
         e0, e1 = dot(first, gap), dot(second, gap)
         if iteration >= PATIENCE:
@@ -301,11 +301,16 @@ def _newton(g, s, p, t, tolerance):
             d00, d11 = h00 + damping * (h00 + h11), h11 + damping * (h00 + h11)
             determinant = d00 * d11 - h01 * h01
             if determinant > 0.0:
-                one = theta_1 - (d11 * e0 - h01 * e1) / determinant
-                two = theta_2 - (d00 * e1 - h01 * e0) / determinant
-                t_new = (math.sin(one), math.cos(one), math.sin(two), math.cos(two))
+                theta_1_new = theta_1 - (d11 * e0 - h01 * e1) / determinant
+                theta_2_new = theta_2 - (d00 * e1 - h01 * e0) / determinant
+                t_new = (
+                    math.sin(theta_1_new),
+                    math.cos(theta_1_new),
+                    math.sin(theta_2_new),
+                    math.cos(theta_2_new),
+                )
                 m_new = place_vertex(g, t_new)
-                v_new, way_new, distance_new = wanted_normal(g, s, p, m_new)
+                v_new, path_new, distance_new = wanted_normal(g, s, p, m_new)
                 if distance_new > 0.0:
                     n_new = mirror_normal(g, t_new)
                     gap_new = minus(n_new, v_new)
@@ -318,13 +323,13 @@ def _newton(g, s, p, t, tolerance):
             # A minimum with a remainder: no pose near here sends the beam to p.
             return UNREACHABLE, iteration, t
         settled = cost_new > 1e-24 and cost - cost_new < 1e-13 * cost_new
-        theta_1, theta_2, t, m, n, cost = one, two, t_new, m_new, n_new, cost_new
-        v, way, distance, gap = v_new, way_new, distance_new, gap_new
+        theta_1, theta_2, t, m, n, cost = theta_1_new, theta_2_new, t_new, m_new, n_new, cost_new
+        v, path, distance, gap = v_new, path_new, distance_new, gap_new
         damping *= 0.1
         if settled:
-            reached = beam_miss(s, way, distance, n) <= tolerance
+            reached = beam_miss(s, path, distance, n) <= tolerance
             return (OK if reached else UNREACHABLE), iteration + 1, t
-    if beam_miss(s, way, distance, n) <= tolerance:
+    if beam_miss(s, path, distance, n) <= tolerance:
         return OK, NEWTON_LIMIT, t
     return NOT_CONVERGED, NEWTON_LIMIT, t
 
@@ -342,7 +347,7 @@ def solve_aim(g, s, p, m, sign, tolerance, limit, newton):
     v = u
     before = np.inf
     for iteration in range(1, limit + 1):
-        v, way, distance = wanted_normal(g, s, p, m)
+        v, path, distance = wanted_normal(g, s, p, m)
         if distance == 0.0:
             return DEGENERATE, iteration, t, m, v, np.nan
         reached, t = solve_direction(g, k, u, v, sign)
@@ -350,22 +355,22 @@ def solve_aim(g, s, p, m, sign, tolerance, limit, newton):
         m = place_vertex(g, t)
         moved = minus(m, moved)
         # The normal is the bisector for the old vertex, so the ray leaves parallel to
-        # the old way and misses by the vertex's motion across it.
+        # the old path and misses by the vertex's motion across it.
         if reached:
-            moved = cross(moved, way)
+            moved = cross(moved, path)
         square = dot(moved, moved)
         if square <= tolerance * tolerance:
-            # A miss turns the way by miss / distance and the bisector by that over |s + t|.
-            residual = math.sqrt(square) / (distance * 2.0 * dot(v, way))
+            # A miss turns the path by miss / distance and the bisector by that over |s + t|.
+            residual = math.sqrt(square) / (distance * 2.0 * dot(v, path))
             if not reached:
                 # On the very edge rounding alone may say so: the beam decides.
-                v, way, distance = wanted_normal(g, s, p, m)
-                reached = beam_miss(s, way, distance, mirror_normal(g, t)) <= tolerance
+                v, path, distance = wanted_normal(g, s, p, m)
+                reached = beam_miss(s, path, distance, mirror_normal(g, t)) <= tolerance
             return (OK if reached else UNREACHABLE), iteration, t, m, v, residual
         if newton and iteration >= 2 and not square < SLOW * SLOW * before:
             status, more, t = _newton(g, s, p, t, tolerance)
             m = place_vertex(g, t)
-            v, way, distance = wanted_normal(g, s, p, m)
+            v, path, distance = wanted_normal(g, s, p, m)
             return status, iteration + more, t, m, v, residual_angle(g, t, u, v)
         before = square
     return NOT_CONVERGED, limit, t, m, v, np.nan
@@ -379,11 +384,11 @@ def local_direction(g, aim):
     the aim is in the vertex, BEHIND if it is not before the mirror.
     """
     n = mirror_normal(g, (0.0, 1.0, 0.0, 1.0))
-    way = served(g, minus(aim, (g[12], g[13], g[14])))
-    size = norm(way)
+    direction = served(g, minus(aim, (g[12], g[13], g[14])))
+    size = norm(direction)
     if not size > DEGENERATE_LIMIT:
-        return DEGENERATE, way
-    way = times(1.0 / size, way)
-    if not dot(way, n) > 0.0:
-        return BEHIND, way
-    return OK, minus(times(2.0 * dot(way, n), n), way)
+        return DEGENERATE, direction
+    direction = times(1.0 / size, direction)
+    if not dot(direction, n) > 0.0:
+        return BEHIND, direction
+    return OK, minus(times(2.0 * dot(direction, n), n), direction)
