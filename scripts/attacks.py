@@ -139,8 +139,8 @@ def small_nested(place: Place, over: threading.Event) -> None:
 
 
 def uploads(place: Place, over: threading.Event) -> None:
-    """Files of 16 MB to the page's framework."""
-    head = _head(place, "POST /_nicegui/client/x/upload/1", "Content-Length: 16000000",
+    """Files of 16 MB to the page."""
+    head = _head(place, "POST /", "Content-Length: 16000000",
                  "Content-Type: multipart/form-data; boundary=x")  # fmt: skip
     _repeat(place, over, head + b"--x\r\n" + bytes(500_000))
 
@@ -251,8 +251,8 @@ def foreign_hosts(place: Place, over: threading.Event) -> None:
 
 
 def foreign_sockets(place: Place, over: threading.Event) -> None:
-    """Sockets of the page's framework from another site."""
-    data = _socket(place, "/_nicegui_ws/socket.io/?EIO=4&transport=websocket")
+    """Sockets from another site, to an address that has none."""
+    data = _socket(place, "/nothing")
     while not over.wait(0.005):
         if b" 101 " in _bytes(place, data):
             sys.exit("attack: a socket from another site was accepted")

@@ -104,7 +104,7 @@ def main() -> None:
         password = Path(plant.told(r"password in (\S+)")).read_text("utf-8").strip()
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS)
-            page = browser.new_page(viewport=WIDE)
+            page = browser.new_page(viewport=WIDE, bypass_csp=True)
             page.set_default_timeout(60_000)
             page.goto(f"{address}login")
             page.fill("[name=name]", "engineer")

@@ -87,7 +87,7 @@ def test_from_a_photograph_to_a_better_mirror() -> None:
 def test_from_the_emergency_button_to_the_last_mirror(tmp_path: Path) -> None:
     stays = stays_of("A click on EMERGENCY to the last mirror")
     recorder = Recorder(stays)
-    console = LiveConsole(tmp_path, 2, page=False, speed=8.0, boards=True)
+    console = LiveConsole(tmp_path, 2, speed=8.0, boards=True)
     try:
         token = console.keeper.people.add_token("viewer", "test", "viewer", time.time())[1]
         operations = console.live.operations

@@ -26,7 +26,7 @@ def cheap_hashes() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
     """Two clusters of 32 heliostats, at eight times the speed of real time, without the page."""
-    made = LiveConsole(tmp_path_factory.mktemp("console"), 64, page=False, speed=8.0)
+    made = LiveConsole(tmp_path_factory.mktemp("console"), 64, speed=8.0)
     yield made
     made.close()
 

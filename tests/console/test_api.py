@@ -16,7 +16,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from heliotrope.console._files import KEPT
+from heliotrope.console._files import KEPT, STATIC
 from heliotrope.console.client import Client, RemoteError
 from heliotrope.console.people import FIRST, first_start
 from heliotrope.console.settings import ConsoleSettings
@@ -160,11 +160,14 @@ def test_bodies_have_a_length_and_a_limit(console: LiveConsole) -> None:
     connection.close()
 
 
-@pytest.mark.parametrize("path", ["api/v1/health", "login", "emergency", "console/static/live.js"])
-def test_safe_headers(console: LiveConsole, path: str) -> None:
-    headers = httpx.get(console.address + path, trust_env=False).headers
-    policy = headers["content-security-policy"]
-    assert "default-src 'none'" in policy
+@pytest.mark.parametrize(
+    "path", ["", "account", "api/v1/health", "login", "emergency", f"{KEPT[1:]}/live.js"]
+)
+def test_safe_headers(console: LiveConsole, signed_in: httpx.Client, path: str) -> None:
+    answer = signed_in.get(console.address + path)
+    assert answer.status_code == 200
+    headers, policy = answer.headers, answer.headers["content-security-policy"]
+    assert "default-src 'none'; script-src 'self'; style-src 'self'; " in policy
     assert "unsafe" not in policy
     assert headers["x-content-type-options"] == "nosniff"
     assert headers["x-frame-options"] == "DENY"
@@ -501,19 +504,39 @@ def test_answers_that_all_share_are_packed(console: LiveConsole, tokens: dict[st
 
 def test_files_of_the_page_are_kept_by_browsers(console: LiveConsole) -> None:
     with httpx.Client(base_url=console.address, trust_env=False) as client:
-        plain = client.get("console/static/live.js")
-        kept = client.get(f"{KEPT[1:]}/live.js")
-        assert kept.content == plain.content
-        assert "immutable" in kept.headers["cache-control"]
-        assert plain.headers["cache-control"] == "no-cache"
+        path = f"{KEPT[1:]}/live.js"
+        plain = client.get(path, headers={"Accept-Encoding": "identity"})
+        assert plain.content == (STATIC / "live.js").read_bytes()
+        assert plain.headers["content-type"] == "text/javascript; charset=utf-8"
+        assert "immutable" in plain.headers["cache-control"]
         tag = {"If-None-Match": plain.headers["etag"]}
-        assert client.get("console/static/live.js", headers=tag).status_code == 304
-        packed = client.get("console/static/live.js", headers={"Accept-Encoding": "gzip"})
+        assert client.get(path, headers=tag).status_code == 304
+        packed = client.get(path, headers={"Accept-Encoding": "gzip"})
         assert packed.headers["content-encoding"] == "gzip"
         assert packed.content == plain.content
-        for path in ("console/static/nothing.js", f"{KEPT[1:]}/../app.py", "console/0/live.js"):
-            assert client.get(path).status_code == 404
-        assert client.get("console/static/live.js", headers={"Host": "x"}).status_code == 421
+        for missing in ("nothing.js", "../app.py", "console.html", "../static/live.js"):
+            assert client.get(f"{KEPT[1:]}/{missing}").status_code == 404
+        assert client.get(path, headers={"Host": "x"}).status_code == 421
+
+
+def test_the_pages_name_files_that_there_are(console: LiveConsole, signed_in: httpx.Client) -> None:
+    for path in ("", "account", "emergency", "login"):
+        text = signed_in.get(console.address + path).text
+        files = re.findall(r'(?:src|href)="(/console/[^"]+)"', text)
+        assert files
+        for file in files:
+            assert signed_in.get(console.address + file[1:]).status_code == 200
+
+
+def test_the_page_preloads_each_module(console: LiveConsole, signed_in: httpx.Client) -> None:
+    text = signed_in.get(console.address).text
+    preloaded = set(re.findall(r'"modulepreload" href="[^"]+/(\w+\.js)"', text))
+    seen, todo = set[str](), ["console.js"]
+    while todo:
+        source = signed_in.get(f"{console.address}{KEPT[1:]}/{todo.pop()}").text
+        todo += (found := set(re.findall(r'from "\./(\w+\.js)"', source)) - seen)
+        seen |= found
+    assert preloaded == seen
 
 
 def test_tls_by_file(console: LiveConsole, tmp_path: Path) -> None:
@@ -543,7 +566,7 @@ def test_tls_by_file(console: LiveConsole, tmp_path: Path) -> None:
         check=True,
         capture_output=True,
     )
-    settings = ConsoleSettings(port=0, page=False, certificate=certificate, key=key)
+    settings = ConsoleSettings(port=0, certificate=certificate, key=key)
 
     second = serving(console.interface, settings)
     _, address = console.console_wait(second.__aenter__())

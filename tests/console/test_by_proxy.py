@@ -37,7 +37,7 @@ def behind(console: LiveConsole, tmp_path: Path) -> Iterator[httpx.Client]:
     before = here.settings
     file = written(tmp_path)
     settings = ConsoleSettings(
-        port=0, page=False, proxies=("127.0.0.1",), people_by_proxy=file, second_factor="viewer"
+        port=0, proxies=("127.0.0.1",), people_by_proxy=file, second_factor="viewer"
     )
 
     def put(chosen: ConsoleSettings, by_proxy: ByProxy | None) -> None:
@@ -116,7 +116,7 @@ def test_without_the_secret_it_is_a_stranger(behind: httpx.Client) -> None:
 def test_other_addresses_are_not_believed(console: LiveConsole, behind: httpx.Client) -> None:
     here = console.server.app.state.console
     settings = here.settings
-    others = ConsoleSettings(port=0, page=False, proxies=("192.0.2.1",))
+    others = ConsoleSettings(port=0, proxies=("192.0.2.1",))
     console.call(lambda: setattr(here, "settings", others))
     assert "set-cookie" not in behind.get("login").headers
     console.call(lambda: setattr(here, "settings", settings))

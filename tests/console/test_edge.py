@@ -8,14 +8,14 @@ from typing import Any
 
 import httpx
 import pytest
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from heliotrope.console import bodies, routes
 from heliotrope.console.headers import network_of
 from heliotrope.errors import InputError
 from heliotrope.local import Buckets
-from support.live_console import PASSWORD, LiveConsole
+from support.live_console import LiveConsole
 
 Ask = Callable[..., httpx.Response]
 #: Nested JSON of 16 MB, as deep as its parser follows.
@@ -152,7 +152,7 @@ def test_the_check_itself_takes_little(body: bytes) -> None:
 
 def test_nothing_is_plain(console: LiveConsole, ask: Ask) -> None:
     with httpx.Client(base_url=console.address, trust_env=False) as client:
-        for path in ("nothing", "x" * 200, "console/static/nothing.js", "_nicegui/nothing.js"):
+        for path in ("nothing", "x" * 200, "console/static/nothing.js"):
             answer = client.get(path)
             assert answer.status_code == 404
             assert len(answer.content) < 100
@@ -221,27 +221,23 @@ def test_one_large_body_at_a_time(console: LiveConsole, tokens: dict[str, str]) 
 
 @pytest.mark.parametrize(
     ("cookie", "origin"),
-    [(True, "http://evil.example"), (True, "http://["), (True, None), (False, "own")],
+    [(True, "http://evil.example"), (True, "http://["), (False, "own")],
 )
-def test_the_socket_of_the_page_is_for_its_own_origin(
-    console: LiveConsole, cookie: bool, origin: str | None
+def test_the_live_stream_is_for_the_page_of_a_known_person(
+    console: LiveConsole, signed_in: httpx.Client, cookie: bool, origin: str
 ) -> None:
-    headers = {}
-    if cookie:
-        answer = httpx.post(
-            f"{console.address}api/v1/session",
-            json={"name": "viewer", "password": PASSWORD},
-            trust_env=False,
-        )
-        headers["Cookie"] = f"heliotrope_session={answer.cookies['heliotrope_session']}"
-    own = console.address.rstrip("/")
-    url = (
-        console.address.replace("http", "ws", 1)
-        + "_nicegui_ws/socket.io/?EIO=4&transport=websocket"
-    )
-    where = own if origin == "own" else origin
+    word = signed_in.cookies["heliotrope_session"]
+    headers = {"Cookie": f"heliotrope_session={word}"} if cookie else {}
+    url = console.address.replace("http", "ws", 1)
+    where = console.address.rstrip("/") if origin == "own" else origin
+    given = {"origin": where, "additional_headers": headers, "proxy": None}
+    with connect(f"{url}api/v1/live", **given) as line, pytest.raises(ConnectionClosed) as closed:
+        line.recv(60.0)
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == 4401
+    # There is no other socket.
     with pytest.raises(InvalidStatus) as refused:
-        connect(url, origin=where, additional_headers=headers, proxy=None)  # type: ignore[arg-type]
+        connect(f"{url}nothing", **given)
     assert refused.value.response.status_code == 403
 
 

@@ -85,7 +85,7 @@ def required(console: LiveConsole) -> Iterator[None]:
         here.settings = settings
         here.known.clear()
 
-    console.call(lambda: put(ConsoleSettings(port=0, page=False, second_factor="operator")))
+    console.call(lambda: put(ConsoleSettings(port=0, second_factor="operator")))
     yield
     console.call(lambda: put(before))
 

@@ -43,7 +43,6 @@ def newcomer(console: LiveConsole, person: Ask) -> Iterator[httpx.Client]:
         ("POST", "commands", {"command": "TRACK", "heliostats": []}),
         ("DELETE", "emergency", None),
         ("POST", "tokens", {"label": "x", "role": "viewer", "own_password": GIVEN}),
-        ("GET", "../../_nicegui/nothing.js", None),
         ("GET", "openapi.json", None),
     ],
 )

@@ -7,7 +7,7 @@ import pytest
 
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from support.live_console import LiveConsole
-from support.pages import NEEDS_BROWSER
+from support.pages import NEEDS_BROWSER, until
 
 pytestmark = NEEDS_BROWSER
 
@@ -84,9 +84,10 @@ def test_the_page_draws_the_prediction_beside_what_comes_true(
     assert page.evaluate("document.documentElement.scrollWidth") <= 800
     assert page.locator(".hx-outlook canvas").bounding_box()["width"] > 600
     for dark in (True, False):
-        page.evaluate("dark => { Quasar.Dark.set(dark); heliotrope.store.emit('theme'); }", dark)
+        if not dark:
+            page.click("[aria-label='Dark or light']")
         for colour in _COLOURS[dark]:
-            page.wait_for_function(_DRAWN, arg=colour)
+            until(page, _DRAWN, colour)
     page.unroute_all(behavior="wait")
 
 
@@ -172,9 +173,10 @@ def test_the_last_measurements_fit_into_every_window(
     page.wait_for_selector(".hx-calibration td:has-text('P0012F')")
     for width in (800, 1100, 1400, 1900):
         page.set_viewport_size({"width": width, "height": 900})
-        page.wait_for_function(
+        until(
+            page,
             """() => { const table = document.querySelector('.hx-calibration .hx-scroll');
-            return table && table.scrollWidth <= table.clientWidth; }"""
+            return table && table.scrollWidth <= table.clientWidth; }""",
         )
         assert page.locator(".hx-calibration td:last-child").first.inner_text() == "✓"
     page.unroute_all(behavior="wait")

@@ -14,7 +14,7 @@ from heliotrope.console._secrets import verify_password
 from heliotrope.console.people import FIRST, first_start
 from heliotrope.store.keeper import Keeper
 from support.live_console import PASSWORD, LiveConsole
-from support.pages import NEEDS_BROWSER, menu, said
+from support.pages import NEEDS_BROWSER, menu, said, until
 
 pytestmark = NEEDS_BROWSER
 
@@ -29,7 +29,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
 
 def test_log_in_and_look(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page = enter("viewer")
-    assert page.inner_text(".hx-plant >> nth=0")
+    assert page.inner_text(".hx-name")
     assert "View only" in page.inner_text(".hx-bar")
     assert page.locator(".hx-bar button").count() == 0
     for title in ("Heliostat", "Targets", "Calibration", "Clusters", "Alarms", "Logs", "Schedule"):
@@ -130,9 +130,7 @@ def test_query_and_detail(field: LiveConsole, enter: Callable[[str], Any]) -> No
     page.keyboard.press("Enter")
     said(page, f"{name} is selected")
     page.click(".hx-tabs >> text=Heliostat")
-    page.wait_for_function(
-        "name => document.querySelector('.hx-heliostat h2')?.textContent.startsWith(name)", arg=name
-    )
+    page.wait_for_selector(f".hx-heliostat h2:has-text('{name}')")
     page.fill(".hx-query", "speed > 3")
     page.keyboard.press("Enter")
     said(page, 'no field "speed"')
@@ -143,13 +141,13 @@ def test_query_and_detail(field: LiveConsole, enter: Callable[[str], Any]) -> No
     said(page, "?; write its name, or: state = TRACKING and error > 1")
     page.fill(".hx-query", f"{name}, {field.live.names[21]}")
     page.keyboard.press("Enter")
-    page.wait_for_function("heliotrope.store.selection.size === 2")
+    until(page, "heliotrope.store.selection.size === 2")
     page.fill(".hx-query", f"name = {name}")
     page.keyboard.press("Enter")
-    page.wait_for_function("heliotrope.store.selection.size === 1")
+    until(page, "heliotrope.store.selection.size === 1")
     page.fill(".hx-query", "cluster = C001 or cluster = C002 and east < 1e9")
     page.keyboard.press("Enter")
-    page.wait_for_function("heliotrope.store.selection.size === 64")
+    until(page, "heliotrope.store.selection.size === 64")
 
 
 def test_calibrate_now_is_for_operators(field: LiveConsole, enter: Callable[[str], Any]) -> None:
@@ -166,14 +164,10 @@ def test_calibrate_now_is_for_operators(field: LiveConsole, enter: Callable[[str
     control = field.live.operations.automatic
     field.call(lambda: control.want([name], wanted=True))
     button.click()
-    page.wait_for_function(
-        matches, arg=f"CALIBRATE: 1 (waiting|acknowledged) .{name}: (it waits: |at )"
-    )
+    until(page, matches, f"CALIBRATE: 1 (waiting|acknowledged) .{name}: (it waits: |at )")
     # In a field that other tests command its turn may never come: it ends when it is withdrawn.
     field.call(lambda: control.want([name], wanted=False))
-    page.wait_for_function(
-        matches, arg=f"CALIBRATE: 1 (done|failed|refused) .{name}: (at .*: |withdrawn: )"
-    )
+    until(page, matches, f"CALIBRATE: 1 (done|failed|refused) .{name}: (at .*: |withdrawn: )")
 
 
 def test_a_tablet_has_all_of_it(field: LiveConsole, enter: Callable[[str], Any]) -> None:
@@ -238,7 +232,7 @@ def test_an_engineer_keeps_the_accounts(field: LiveConsole, enter: Callable[[str
 def test_tokens_are_made_and_revoked(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page, people = enter("viewer"), field.keeper.people
     menu(page, "API tokens")
-    assert page.locator(".q-menu >> text=People").count() == 0
+    assert page.locator(".hx-menu >> text=People").count() == 0
     dialog = page.locator("dialog.wide")
     dialog.locator("text=Create…").click()
     page.fill("dialog:last-of-type [name=label]", "nightly")
@@ -274,10 +268,55 @@ def test_dark_and_light(enter: Callable[[str], Any]) -> None:
     ground = "getComputedStyle(document.body).backgroundColor"
     night = page.evaluate(ground)
     page.click("[aria-label='Dark or light']")
-    page.wait_for_function(f"{ground} !== '{night}'")
+    until(page, f"{ground} !== '{night}'")
     page.reload()
     page.wait_for_selector(".hx-legend b")
     assert page.evaluate(ground) != night
+
+
+def test_the_tabs_are_reached_by_keys(enter: Callable[[str], Any]) -> None:
+    page = enter("viewer")
+    page.focus(".hx-tabs [aria-selected=true]")
+    for key, kind in (("ArrowRight", "heliostat"), ("ArrowLeft", "plant"), ("End", "schedule")):
+        page.keyboard.press(key)
+        page.wait_for_selector(f".hx-tabs [data-tab={kind}][aria-selected=true]:focus")
+        page.wait_for_selector(f".hx-panels > .hx-{kind}")
+        assert page.locator(".hx-panels > *").count() == 1
+
+
+def test_the_menu_closes(enter: Callable[[str], Any]) -> None:
+    page = enter("viewer")
+    for close in (lambda: page.keyboard.press("Escape"), lambda: page.click(".hx-map-field")):
+        page.click(".hx-menu summary")
+        page.wait_for_selector(".hx-menu button >> text=Sign out")
+        close()
+        page.wait_for_selector(".hx-menu button >> nth=0", state="hidden")
+
+
+def test_the_head_fits_into_every_width(enter: Callable[[str], Any]) -> None:
+    """Each part of the head is whole, and none lies below EMERGENCY."""
+    page = enter("engineer")
+    for width in (1440, 1280, 1024, 900, 820, 600):
+        page.set_viewport_size({"width": width, "height": 900})
+        stop = page.locator("#emergency").bounding_box()
+        for part in (".hx-live", ".hx-authority button", ".hx-theme", ".hx-menu"):
+            box = page.locator(part).bounding_box()
+            beside = box["x"] + box["width"] <= stop["x"]
+            assert beside or box["y"] >= stop["y"] + stop["height"], (width, part)
+        for part in (".hx-head", ".hx-name", ".hx-tabs"):
+            assert page.locator(part).evaluate("e => e.scrollWidth <= e.clientWidth"), (width, part)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_the_page_waits_for_a_plant_that_does_not_answer_yet(enter: Callable[[str], Any]) -> None:
+    page = enter("operator")
+    away = {"detail": "the plant does not answer"}
+    page.route("**/api/v1/field", lambda route: route.fulfill(status=503, json=away))
+    page.reload()
+    said(page, "no data from the plant, asking again: the plant does not answer")
+    page.unroute("**/api/v1/field")
+    page.wait_for_selector(".hx-legend b")
+    until(page, "document.querySelector('.hx-bar .hx-said').textContent === ''")
 
 
 def test_calibration_is_seen(field: LiveConsole, enter: Callable[[str], Any]) -> None:
@@ -296,8 +335,8 @@ def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any])
     order = field.until(lambda: field.live.operations.plant.emergency)
     assert order.who == "engineer"
     page.wait_for_selector(".hx-alert.on")
-    page.wait_for_function(
-        "document.querySelector('.hx-alert').textContent.includes('acknowledged 640 of 640')"
+    until(
+        page, "document.querySelector('.hx-alert').textContent.includes('acknowledged 640 of 640')"
     )
     page.click(".hx-alert >> text=Withdraw")
     page.click("dialog >> text='Withdraw'")
@@ -313,14 +352,17 @@ def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any])
     assert not field.call(lambda: field.live.operations.plant.emergency_on)
 
 
-def test_emergency_without_the_frame(field: LiveConsole, enter: Callable[[str], Any]) -> None:
-    """The plain page works with nothing but its own script."""
+@pytest.mark.parametrize("path", ["", "emergency"])
+def test_emergency_needs_its_own_script_only(
+    field: LiveConsole, enter: Callable[[str], Any], path: str
+) -> None:
     page = enter("viewer")
     before = field.call(lambda: field.live.operations.plant.emergency)
-    page.route("**/_nicegui/**", lambda route: route.abort())
-    page.goto(f"{field.address}emergency")
+    page.route("**/live.js", lambda route: route.abort())
+    page.goto(f"{field.address}{path}")
     page.click("#emergency")
     page.wait_for_selector("#emergency-said:has-text('ordered')")
+    assert not page.evaluate("window.heliotrope")
     order = field.call(lambda: field.live.operations.plant.emergency)
     assert order is not before
     field.calm()
@@ -329,7 +371,7 @@ def test_emergency_without_the_frame(field: LiveConsole, enter: Callable[[str], 
 def test_a_page_that_hears_nothing_says_so(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page = enter("viewer")
     page.evaluate("heliotrope.store.take = () => {}")
-    page.wait_for_function("document.body.classList.contains('hx-dead')")
+    until(page, "document.body.classList.contains('hx-dead')")
     assert "NOT LIVE" in page.inner_text(".hx-live")
     assert page.evaluate("heliotrope.store.stateName(0)") == "stale"
 
@@ -342,14 +384,12 @@ def test_a_dead_cluster_is_shown_as_stale(field: LiveConsole, enter: Callable[[s
     page.wait_for_selector(".hx-clusters tbody tr")
     field.call(lambda: setattr(buses[3], "plugged", False))
     try:
-        page.wait_for_function("heliotrope.store.state.filter(s => s === 255).length === 32")
+        until(page, "heliotrope.store.state.filter(s => s === 255).length === 32")
         page.wait_for_selector(".hx-clusters tbody tr:has-text('degraded')")
-        page.wait_for_function(
-            "document.querySelector('.hx-legend').textContent.includes('stale 32')"
-        )
+        until(page, "document.querySelector('.hx-legend').textContent.includes('stale 32')")
     finally:
         field.call(lambda: setattr(buses[3], "plugged", True))
-    page.wait_for_function("heliotrope.store.state.every(s => s !== 255)")
+    until(page, "heliotrope.store.state.every(s => s !== 255)")
 
 
 def test_a_flight_is_taken_and_shown(

@@ -9,7 +9,7 @@ import pytest
 
 from heliotrope.plant.drive_checks import PHOTOGRAPH
 from support.live_console import LiveConsole
-from support.pages import NEEDS_BROWSER, menu, orders_counted, said
+from support.pages import NEEDS_BROWSER, menu, orders_counted, said, until
 
 pytestmark = NEEDS_BROWSER
 
@@ -38,8 +38,8 @@ def _open_people(page: Any) -> None:
 
 
 def _open_menu(page: Any) -> None:
-    page.click("header >> text=/engineer/")
-    page.wait_for_selector(".q-menu")
+    page.click(".hx-menu summary")
+    page.wait_for_selector(".hx-menu button")
 
 
 def _by_mouse(page: Any) -> None:
@@ -121,7 +121,7 @@ def test_after_a_loss_of_many_a_person_presses_resume(
     field.until(up)
     link = live.links[live.operations.clusters[0]]
     field.call(lambda: setattr(link, "plugged", False))
-    page.wait_for_function("heliotrope.store.state.filter(s => s === 255).length === 32")
+    until(page, "heliotrope.store.state.filter(s => s === 255).length === 32")
     page.wait_for_timeout(3000)
     field.call(lambda: setattr(link, "plugged", True))
     page.wait_for_selector(".hx-alert.on:has-text('left the receiver without an order')")
@@ -133,7 +133,7 @@ def test_after_a_loss_of_many_a_person_presses_resume(
     assert field.call(lambda: live.operations.summary().resume)
     page.click(".hx-alert button >> text=Resume")
     page.click("dialog >> text='Resume'")
-    page.wait_for_function("!document.querySelector('.hx-alert.on')")
+    until(page, "!document.querySelector('.hx-alert.on')")
     assert not field.call(lambda: live.operations.summary().resume)
 
 
@@ -151,7 +151,7 @@ def test_an_emergency_is_withdrawn_after_one_question_and_its_text_ends(
     page.click(".hx-alert button >> text=Withdraw")
     page.click("dialog >> text='Withdraw'")
     field.calm()
-    page.wait_for_function("!document.querySelector('.hx-alert.on')")
+    until(page, "!document.querySelector('.hx-alert.on')")
     page.wait_for_selector(".hx-plant p:has-text('ordered by')", state="detached")
 
 
@@ -265,8 +265,8 @@ def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
     assert "STOWED" in row.inner_text()
     row.locator("text=Return lock").click()
     page.click("dialog >> text='Return lock'")
-    page.wait_for_function("heliotrope.store.out.every((one) => !one)")
-    page.wait_for_function("!document.querySelector('.hx-legend .hx-out')")
+    until(page, "heliotrope.store.out.every((one) => !one)")
+    until(page, "!document.querySelector('.hx-legend .hx-out')")
 
 
 def test_a_target_is_locked_and_the_lock_returned(

@@ -8,7 +8,7 @@ import pytest
 
 from heliotrope.console.client import Client
 from support.live_console import PASSWORD
-from support.pages import NEEDS_BROWSER, entering
+from support.pages import NEEDS_BROWSER, entering, until
 from support.program import MAIN, Program
 
 pytestmark = NEEDS_BROWSER
@@ -49,7 +49,7 @@ def test_the_page_is_live_through_a_joint_visit_and_an_emergency(
     page.click(".hx-tabs >> text=Calibration")
     page.wait_for_selector(".hx-calibration li:has-text('photograph')")
     # The beams of one of the targets are taken apart.
-    page.wait_for_function(ENOUGH)
+    until(page, ENOUGH)
     page.click("#emergency")
     page.wait_for_selector(".hx-alert.on:has-text('EMERGENCY')")
     page.wait_for_selector(".hx-alert.on:has-text('done 12')")

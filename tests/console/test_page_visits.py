@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from support.live_console import LiveConsole
-from support.pages import NEEDS_BROWSER
+from support.pages import NEEDS_BROWSER, until
 
 pytestmark = NEEDS_BROWSER
 
@@ -72,7 +72,7 @@ def test_an_emergency_in_a_joint_visit_leaves_nothing_locked(
     page.click("dialog >> text='Withdraw'")
     page.wait_for_selector(".hx-alert >> text=acknowledge its alarms")
     field.calm()
-    page.wait_for_function("!document.querySelector('.hx-alert.on')")
+    until(page, "!document.querySelector('.hx-alert.on')")
     page.click(".hx-tabs >> text=Calibration")
     page.wait_for_selector(".hx-calibration >> text=no heliostat is given to automatic control")
     page.select_option(".hx-to select", "field")

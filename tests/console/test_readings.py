@@ -19,7 +19,7 @@ GUST = "readings/wind_gust"
 def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
     """A plant whose wind a program reads, in real time."""
     folder = tmp_path_factory.mktemp("readings")
-    made = LiveConsole(folder, 4, page=False, given=frozenset({"wind_gust"}))
+    made = LiveConsole(folder, 4, given=frozenset({"wind_gust"}))
     yield made
     made.close()
 

@@ -83,7 +83,7 @@ class Watch:
 def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
     """Thirty-two heliostats out of stow, and a console in a process of its own."""
     patience = Patience(begin=240.0, silent=6.0, pause=0.2, longest=0.4)
-    made = LiveConsole(tmp_path_factory.mktemp("plant"), 32, page=False, speed=8.0, child=patience)
+    made = LiveConsole(tmp_path_factory.mktemp("plant"), 32, speed=8.0, child=patience)
     try:
         assert made.address
         _raised(made)

@@ -14,8 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from nicegui import core
-
 from heliotrope.console import _secrets
 from heliotrope.console.beside import ConsoleProcesses
 from heliotrope.console.lines import Lines
@@ -88,7 +86,6 @@ class LiveConsole:
         folder: Path,
         heliostats: int,
         *,
-        page: bool = True,
         speed: float = 1.0,
         rendered: bool = False,
         boards: bool = False,
@@ -101,7 +98,7 @@ class LiveConsole:
     ) -> None:
         self.folder, self.address = folder, ""
         self._made, self._child = (heliostats, speed), child
-        self._settings = settings or ConsoleSettings(port=0, page=page)
+        self._settings = settings or ConsoleSettings(port=0)
         self._marks = marks
         self._options = LiveOptions(
             rendered=rendered,
@@ -185,8 +182,6 @@ class LiveConsole:
 
     async def _console(self, settings: ConsoleSettings) -> None:
         self._console_loop = asyncio.get_running_loop()
-        # NiceGUI's application is one for the process, and the tests open several consoles.
-        core.app.middleware_stack = None
         async with serving(self.interface, settings) as (self.server, self.address):
             self._ready.set()
             while not self._over.is_set():

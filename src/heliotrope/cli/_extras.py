@@ -6,9 +6,9 @@ from heliotrope.errors import InputError
 EXTRAS = {
     "aiomqtt": "control", "alembic": "store", "argon2": "console", "cryptography": "control",
     "dask": "cluster", "distributed": "cluster", "duckdb": "store", "fastapi": "console",
-    "nicegui": "console", "plotly": "notebook", "psycopg": "postgresql", "pyotp": "console",
-    "segno": "console", "serialx": "control", "sqlalchemy": "store", "starlette": "console",
-    "uvicorn": "console",
+    "plotly": "notebook", "psycopg": "postgresql", "pyotp": "console", "segno": "console",
+    "serialx": "control", "sqlalchemy": "store", "starlette": "console", "uvicorn": "console",
+    "websockets": "console",
 }  # fmt: skip
 #: The extra with everything that a command needs, where that is more than one package.
 _WHOLE = {"run": "console", "ctl": "console", "store": "store"}

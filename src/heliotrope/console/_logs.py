@@ -5,10 +5,7 @@ import time
 from collections.abc import Callable
 
 #: Loggers whose lines strangers can cause.
-NOISY = (
-    "asyncio", "engineio.server", "heliotrope.console", "nicegui", "socketio.server",
-    "uvicorn.error", "websockets.server",
-)  # fmt: skip
+NOISY = ("asyncio", "heliotrope.console", "uvicorn.error", "websockets.server")
 #: Lines of one kind within a span, s, and kinds that are kept.
 MOST, SPAN, KINDS = 5, 60.0, 500
 

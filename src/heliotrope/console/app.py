@@ -8,16 +8,16 @@ import contextlib
 import itertools
 import time
 from collections.abc import AsyncIterator, Callable
+from html import escape
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response
-from starlette.staticfiles import StaticFiles
+from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 
 from heliotrope import __version__
 from heliotrope.console import accounts, api, commands, factor
 from heliotrope.console._attempts import Attempts
-from heliotrope.console._files import CLICKING, KEPT, PLAIN, STATIC, Files
+from heliotrope.console._files import Files, page
 from heliotrope.console.auth import Caller, Console, introduced
 from heliotrope.console.by_proxy import ByProxy
 from heliotrope.console.connections import FOUND
@@ -42,6 +42,8 @@ ABOUT = (
 )
 
 ROUTERS = (api.router, commands.router, accounts.router, factor.router)
+#: Address and file of each page but the sign-in's.
+PAGES = {"/": "console", "/emergency": "emergency", "/account": "account"}
 #: Errors of a request that the answer lists, and their longest texts, characters.
 MOST_ERRORS, LONGEST_TEXT, LONGEST_WORD = 5, 200, 64
 
@@ -54,8 +56,7 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
     plant
         The plant at work, in its own process.
     settings
-        Settings of the console. A process can have one page (NiceGUI is global), and any number of
-        applications without one.
+        Settings of the console.
     """
     chosen = settings or ConsoleSettings()
     people, stream = RemotePeople(plant), Stream(plant, chosen.period)
@@ -100,12 +101,8 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_middleware(Files)
     # The middleware added last comes first.
-    app.add_middleware(Guard, console=lambda: console, routes=_routes(chosen), edge=app.state.edge)
+    app.add_middleware(Guard, console=lambda: console, routes=_routes(), edge=app.state.edge)
     _pages(app)
-    if chosen.page:
-        from heliotrope.console import page
-
-        page.attach(app)
     return app
 
 
@@ -133,50 +130,38 @@ def _invalid(request: Request, error: Exception) -> Response:
     return JSONResponse({"detail": errors}, 422)
 
 
-def _routes(settings: ConsoleSettings) -> Routes:
+def _routes() -> Routes:
     """Return the routes that the guard admits."""
-    files = [
-        f"{place}/{file.name}" for place in (KEPT, PLAIN) for file in (*STATIC.iterdir(), CLICKING)
-    ]
-    page = ["/"] * settings.page
     own = {"/api/v1/openapi.json": Role.VIEWER}
-    if settings.page:
-        own["/favicon.ico"] = Role.VIEWER
-    return Routes(ROUTERS, [*files, *page, "/login", "/emergency", "/account"], own)
+    return Routes(ROUTERS, [*Files.paths, *PAGES, "/login"], own)
 
 
 def _pages(app: FastAPI) -> None:
-    """Add the page's files and the sign-in page, which does without the frame."""
+    """Add the pages; the guard has sent away everybody who may not see one."""
+    texts = {path: page(name) for path, name in PAGES.items()}
 
-    async def clicking(request: Request) -> Response:
-        del request
-        return FileResponse(CLICKING, media_type="text/javascript; charset=utf-8")
+    async def show(request: Request) -> Response:
+        console: Console = request.scope["heliotrope"]
+        who: Caller | None = request.scope[FOUND]
+        facts = {"emergency": str(console.emergency_port)}
+        if who is not None:
+            facts |= {"csrf": who.csrf, "person": who.person.name}
+            facts["role"] = who.person.role.name.lower()
+        metas = "".join(
+            f'\n<meta name="heliotrope-{name}" content="{escape(text)}">'
+            for name, text in facts.items()
+        )
+        text = texts[request.scope["path"]]
+        return HTMLResponse(text.replace("</title>", f"</title>{metas}"))
 
-    for place in (KEPT, PLAIN):
-        app.add_route(f"{place}/{CLICKING.name}", clicking, include_in_schema=False)
-        app.mount(place, StaticFiles(directory=STATIC), name=place)
-
-    @app.get("/login", include_in_schema=False)
     async def login(request: Request) -> Response:
         console: Console = request.scope["heliotrope"]
         if (found := introduced(console, request)) is not None:
             answer = RedirectResponse("/", 303)
             set_cookie(console, answer, await enter(console, found, request))
             return answer
-        return FileResponse(STATIC / "login.html", media_type="text/html; charset=utf-8")
+        return HTMLResponse(page("login"))
 
-    plain = {
-        name: (STATIC / f"{name}.html").read_text("utf-8") for name in ("emergency", "account")
-    }
-
-    @app.get("/emergency", include_in_schema=False)
-    @app.get("/account", include_in_schema=False)
-    async def with_emergency(request: Request) -> Response:
-        console: Console = request.scope["heliotrope"]
-        who: Caller | None = request.scope[FOUND]
-        facts = {"csrf": "" if who is None else who.csrf, "emergency": console.emergency_port}
-        metas = "".join(
-            f'<meta name="heliotrope-{name}" content="{text}">' for name, text in facts.items()
-        )
-        text = plain[request.scope["path"].strip("/")]
-        return HTMLResponse(text.replace("<main>", f"{metas}\n<main>"))
+    for path in PAGES:
+        app.add_route(path, show, include_in_schema=False)
+    app.add_route("/login", login, include_in_schema=False)

@@ -15,36 +15,20 @@ from starlette.responses import JSONResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from heliotrope.console import bodies
-from heliotrope.console.auth import (
-    AtLeast,
-    Caller,
-    Console,
-    caller,
-    refused,
-    same_origin,
-    settle,
-)
+from heliotrope.console.auth import AtLeast, Caller, Console, caller, refused
 from heliotrope.console.connections import FOUND
 from heliotrope.console.edge import Edge
 from heliotrope.console.headers import host_known, parts_of
-from heliotrope.console.routes import FORM, LARGEST, READ, TINY, Found, Routes
+from heliotrope.console.routes import FORM, LARGEST, TINY, Found, Routes
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.plant.operations.security import SecurityEvent
 
 #: Nothing from other origins, nothing inline.
-STRICT = (
+POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
     "connect-src 'self'; font-src 'self'; form-action 'self'; base-uri 'none'; "
     "frame-ancestors 'none'"
 )
-#: The page's frame is NiceGUI's, which has inline scripts and compiles templates.
-FRAME = (
-    "default-src 'none'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
-    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; connect-src 'self'; "
-    "font-src 'self' data:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
-)
-#: Where the page's framework lives: for people who are signed in, from this page only.
-FRAMEWORK, SOCKET = "/_nicegui/", "/_nicegui_ws/"
 #: The live stream answers strangers itself: the page reads its close code.
 LIVE = "/api/v1/live"
 
@@ -106,10 +90,11 @@ class Guard:
             raise HTTPException(421, "this machine is not known here by that name; see --name")
         who = scope[FOUND] = await self._edge.find(console, connection)
         if scope["type"] == "websocket":
-            await _check_socket(console, connection, who)
+            if scope["path"] != LIVE:
+                raise HTTPException(404, "nothing is at this address")
             await self._app(scope, receive, send)
             return
-        found = await self._route(scope, who)
+        found = self._route(scope, who)
         if found.role is not None:
             who = await caller(connection, console)
             if who.person.role < found.role:
@@ -135,17 +120,14 @@ class Guard:
                 receive = bodies.replayed(body, receive)
             await self._app(scope, receive, send)
 
-    async def _route(self, scope: Scope, who: Caller | None) -> Found:
+    def _route(self, scope: Scope, who: Caller | None) -> Found:
         """Return the route of a request; raises `HTTPException` if there is none."""
-        path = scope["path"]
-        if path.startswith((FRAMEWORK, SOCKET)) and who is not None and who.by == "session":
-            return await _framework(self._console(), scope, who)
         found = self._routes.find(scope)
         if found.status == 200:
             return found
         if who is None:
             # Strangers do not learn which addresses there are.
-            if path.startswith("/api/"):
+            if scope["path"].startswith("/api/"):
                 raise HTTPException(401, "sign in, or send a valid token")
             raise HTTPException(404, "nothing is at this address")
         if found.status == 405:
@@ -154,9 +136,9 @@ class Guard:
 
     def _dress(self, console: Console, scope: Scope, headers: Any) -> None:
         """Add the safe headers."""
-        path, urgent = scope["path"], _urgent(console, scope)
-        policy = FRAME if path == "/" else STRICT
+        path, policy = scope["path"], POLICY
         if path in ("/", "/emergency", "/account"):
+            urgent = _urgent(console, scope)
             policy = policy.replace("connect-src 'self'", f"connect-src 'self' {urgent}")
         headers["Content-Security-Policy"] = policy
         headers["X-Content-Type-Options"] = "nosniff"
@@ -178,35 +160,6 @@ def _urgent(console: Console, scope: Scope) -> str:
         return ""
     scheme = "https" if console.settings.tls or console.settings.plain else scope["scheme"]
     return f"{scheme}://{host}:{console.emergency_port}"
-
-
-async def _framework(console: Console, scope: Scope, who: Caller) -> Found:
-    """Return the route of the framework's files, and of its stream where it has no socket."""
-    connection = HTTPConnection(scope)
-    if not same_origin(console, connection):
-        await console.note(SecurityEvent.ORIGIN_REFUSED, connection, who.person.name)
-        raise HTTPException(403, "this page comes from another site")
-    settle(who, connection)
-    if scope["method"] in READ:
-        return Found(200)
-    if scope["path"].startswith(SOCKET) and scope["method"] == "POST":
-        return Found(200, largest=FORM)
-    raise HTTPException(405, "not this method")
-
-
-async def _check_socket(console: Console, connection: HTTPConnection, who: Caller | None) -> None:
-    """Raise `HTTPException` for a socket that may not be opened."""
-    path = connection.scope["path"]
-    if path == LIVE:
-        return
-    if not path.startswith(SOCKET):
-        raise HTTPException(404, "nothing is at this address")
-    if who is None or who.by != "session":
-        raise HTTPException(401, "sign in")
-    settle(who, connection)
-    if "origin" not in connection.headers or not same_origin(console, connection):
-        await console.note(SecurityEvent.ORIGIN_REFUSED, connection, who.person.name)
-        raise HTTPException(403, "this page comes from another site")
 
 
 async def _check_body(scope: Scope, body: bytes) -> None:

@@ -30,8 +30,6 @@ class ConsoleSettings:
         Time between messages of the live stream, s.
     viewers
         Largest number of concurrent live streams.
-    page
-        Whether to serve the operator page beside the API.
     plain
         Whether other machines may connect without TLS, behind a proxy that has it.
     proxies
@@ -58,7 +56,6 @@ class ConsoleSettings:
     session_s: float = 36_000.0
     period: float = 1.0
     viewers: int = 200
-    page: bool = True
     plain: bool = False
     proxies: tuple[str, ...] = ()
     people_by_proxy: Path | None = None

@@ -40,7 +40,7 @@ from heliotrope.store.telemetry import Look, Telemetry
 #: Factor on the time between lines while a console is served: people look at the console.
 _SELDOM = 6.0
 #: What the console needs beside the base installation.
-_OF_CONSOLE = ("argon2", "nicegui", "uvicorn", "websockets")
+_OF_CONSOLE = ("argon2", "fastapi", "uvicorn", "websockets")
 #: File with the password of the first account, where no terminal can show it.
 FIRST_FILE = "first-password"
 #: Default time between lines, and period of the archive, s.

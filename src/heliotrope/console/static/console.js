@@ -1,4 +1,4 @@
-// Puts the parts of the page into the frame.
+// Fills the page, console.html, with its parts.
 import { api, me, rowsWhere, store } from "./live.js";
 import { FieldMap } from "./map.js";
 import { VIEWS } from "./palette.js";
@@ -6,8 +6,6 @@ import * as panels from "./panels.js";
 import * as people from "./people.js";
 import { act, bar, say, whoCommands } from "./orders.js";
 import { ask, count, degrees, h, span } from "./dom.js";
-
-const ready = store.begun.catch((error) => say(`no data from the plant: ${error.message}`, true));
 
 function map(box) {
   const view = h("select", { title: "Colour by (V)", onchange: () => store.emit("view", view.value) },
@@ -21,36 +19,32 @@ function map(box) {
   query.addEventListener("keydown", (event) => { if (event.key === "Enter") run(); event.stopPropagation(); });
   const field = h("div", { className: "hx-map-field" });
   box.append(h("div", { className: "hx-tools" }, view, lasso, all, none, query, h("button", { className: "hx-button", onclick: run }, "Select")), field);
-  const off = store.on("mode", (mode) => lasso.classList.toggle("main", mode === "lasso"));
+  store.on("mode", (mode) => lasso.classList.toggle("main", mode === "lasso"));
   document.addEventListener("keydown", (event) => {
     if (event.key === "/" && !/INPUT|SELECT|TEXTAREA/.test(document.activeElement?.tagName)) { event.preventDefault(); query.focus(); }
   });
-  const drawn = new FieldMap(field);
-  return () => { off(); drawn.close(); };
+  new FieldMap(field);
 }
 
 function head(box) {
-  const time = h("b"), speed = h("span", { className: "hx-hint" }), sun = h("span"), live = h("span", { className: "hx-live" });
-  box.append(h("span", { className: "hx-plant" }, store.field.plant), live, time, speed, sun);
+  const day = h("b", { className: "hx-day" }), time = h("b"), speed = h("span", { className: "hx-hint" }), sun = h("span", { className: "hx-sun" }), live = h("span", { className: "hx-live" });
+  box.append(h("span", { className: "hx-name" }, store.field.plant), live, day, time, speed, sun);
   const show = () => {
     const now = store.head;
     if (!now) return;
-    time.textContent = `${now.at.slice(0, 10)} ${now.at.slice(11, 19)} UTC`;
+    day.textContent = now.at.slice(0, 10);
+    time.textContent = `${now.at.slice(11, 19)} UTC`;
     speed.textContent = now.extra?.speed && now.extra.speed !== 1 ? `×${now.extra.speed}` : now.lag > 2 ? `simulated time ${span(now.lag)} late` : "";
     sun.textContent = `☀ ${degrees(now.sun.azimuth, 0)}° ↑${degrees(now.sun.elevation, 0)}°`;
   };
   const mark = () => { live.textContent = store.live ? "● live" : "✕ NOT LIVE"; live.classList.toggle("bad", !store.live); document.body.classList.toggle("hx-dead", !store.live); };
-  const off = [store.on("frame", show), store.on("live", mark)];
+  store.on("frame", show);
+  store.on("live", mark);
   mark(); show();
-  return () => off.forEach((end) => end());
 }
 
 function badge(box) {
-  const show = (now) => {
-    box.textContent = now.alarms ? String(now.alarms) : "";
-    document.body.classList.toggle("hx-emergency", now.emergency);
-  };
-  return store.on("frame", show);
+  store.on("frame", (now) => { box.textContent = now.alarms ? String(now.alarms) : ""; });
 }
 
 function alert(box) {
@@ -71,8 +65,7 @@ function alert(box) {
     if (await ask("Resume automatic control? It raises the heliostats that it has lost.", [], "Resume")) await act(() => api("POST", "automatic/resume"), "Resume");
   } }, "Resume");
   box.append(text, viewer ? "" : back, viewer ? "" : resume);
-  new ResizeObserver(() => document.body.style.setProperty("--alert", `${box.offsetHeight}px`)).observe(box);
-  return store.on("frame", (now) => {
+  store.on("frame", (now) => {
     box.classList.toggle("on", now.emergency || Boolean(now.resume));
     box.classList.toggle("waits", !now.emergency);
     back.hidden = !now.emergency || !now.order.calls.length; resume.hidden = !now.resume;
@@ -80,24 +73,53 @@ function alert(box) {
   });
 }
 
-const PARTS = { map, head, bar, badge, alert, authority: whoCommands, ...panels };
-
-export function mount(kind, box) {
-  let end = null, over = false;
-  ready.then(() => { if (!over && store.field) end = PARTS[kind](box); });
-  return () => { over = true; end?.(); };
+// The tabs: one panel at a time; the one that is left stops asking.
+function tabs() {
+  const buttons = [...document.querySelectorAll("[role=tab]")], panel = document.querySelector(".hx-panels");
+  let end = null;
+  const open = (button) => {
+    end?.();
+    for (const one of buttons) { one.ariaSelected = one === button; one.tabIndex = one === button ? 0 : -1; }
+    const box = h("div", { className: `hx-view hx-${button.dataset.tab}` });
+    panel.replaceChildren(box);
+    panel.scrollTop = 0;
+    panel.ariaLabel = button.firstChild.textContent;
+    end = panels[button.dataset.tab](box);
+  };
+  buttons.forEach((button, i) => {
+    button.onclick = () => open(button);
+    button.onkeydown = ({ key }) => {
+      const next = { ArrowRight: i + 1, ArrowLeft: i - 1, Home: 0, End: -1 }[key];
+      if (next !== undefined) { const to = buttons.at(next % buttons.length); to.focus(); open(to); }
+    };
+  });
+  open(buttons[0]);
 }
 
-window.heliotrope = {
-  theme() {
-    const night = !document.body.classList.contains("body--dark");
-    Quasar.Dark.set(night);
-    localStorage.setItem("heliotrope-theme", night ? "dark" : "light");
-    setTimeout(() => store.emit("theme"), 50);
-  },
-  open: (part) => people[part](),
-  async leave() { await api("DELETE", "session"); location.assign("/login"); },
-  store,
+// The person's menu, which any press elsewhere closes.
+function menu(box) {
+  const does = { ...people, factor: () => location.assign("/account"), async leave() { await api("DELETE", "session"); location.assign("/login"); } };
+  const summary = box.querySelector("summary");
+  summary.textContent = `${me.name} · ${me.role}`;
+  for (const item of box.querySelectorAll("button")) {
+    if (item.dataset.role && item.dataset.role !== me.role) item.remove();
+    item.onclick = () => { box.open = false; does[item.dataset.opens](); };
+  }
+  box.onkeydown = ({ key }) => { if (key === "Escape") { box.open = false; summary.focus(); } };
+  document.addEventListener("pointerdown", (event) => { if (!box.contains(event.target)) box.open = false; });
+}
+
+const THEME = "heliotrope-theme", { classList } = document.documentElement, part = (name) => document.querySelector(`.hx-${name}`);
+classList.toggle("light", localStorage.getItem(THEME) === "light");
+part("theme").onclick = () => {
+  localStorage.setItem(THEME, classList.toggle("light") ? "light" : "dark");
+  store.emit("theme");
 };
-const wanted = localStorage.getItem("heliotrope-theme");
-if (wanted) { Quasar.Dark.set(wanted === "dark"); setTimeout(() => store.emit("theme"), 50); }
+menu(part("menu"));
+bar(part("bar"));
+store.begun.then(() => {
+  map(part("map")); head(part("head")); whoCommands(part("authority")); alert(part("alert")); badge(part("badge"));
+  tabs();
+});
+
+window.heliotrope = { store }; // for tests and measurements

@@ -50,7 +50,7 @@
   }
 
   let touched = -Infinity;
-  // An open menu swallows the click of the touch that closes it, but not the touch itself.
+  // A touch counts by itself: whatever it closes may swallow its click.
   button.addEventListener("pointerup", (event) => { if (event.pointerType !== "mouse") { touched = event.timeStamp; call(true); } });
   button.addEventListener("click", (event) => { if (event.timeStamp - touched > 1000) call(true); });
   // Before anything else on the page hears the key; AltGr, which reports Ctrl too, is for writing.

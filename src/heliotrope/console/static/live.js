@@ -29,7 +29,12 @@ class Store extends EventTarget {
 
   async start() {
     this.connect(); // messages that come before the field are kept in `early`
-    this.field = await api("GET", "field");
+    while (!this.field) {
+      try { this.field = await api("GET", "field"); } catch (error) {
+        this.emit("said", { text: `no data from the plant, asking again: ${error.message}`, bad: true });
+        await new Promise((wake) => setTimeout(wake, 1000));
+      }
+    }
     const n = this.field.names.length;
     this.index = new Map(this.field.names.map((name, row) => [name, row]));
     this.state = new Uint8Array(n).fill(STALE);
@@ -42,6 +47,7 @@ class Store extends EventTarget {
     this.error = new Float32Array(n).fill(NaN);
     this.measured = new Float32Array(n).fill(NaN);
     this.emit("field");
+    this.emit("said", { text: "" });
     this.early.forEach((buffer) => this.take(buffer));
     this.early = [];
     setInterval(() => this.watch(), 500);

@@ -31,20 +31,16 @@ export class FieldMap {
     this.context = this.canvas.getContext("2d", { alpha: false });
     this.tip = box.appendChild(Object.assign(document.createElement("div"), { className: "hx-tip" }));
     this.legend = box.appendChild(Object.assign(document.createElement("div"), { className: "hx-legend" }));
-    this.off = [
-      store.on("frame", () => this.news()), store.on("live", () => this.news()),
-      store.on("selection", () => { this.dirty = true; }), store.on("theme", () => this.news()),
-      store.on("field", () => this.fit()), store.on("view", (view) => { this.view = view; this.news(); }),
-      store.on("mode", (mode) => { this.mode = mode; box.classList.toggle("lasso", mode === "lasso"); }),
-      store.on("fit", () => this.fit()),
-    ];
-    this.sizes = new ResizeObserver(() => this.resize());
-    this.sizes.observe(box);
+    for (const name of ["frame", "live", "theme"]) store.on(name, () => this.news());
+    store.on("selection", () => { this.dirty = true; });
+    store.on("view", (view) => { this.view = view; this.news(); });
+    store.on("mode", (mode) => { this.mode = mode; box.classList.toggle("lasso", mode === "lasso"); });
+    store.on("fit", () => this.fit());
+    new ResizeObserver(() => this.resize()).observe(box);
     this.hear();
     this.resize();
-    if (store.field) this.fit();
-    const turn = (now) => {
-      if (!this.box.isConnected) return;
+    this.fit();
+    const turn = () => {
       if (this.dirty) { this.dirty = false; this.draw(); this.drawn(); }
       requestAnimationFrame(turn);
     };
@@ -57,8 +53,6 @@ export class FieldMap {
     if (!this.seen && store.live && this.x) { this.seen = true; performance.mark("heliotrope-ready"); }
   }
 
-  close() { this.off.forEach((end) => end()); this.sizes.disconnect(); }
-
   news() { this.order = null; this.dirty = true; this.showLegend(); }
 
   resize() {
@@ -68,12 +62,12 @@ export class FieldMap {
     this.height = this.box.clientHeight;
     this.canvas.width = Math.max(1, Math.round(this.width * ratio));
     this.canvas.height = Math.max(1, Math.round(this.height * ratio));
-    if (store.field && !this.moved) this.fit();
+    if (!this.moved) this.fit();
     this.dirty = true;
   }
 
   fit() {
-    if (!store.field || !this.width) return;
+    if (!this.width) return;
     const places = store.field.positions, n = places.length;
     this.x = Float32Array.from(places, (p) => p[0]);
     this.y = Float32Array.from(places, (p) => p[1]);

@@ -98,8 +98,6 @@ const ORDERS = [
 ];
 
 export function bar(box) {
-  // The bar may need two lines; the page gets the rest of the height.
-  new ResizeObserver(() => document.body.style.setProperty("--foot", `${box.parentElement.offsetHeight}px`)).observe(box);
   const said = h("div", { className: "hx-said", role: "status" });
   if (me.role === "viewer") {
     box.append(h("span", { className: "hx-hint" }, "View only. EMERGENCY is open to everybody."), said);
@@ -113,20 +111,21 @@ export function bar(box) {
       to.options[0].textContent = `Selection (${count(n)})`;
       for (const [button, kind] of buttons) {
         const may = kind === "safe" || kind === "free" || store.mine;
-        button.disabled = !may || (scope !== "field" && !n);
+        button.disabled = !store.field || !may || (scope !== "field" && !n);
       }
     };
     box.append(h("div", { className: "hx-orders" }, h("label", { className: "hx-to" }, "Scope ", to), buttons.map(([button]) => button)), said);
     // The whole field, or whole clusters, must be chosen anew after each selection.
     store.on("selection", () => { if (store.selection.size) scope = to.value = "selection"; mark(); });
     store.on("authority", mark);
+    store.on("field", mark);
     document.addEventListener("keydown", (event) => {
       const found = event.altKey && ORDERS.find(([, key]) => key && event.code === `Key${key}`);
       if (found) { event.preventDefault(); found[2](); }
     });
     mark();
   }
-  return store.on("said", ({ text, bad }) => { said.textContent = text; said.title = text; said.classList.toggle("bad", Boolean(bad)); });
+  store.on("said", ({ text, bad }) => { said.textContent = text; said.title = text; said.classList.toggle("bad", Boolean(bad)); });
 }
 
 // The holder of the authority, and the button to take it and give it back.
@@ -155,5 +154,5 @@ export function whoCommands(box) {
       api("PUT", "authority").catch(() => {});
     }
   };
-  return store.on("frame", show);
+  store.on("frame", show);
 }

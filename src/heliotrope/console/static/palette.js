@@ -1,7 +1,7 @@
 // Colours that the colour-blind can tell apart: Okabe and Ito's for kinds, cividis for amounts.
 import { STALE, STATES, store } from "./live.js";
 
-export const dark = () => document.body.classList.contains("body--dark");
+export const dark = () => !document.documentElement.classList.contains("light");
 
 const KINDS = { // state: [on dark, on light]
   UNCONFIGURED: ["#8a8f98", "#6d7278"], STOWED: ["#5c7186", "#7f93a6"], STOWING: ["#a5bdd4", "#4f6b86"],

@@ -52,8 +52,7 @@ export function plant(box) {
 function drawFlux(canvas, view) {
   const rows = view.flux.length, columns = view.flux[0].length, peak = Math.max(1, ...view.flux.flat());
   const c = canvas.getContext("2d"), high = 190, aspect = (view.right.at(-1) - view.right[0]) / Math.max(0.1, view.up.at(-1) - view.up[0]);
-  // While its tab is being opened the part has no width yet.
-  const room = (canvas.parentElement.clientWidth || 480) - 90, wide = Math.round(Math.max(120, Math.min(room, high * aspect)));
+  const room = canvas.parentElement.clientWidth - 90, wide = Math.round(Math.max(120, Math.min(room, high * aspect)));
   canvas.width = wide + 84; canvas.height = high + 22;
   const image = new ImageData(columns, rows);
   for (let y = 0; y < rows; y++) for (let x = 0; x < columns; x++) {
