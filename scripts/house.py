@@ -13,6 +13,7 @@ import re
 import sys
 import tomllib
 from collections import Counter, defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -217,6 +218,65 @@ def repeated(known: dict[str, Module]) -> dict[str, int]:
     return {name: n for name, n in sorted(count.items()) if n > 1 and not name.startswith("_")}
 
 
+def literals(known: dict[str, Module]) -> tuple[list[str], list[str]]:
+    """Return where `plant` and `cluster` write out sets of command names, and sets of states.
+
+    Traits of `lcu/messages.py` and sets of `lcu/states.py` give names to both.
+    """
+    commands = _table(known[f"{NAME}.lcu.messages"], "MESSAGES", column=1)
+    states = _table(known[f"{NAME}.lcu.states"], "STATES")
+    found: tuple[list[str], list[str]] = [], []
+    for node, place in _nodes(known, ("plant", "cluster")):
+        if isinstance(node, ast.Set | ast.Tuple | ast.List) and not _stored(node):
+            texts = [e.value for e in node.elts if isinstance(e, ast.Constant)]
+            some = sum(text in commands for text in texts)
+            if some > 1 or (some and isinstance(node, ast.Set)):
+                found[0].append(place)
+            if sum(_word(each) in states for each in node.elts) > 1:
+                found[1].append(place)
+    return found
+
+
+def reasons(known: dict[str, Module]) -> list[str]:
+    """Return the functions in `plant` that return a mapping of texts: heliostat to reason."""
+    return [
+        f"{place} {node.name}"
+        for node, place in _nodes(known, ("plant",))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and node.returns is not None
+        and re.search(r"(dict|Mapping)\[str, str\]", ast.unparse(node.returns))
+    ]
+
+
+def _nodes(known: dict[str, Module], rooms_: tuple[str, ...]) -> Iterator[tuple[ast.AST, str]]:
+    """Yield the syntax of some packages, with the place of each node."""
+    for module in known.values():
+        if module.room in rooms_:
+            for node in ast.walk(ast.parse(module.path.read_text(encoding="utf-8"))):
+                yield node, f"{module.name.removeprefix(NAME + '.')}:{getattr(node, 'lineno', 0)}"
+
+
+def _table(module: Module, name: str, column: int = 0) -> set[str]:
+    """Return the texts of a tuple at the top of a module; of its rows, those of a column."""
+    for node in ast.parse(module.path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name:
+            assert isinstance(node.value, ast.Tuple)
+            rows = [
+                each.elts[column] if isinstance(each, ast.Tuple) else each
+                for each in node.value.elts
+            ]
+            return {each.value for each in rows if isinstance(each, ast.Constant)}
+    raise KeyError(f"{module.name} defines no {name}")
+
+
+def _stored(node: ast.AST) -> bool:
+    return isinstance(getattr(node, "ctx", None), ast.Store)
+
+
+def _word(node: ast.expr) -> str:
+    return node.attr if isinstance(node, ast.Attribute) else getattr(node, "id", "")
+
+
 def rooms(known: dict[str, Module], levels: list[list[str]]) -> list[tuple[str, int, int, int]]:
     """Return each package with its rooms, files and lines, from the top floor down."""
     per: dict[str, list[Module]] = defaultdict(list)
@@ -345,6 +405,13 @@ def main() -> int:
     faces = [m for m in known.values() if m.face]
     shown = sum(bool(m.offers) for m in faces)
     print(f"packages and rooms with a public face (__all__): {shown} of {len(faces)}")
+    listed = dict(zip(("command sets", "state sets"), literals(known), strict=True))
+    counted = {f"literal {what} in plant and cluster": at for what, at in listed.items()}
+    counted["functions in plant that return heliostat → reason"] = reasons(known)
+    for what, places in counted.items():
+        print(f"{what}: {len(places)}")
+        for place in places if given.verbose else ():
+            print(f"  {place}")
     names = repeated(known)
     print(f"class names in several modules: {len(names)}")
     if given.verbose:

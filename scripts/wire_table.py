@@ -89,7 +89,7 @@ def page() -> str:
         f"`{keyed_names}` (`{keyed}`); the table leaves this head out."
     )
     said = meanings()
-    for number, name, who, codes, fields in messages.MESSAGES:
+    for number, name, who, codes, fields, _ in messages.MESSAGES:
         if number & 0xF0 in GROUPS and number == min(
             row[0] for row in messages.MESSAGES if row[0] & 0xF0 == number & 0xF0
         ):

@@ -1,6 +1,7 @@
 """The state table, exhaustively; and its page in the documentation."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -133,3 +134,39 @@ def test_the_page_shows_every_transition() -> None:
     assert text.count("\n| ") == len(TRANSITIONS)
     for state, event, new, _ in TRANSITIONS:
         assert f"| {states.STATES[state]} | {event} | {states.STATES[new]} |" in text
+
+
+# The named sets.
+
+
+@pytest.mark.parametrize(
+    ("sets", "leads"),
+    [
+        (states.UP, lambda s: states.transition(s, "STOW") == (states.STOWING, "stow")),
+        (states.ON_AIM, lambda s: s in _reached_by("TRACK") | _reached_by("SEARCH")),
+        (states.KEPT, lambda s: s not in states.TO_STOW and _after(s, "STOW") == s),
+    ],
+)
+def test_the_named_sets_agree_with_the_table(
+    sets: tuple[int, ...], leads: Callable[[int], bool]
+) -> None:
+    assert set(sets) == {state for state in EVERY if leads(state)}
+
+
+def test_the_named_sets_lie_in_each_other() -> None:
+    assert set(states.ON_AIM) < set(states.BEAM_OUT) < set(states.UP)
+    assert set(states.AVAILABLE) < set(states.BEAM_OUT)
+    assert not set(states.BEAM_OUT) & {*states.LEAVING, *states.TO_STOW, *states.AWAY}
+
+
+def test_every_flag_has_its_bit() -> None:
+    assert [getattr(names, flag) for flag in names.FLAGS] == [1 << i for i in range(20)]
+
+
+def _after(state: int, event: str) -> int | None:
+    step = states.transition(state, event)
+    return None if step is None else step[0]
+
+
+def _reached_by(event: str) -> set[int | None]:
+    return {_after(state, event) for state in EVERY} - {None}

@@ -4,15 +4,17 @@ import hashlib
 import hmac
 import math
 import random
+import re
 import runpy
 import struct
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliotrope.lcu import messages, wire
+from heliotrope.lcu import messages, names, states, wire
 
 ROOT = Path(__file__).parents[2]
 KEY = b"a key of sixteen"
@@ -73,7 +75,7 @@ def same(one: wire.Frame, other: wire.Frame) -> bool:
 
 def test_table_is_sound() -> None:
     assert len({row[0] for row in messages.MESSAGES}) == len(messages.MESSAGES) == len(set(NAMES))
-    for number, name, who, row_codes, fields in messages.MESSAGES:
+    for number, name, who, row_codes, fields, _ in messages.MESSAGES:
         assert messages.name_of(number) == name
         assert messages.who_of(number) == who
         counted = [c for c in row_codes if not c.isdigit()]
@@ -94,6 +96,39 @@ def test_table_is_sound() -> None:
 def test_only_what_makes_the_field_safe_is_taken_from_anyone() -> None:
     free = {row[1] for row in messages.MESSAGES if row[2] == messages.ANYONE}
     assert free == {"DEFOCUS", "STOW"}
+
+
+def test_traits_are_those_that_the_docstring_explains() -> None:
+    used = {trait for row in messages.MESSAGES for trait in row[5].split()}
+    assert messages.__doc__ is not None
+    assert used == set(re.findall(r"^([a-z]+)  +[a-z]", messages.__doc__, re.MULTILINE))
+    sent = {messages.ANYONE, messages.AUTHORITY, messages.KEY}
+    assert all(row[2] in sent for row in messages.MESSAGES if row[5])
+
+
+def test_traits_agree_with_the_state_table() -> None:
+    motions, ends = defaultdict[str, set[str]](set), defaultdict[str, set[int]](set)
+    for _, event, state, motion in names.transitions():
+        motions[event].add(motion)
+        ends[event].add(state)
+    commands = {name for name in NAMES if motions[name]} - messages.SAFE
+    moved = {"approach", "standby", "track", "search", "move", "diagnose"}
+    assert {name for name in commands if motions[name] & moved} == messages.MOTIONS
+    assert {name for name in commands if ends[name] <= set(states.ON_AIM)} == messages.JOINING
+    for trait, does in (
+        (messages.TO_STANDBY, {"approach", "standby"}),
+        (messages.BY_COUNTS, {"move", "diagnose"}),
+    ):
+        assert {name for name in commands if motions[name] & does} == trait
+    assert {name for name in commands if motions[name] == {"hold"}} == messages.RELEASES
+    assert not messages.HARMLESS & messages.MOTIONS
+    assert messages.SETTINGS < messages.HARMLESS
+    assert {"AIM", "STANDBY"} == messages.POINTS
+
+
+def test_an_operator_may_not_drive_by_hand() -> None:
+    engineers = {row[1] for row in messages.MESSAGES if row[2] == messages.AUTHORITY}
+    assert engineers - messages.BY_OPERATORS == messages.BY_COUNTS | {"CLEAR_FAULT", "ROUGH"}
 
 
 def test_results_have_texts() -> None:

@@ -25,8 +25,6 @@ from heliotrope.lcu.signing import NO_KEY, fingerprint, pads_of, tag, wrapped
 from heliotrope.links.keys import KeyRing
 from heliotrope.safety import alarms
 
-_KEYED = 1 << names.FLAGS.index("BUS_KEY")
-_WANTS = 1 << names.FLAGS.index("SESSION_WANTED")
 #: Time for meeting in one second, s: the sun goes out after it.
 _SHARE = 0.2
 #: A local controller that does not answer is asked again this often, then after a pause, s.
@@ -104,7 +102,7 @@ class BusKeys:
 
     def _all_have(self, newest: int) -> bool:
         heard = [node for node in self._nodes if node.known and node.missed == 0]
-        held = [self._held.get(node.index) for node in heard if node.flags & _KEYED]
+        held = [self._held.get(node.index) for node in heard if node.flags & names.BUS_KEY]
         return bool(heard) and all(
             each is not None and each.prints is not None and newest in each.prints for each in held
         )
@@ -144,8 +142,8 @@ class BusKeys:
         held = self._held.get(node.index)
         if held is None or held.boots != node.status[8]:
             held = self._held[node.index] = _Held(node.status[8])
-        wants = bool(node.flags & _WANTS) and bool(self._keys)
-        known = held.prints is not None and bool(held.prints[0]) == bool(node.flags & _KEYED)
+        wants = bool(node.flags & names.SESSION_WANTED) and bool(self._keys)
+        known = held.prints is not None and bool(held.prints[0]) == bool(node.flags & names.BUS_KEY)
         if (known and not wants) or now < held.again:
             return
         answer = await self._exchange.ask(node, "QUERY_BUS", expires=now + 1.0, numbers=("BUS",))
@@ -245,12 +243,12 @@ class BusKeys:
 
     def _is_wrong(self, node: ClusterNode) -> bool:
         if self._ring is None:
-            return bool(node.flags & _KEYED)
+            return bool(node.flags & names.BUS_KEY)
         if not self._keys:
-            return bool(node.flags & _KEYED)
+            return bool(node.flags & names.BUS_KEY)
         held = self._held.get(node.index)
         if held is None or held.prints is None:
-            return not node.flags & _KEYED
+            return not node.flags & names.BUS_KEY
         return not set(held.prints) & set(self._keys)
 
 

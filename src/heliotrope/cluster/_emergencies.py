@@ -15,7 +15,6 @@ from heliotrope.cluster._reports import Reports
 from heliotrope.links.messages import Stage
 from heliotrope.safety import ORDER_BUDGET, alarms
 
-NAMES = ("DEFOCUS", "STOW")
 _CALLS = 3
 #: Time for asking again in each second after the first, s: polling and the sun go on.
 _SHARE = 0.3

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from heliotrope.cluster._nodes import ClusterNode, Nodes
 from heliotrope.cluster._reports import Reports
-from heliotrope.lcu import names, states
+from heliotrope.lcu import messages, names, states
 from heliotrope.lcu.states import (
     APPROACHING,
     FAULT,
@@ -25,14 +25,9 @@ from heliotrope.links.messages import Stage
 from heliotrope.safety import DEFOCUS_BUDGET, STOW_BUDGET
 
 _ALL = frozenset(range(len(states.STATES)))
-#: States in which a beam may be on the receiver, at standby, or on the way there.
-BEAM_OUT = frozenset({APPROACHING, IDLE, TRACKING, SEARCHING})
+#: States that show that the beam is off.
+_BEAM_OFF = _ALL.difference(states.BEAM_OUT)
 
-_MOVING = 1 << names.FLAGS.index("MOVING")
-_UNKNOWN = 1 << names.FLAGS.index("COUNTS_UNKNOWN")
-_SWITCHED_OFF = 1 << names.FLAGS.index("LOCAL_SWITCH")
-_AT_STOW = 1 << names.FLAGS.index("AT_STOW")
-_DIAGNOSING = 1 << names.FLAGS.index("DIAGNOSING")
 
 #: A STATUS requested sooner after the ACK may not show the motion yet, s: a few ticks of a board.
 _SETTLE = 0.2
@@ -96,16 +91,16 @@ GOALS = {
     "LOCK": Goal(frozenset({LOCKED})),
     "UNLOCK": Goal(_ALL - {LOCKED}),
     "CLEAR_FAULT": Goal(_ALL - {FAULT}),
-    "JOG": Goal(frozenset({IDLE}), clear=_MOVING, told=_NOTHING),
-    "GOTO": Goal(frozenset({IDLE}), clear=_MOVING, told=_NOTHING),
-    "DIAGNOSE": Goal(frozenset({IDLE}), clear=_DIAGNOSING, told=(frozenset(), _DIAGNOSING)),
-    "DEFOCUS": Goal(_ALL - BEAM_OUT, near=True, limit=DEFOCUS_BUDGET),
+    "JOG": Goal(frozenset({IDLE}), clear=names.MOVING, told=_NOTHING),
+    "GOTO": Goal(frozenset({IDLE}), clear=names.MOVING, told=_NOTHING),
+    "DIAGNOSE": Goal(
+        frozenset({IDLE}), clear=names.DIAGNOSING, told=(frozenset(), names.DIAGNOSING)
+    ),
+    "DEFOCUS": Goal(_BEAM_OFF, near=True, limit=DEFOCUS_BUDGET),
     "STOW": Goal(
-        _ALL - BEAM_OUT - {states.DEFOCUSED}, clear=_MOVING, needed=_AT_STOW, limit=STOW_BUDGET
+        _BEAM_OFF - {states.DEFOCUSED}, clear=names.MOVING, needed=names.AT_STOW, limit=STOW_BUDGET
     ),
 }
-#: Commands that take a beam off, which only known step counts prove.
-_LEAVE = ("DEFOCUS", "STOW")
 #: Goals that an order leaves in force, besides those of its own name: a stow is not undone.
 _SPARED = {"DEFOCUS": ("STOW",)}
 assert STOWED in GOALS["STOW"].there
@@ -216,9 +211,12 @@ class Goals:
         """Return "" if it is done, a text if it has failed, None if neither."""
         if asked_at < watch.since + _SETTLE:
             return None
-        if watch.name in _LEAVE and node.flags & _UNKNOWN:
+        if watch.name in messages.SAFE and node.flags & names.COUNTS_UNKNOWN:
             return "its step counts are unknown, so nothing shows where its beam is"
-        if watch.name in _LEAVE and node.flags & (_SWITCHED_OFF | _AT_STOW) == _SWITCHED_OFF:
+        if (
+            watch.name in messages.SAFE
+            and node.flags & (names.LOCAL_SWITCH | names.AT_STOW) == names.LOCAL_SWITCH
+        ):
             return "its drives are switched off at the mirror, away from stow"
         goal = GOALS[watch.name]
         watch.sure = watch.sure or goal.shown(node.state, node.flags)

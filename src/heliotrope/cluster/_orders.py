@@ -33,24 +33,13 @@ TRIES = 3
 _AGAIN = (messages.DUPLICATE, messages.EXPIRED, messages.REFUSED_AUTHORITY)
 #: Refusals that may mean that an earlier frame was taken and its answer lost.
 _MAYBE = (messages.DUPLICATE, messages.REFUSED_STATE, messages.BUSY)
-#: Commands whose goal looks like the state before: "duplicate" leaves the first answer open. A
-#: new frame settles it, and does no harm if the first was taken.
-_ANEW = ("GOTO", "SEARCH", "DIAGNOSE")
-#: Commands that would act again if sent in a second frame.
-_RELATIVE = ("JOG",)
 #: Limit for all heliostats together; the bus carries about a hundred a second.
 _MOST_JOBS = 2048
 #: The step counts of heliostats commanded at most this many at a time are requested each second
 #: for this long, s.
 _FEW, FOLLOWED = 4, 60.0
-#: Commands written to flash before they are acknowledged.
-_STORED = ("STANDBY",)
-#: Commands of which the last one counts: an earlier one that waits to be tried again is given up.
-_POINTS = ("AIM", "STANDBY")
 #: Commands that may move a mirror: refused while a row of the safety table forbids motion.
-MOTIONS = frozenset(
-    {"APPROACH", "IDLE", "TRACK", "REFOCUS", "AIM", "STANDBY", "JOG", "GOTO", "SEARCH", "DIAGNOSE"}
-)
+MOTIONS = messages.MOTIONS | messages.POINTS
 #: A command's life on the wire, s: less than a local controller accepts by its clock.
 _WIRE_LIFE = wire.HORIZON_S - 2.0
 _ITEM_NUMBER = {row[0]: number for number, row in enumerate(ITEMS, 1)}
@@ -228,7 +217,7 @@ class Orders:
 
     def _begin(self, order: Order, node: ClusterNode) -> None:
         self._reports.add(order.identity, Stage.ACCEPTED, node.name)
-        if order.name in _POINTS:
+        if order.name in messages.POINTS:
             self._supersede(order, node)
         self._ready.append(NodeOrder(order, node))
 
@@ -283,7 +272,7 @@ class Orders:
             return self._fail(job, job.last or "not acknowledged before it expired")
         if not job.told_sent:
             job.told_sent = True
-            if job.step.name in _RELATIVE:
+            if job.step.name in messages.RELATIVE:
                 await self._note_origin(job)
             elif self._goals.waits(job.node):
                 # A goal reached since the last poll would be given up.
@@ -320,7 +309,7 @@ class Orders:
             head, key = (*head, edition), node.member.key
         if step.name == "SET_ADDRESS":
             return await self._give_address(job, head, key)
-        slow = bool(key) or step.name in _STORED
+        slow = bool(key) or step.name in messages.STORED
         answer = await self._exchange.ask(
             node,
             step.name,
@@ -334,7 +323,7 @@ class Orders:
         if answer is not None:
             return self._judge(job, answer.values[2], lost=job.unanswered or answer.attempt > 0)
         job.unanswered = True
-        if step.name in _RELATIVE:
+        if step.name in messages.RELATIVE:
             return self._fail(job, f"no answer to {step.name}; it may have been taken")
         return self._again(job, f"no answer to {step.name} before it expired")
 
@@ -406,7 +395,7 @@ class Orders:
             self._epoch.taken(job.node.index)
             return self._advance(job)
         text = f"{name}: {self._why(job.node, result)}"
-        if lost and result == messages.DUPLICATE and name in _ANEW:
+        if lost and result == messages.DUPLICATE and name in messages.AGAIN:
             job.unanswered = True
             return self._again(job, text)
         if lost and result in _MAYBE and name in GOALS:

@@ -9,7 +9,7 @@ from typing import Any
 
 from heliotrope.cluster._emergencies import Emergencies
 from heliotrope.cluster._exchange import Exchange
-from heliotrope.cluster._goals import BEAM_OUT, Goals
+from heliotrope.cluster._goals import Goals
 from heliotrope.cluster._nodes import STATUS, STEPS, ClusterNode, Nodes
 from heliotrope.cluster._reports import Reports
 from heliotrope.cluster._watch import Watch
@@ -23,7 +23,6 @@ from heliotrope.safety import alarms
 _ABSENT, _PROBE = 3, 5
 #: A node shows a sun that jumped until it is restarted; the alarm ends after this time, s.
 _JUMP_SHOWS = 60.0
-_SUN_JUMPED = 1 << names.FLAGS.index("SUN_JUMPED")
 
 
 class Polling:
@@ -118,11 +117,11 @@ class Polling:
         node.take_status(status, asked_at)
         if node.fault != before:
             self._report_fault(node)
-        if bool(node.flags & _SUN_JUMPED) != (node.name in self._jumped):
+        if bool(node.flags & names.SUN_JUMPED) != (node.name in self._jumped):
             self._report_sun(node)
         if (
             self._watch.verdict.dark
-            and node.state in BEAM_OUT
+            and node.state in states.BEAM_OUT
             and not self._emergencies.waits(node)
         ):
             # It missed the broadcast, or has just come back.
@@ -139,7 +138,7 @@ class Polling:
 
     def _report_sun(self, node: ClusterNode) -> None:
         """Report the first jump of the sun since a local controller was started."""
-        if node.flags & _SUN_JUMPED:
+        if node.flags & names.SUN_JUMPED:
             self._jumped[node.name] = node.heard_at
             self._reports.alarm(alarms.SUN_JUMPED.raised(node.name))
         else:
@@ -166,7 +165,7 @@ class Polling:
                 self._reports.clear(alarms.NODE_SILENT.ended(node.name))
 
     def _report_silence(self, node: ClusterNode, limit: float) -> None:
-        out = node.known and node.state in BEAM_OUT
+        out = node.known and node.state in states.BEAM_OUT
         if not node.known:
             last = "never heard" if node.heard_at < self._started else "its state was never heard"
         elif self._clock.monotonic() - node.heard_at <= limit:

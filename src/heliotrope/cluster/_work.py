@@ -1,12 +1,13 @@
 """Work for the bus: emergencies first, then commands and parameters, then questions."""
 
-from heliotrope.cluster._emergencies import NAMES, Emergencies
+from heliotrope.cluster._emergencies import Emergencies
 from heliotrope.cluster._epoch import Epoch
 from heliotrope.cluster._exchange import Exchange
 from heliotrope.cluster._nodes import ClusterNode, Nodes
 from heliotrope.cluster._orders import Orders
 from heliotrope.cluster._questions import Questions
 from heliotrope.cluster._reports import Reports
+from heliotrope.lcu import messages
 from heliotrope.links.messages import Ask, Command, Emergency, Parameters, Stage
 
 
@@ -45,7 +46,7 @@ class Work:
             self._reports.add(message.identity, Stage.REFUSED, name, refusal)
         if not nodes:
             return
-        if message.name in NAMES:
+        if message.name in messages.SAFE:
             self._take_emergency(message.identity, message.name, nodes)
         elif isinstance(message, Command):
             self._orders.accept(message, nodes)

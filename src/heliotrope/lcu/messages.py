@@ -1,6 +1,6 @@
 """All messages of the wire, version 2: one table.
 
-A row: number, name, who may send it, codes of the payload, names of its fields. Codes are
+A row: number, name, who may send it, codes of the payload, names of its fields, traits. Codes are
 those of ``struct``, little-endian; ``s`` alone stands for the remaining bytes. A field of several
 numbers has a code with a count ("18d"). Names of fields end in their unit. The meaning of a message
 is in the comment above its row, from where ``docs/reference/wire.md`` takes it (on a
@@ -21,6 +21,25 @@ KEY the ``edition``, a number that only rises, kept in the journal, so that a st
 cannot be set again by a recorded message, whatever was reset in between.
 
 GPS seconds count from 6 January 1980 without leap seconds, modulo 2^32.
+
+Traits, which plant and clusters need, and boards do not:
+
+moves      moves the heliostat by its parameters
+joins      brings its beam to the aim
+standby    brings its beam to the standby point
+counts     moves it by step counts, from where it stands
+sliced     goes to many heliostats in slices
+releases   ends a lock or a fault
+stands     an idle heliostat stands still after it, and follows no standby point
+point      gives a point; only the last one counts
+setting    changes how it moves later; it takes no heliostat out of a visit
+harmless   moves nothing, now or later
+relative   acts again in a second frame
+again      its goal looks like the state before it; a second frame does no harm
+stored     written to flash before it is acknowledged
+operator   an operator may give it; the others of AUTHORITY and KEY need an engineer
+manual     a person who gives it takes the heliostat from automatic control
+automatic  a person who gives it gives the heliostat to automatic control
 """
 
 ANYONE, AUTHORITY, KEY, CLUSTER, NODE, ASK = 0, 1, 2, 3, 4, 5
@@ -30,112 +49,137 @@ HEADS = {AUTHORITY: ("II", "token expires_s"), KEY: ("III", "token expires_s edi
 
 MESSAGES = (
     # Ask for step counts.
-    (0x01, "QUERY_STEPS", ASK, "", ""),
+    (0x01, "QUERY_STEPS", ASK, "", "", ""),
     # Step counts and their goals.
-    (0x02, "STEPS", NODE, "iiii", "primary secondary primary_goal secondary_goal"),
+    (0x02, "STEPS", NODE, "iiii", "primary secondary primary_goal secondary_goal", ""),
     # Ask for state and flags.
-    (0x03, "QUERY_STATUS", ASK, "", ""),
+    (0x03, "QUERY_STATUS", ASK, "", "", ""),
     # State, flags and health.
     (0x04, "STATUS", NODE, "BIBIIHbIH",
-     "state flags fault uptime_s sun_age_ms supply_mv temperature_degc armature_crc boots"),
+     "state flags fault uptime_s sun_age_ms supply_mv temperature_degc armature_crc boots", ""),
     # Ask for the heliostat's location.
-    (0x05, "QUERY_POSITION", ASK, "", ""),
+    (0x05, "QUERY_POSITION", ASK, "", "", ""),
     # The heliostat's location, ENU.
-    (0x06, "POSITION", NODE, "fff", "east_m north_m up_m"),
+    (0x06, "POSITION", NODE, "fff", "east_m north_m up_m", ""),
     # Ask for the last diagnosis of movement.
-    (0x07, "QUERY_DIAGNOSIS", ASK, "", ""),
+    (0x07, "QUERY_DIAGNOSIS", ASK, "", "", ""),
     # Whether the mirror moved as ordered, by accelerometer or limit switch.
     (0x08, "DIAGNOSIS", NODE, "Biiff",
-     "result moved_primary moved_secondary tilt_x_rad tilt_y_rad"),
+     "result moved_primary moved_secondary tilt_x_rad tilt_y_rad", ""),
     # Ask for a stored item, by its number in the journal.
-    (0x09, "QUERY_STORED", ASK, "B", "item"),
+    (0x09, "QUERY_STORED", ASK, "B", "item", ""),
     # A stored item.
-    (0x0A, "STORED", NODE, "Bs", "item data"),
+    (0x0A, "STORED", NODE, "Bs", "item data", ""),
     # Ask all controllers with a serial number in a range to answer, in slots drawn at random.
-    (0x0B, "DISCOVER", ASK, "II", "low high"),
+    (0x0B, "DISCOVER", ASK, "II", "low high", ""),
     # Serial number, firmware and address.
-    (0x0C, "HERE", NODE, "IHH", "serial firmware address"),
+    (0x0C, "HERE", NODE, "IHH", "serial firmware address", ""),
     # Result of a command.
-    (0x0D, "ACK", NODE, "HBB", "sequence_of type_of result"),
+    (0x0D, "ACK", NODE, "HBB", "sequence_of type_of result", ""),
     # Ask for what a signed session needs.
-    (0x0E, "QUERY_BUS", ASK, "", ""),
+    (0x0E, "QUERY_BUS", ASK, "", "", ""),
     # A number drawn by the local controller, over which the next SESSION to its address must be
     # signed, and the fingerprints of the keys of the bus that it has (0: none).
-    (0x0F, "BUS", NODE, "IIII", "number_high number_low key old_key"),
+    (0x0F, "BUS", NODE, "IIII", "number_high number_low key old_key", ""),
     # GPS time.
-    (0x10, "TIME", CLUSTER, "HIB", "week time_of_week_ms quality"),
+    (0x10, "TIME", CLUSTER, "HIB", "week time_of_week_ms quality", ""),
     # Unit vector to the sun at a GPS second, in 2^-30, and its rate, in 2^-28 a second (the
     # sun's 7.3e-5 rad/s would not fit 16 bits of 2^-30); the only thing that renews the lease.
-    (0x11, "SUN", CLUSTER, "Iiiihhh", "time_s east north up east_rate north_rate up_rate"),
+    (0x11, "SUN", CLUSTER, "Iiiihhh", "time_s east north up east_rate north_rate up_rate", ""),
     # The sender's session: its epoch, which rises with every start; the upper bits of its
     # sequence; and the token of the authority that commands through it (0: nobody).
-    (0x12, "SESSION", CLUSTER, "IHI", "epoch rollover token"),
+    (0x12, "SESSION", CLUSTER, "IHI", "epoch rollover token", ""),
     # Take the beam off the receiver, now.
-    (0x20, "DEFOCUS", ANYONE, "", ""),
+    (0x20, "DEFOCUS", ANYONE, "", "", "manual"),
     # Go to the stow position: one heliostat, or all by broadcast.
-    (0x21, "STOW", ANYONE, "", ""),
+    (0x21, "STOW", ANYONE, "", "", "manual"),
     # Leave stow for standby by the safe way.
-    (0x30, "APPROACH", AUTHORITY, "", ""),
+    (0x30, "APPROACH", AUTHORITY, "", "", "operator moves standby automatic sliced"),
     # Hold position, ready.
-    (0x31, "IDLE", AUTHORITY, "", ""),
+    (0x31, "IDLE", AUTHORITY, "", "", "operator moves standby manual"),
     # Track the sun onto the aim.
-    (0x32, "TRACK", AUTHORITY, "", ""),
+    (0x32, "TRACK", AUTHORITY, "", "", "operator moves joins automatic"),
     # Back from defocus to the aim.
-    (0x33, "REFOCUS", AUTHORITY, "", ""),
+    (0x33, "REFOCUS", AUTHORITY, "", "", "operator moves joins automatic"),
     # Release a lock.
-    (0x34, "UNLOCK", AUTHORITY, "", ""),
+    (0x34, "UNLOCK", AUTHORITY, "", "", "operator releases stands"),
     # Leave FAULT once its cause is gone.
-    (0x35, "CLEAR_FAULT", AUTHORITY, "", ""),
+    (0x35, "CLEAR_FAULT", AUTHORITY, "", "", "releases stands"),
     # Stop and hold position.
-    (0x36, "LOCK", AUTHORITY, "", ""),
+    (0x36, "LOCK", AUTHORITY, "", "", "operator harmless stands manual"),
     # Aim point of the beam, ENU.
-    (0x40, "AIM", AUTHORITY, "fff", "east_m north_m up_m"),
+    (0x40, "AIM", AUTHORITY, "fff", "east_m north_m up_m", "operator point"),
     # Hold the aim against changes.
-    (0x41, "LOCK_AIM", AUTHORITY, "B", "locked"),
+    (0x41, "LOCK_AIM", AUTHORITY, "B", "locked", "operator harmless setting"),
     # Move one axis by hand: up and down, east and west.
-    (0x42, "JOG", AUTHORITY, "Bi", "axis steps"),
+    (0x42, "JOG", AUTHORITY, "Bi", "axis steps", "moves counts stands relative manual"),
     # Move to step counts.
-    (0x43, "GOTO", AUTHORITY, "ii", "primary secondary"),
+    (0x43, "GOTO", AUTHORITY, "ii", "primary secondary", "moves counts stands again manual"),
     # Rough (1) or fine (0) stepping: by full steps of the motors where SET_STEPPING has told them,
     # else by 16 steps at a time.
-    (0x44, "ROUGH", AUTHORITY, "B", "rough"),
+    (0x44, "ROUGH", AUTHORITY, "B", "rough", "harmless setting"),
     # Move the beam in a spiral about its aim until the target's camera finds it.
-    (0x45, "SEARCH", AUTHORITY, "ff", "pitch_rad radius_rad"),
+    (0x45, "SEARCH", AUTHORITY, "ff", "pitch_rad radius_rad", "operator moves joins again manual"),
     # Move a little and back, and check whether the mirror moved.
-    (0x46, "DIAGNOSE", AUTHORITY, "", ""),
+    (0x46, "DIAGNOSE", AUTHORITY, "", "", "moves counts stands again manual"),
     # Standby point beside the receiver, ENU.
-    (0x47, "STANDBY", AUTHORITY, "fff", "east_m north_m up_m"),
+    (0x47, "STANDBY", AUTHORITY, "fff", "east_m north_m up_m", "operator point stored"),
     # Axes, origins, vertex and normal of the calibrated heliostat, in place of a matrix.
-    (0x50, "SET_ARMATURE", KEY, "18d", "numbers"),
+    (0x50, "SET_ARMATURE", KEY, "18d", "numbers", ""),
     # Conversion of steps to angles.
-    (0x51, "SET_DRIVES", KEY, "BB10d", "axis kind numbers"),
+    (0x51, "SET_DRIVES", KEY, "BB10d", "axis kind numbers", ""),
     # Biases of the angles.
-    (0x52, "SET_BIAS", KEY, "ff", "primary_rad secondary_rad"),
+    (0x52, "SET_BIAS", KEY, "ff", "primary_rad secondary_rad", ""),
     # The heliostat's location, ENU.
-    (0x53, "SET_POSITION", KEY, "ddd", "east_m north_m up_m"),
+    (0x53, "SET_POSITION", KEY, "ddd", "east_m north_m up_m", ""),
     # Address on the bus.
-    (0x54, "SET_ADDRESS", KEY, "IH", "serial address"),
+    (0x54, "SET_ADDRESS", KEY, "IH", "serial address", ""),
     # Declare the present step counts.
-    (0x55, "ZERO", KEY, "ii", "primary secondary"),
+    (0x55, "ZERO", KEY, "ii", "primary secondary", "stands"),
     # Step counts of the stow position.
-    (0x56, "SET_STOW", KEY, "ii", "primary secondary"),
+    (0x56, "SET_STOW", KEY, "ii", "primary secondary", ""),
     # Range, rate and backlash of an axis.
     (0x57, "SET_LIMITS", KEY, "BiiIIH",
-     "axis low high rate_steps_per_s acceleration_steps_per_s2 backlash"),
+     "axis low high rate_steps_per_s acceleration_steps_per_s2 backlash", ""),
     # Angles by which the axes turn when defocused.
-    (0x58, "SET_DEFOCUS", KEY, "ff", "primary_rad secondary_rad"),
+    (0x58, "SET_DEFOCUS", KEY, "ff", "primary_rad secondary_rad", ""),
     # The safe way from stow: the axis (0 or 1) that moves first when leaving and last when
     # returning, the number of points (0: the way is found without them), and the points
     # that the beam passes on its way from the ground to the standby point, ENU.
-    (0x59, "SET_WAY", KEY, "BB12f", "azimuth_axis points path_m"),
+    (0x59, "SET_WAY", KEY, "BB12f", "azimuth_axis points path_m", ""),
     # Microsteps of a full step of each motor, and whether the drivers rest (0, 1): then stepping is
     # rough from the start, motions that follow the sun end on full steps, and the drivers are off
     # between them.
-    (0x5A, "SET_STEPPING", KEY, "HHB", "microsteps_primary microsteps_secondary rests"),
+    (0x5A, "SET_STEPPING", KEY, "HHB", "microsteps_primary microsteps_secondary rests", ""),
     # Key of the bus, encrypted under the key of the local controller; it needs no session and no
     # clock. The present key again ends the one before; zeros end both.
-    (0x5B, "SET_BUS_KEY", KEY, "4I", "key"),
+    (0x5B, "SET_BUS_KEY", KEY, "4I", "key", ""),
 )  # fmt: skip
+
+
+def having(trait: str) -> "frozenset[str]":
+    """Return the names of the messages with a trait."""
+    return frozenset([row[1] for row in MESSAGES if trait in row[5].split()])
+
+
+#: Commands that anyone may give at any time.
+SAFE = frozenset([row[1] for row in MESSAGES if row[2] == ANYONE])
+MOTIONS = having("moves")
+JOINING = having("joins")
+TO_STANDBY = having("standby")
+BY_COUNTS = having("counts")
+SLICED = having("sliced")
+RELEASES = having("releases")
+STANDS = having("stands")
+POINTS = having("point")
+SETTINGS = having("setting")
+HARMLESS = having("harmless")
+RELATIVE = having("relative")
+AGAIN = having("again")
+STORED = having("stored")
+BY_OPERATORS = having("operator")
+TAKES_FROM_AUTOMATIC = having("manual")
+GIVES_TO_AUTOMATIC = having("automatic")
 
 NUMBER_OF = {row[1]: row[0] for row in MESSAGES}
 ROW_OF = {row[0]: row for row in MESSAGES}

@@ -63,11 +63,16 @@ def transitions() -> list[tuple[int, str, int, str]]:
     return found
 
 
-#: Bits of the flags.
+#: Flags of STATUS, from bit 0 up.
 FLAGS = ("MOVING", "SUN_FRESH", "CLOCK_SET", "CONFIGURED", "READY", "AT_STOW", "AIM_LOCKED",
          "ROUGH", "COUNTS_DOUBTFUL", "COUNTS_UNKNOWN", "UNREACHABLE", "CUT", "CLOCK_JUMPED",
          "TICKS_JUMPED", "FAULT_PRESENT", "DIAGNOSING", "SUN_JUMPED", "LOCAL_SWITCH",
          "BUS_KEY", "SESSION_WANTED")  # fmt: skip
+# Their bits.
+(MOVING, SUN_FRESH, CLOCK_SET, CONFIGURED, READY, AT_STOW, AIM_LOCKED,
+ ROUGH, COUNTS_DOUBTFUL, COUNTS_UNKNOWN, UNREACHABLE, CUT, CLOCK_JUMPED,
+ TICKS_JUMPED, FAULT_PRESENT, DIAGNOSING, SUN_JUMPED, LOCAL_SWITCH,
+ BUS_KEY, SESSION_WANTED) = [1 << bit for bit in range(20)]  # fmt: skip
 
 #: Faults.
 FAULTS = ("none", "primary drive stuck", "secondary drive stuck", "limit switch", "supply",

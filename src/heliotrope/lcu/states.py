@@ -34,6 +34,23 @@ STATES = (
 #: States that need a fresh sun to enter and to stay in: LAPSED leaves them.
 NEED_SUN = (APPROACHING, TRACKING, SEARCHING)
 
+#: States in which a beam is at its aim.
+ON_AIM = (TRACKING, SEARCHING)
+#: States in which a beam is at the receiver or the standby point, or on its way there.
+BEAM_OUT = (APPROACHING, IDLE, TRACKING, SEARCHING)
+#: States in which a heliostat is neither at stow nor on its way there, and obeys STOW.
+UP = (APPROACHING, IDLE, TRACKING, SEARCHING, DEFOCUSED)
+#: States from which a heliostat can be sent to a target.
+AVAILABLE = (IDLE, TRACKING)
+#: States in which a beam leaves, or has left, by DEFOCUS or STOW.
+LEAVING = (DEFOCUSED, STOWING)
+#: States in which a heliostat is at stow or on its way there.
+TO_STOW = (STOWED, STOWING)
+#: States in which a beam is off and a command brings it out again.
+AWAY = (STOWED, DEFOCUSED)
+#: States that STOW does not change, though the mirror may turn away or go to stow in them.
+KEPT = (UNCONFIGURED, LOCKED, FAULT)
+
 TABLE = """
 UNCONFIGURED DEFOCUS UNCONFIGURED defocus
 UNCONFIGURED STOW UNCONFIGURED stow_directly

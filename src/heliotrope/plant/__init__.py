@@ -18,13 +18,11 @@ from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
 from heliotrope.plant.field_state import FieldState, HeliostatState
-from heliotrope.plant.ordered import JOINING
 from heliotrope.plant.refusals import Refusal, RefusedError
 from heliotrope.plant.settings import PlantSettings, clusters_of
 from heliotrope.plant.tickets import Ticket
 
 __all__ = [
-    "JOINING",
     "OPERATOR_COMMANDS",
     "Assigned",
     "AssignedError",

@@ -21,8 +21,8 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, normalize
+from heliotrope.lcu import messages, states
 from heliotrope.lcu import names as meanings
-from heliotrope.lcu import states
 from heliotrope.links.messages import ClusterStatus
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.board_items import packed
@@ -45,14 +45,10 @@ _SETTLE = 1.0
 _CLOSING = 1e-4
 #: The motion of the sun is taken over this time, s.
 _SPAN = 10.0
-#: Commands after which an idle heliostat holds still.
-_STILL = ("JOG", "GOTO", "DIAGNOSE", "LOCK", "UNLOCK", "CLEAR_FAULT", "ZERO")
-#: Longest time that one of them is under way to its heliostat, s.
+#: Longest time that a command of `messages.STANDS` is under way to its heliostat, s.
 _UNDER_WAY = 15.0
 #: States from which a heliostat that is ready comes to IDLE by following its standby point.
 _COMES = (states.APPROACHING, states.TRACKING, states.SEARCHING, states.DEFOCUSED)
-_ON_AIM = (states.TRACKING, states.SEARCHING)
-_READY = 1 << meanings.FLAGS.index("READY")
 
 Rows = npt.NDArray[np.intp]
 
@@ -156,7 +152,7 @@ class Agreement:
         self, name: str, values: Sequence[float], heliostats: Collection[str], now: float
     ) -> None:
         """Note a command that has been sent."""
-        if name != "SEARCH" and name not in _STILL:
+        if name != "SEARCH" and name not in messages.STANDS:
             return
         rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
         if name == "SEARCH":
@@ -231,10 +227,10 @@ class Agreement:
         """Find which beams are sent to which points; return those for which that has changed."""
         field = self._field
         live, state = field.live(now), field.rows["state"].astype(np.int64)
-        ready = live & (state == states.IDLE) & (field.rows["flags"] & _READY != 0)
+        ready = live & (state == states.IDLE) & (field.rows["flags"] & meanings.READY != 0)
         came = ready & np.isin(self._states, _COMES) & (self._stilled_at < now - _UNDER_WAY)
         at_rest = np.where(live, ready & (self._at_rest | came), self._at_rest)
-        on_aim = live & np.isin(state, _ON_AIM)
+        on_aim = live & np.isin(state, states.ON_AIM)
         on_aim &= (state == states.TRACKING) | np.isfinite(self._radius)
         begins = (on_aim & ~self._on_aim) | (at_rest & ~self._at_rest)
         self._since[begins] = now

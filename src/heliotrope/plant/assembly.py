@@ -60,8 +60,6 @@ _SENSED = 0.5
 _WITNESSED = 5.0
 #: The audit has changed limits in this name.
 _PLANT_FILE = Person("plant file", Role.ENGINEER)
-#: States that STOW does not change: only their motion shows whether such heliostats obey.
-_HELD = (states.FAULT, states.LOCKED, states.UNCONFIGURED)
 
 
 class MachineTables(Enum):
@@ -327,7 +325,8 @@ class PlantAssembly:
         """Return the heliostats that an order leads to stow and that are not there, (N,)."""
         rows = self.plant.field
         away = (rows.age(now) <= SILENT) & ~(rows.live(now) & at_stow(rows.rows))
-        stands = rows.among(_HELD, now) & (now - self._moved_at > _STANDS)
+        # In these states only the motion shows whether a heliostat obeys STOW.
+        stands = rows.among(states.KEPT, now) & (now - self._moved_at > _STANDS)
         return np.asarray(away & ~stands)
 
     def to_stow(self) -> tuple[dict[str, int], float]:

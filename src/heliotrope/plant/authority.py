@@ -22,6 +22,7 @@ from enum import IntEnum
 
 from heliotrope import safety
 from heliotrope.errors import InputError
+from heliotrope.lcu import messages
 from heliotrope.links.clock import Clock
 from heliotrope.plant import refusals
 from heliotrope.plant.refusals import RefusedError
@@ -63,23 +64,8 @@ class Role(IntEnum):
         }[self]
 
 
-#: Wire commands that an operator may give; all others need an engineer.
-OPERATOR_COMMANDS = frozenset(
-    {
-        "APPROACH",
-        "IDLE",
-        "TRACK",
-        "REFOCUS",
-        "LOCK",
-        "UNLOCK",
-        "AIM",
-        "STANDBY",
-        "LOCK_AIM",
-        "SEARCH",
-    }
-)
-
-
+#: Commands of the wire that an operator may give; all others need an engineer.
+OPERATOR_COMMANDS = messages.BY_OPERATORS
 #: Tokens of mandates are above those of the wire, which have 32 bits.
 _MANDATES = 1 << 32
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.geometry import FloatArray
-from heliotrope.lcu import states
+from heliotrope.lcu import messages, states
 from heliotrope.lcu.diagnosis import NUDGE
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
@@ -19,7 +19,7 @@ from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import BEFORE, KINDS, Points
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.leaving import way_out
-from heliotrope.plant.ordered import JOINING, OFF, Ordered
+from heliotrope.plant.ordered import Ordered
 from heliotrope.plant.parameters import Tables
 from heliotrope.plant.refusals import BEAM_REFUSED, STILL_MOVING, RefusedError
 from heliotrope.plant.unsent import TURNS, UnsentBeams
@@ -32,13 +32,10 @@ Rows = npt.NDArray[np.intp]
 LOOK_PERIOD = 1.0
 #: A heliostat moves if its counts and goals differ by more steps than this.
 _MOVES = 200
-#: States whose motions were commanded: the whole way is looked at. Of every other state the present
-#: pose and the end of the motion are, as a way to safety is never held up.
-_COMMANDED = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)
 #: Where stow is not known: an approach turns by more than this (rad) only when it leaves stow.
 _FROM_STOW = 0.15
 #: Commands whose whole motion is proven before they are sent.
-_PROVEN = ("APPROACH", "IDLE", "JOG", "GOTO", "DIAGNOSE")
+_PROVEN = messages.TO_STANDBY | messages.BY_COUNTS
 #: States from which IDLE moves a heliostat straight to its standby point; from the last two it
 #: does so once the heliostat has been unlocked, or its fault cleared, which no report may show yet.
 _TO_STANDBY = (
@@ -152,7 +149,7 @@ class BeamWatch:
         if not self._check.volumes:
             return {}
         if name == "AIM":  # those that track join it, and are examined then
-            return self.ordered.unshown(rows, JOINING)
+            return self.ordered.unshown(rows, messages.JOINING)
         state = self._field.rows["state"][rows]
         found = self.ordered.unshown(rows[np.isin(state, _TO_STANDBY)])
         return found | self._unsettled(rows[state == states.IDLE])
@@ -205,7 +202,7 @@ class BeamWatch:
 
     def _from_stow(self, rows: Rows) -> dict[str, str]:
         """Return which heliostats have no free way from stow to standby, and why."""
-        early = self.ordered.unshown(rows, OFF)
+        early = self.ordered.unshown(rows, messages.SAFE)
         rows, wrong = self._resting(rows)
         if not self._check.volumes:
             wrong = {}  # a way to a point that is not known here is not proven
@@ -357,7 +354,7 @@ class BeamWatch:
         }
         if not unknown.all():
             light = self._sun(0.0)
-            found |= self.ordered.unshown(rows, OFF) | self.ordered.silent(rows, now)
+            found |= self.ordered.unshown(rows, messages.SAFE) | self.ordered.silent(rows, now)
             possible = self.points.possible("AIM", rows[~unknown])
             for known, places in [(rows, aims)] if new else possible:
                 found |= self._by_earlier(known, places)
@@ -487,7 +484,9 @@ class BeamWatch:
         rows, moves, state = every[chosen], moves[chosen], state[chosen]
         begin, end = begin[chosen], end[chosen]
         light = self._sun(0.0)
-        follows = moves & np.isin(state, _COMMANDED)
+        # A commanded motion is looked at on its whole way; of every other, the present pose and the
+        # end are, as a way to safety is never held up.
+        follows = moves & np.isin(state, states.BEAM_OUT)
         turns = follows & self._leaves_stow(rows, state, begin, end)
         both, ends = follows & ~turns, moves & ~follows
         stand = np.concatenate([rows[~follows], rows[ends]])

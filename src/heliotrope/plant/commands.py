@@ -23,18 +23,13 @@ from heliotrope.plant.given import Given
 from heliotrope.plant.joining import Assign, Clear, JoiningJob, JoinQueue, in_slices
 from heliotrope.plant.locks import Locks
 from heliotrope.plant.movements import Movements
-from heliotrope.plant.ordered import JOINING
 from heliotrope.plant.orders import PlantOrders, whole
-from heliotrope.plant.permission import SETTINGS, Permission
+from heliotrope.plant.permission import Permission
 from heliotrope.plant.stepping import Stepping
 from heliotrope.plant.tickets import Ticket
 
-#: Commands that assign points; `Commands.point` proves their beams.
-POINTS = frozenset({"AIM", "STANDBY"})
 #: Work of the disk, and its reverse.
 Storing = tuple[Work, Callable[..., object]]
-#: States in which a beam is at its aim.
-_ON_AIM = (states.TRACKING, states.SEARCHING)
 #: A new point so near the last one, and both so far off all receivers, bring no light there, m.
 _BESIDE = 3.0
 
@@ -143,8 +138,9 @@ class Commands:
     ) -> Ticket:
         """Give a command without points; see `PlantController.command`."""
         row = wire.ROW_OF.get(wire.NUMBER_OF.get(name, -1))
-        if row is None or row[2] != wire.AUTHORITY or name in POINTS:
-            known = [r[1] for r in wire.MESSAGES if r[2] == wire.AUTHORITY and r[1] not in POINTS]
+        if row is None or row[2] != wire.AUTHORITY or name in wire.POINTS:
+            known = [r[1] for r in wire.MESSAGES if r[2] == wire.AUTHORITY]
+            known = [each for each in known if each not in wire.POINTS]
             raise UnknownNameError("command (points are given by aim and standby)", name, known)
         numbers = whole(values, row[3], name)
         self._authority.check(person, token, name)
@@ -156,7 +152,7 @@ class Commands:
         accept = self._permission.accept
         store = self._lock_record(clear, token) if name == "LOCK" else None
         ticket = accept(person, token, name, numbers, names, store=store, blocked=blocked)
-        if name not in SETTINGS:
+        if name not in wire.SETTINGS:
             # A heliostat that still waits to join must not undo a later command.
             self._joining.drop(f"superseded by {name}", frozenset(names))
         self._orders.when_recorded(ticket, partial(self._send, ticket, numbers, clear, token))
@@ -183,7 +179,7 @@ class Commands:
             others = tuple(n for n in left if n not in out)
             left, wrong = self.examine(name, numbers, others, token)
             ticket.block({**wrong, **out})
-            if name not in SETTINGS:
+            if name not in wire.SETTINGS:
                 # One that was given before it may have joined the queue after its acceptance.
                 self._joining.drop(f"superseded by {name}", frozenset(left))
         if left and name == "LOCK":
@@ -191,7 +187,7 @@ class Commands:
         if name == "ROUGH":
             self._stepping.ordered(left, bool(numbers[0]))
         if left:
-            waits = name in JOINING or in_slices(name, left)
+            waits = name in wire.JOINING or in_slices(name, left)
             send = self._join if waits else self._orders.command
             send(ticket, name, numbers, left, token)
 
@@ -315,7 +311,7 @@ class Commands:
 
     def _destined(self, name: str, names: Sequence[str]) -> FloatArray | None:
         """Return the aims (K, 3) to which a command sends beams; None: it sends them to none."""
-        return self._aims(self._places(names)) if name in JOINING else None
+        return self._aims(self._places(names)) if name in wire.JOINING else None
 
     def _aims(self, rows: npt.NDArray[np.intp]) -> FloatArray:
         return np.asarray(self._ways.points.aims[rows])
@@ -418,7 +414,7 @@ class Commands:
         if new.name != "AIM":
             return frozenset()
         rows = self._places(new.names)
-        moves = self._field.among(_ON_AIM, self._now())[rows]
+        moves = self._field.among(states.ON_AIM, self._now())[rows]
         if new.free is not None:
             return frozenset(new.names[i] for i in np.flatnonzero(moves)) - new.free()
         return frozenset(
@@ -434,7 +430,7 @@ class Commands:
             If one of them may not.
         """
         rows = self._places(names)
-        tracking = self._field.among(_ON_AIM, self._now())[rows]
+        tracking = self._field.among(states.ON_AIM, self._now())[rows]
         moves = tracking if name == "AIM" else self._field.among((states.IDLE,), self._now())[rows]
         moved = [names[i] for i in np.flatnonzero(moves)]
         if wrong := self._permission.unready(name, moved, wanted[moves]):

@@ -28,6 +28,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.volumes import Volume
 from heliotrope.files.disk import AtOnce, Disk
 from heliotrope.geometry import FloatArray
+from heliotrope.lcu import messages
 from heliotrope.lcu.journal import CODES_OF
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.common_settings import settings_checksum
@@ -747,7 +748,7 @@ class PlantController:
         InputError
             An unknown name, or values that do not fit.
         """
-        if name in ("DEFOCUS", "STOW"):
+        if name in messages.SAFE:
             return self._safe(person.name, Act[name], heliostats)
         return self._commands.give(person, token, name, heliostats, values)
 

@@ -21,10 +21,6 @@ from heliotrope.plant import refusals
 from heliotrope.plant.field_state import FieldState, Mask
 from heliotrope.safety import Alarm, alarms
 
-_DOUBTFUL = 1 << meanings.FLAGS.index("COUNTS_DOUBTFUL")
-#: Counts that are not known at all are a fault of their own, which only ZERO ends.
-_UNKNOWN = 1 << meanings.FLAGS.index("COUNTS_UNKNOWN")
-
 
 class Doubts:
     """Doubts of local controllers about their step counts.
@@ -114,7 +110,9 @@ class Doubts:
 
     def _judge(self, rows: list[int]) -> None:
         found = self._field.rows[rows]
-        doubtful = found["flags"] & (_DOUBTFUL | _UNKNOWN) == _DOUBTFUL
+        # Counts that are not known at all are a fault of their own, which only ZERO ends.
+        doubtful = found["flags"] & meanings.COUNTS_DOUBTFUL != 0
+        doubtful &= found["flags"] & meanings.COUNTS_UNKNOWN == 0
         doubtful &= found["boots"] != self._confirmed[rows]
         changed = np.flatnonzero(doubtful != self.standing[rows])
         self.standing[rows] = doubtful

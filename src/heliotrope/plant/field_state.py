@@ -27,8 +27,6 @@ _HELD = (states.LOCKED, states.FAULT)
 #: Goals that differ by more steps than this belong to another motion.
 _TURN = 200
 
-_UNKNOWN = 1 << meanings.FLAGS.index("COUNTS_UNKNOWN")
-
 Mask = npt.NDArray[np.bool_]
 
 
@@ -186,7 +184,7 @@ class FieldState:
         self.heard[mine] = at - 1e-3 * new["heard_ms"].astype(np.float64)
         steps = new["steps_ms"].astype(np.float64)
         self.counted_at[mine] = np.where(steps < NEVER, at - 1e-3 * steps, -np.inf)
-        known = (steps < NEVER) & (new["flags"] & _UNKNOWN == 0)
+        known = (steps < NEVER) & (new["flags"] & meanings.COUNTS_UNKNOWN == 0)
         self.posed[mine[known]] = self.counts(mine[known])
         self.posed_state[mine[known]] = new["state"][known]
         self.posed_at[mine[known]] = self.counted_at[mine[known]]
@@ -264,7 +262,7 @@ class FieldState:
 
     def sure(self, now: float) -> Mask:
         """Return which heliostats are live and know their step counts, (N,)."""
-        known = (self.rows["flags"] & _UNKNOWN == 0) & np.isfinite(self.counted_at)
+        known = (self.rows["flags"] & meanings.COUNTS_UNKNOWN == 0) & np.isfinite(self.counted_at)
         return np.asarray(self.live(now) & known)
 
     def among(self, wanted: Sequence[int], now: float) -> Mask:

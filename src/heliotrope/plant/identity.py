@@ -19,12 +19,8 @@ from heliotrope.plant import refusals
 from heliotrope.plant.field_state import FieldState
 from heliotrope.safety import Act, Alarm, alarms
 
-#: States in which a heliostat is safe whoever's board it has, or on its way there. DEFOCUSED is not
-#: among them: a defocus is relative to goals, which may belong to the other mirror.
-_OFF = (states.STOWED, states.STOWING)
 #: Why a board proves nothing that stores an armature which the plant has never known.
 _UNKNOWN = "its local controller stores parameters that this plant does not know"
-_AT_STOW = 1 << meanings.FLAGS.index("AT_STOW")
 
 
 class Identities:
@@ -170,7 +166,9 @@ class Identities:
         if not self.strange:
             return {}
         field = self._field
-        going = field.among(_OFF, now) | (field.rows["flags"] & _AT_STOW != 0)
+        # DEFOCUSED is not among them: a defocus is relative to goals, which may belong to the
+        # other mirror.
+        going = field.among(states.TO_STOW, now) | (field.rows["flags"] & meanings.AT_STOW != 0)
         needed = field.live(now) & ~going
         return {
             name: (Act.STOW, f"{name}: {text}")

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+from heliotrope.lcu import messages
 from heliotrope.links.messages import Stage
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.beam_watch import BeamError, BeamWatch
@@ -16,8 +17,8 @@ from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import JoinLimiter
 
-#: The command that goes in slices, and the heliostats of a slice: their proof takes 30 ms.
-SLICED, SLICE = "APPROACH", 500
+#: Heliostats of a slice: their proof takes 30 ms.
+SLICE = 500
 #: Returns which of some heliostats may be sent a command with values, and why the others may not.
 Examine = Callable[
     [str, tuple[float, ...], tuple[str, ...]], tuple[tuple[str, ...], dict[str, str]]
@@ -33,7 +34,7 @@ Lost = Callable[[int, Iterable[str]], frozenset[str]]
 
 def in_slices(name: str, heliostats: Sequence[str]) -> bool:
     """Whether a command to some heliostats is examined and sent in slices."""
-    return name == SLICED and len(heliostats) > SLICE
+    return name in messages.SLICED and len(heliostats) > SLICE
 
 
 @dataclass
@@ -74,7 +75,7 @@ class JoinQueue:
 
     def __len__(self) -> int:
         """Return how many wait to join the receiver."""
-        return sum(len(job.waiting) for job in self._jobs if job.name != SLICED)
+        return sum(len(job.waiting) for job in self._jobs if job.name not in messages.SLICED)
 
     def waiting(self, name: str) -> frozenset[str]:
         """Return the heliostats that wait with a command."""
@@ -102,12 +103,12 @@ class JoinQueue:
         self._limiter, granted = self._limiter.admit(len(self), now)
         leave, admitted = SLICE, []
         for job in self._jobs:
-            most = leave if job.name == SLICED else granted
+            most = leave if job.name in messages.SLICED else granted
             part = tuple(job.waiting.popleft() for _ in range(min(most, len(job.waiting))))
             if not part:
                 continue
             admitted.append((job, part))
-            if job.name == SLICED:
+            if job.name in messages.SLICED:
                 leave -= len(part)
             else:
                 granted -= len(part)
@@ -189,7 +190,7 @@ class JoinDispatcher:
 
     def _wrong(self, job: JoiningJob, part: tuple[str, ...]) -> dict[str, str]:
         """Return which heliostats whose turn has come may not go, and why."""
-        if job.name != SLICED:
+        if job.name not in messages.SLICED:
             wrong = self._beams.joining(job.name, job.values, part, self._now())
             return wrong | self._barred(job.name, part)
         try:

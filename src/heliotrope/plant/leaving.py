@@ -19,8 +19,6 @@ from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.ways import motion_of
 from heliotrope.safety import Act
 
-#: States from which a mirror does not turn nearer to its standby point, wherever it stands.
-_AT_AIM = (states.TRACKING, states.SEARCHING)
 #: Turn of the axes between two poses that are looked at, rad.
 _PIECE = 0.02
 #: One in IDLE or LOCKED stands by if its axes are this near to the angles of standby, rad.
@@ -88,7 +86,7 @@ def defocused(
     drives = Drive(check.drives.table[row])
     begin = as_float(drives.angles(counts))
     stood = _angles(check, row, standby, counts, sun)
-    if state in _AT_AIM:
+    if state in states.ON_AIM:  # it does not turn nearer to its standby point
         return turned_away(begin, machine, drives, None, stood)
     if machine is not None and standby is not None and stood is not None:
         end = _down(check, machine, row, counts, sun, state, standby)

@@ -17,10 +17,8 @@ import numpy.typing as npt
 
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
+from heliotrope.lcu import messages
 
-#: Commands that move nothing, now or later: they may be given to a heliostat out of service. ZERO
-#: and PARAMETERS are not among them: the next STOW would go where stow is by then.
-STILL = frozenset({"LOCK", "LOCK_AIM", "ROUGH"})
 #: Name of the tower among what is locked.
 TOWER = "tower"
 #: A beam whose aim is this close to the edge of a locked surface counts as on it, m.
@@ -141,7 +139,8 @@ class Lockouts:
         points
             Where it sends their beams, ENU, m, (K, 3); None: to no surface.
         """
-        if command in STILL or not self._locks:
+        # ZERO and PARAMETERS are not harmless: the next STOW would go where stow is by then.
+        if command in messages.HARMLESS or not self._locks:
             return {}
         reasons: dict[str, str] = {}
         if points is not None:

@@ -15,11 +15,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
+from heliotrope.lcu import messages, states
 from heliotrope.lcu import names as meanings
-from heliotrope.lcu import states
 from heliotrope.plant.assigned import Held, Places
 from heliotrope.plant.field_state import FieldState
-from heliotrope.plant.ordered import OFF, STOWING, Ordered
+from heliotrope.plant.ordered import STOWING, Ordered
 
 #: A report from this long after a lock was sent shows it, s.
 _SHOWN = 1.0
@@ -29,7 +29,6 @@ _AGAIN, _LONGEST = 3.0, 300.0
 CERTAIN = 3600.0
 #: Instead of an order: a person must give it.
 _WAIT = "wait"
-_AT_STOW = 1 << meanings.FLAGS.index("AT_STOW")
 
 
 @dataclass
@@ -104,7 +103,7 @@ class Locks:
         if visit:
             return f"{visit} has locked it {since}, until its parameters are written and read back"
         left = "a visit that the plant's program did not survive" if lock.recalled else "a visit"
-        off = lock.recalled or self._ordered.since(heliostat, OFF, lock.since)
+        off = lock.recalled or self._ordered.since(heliostat, messages.SAFE, lock.since)
         there = "at stow, " if off else ""
         return (
             f"{left} has left it locked ({since}); the plant unlocks it {there}as soon as motions "
@@ -155,8 +154,8 @@ class Locks:
             return "IDLE" if lock.released and node["state"] == states.IDLE else ""
         if lock.uncertain:
             return _WAIT
-        off = lock.recalled or self._ordered.since(name, OFF, lock.since)
-        return "STOW" if off and not node["flags"] & _AT_STOW else "UNLOCK"
+        off = lock.recalled or self._ordered.since(name, messages.SAFE, lock.since)
+        return "STOW" if off and not node["flags"] & meanings.AT_STOW else "UNLOCK"
 
     def sent(self, what: str, heliostats: Iterable[str]) -> None:
         """Note an order that has been given; one that is not obeyed is given again."""

@@ -13,27 +13,23 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.geometry import FloatArray
-from heliotrope.lcu import states
+from heliotrope.lcu import messages, states
 from heliotrope.plant import refusals
 from heliotrope.plant.field_state import FieldState
 
-#: Commands that bring beams to the receiver or move them across it.
-JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
-#: Commands that move heliostats by their parameters.
-MOTIONS = JOINING | {"APPROACH", "IDLE", "JOG", "GOTO", "DIAGNOSE"}
-#: Orders that send heliostats off, and those that send them to stow.
-OFF, STOWING = frozenset({"DEFOCUS", "STOW"}), frozenset({"STOW"})
 #: Orders after which a heliostat may be out again.
-_OUT = MOTIONS | {"UNLOCK", "CLEAR_FAULT"}
+_OUT = messages.MOTIONS | messages.RELEASES
 #: States in which a new point moves a heliostat.
-_POINTS = {"AIM": (states.TRACKING, states.SEARCHING), "STANDBY": (states.IDLE,)}
+_POINTS = {"AIM": states.ON_AIM, "STANDBY": (states.IDLE,)}
 #: Orders that move.
-MOVING = MOTIONS | OFF | frozenset(_POINTS)
+MOVING = messages.MOTIONS | messages.SAFE | messages.POINTS
+#: Orders that send heliostats to stow.
+STOWING = frozenset({"STOW"})
 #: From an order to a report that the board may have made before it took the order, s.
 _TAKEN_WITHIN = 1.0
 
 #: States in which a heliostat is off already: an order does not take it off.
-_GONE = (states.DEFOCUSED, states.STOWING, states.STOWED)
+_GONE = (*states.LEAVING, states.STOWED)
 
 Rows = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
@@ -51,7 +47,7 @@ class Ordered:
     def __init__(self, field: FieldState) -> None:
         self._field = field
         #: Times from which a report shows the last order of each kind, (N,).
-        kinds = (MOVING, OFF, JOINING, STOWING)
+        kinds = (MOVING, messages.SAFE, messages.JOINING, STOWING)
         self._shown = {kind: np.full(len(field), -np.inf) for kind in kinds}
         #: When heliostats that were out were ordered off, and when out, monotonic s, (N,).
         self._off_at, self._out_at = np.full(len(field), -np.inf), np.full(len(field), -np.inf)
@@ -63,7 +59,7 @@ class Ordered:
     def sent(self, name: str, heliostats: Sequence[str], now: float) -> None:
         """Note an order that has been sent."""
         rows = self._rows(name, heliostats)
-        if name in OFF:
+        if name in messages.SAFE:
             # One that is silent, off already, or has refused a command since it was last heard, may
             # have left before: then the order is no cause.
             gone = np.isin(self._field.rows["state"][rows], _GONE)
@@ -93,7 +89,7 @@ class Ordered:
     def taken(self, name: str, heliostats: Sequence[str], now: float) -> None:
         """Note that an order has been acknowledged: it may have been long under way."""
         rows = self._rows(name, heliostats)
-        if name in OFF:
+        if name in messages.SAFE:
             heard = rows[self._field.live(now)[rows]]
             last = heard[self._off_at[heard] > self._out_at[heard]]
             self._off_at[last], self._obeyed[last] = now, True
@@ -114,7 +110,7 @@ class Ordered:
     def since(self, heliostat: str, kind: frozenset[str], at: float) -> bool:
         """Return whether a heliostat was sent an order of a kind since a time, monotonic s.
 
-        ``kind`` is `OFF` or `STOWING`.
+        ``kind`` is `messages.SAFE` or `STOWING`.
         """
         return bool(self._shown[kind][self._field.index[heliostat]] > at)
 
@@ -135,7 +131,7 @@ class Ordered:
     def unshown(self, rows: Rows, kind: frozenset[str] = MOVING) -> dict[str, str]:
         """Return which heliostats (K,) have told nothing since an order, and why others wait.
 
-        ``kind`` is what counts: MOVING, OFF or JOINING.
+        ``kind`` is what counts: MOVING, `messages.SAFE` or `messages.JOINING`.
         """
         late = self._field.heard[rows] < self._shown[kind][rows]
         return {self._field.names[row]: refusals.PLACE_UNKNOWN.text for row in rows[late]}

@@ -9,6 +9,7 @@ from itertools import islice
 
 from heliotrope.errors import InputError
 from heliotrope.files.disk import Disk, DiskBusyError, Work
+from heliotrope.lcu import messages
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.link import SendOutcome
 from heliotrope.links.messages import Command, Emergency, Parameters, Progress, Stage
@@ -20,8 +21,6 @@ from heliotrope.plant.stowing import WAITS, StowQueue
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act
 
-#: Commands accepted from anybody.
-SAFE = ("DEFOCUS", "STOW")
 #: Reports on a message are ignored this long after it was sent, once its ticket has ended, s.
 FORGOTTEN = 60.0
 #: Pause between repetitions of DEFOCUS and STOW to heliostats that have not acknowledged, s.
@@ -36,7 +35,7 @@ _BATCH, _TURN = 256, 0.5
 #: Clusters hear of a new token within this time, s.
 _HEARD = 3.0
 #: Commands that move nothing by themselves: an emergency does not overtake them.
-_STILL = frozenset({"AIM", "STANDBY", "PARAMETERS"})
+_STILL = messages.POINTS | {"PARAMETERS"}
 #: Time allowed at the end of the plant for the records that are owed, s.
 _LAST = 10.0
 
@@ -531,7 +530,7 @@ class PlantOrders:
         def told(outcome: SendOutcome) -> None:
             under = self._under.get(identity)
             # DEFOCUS and STOW are repeated until they are acknowledged.
-            if under is None or outcome is SendOutcome.SENT or under.ticket.name in SAFE:
+            if under is None or outcome is SendOutcome.SENT or under.ticket.name in messages.SAFE:
                 return
             text = f"cluster {under.cluster}: {outcome.value}"
             under.ticket.advance(under.heliostats, Stage.FAILED, text)
@@ -587,7 +586,7 @@ class PlantOrders:
             ticket.expire(now)
             if ticket.finished and identity not in self._recording:
                 ended.append(identity)
-                unsent = "" if ticket.sent or ticket.name in SAFE else "not sent: "
+                unsent = "" if ticket.sent or ticket.name in messages.SAFE else "not sent: "
                 self._owe_result(identity, f"{unsent}{ticket.text}")
         for identity in ended:
             del self._open[identity]

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from heliotrope.geometry import FloatArray, angle_between, normalize, reflect
 from heliotrope.lcu import states
+from heliotrope.lcu.controller import HARMLESS, MACHINE, POSE
 from heliotrope.links.messages import Answer, ProtocolError
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.board_items import CALIBRATION_ITEMS, POSE_ITEMS, Wanted, checksums
@@ -21,18 +22,8 @@ from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Alarm, alarms
 
-#: States in which a controller takes items of its calibration, and items of its machine. Items that
-#: change the pose are written only where it stands still: at stow too, beside those of the machine.
-TAKES_CALIBRATION = (
-    states.UNCONFIGURED,
-    states.STOWED,
-    states.LOCKED,
-    states.FAULT,
-    states.IDLE,
-    states.DEFOCUSED,
-)
-TAKES_MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT)
-TAKES_POSE = (*TAKES_MACHINE, states.STOWED)
+#: States in which a local controller takes items that change the pose: it stands still there.
+TAKES_POSE = POSE
 #: Pause before another attempt, s.
 AGAIN = 30.0
 
@@ -300,5 +291,5 @@ class ParameterSync:
 def _takes(item: str) -> tuple[int, ...]:
     """Return the states in which an item is written."""
     if item not in CALIBRATION_ITEMS:
-        return TAKES_MACHINE
-    return TAKES_POSE if item in POSE_ITEMS else TAKES_CALIBRATION
+        return MACHINE
+    return TAKES_POSE if item in POSE_ITEMS else HARMLESS

@@ -5,7 +5,7 @@ from types import MappingProxyType
 
 from heliotrope.files.disk import Work
 from heliotrope.geometry import FloatArray
-from heliotrope.lcu import states
+from heliotrope.lcu import messages, states
 from heliotrope.plant import refusals
 from heliotrope.plant.audit import AuditError
 from heliotrope.plant.authority import Authority, Person
@@ -16,22 +16,13 @@ from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.given import Given
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.lockouts import Lockouts
-from heliotrope.plant.ordered import JOINING, MOTIONS
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.parameters import ParameterSync
 from heliotrope.plant.rivals import Rivals
 from heliotrope.plant.tickets import Ticket
 
-#: Commands that move nothing; they take no heliostat out of a visit.
-SETTINGS = frozenset({"LOCK_AIM", "ROUGH"})
 #: Commands that send beams to their aims.
-_TO_AIMS = JOINING | {"AIM"}
-#: Commands that bring beams to standby.
-_TO_STANDBY = ("APPROACH", "IDLE")
-#: States in which beams are off.
-_AWAY = (states.STOWED, states.DEFOCUSED)
-#: Commands after which a heliostat that turns away or goes to stow stands still.
-_STILL = ("UNLOCK", "CLEAR_FAULT")
+_TO_AIMS = messages.JOINING | {"AIM"}
 #: Row of the safety table for beams that are not where they were sent, and those by which beams
 #: are sent off from where they may not be.
 ASTRAY = "pointing_disagrees"
@@ -91,21 +82,21 @@ class Permission:
         """
         held = self.held(name, names)
         wrong = {} if name == "LOCK" else self._identities.barred(names)
-        if name in SETTINGS:
+        if name in messages.SETTINGS:
             wrong = wrong | self._visited(token, names)
-        if name in MOTIONS:
+        if name in messages.MOTIONS:
             wrong = self._sync.differing(names) | self._orders.to_stow(names) | wrong
-        if name in JOINING:
+        if name in messages.JOINING:
             wrong |= self._sentinel.barred(names) | self._doubts.barred(names)
             wrong |= self._untaken(names)
-        elif name in _TO_STANDBY:
+        elif name in messages.TO_STANDBY:
             wrong |= self._sentinel.barred(self._off(names), ASTRAY)
             wrong |= self._sentinel.barred(names, UNPROVEN)
             wrong |= {
                 each: refusals.STANDBY_NOT_TAKEN.text.format(reason=why)
                 for each, why in self._given.unknown("STANDBY", names).items()
             }
-        elif name in _STILL:
+        elif name in messages.RELEASES:
             for row in _SENT_OFF:
                 wrong |= self._sentinel.barred(names, row)
         wrong |= held
@@ -128,7 +119,7 @@ class Permission:
         """Return which heliostats whose turn to join has come may not be sent, and why."""
         wrong = self._sync.differing(names) | self._identities.barred(names)
         wrong |= self._doubts.barred(names)
-        if name in JOINING:
+        if name in messages.JOINING:
             wrong |= self._sentinel.barred(names) | self._untaken(names)
         return wrong
 
@@ -142,7 +133,7 @@ class Permission:
     def _off(self, names: Sequence[str]) -> tuple[str, ...]:
         """Return which heliostats are at stow or have turned away."""
         state, index = self._field.rows["state"], self._field.index
-        return tuple(name for name in names if state[index[name]] in _AWAY)
+        return tuple(name for name in names if state[index[name]] in states.AWAY)
 
     def strange(self, names: Sequence[str]) -> dict[str, str]:
         """Return which heliostats' boards are not known to be theirs, and why."""
@@ -202,7 +193,7 @@ class Permission:
             wrong = mandate.refused(heliostats)
         else:
             wrong = self._doubts.verifying(heliostats) if name in _TO_AIMS else {}
-            if name in JOINING and len(wrong) < len(heliostats):
+            if name in messages.JOINING and len(wrong) < len(heliostats):
                 blocked, wrong = {**blocked, **wrong}, {}
         if wrong:
             raise BeamError(name, wrong)
@@ -213,7 +204,7 @@ class Permission:
         except AuditError as error:
             raise refusals.NOT_RECORDED.error(what=name, problem=error) from None
         ticket.block(blocked)
-        if mandate is None and name not in SETTINGS:
+        if mandate is None and name not in messages.SETTINGS:
             self._authority.prevail(ticket.waiting(heliostats), f"{person.name} ordered {name}")
         return ticket
 
@@ -246,6 +237,6 @@ class Permission:
         """Return why no new motion may begin in a cluster, "" if it may; all take LOCK."""
         reason = "" if name == "LOCK" else self._sentinel.refusal((cluster,))
         # The sun is needed to follow it, and to stand at standby; work at the mirrors is not.
-        if name in JOINING or name in _TO_STANDBY:
+        if name in messages.JOINING or name in messages.TO_STANDBY:
             reason = reason or self._sentinel.night
         return reason or self._rivals.refusal((cluster,))

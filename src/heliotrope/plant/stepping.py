@@ -16,7 +16,6 @@ from heliotrope.lcu import names as meanings
 from heliotrope.plant.assigned import Held
 from heliotrope.plant.field_state import FieldState
 
-_ROUGH = 1 << meanings.FLAGS.index("ROUGH")
 #: From an order to a report that the board may have made before it took the order, s.
 _TAKEN_WITHIN = 1.0
 #: Time after which an order that was not obeyed is given again, s.
@@ -108,7 +107,7 @@ class Stepping:
         heard = float(self._field.heard[row])
         if not now - heard <= self._field.limit or heard < self._sent(name) + _TAKEN_WITHIN:
             return None
-        return bool(self._field.rows["flags"][row] & _ROUGH)
+        return bool(self._field.rows["flags"][row] & meanings.ROUGH)
 
     def _sent(self, name: str) -> float:
         return self._sent_at.get(name, -np.inf)

@@ -26,10 +26,6 @@ TURNS = 3
 #: A heliostat moves if its counts and goals differ by more steps than this, and comes nearer to its
 #: goal if it has made more steps than that since the last look.
 _MOVES, _GAINS = 200, 20
-#: States in which a beam was sent to its aim.
-_SENT = (states.TRACKING, states.SEARCHING)
-#: States in which DEFOCUS turns nothing any more.
-_TURNED = (states.DEFOCUSED, states.STOWING)
 
 
 class UnsentBeams:
@@ -83,7 +79,7 @@ class UnsentBeams:
         field = self._field
         self._turn = (self._turn + 1) % TURNS
         every = np.arange(len(field))
-        watched = field.sure(now) & ~np.isin(field.rows["state"], _SENT)
+        watched = field.sure(now) & ~np.isin(field.rows["state"], states.ON_AIM)
         left = np.abs(field.goals(every) - field.counts(every)).max(axis=-1)
         moves = left > _MOVES
         chosen = watched & (moves | (every % TURNS == self._turn))
@@ -97,7 +93,7 @@ class UnsentBeams:
     def way_out(self, name: str, *, again: bool) -> Act:
         """Return DEFOCUS, or STOW where DEFOCUS has not helped or would end on a receiver too."""
         row = self._field.place(name)
-        if again or self._field.rows["state"][row] in _TURNED or self._field.turned[row]:
+        if again or self._field.rows["state"][row] in states.LEAVING or self._field.turned[row]:
             return Act.STOW
         rows, sun, state = np.array([row]), self._sun(0.0), int(self._field.rows["state"][row])
         aim, standby = self._points.aims[row], self._points.standbys[row]

@@ -27,12 +27,6 @@ from heliotrope.safety import Act, Proof, ProofReport
 NEAR = 5e-3
 #: A heliostat on its way to stow has left the receiver this long (s) after the order.
 LEAVING = 5.0
-#: States in which a beam is on the receiver or the standby point, or on its way there.
-ON_BEAM = (states.TRACKING, states.SEARCHING, states.APPROACHING, states.IDLE)
-#: Flag of a heliostat whose step counts mean nothing.
-COUNTS_UNKNOWN = 1 << meanings.FLAGS.index("COUNTS_UNKNOWN")
-_AT_STOW = 1 << meanings.FLAGS.index("AT_STOW")
-_SWITCHED_OFF = 1 << meanings.FLAGS.index("LOCAL_SWITCH")
 
 Mask = npt.NDArray[np.bool_]
 
@@ -103,7 +97,7 @@ class EmergencyOrder:
         They are no longer done. A row (`NODE`) from before that says nothing.
         """
         done = self.proof.done
-        out = np.isin(rows["state"], ON_BEAM)
+        out = np.isin(rows["state"], states.BEAM_OUT)
         later = heard > np.array([done.get(name, np.inf) for name in names])
         back = tuple(names[i] for i in np.flatnonzero(out & later))
         if back:
@@ -163,7 +157,7 @@ class EmergencyOrder:
 
 def switched_off(flags: npt.NDArray[Any]) -> Mask:
     """Return whether drives are switched off at the mirror, away from stow: it cannot obey."""
-    return np.asarray((flags & _SWITCHED_OFF != 0) & (flags & _AT_STOW == 0))
+    return np.asarray((flags & meanings.LOCAL_SWITCH != 0) & (flags & meanings.AT_STOW == 0))
 
 
 def at_stow(rows: npt.NDArray[Any]) -> Mask:
@@ -171,8 +165,8 @@ def at_stow(rows: npt.NDArray[Any]) -> Mask:
 
     One that is locked there, or has a fault, is; one that is IDLE there may go on to track.
     """
-    there = (rows["state"] == states.STOWED) | (rows["flags"] & _AT_STOW != 0)
-    return np.asarray(there & ~np.isin(rows["state"], ON_BEAM))
+    there = (rows["state"] == states.STOWED) | (rows["flags"] & meanings.AT_STOW != 0)
+    return np.asarray(there & ~np.isin(rows["state"], states.BEAM_OUT))
 
 
 def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) -> Mask:
@@ -189,8 +183,8 @@ def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) 
     settled
         Whether a heliostat on its way to stow has had the time to leave the receiver, (K,).
     """
-    off = ~np.isin(rows["state"], ON_BEAM)
-    known = (rows["flags"] & COUNTS_UNKNOWN == 0) & ~switched_off(rows["flags"])
+    off = ~np.isin(rows["state"], states.BEAM_OUT)
+    known = (rows["flags"] & meanings.COUNTS_UNKNOWN == 0) & ~switched_off(rows["flags"])
     stowed = known & at_stow(rows)
     if act is Act.STOW:
         return np.asarray(stowed)

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
 from heliotrope.links.messages import Progress, Stage
@@ -19,8 +20,6 @@ from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.beam_watch import BeamWatch
 from heliotrope.plant.drive_checks import DriveChecks
 from heliotrope.plant.emergency.order import (
-    COUNTS_UNKNOWN,
-    ON_BEAM,
     EmergencyOrder,
     switched_off,
 )
@@ -364,7 +363,7 @@ class Sentinel:
         stage = progress.stage
         if stage is Stage.DONE:
             flags = self._field.rows["flags"]
-            good = (flags & COUNTS_UNKNOWN == 0) & ~switched_off(flags)
+            good = (flags & meanings.COUNTS_UNKNOWN == 0) & ~switched_off(flags)
             heliostats = tuple(
                 n for n in heliostats if good[self._field.index[n]] and not self._doubted(n)
             )
@@ -397,7 +396,7 @@ class Sentinel:
             )
         for row, shines in zip(rows, lit if rows else (), strict=True):
             name = self._field.names[row]
-            if int(self._field.rows["flags"][row]) & COUNTS_UNKNOWN:
+            if int(self._field.rows["flags"][row]) & meanings.COUNTS_UNKNOWN:
                 order.unknown[name] = self._last_of(row, now)
             elif switched_off(self._field.rows["flags"][row]):
                 order.unknown[name] = (
@@ -444,9 +443,9 @@ class Sentinel:
         if not math.isfinite(field.posed_at[row]):
             return text + "nothing is known of its beam"
         state = int(field.posed_state[row])
-        on_aim = state in (states.TRACKING, states.SEARCHING)
+        on_aim = state in states.ON_AIM
         place = (points.aims if on_aim else points.standbys)[row]
-        out = state in ON_BEAM and np.isfinite(place).all()
+        out = state in states.BEAM_OUT and np.isfinite(place).all()
         beam = f" with its beam at ({', '.join(f'{x:.1f}' for x in place)}) m" if out else ""
         return text + f"{now - field.posed_at[row]:.0f} s ago it was {states.STATES[state]}{beam}"
 

@@ -52,8 +52,6 @@ from heliotrope.store.records import Records
 
 #: The person under whose name it commands.
 AUTOMATIC = Person("automatic control", Role.ENGINEER)
-_UP = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING, states.DEFOCUSED)
-_READY = (states.IDLE, states.TRACKING)
 #: What a person does about a state from which automatic control raises nothing.
 _REMEDIES = {
     states.LOCKED: "unlock it",
@@ -380,7 +378,7 @@ class AutomaticControl:
             return Step(f"it is {shown.condition}: {_REMEDIES[state]}", Stage.FAILED)
         if why := self._raising.why_not(name):
             return Step(why, Stage.FAILED)
-        if state == states.APPROACHING or (state in _READY and able):
+        if state == states.APPROACHING or (state in states.AVAILABLE and able):
             text = f"automatic control has it: {shown.condition}"
             return Step(f"{text}; it waits: {waits}" if waits else text, Stage.DONE)
         return Step(f"it waits: {waits}" if waits else f"it waits for its turn: {shown.condition}")
@@ -600,7 +598,7 @@ class AutomaticControl:
 
     def _stow_up(self, *, told: bool) -> None:
         """Stow the wanted heliostats that are up; with ``told`` say so even if there are none."""
-        up = self._plant.field.among(_UP, self._plant.now()) & self._raising.wanted
+        up = self._plant.field.among(states.UP, self._plant.now()) & self._raising.wanted
         if up.any():
             names = tuple(self._plant.field.names[row] for row in np.flatnonzero(up))
             self._plant.stow(AUTOMATIC.name, names)
@@ -647,7 +645,7 @@ class AutomaticControl:
 
     def _ready(self) -> npt.NDArray[np.bool_]:
         """Return which heliostats may be calibrated now, (N,)."""
-        ready = self._plant.field.among(_READY, self._plant.now()) & self._raising.wanted
+        ready = self._plant.field.among(states.AVAILABLE, self._plant.now()) & self._raising.wanted
         ready &= ~self.service.rows() & self._raising.able()
         ready[[self._plant.field.place(name) for name in self._visiting()]] = False
         return ready

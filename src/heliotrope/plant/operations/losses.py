@@ -22,10 +22,6 @@ from heliotrope.store.records import Records
 
 #: Losses that may lie within this span count together; until it is over, none is raised again, s.
 SPAN = 30.0
-#: States in which a beam is at the receiver or at its standby point, or on its way there.
-_UP = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)
-#: States that show at the first sight that a heliostat was lost before.
-_LEAVING = (states.DEFOCUSED, states.STOWING)
 
 Mask = npt.NDArray[np.bool_]
 _NONE: Mask = np.zeros(1, dtype=np.bool_)
@@ -78,11 +74,11 @@ class Losses:
         Those that are diagnosed ``at_stow`` (N,) are IDLE there, and no loss.
         """
         field, now = self._plant.field, self._plant.now()
-        live, up = field.live(now), field.among(_UP, now) & ~at_stow
+        live, up = field.live(now), field.among(states.BEAM_OUT, now) & ~at_stow
         # Only an order locks a heliostat: a person's, or a visit's that writes parameters.
         held = field.among((states.LOCKED,), now)
         lost = live & ~up & ~held & self._up
-        lost |= ~self._seen & field.among(_LEAVING, now)
+        lost |= ~self._seen & field.among(states.LEAVING, now)
         lost &= wanted & ~self._plant.ordered_off(self._up_at)
         # A heliostat that is not heard, or is locked, keeps what was seen of it last.
         self._up = np.where(live & ~held, up, self._up)

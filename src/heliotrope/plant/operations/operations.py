@@ -26,6 +26,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.field.timetable import TimetableEntry
 from heliotrope.geometry import FloatArray
+from heliotrope.lcu import messages
 from heliotrope.links.clock import sleep_until
 from heliotrope.optics import FluxView, predict_flux
 from heliotrope.plant import refusals
@@ -69,10 +70,6 @@ from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import Act
 from heliotrope.store.records import Records
 
-#: People's commands after which automatic control leaves heliostats alone, and those that give them
-#: to it until they are lost.
-_AWAY = frozenset({"STOW", "DEFOCUS", "LOCK", "JOG", "GOTO", "SEARCH", "DIAGNOSE", "IDLE"})
-_BACK = frozenset({"APPROACH", "TRACK", "REFOCUS"})
 #: Time between predictions of the flux, s.
 _FLUX_EVERY = 5.0
 #: Time between looks after the security events, s.
@@ -773,9 +770,9 @@ class Operations:
     # -- notes -----------------------------------------------------------------------------
 
     def _meant(self, name: str, heliostats: Sequence[str]) -> None:
-        if name in _AWAY:
+        if name in messages.TAKES_FROM_AUTOMATIC:
             self.automatic.want(heliostats, wanted=False)
-        elif name in _BACK:
+        elif name in messages.GIVES_TO_AUTOMATIC:
             self.automatic.want(heliostats, wanted=True, by_person=True)
 
     def _told(self, person: Person, ticket: Ticket) -> None:
@@ -798,7 +795,7 @@ def _named(places: Sequence[tuple[Kind, str]]) -> str:
 
 def _act(name: str) -> Act:
     if name not in Act.__members__:
-        raise UnknownNameError("act of an emergency", name, ("DEFOCUS", "STOW"))
+        raise UnknownNameError("act of an emergency", name, sorted(messages.SAFE))
     return Act[name]
 
 

@@ -33,7 +33,6 @@ RAISING = RetryLaw(
     memory=1800.0,
     alarm=alarms.RAISING_GIVEN_UP,
 )
-_READY = 1 << meanings.FLAGS.index("READY")
 
 Rows = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
@@ -196,7 +195,7 @@ class Raising:
     def able(self) -> Mask:
         """Return which heliostats can track from standby, as far as they tell, (N,)."""
         field = self._plant.field
-        found: Mask = field.rows["flags"] & _READY != 0
+        found: Mask = field.rows["flags"] & meanings.READY != 0
         found[[field.place(name) for name in self._plant.wanted.missing]] = False
         return found
 

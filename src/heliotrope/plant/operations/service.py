@@ -18,14 +18,6 @@ from heliotrope.plant.operations.errands import Step
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.safety import Alarm, alarms
 
-#: States from which a heliostat out of service is sent to stow.
-_AWAY = (
-    states.APPROACHING,
-    states.IDLE,
-    states.TRACKING,
-    states.SEARCHING,
-    states.DEFOCUSED,
-)
 #: Orders to stow, until a heliostat out of service is seen there.
 PARKING = RetryLaw(
     "stow of a heliostat out of service",
@@ -36,7 +28,6 @@ PARKING = RetryLaw(
     rest=60.0,
     alarm=alarms.NOT_PARKED,
 )
-_SWITCHED_OFF = 1 << meanings.FLAGS.index("LOCAL_SWITCH")
 
 
 class Service:
@@ -151,7 +142,7 @@ class Service:
         field, now = self._plant.field, self._plant.now()
         if not self._unparked:
             return
-        there, away = field.among((states.STOWED,), now), field.among(_AWAY, now)
+        there, away = field.among((states.STOWED,), now), field.among(states.UP, now)
         for name, since in list(self._unparked.items()):
             row = field.place(name)
             # A status from before the order says nothing: it may have been on its way from stow.
@@ -180,7 +171,7 @@ class Service:
         if not self.rows()[field.place(name)]:
             return Step("it was given back to service", Stage.REFUSED)
         if name not in self._unparked:
-            off = int(field.rows["flags"][field.place(name)]) & _SWITCHED_OFF
+            off = int(field.rows["flags"][field.place(name)]) & meanings.LOCAL_SWITCH
             more = "its drives are off at the mirror" if off else "switch its drives off there"
             return Step(f"parked in stow and locked out; {more}", Stage.DONE)
         if self._plant.waits_to_stow(name):

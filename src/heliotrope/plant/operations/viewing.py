@@ -24,8 +24,6 @@ from heliotrope.safety import FluxProof
 
 #: Life of a frame, s of the plant's clock.
 _EVERY = 1.0
-#: States in which a beam is at its aim.
-_ON_AIM = (states.TRACKING, states.SEARCHING)
 #: An aim this many half diagonals from the middle of a surface is still on it.
 _NEAR = 1.0
 #: Supply voltage of a board that has not reported it yet, mV.
@@ -102,7 +100,7 @@ class Viewer:
     def _on(self, now: float) -> npt.NDArray[np.uint8]:
         """Return the place of each beam in `aim_names`, (N,)."""
         aims, found = self._plant.aims, np.zeros(len(self._plant.field), dtype=np.uint8)
-        on = self._plant.field.among(_ON_AIM, now) & np.isfinite(aims).all(axis=-1)
+        on = self._plant.field.among(states.ON_AIM, now) & np.isfinite(aims).all(axis=-1)
         found[on] = len(self.aim_names) - 1
         for k, (center, reach) in enumerate(zip(self._centers, self._reach, strict=True), 1):
             found[on & (np.linalg.norm(aims - center, axis=-1) <= reach)] = k

@@ -36,8 +36,6 @@ from heliotrope.safety import alarms
 
 #: A beam this many times as far off as expected says that its heliostat has changed.
 SURPRISE = 3.0
-#: States from which a heliostat can be sent to a target.
-READY = (lcu_states.IDLE, lcu_states.TRACKING)
 #: Visits from which their true pace counts in a prediction.
 ENOUGH = 10
 #: Visits to targets that failed, by heliostat; the wait is that of the settings. The rest lasts to
@@ -394,7 +392,7 @@ class Scheduler:
                     f"schedule: states of shape {np.shape(states.state)}; give one for each of "
                     f"{len(ready)} heliostats"
                 )
-            ready &= np.isin(states.state, READY)
+            ready &= np.isin(states.state, lcu_states.AVAILABLE)
         return self._without(ready, (*away, *self.attempts.waiting(now)))
 
     def _without(self, ready: Mask, names: Collection[str]) -> Mask:

@@ -35,7 +35,7 @@ _FEW, _LATE = 0.1, 10.0
 _LOOK = 0.25
 #: States in which a beam may be on the target, and those that an order of others has led to, which
 #: a visit does not undo.
-_ON = (states.IDLE, states.TRACKING, states.SEARCHING)
+_ON = (states.IDLE, *states.ON_AIM)
 _OFF = (states.DEFOCUSED, states.STOWING, states.STOWED, states.LOCKED, states.APPROACHING)
 
 
@@ -109,7 +109,7 @@ class JointVisit(BroughtHome):
         """
         for name, visit in list(self.visits.items()):
             try:
-                if visit.state not in (states.IDLE, states.TRACKING):
+                if visit.state not in states.AVAILABLE:
                     state = states.STATES[visit.state]
                     said = f"{name} is {state}; bring it to standby (APPROACH) first"
                     self.drop({name: said})

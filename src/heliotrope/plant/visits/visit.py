@@ -255,7 +255,7 @@ class Visit(BroughtHome):
             arrive within ``limit`` s.
         """
         state = self.state
-        if state not in (states.IDLE, states.TRACKING):
+        if state not in states.AVAILABLE:
             raise RefusedError(
                 f"{self.heliostat} is {states.STATES[state]}; bring it to standby (APPROACH) first"
             )
@@ -376,7 +376,7 @@ class Visit(BroughtHome):
     def taken_off(self) -> None:
         """Take its beam off where another order has left it at an aim with unproven parameters."""
         state = int(self.plant.field.rows["state"][self.row])
-        if state in (states.TRACKING, states.SEARCHING):
+        if state in states.ON_AIM:
             self.plant.defocus(f"visit of {self.mandate.person.name}", (self.heliostat,))
 
     async def home(self) -> None:
