@@ -10,13 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.coded_visits import JointSettings, ReceiverSettings
 from heliotrope.field.example import example_plant
 from heliotrope.field.formats import paint, plant_file
 from heliotrope.field.heliostats import Heliostats
-from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
-from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.stellenbosch import prototype
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere

@@ -10,17 +10,18 @@ import pytest
 
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.calibration.uncertainty import expected_error, precision
-from heliotrope.field.joint_visits import JointSettings
+from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import bisector, direction
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.visits import coded_layout, joint_layout
 from heliotrope.plant.visits import expected_errors as module
-from heliotrope.plant.visits import joint_layout
+from heliotrope.plant.visits.coded_layout import beams_of, moments_on
 from heliotrope.plant.visits.expected_errors import expected_errors
 from heliotrope.plant.visits.first_layout import newcomers
-from heliotrope.plant.visits.joint_layout import arranged, beams_of, bells, moments_on
+from heliotrope.plant.visits.joint_layout import arranged, bells
 from heliotrope.plant.visits.resolution import beam_slopes, beam_steps
 
 NOW = datetime(2026, 6, 21, 10, tzinfo=UTC)
@@ -129,8 +130,12 @@ def test_a_layout_computes_its_beams_at_once(plant: Any, monkeypatch: pytest.Mon
         monkeypatch.setattr(place, name, count)
 
     counted(module, "expected_error")
-    for name in ("beam_steps", "moments_on", "bells"):
-        counted(joint_layout, name)
+    for place, name in (
+        (coded_layout, "beam_steps"),
+        (coded_layout, "moments_on"),
+        (joint_layout, "bells"),
+    ):
+        counted(place, name)
     names, target = plant.design.names, plant.design.targets[0]
     settings = replace(JointSettings(), known=1.0)
 

@@ -511,7 +511,7 @@ class _Commissioning:
     def _best(self, j: int, choices: _Choices, free: Mask) -> tuple[Rows, bool]:
         """Return the heliostats of the next visit to a place, and whether it is a joint one."""
         if j == len(self.targets) and (shining := self.terms.receiver) is not None:
-            many = choices.known.first(free, shining.party(self._lit))
+            many = choices.known.first(free, shining.at_once(self._lit))
             return (many if len(many) >= shining.settings.least else many[:0]), True
         alone, terms = choices.alone.first(free, 1), self.terms.joint
         if terms is None:

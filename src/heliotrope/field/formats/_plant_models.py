@@ -340,14 +340,9 @@ class GroupTable(StrictTable):
     )
 
 
-class JointVisitsTable(StrictTable):
-    """``[joint_visits]``: several heliostats on one target at once, told apart by movements."""
+class CodedVisitsTable(StrictTable):
+    """Numbers of joint visits and of receiver visits alike."""
 
-    allowed: bool = Field(True, description="False: each heliostat is calibrated alone.")
-    most: int | None = Field(None, description="Heliostats on one target at once; default: 49.")
-    least: int | None = Field(
-        None, description="Heliostats that a visit of automatic control needs; default: 4."
-    )
     known_mrad: Number | None = Field(
         None, description="Largest expected beam error of one that takes part, RMS; default: 4."
     )
@@ -356,12 +351,22 @@ class JointVisitsTable(StrictTable):
         None, description="Part of it that is drawn anew at each visit, each axis; default: 0.5."
     )
     visit_rad: Number | None = Field(None, description="Instead, as the program writes it.")
-    movement_mrad: Number | None = Field(
-        None, description="Coded movement of a beam, either way along each axis; default: 0.5."
-    )
-    movement_rad: Number | None = Field(None, description="Instead, as the program writes it.")
+    movement_rad: Number | None = Field(None, description="Instead of movement_mrad, so written.")
     settle_s: Number | None = Field(
         None, description="From the moment that all stand at their aims; default: 1."
+    )
+
+
+class JointVisitsTable(CodedVisitsTable):
+    """``[joint_visits]``: several heliostats on one target at once, told apart by movements."""
+
+    allowed: bool = Field(True, description="False: each heliostat is calibrated alone.")
+    most: int | None = Field(None, description="Heliostats on one target at once; default: 49.")
+    least: int | None = Field(
+        None, description="Heliostats that a visit of automatic control needs; default: 4."
+    )
+    movement_mrad: Number | None = Field(
+        None, description="Coded movement of a beam, either way along each axis; default: 0.5."
     )
     brightest_suns: Number | None = Field(None, description="Most light on a target; default: 10.")
     again: Number | None = Field(
@@ -379,8 +384,8 @@ class JointVisitsTable(StrictTable):
     )
 
 
-class ReceiverVisitsTable(StrictTable):
-    """``[receiver_visits]``: heliostats in production, measured where they shine."""
+class ReceiverVisitsTable(CodedVisitsTable):
+    """``[receiver_visits]``: heliostats that shine on a receiver, measured there."""
 
     camera: str = Field(min_length=1, description="A camera with a place that sees the receiver.")
     receiver: str = Field(min_length=1, description="A planar receiver.")
@@ -388,20 +393,8 @@ class ReceiverVisitsTable(StrictTable):
     least: int | None = Field(
         None, description="Heliostats that a visit of automatic control needs; default: 8."
     )
-    known_mrad: Number | None = Field(
-        None, description="Largest expected beam error of one that takes part, RMS; default: 4."
-    )
-    known_rad: Number | None = Field(None, description="Instead, as the program writes it.")
-    visit_mrad: Number | None = Field(
-        None, description="Part of it that is drawn anew at each visit, each axis; default: 0.5."
-    )
-    visit_rad: Number | None = Field(None, description="Instead, as the program writes it.")
     movement_mrad: Number | None = Field(
         None, description="Coded movement of a beam, either way along each axis; default: 1."
-    )
-    movement_rad: Number | None = Field(None, description="Instead, as the program writes it.")
-    settle_s: Number | None = Field(
-        None, description="From the moment that all stand at their aims; default: 1."
     )
     exposures: int | None = Field(
         None, description="Frames that are averaged for a photograph; default: 1."
@@ -459,7 +452,7 @@ class PlantDocument(StrictTable):
         None, description="Without: joint visits with the default settings."
     )
     receiver_visits: ReceiverVisitsTable | None = Field(
-        None, description="Without: no heliostat in production is measured."
+        None, description="Without: no heliostat is measured on a receiver."
     )
     timetable: list[TimetableTable] = Field(
         default_factory=list, description="Calibrations at times of day and at intervals."

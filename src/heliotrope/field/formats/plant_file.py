@@ -19,13 +19,8 @@ from heliotrope.field.formats._plant_cameras import (
     camera_document,
     mark_document,
 )
+from heliotrope.field.formats._plant_coded import build_joint, build_receiver, coded_document
 from heliotrope.field.formats._plant_groups import build_group, group_document
-from heliotrope.field.formats._plant_joint import (
-    build_joint,
-    build_receiver_visits,
-    joint_document,
-    receiver_visits_document,
-)
 from heliotrope.field.formats._plant_models import (
     PlantDocument,
     ReceiverTable,
@@ -141,8 +136,7 @@ def _assemble(
     keep_outs = _each(path, "keep_out", document.keep_out, build_volume, problems)
     eyes = {name: np.array(point) for name, point in document.eyes_m.items()}
     joint = _one(path, "joint_visits", document.joint_visits, build_joint, problems)
-    given = document.receiver_visits
-    receiver_visits = _one(path, "receiver_visits", given, build_receiver_visits, problems)
+    receiver = _one(path, "receiver_visits", document.receiver_visits, build_receiver, problems)
     timetable = _each(path, "timetable", document.timetable, _timetable_entry, problems)
     _one(path, "safety", document.safety, lambda given: limited(CONDITIONS, given or {}), problems)
     if problems:
@@ -158,7 +152,7 @@ def _assemble(
             keep_outs=keep_outs,
             eyes=eyes,
             joint_visits=joint,
-            receiver_visits=receiver_visits,
+            receiver_visits=receiver,
             timetable=timetable,
             safety=document.safety,
         )
@@ -305,8 +299,7 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
         "cameras": [camera_document(camera) for camera in plant.cameras],
         "keep_out": [volume_document(volume) for volume in plant.keep_outs],
         "eyes_m": {name: np.asarray(point).tolist() for name, point in plant.eyes.items()},
-        **joint_document(plant.joint_visits),
-        **receiver_visits_document(plant.receiver_visits),
+        **coded_document(plant.joint_visits, plant.receiver_visits),
         **({"timetable": [e.document for e in plant.timetable]} if plant.timetable else {}),
         **({"safety": {k: dict(v) for k, v in plant.safety.items()}} if plant.safety else {}),
         "groups": groups,

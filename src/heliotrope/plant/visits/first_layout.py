@@ -8,23 +8,18 @@ bright wherever the beams truly are: the expected light and twice its standard d
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.plan.on_target import LOOKS, search_places
-from heliotrope.field.joint_visits import JointSettings
+from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.visits.joint_layout import (
-    Layout,
-    SentBeam,
-    beams_of,
-    bells,
-    coded,
-    errors_on,
-)
+from heliotrope.plant.visits.coded_layout import Layout, SentBeam, beams_of, coded
+from heliotrope.plant.visits.joint_layout import bells, errors_on
 
 #: A beam keeps this many of its standard deviations from the border, and those of its place.
 _BORDER, _PLACED = 1.5, 1.5
@@ -71,7 +66,8 @@ def newcomers(
     looks = search_places(target, LOOKS)
     count = [min((missed or {}).get(name, 0), LOOKS - 1) for name in sent]
     places = _places(target, sent) + looks[count]
-    return coded(target, sent, places, code, settings.first_movement, along=_RIGHT), wrong
+    layout = coded(target, sent, places, code, settings.first_movement, along=_RIGHT)
+    return replace(layout, first=True), wrong
 
 
 def _places(target: Target, sent: Mapping[str, SentBeam]) -> FloatArray:

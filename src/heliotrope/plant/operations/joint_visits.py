@@ -1,7 +1,7 @@
 """Joint visits of automatic calibration: which heliostats go to a target together."""
 
 import asyncio
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
@@ -9,8 +9,10 @@ import numpy.typing as npt
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.lcu import states
+from heliotrope.plant.attempts import Retry
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.plant.operations.requests import Requests
 from heliotrope.plant.operations.views import Planned
 from heliotrope.plant.visits.calibration_cycle import CycleResult
 from heliotrope.plant.visits.joint_cycle import JointCycle
@@ -31,7 +33,7 @@ _PART = 500
 _WRONG = (Verdict.STUCK, Verdict.EXCHANGED, Verdict.ELSEWHERE)
 
 
-class Parties:
+class JointVisits:
     """The heliostats of joint visits.
 
     Parameters
@@ -47,6 +49,8 @@ class Parties:
     ----------
     cycle
         As given.
+    requests
+        What persons want.
     """
 
     def __init__(
@@ -57,36 +61,13 @@ class Parties:
         tell: Callable[[Alarm], None],
     ) -> None:
         self._plant, self._book, self.cycle, self._tell = plant, book, cycle, tell
-        self._asked: list[tuple[list[str], str]] = []
+        self.requests = Requests(plant.field.place)
         self._disproved: set[str] = set()
         #: Targets whose last visit was a joint one.
         self._last: set[str] = set()
         #: Since when a target has waited for a joint first visit.
         self._waited: dict[str, float] = {}
         self._choosing = asyncio.Lock()
-
-    @property
-    def asked(self) -> tuple[str, ...]:
-        """Heliostats that persons want calibrated together."""
-        return tuple(name for names, _ in self._asked for name in names)
-
-    def ask(self, heliostats: Sequence[str], target: str) -> None:
-        """Calibrate heliostats together, on a target or, for "", on the next free one."""
-        self._asked.append((list(dict.fromkeys(heliostats)), target))
-
-    def withdraw(self, heliostats: Collection[str]) -> None:
-        """Forget that persons wanted these heliostats calibrated."""
-        left = [([n for n in names if n not in heliostats], t) for names, t in self._asked]
-        self._asked = [(names, target) for names, target in left if names]
-
-    def wanted(self, target: str, ready: Mask) -> tuple[str, ...]:
-        """Return the heliostats that persons want on a target together; () until all are ready."""
-        for i, (names, where) in enumerate(self._asked):
-            rows = [self._plant.field.place(name) for name in names]
-            if where in ("", target) and ready[rows].all():
-                del self._asked[i]
-                return tuple(names)
-        return ()
 
     async def chosen(self, target: str, ready: Mask, following: Next) -> tuple[str, ...]:
         """Return the ready heliostats (N,) that go to a target together; () if too few would.
@@ -169,6 +150,10 @@ class Parties:
         if int((ready & first).sum()) >= full or not coming.any():
             return False
         return now - self._waited.setdefault(target, now) < _PATIENCE
+
+    def retries(self, now: float) -> tuple[Retry, ...]:
+        """Return the heliostats that come again, or were given up."""
+        return self.cycle.attempts.shown(now)
 
     def begun(self, target: str) -> None:
         """Note that a joint visit to a target begins."""

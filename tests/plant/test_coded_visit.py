@@ -16,8 +16,9 @@ from heliotrope.plant import refusals
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.authority import Mandate, Person, Role
 from heliotrope.plant.beam_watch import BeamError
-from heliotrope.plant.visits.joint_layout import SentBeam, _places, _too_bright, beams_of, coded
-from heliotrope.plant.visits.joint_visit import JointVisit
+from heliotrope.plant.visits.coded_layout import SentBeam, beams_of, coded
+from heliotrope.plant.visits.coded_visit import CodedVisit
+from heliotrope.plant.visits.joint_layout import _places, _too_bright
 from heliotrope.plant.visits.visit import ARRIVED, SILENT
 
 NAMES = ("A", "B", "C")
@@ -58,7 +59,7 @@ class Order:
 
 def visit_of(clock: VirtualClock, left: dict[str, float]) -> Any:
     """A visit of a plant that reports a row of step counts each second."""
-    found = object.__new__(JointVisit)
+    found = object.__new__(CodedVisit)
     counted = SimpleNamespace(counted_at=np.zeros(len(NAMES)))
 
     def now() -> float:

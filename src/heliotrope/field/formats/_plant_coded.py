@@ -8,13 +8,12 @@ from dataclasses import MISSING, fields
 from typing import Any
 
 from heliotrope.errors import InputError
+from heliotrope.field.coded_visits import CodedSettings, JointSettings, ReceiverSettings
 from heliotrope.field.formats._plant_models import (
+    CodedVisitsTable,
     JointVisitsTable,
     ReceiverVisitsTable,
-    StrictTable,
 )
-from heliotrope.field.joint_visits import JointSettings
-from heliotrope.field.receiver_visits import ReceiverSettings
 
 #: Units at the end of a key, and what makes them the program's own.
 _UNITS = {"_mrad": 1e-3, "_rad": 1.0, "_s": 1.0, "_suns": 1.0}
@@ -30,35 +29,30 @@ def build_joint(table: JointVisitsTable | None) -> JointSettings | None:
     InputError
         If its numbers cannot be.
     """
-    made = JointSettings(**_values(table, "joint visits"))
+    made = JointSettings(**_values(table, JointSettings.kind))
     return made if table is None or table.allowed else None
 
 
-def joint_document(settings: JointSettings | None) -> dict[str, Any]:
-    """Return the document's part with the table: what differs from the default."""
-    if settings is None:
-        return {"joint_visits": {"allowed": False}}
-    table = _table(settings, JointVisitsTable)
-    return {"joint_visits": table} if table else {}
+def build_receiver(table: ReceiverVisitsTable | None) -> ReceiverSettings | None:
+    """Return the settings of a table, see `build_joint`; None without one."""
+    return None if table is None else ReceiverSettings(**_values(table, ReceiverSettings.kind))
 
 
-def build_receiver_visits(table: ReceiverVisitsTable | None) -> ReceiverSettings | None:
-    """Return the settings of a table; None without one.
-
-    Raises
-    ------
-    InputError
-        If its numbers cannot be.
-    """
-    return None if table is None else ReceiverSettings(**_values(table, "receiver visits"))
-
-
-def receiver_visits_document(settings: ReceiverSettings | None) -> dict[str, Any]:
-    """Return the document's part with the table: what differs from the default."""
-    return {} if settings is None else {"receiver_visits": _table(settings, ReceiverVisitsTable)}
+def coded_document(
+    joint: JointSettings | None, receiver: ReceiverSettings | None
+) -> dict[str, dict[str, Any]]:
+    """Return the document's part with the tables: what differs from the default."""
+    tables = {}
+    if joint is None:
+        tables["joint_visits"] = {"allowed": False}
+    elif table := _table(joint, JointVisitsTable):
+        tables["joint_visits"] = table
+    if receiver is not None:
+        tables["receiver_visits"] = _table(receiver, ReceiverVisitsTable)
+    return tables
 
 
-def _values(table: StrictTable | None, who: str) -> dict[str, Any]:
+def _values(table: CodedVisitsTable | None, kind: str) -> dict[str, Any]:
     """Return the settings that a table gives, by name, in the program's own units."""
     values: dict[str, Any] = {}
     given = {} if table is None else table.model_dump(exclude_none=True, exclude={"allowed"})
@@ -66,12 +60,12 @@ def _values(table: StrictTable | None, who: str) -> dict[str, Any]:
         unit = next((unit for unit in _UNITS if key.endswith(unit)), "")
         name = key.removesuffix(unit)
         if name in values:
-            raise InputError(f"{who}: {name} is given twice, the second time as {key}")
+            raise InputError(f"{kind}: {name} is given twice, the second time as {key}")
         values[name] = value * _UNITS[unit] if unit else value
     return values
 
 
-def _table(settings: JointSettings | ReceiverSettings, model: type[StrictTable]) -> dict[str, Any]:
+def _table(settings: CodedSettings, model: type[CodedVisitsTable]) -> dict[str, Any]:
     """Return the table of settings: those without a default, and those that differ from it."""
     keys = model.model_fields
     return {

@@ -1,6 +1,6 @@
-"""Receiver visits of automatic calibration: which heliostats are measured in production."""
+"""Receiver visits of automatic calibration: which heliostats are measured where they shine."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -8,9 +8,10 @@ import numpy.typing as npt
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.imaging.coded import Verdict
 from heliotrope.lcu import states
-from heliotrope.plant.attempts import Attempts, RetryLaw
+from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.plant.operations.requests import Requests
 from heliotrope.plant.visits.calibration_cycle import CycleResult
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import Alarm, alarms
@@ -44,7 +45,7 @@ _BROKEN = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)
 _ODD = (Verdict.STUCK, Verdict.EXCHANGED, Verdict.ELSEWHERE, Verdict.JOINED, Verdict.FAINT)
 
 
-class ProductionVisits:
+class ReceiverVisits:
     """The heliostats of receiver visits.
 
     Parameters
@@ -60,6 +61,8 @@ class ProductionVisits:
     ----------
     cycle
         As given.
+    requests
+        What persons want.
     attempts
         Visits that came to nothing, by receiver.
     mirrors
@@ -74,7 +77,8 @@ class ProductionVisits:
         tell: Callable[[Alarm], None],
     ) -> None:
         self._plant, self._book, self.cycle = plant, book, cycle
-        self._asked: list[tuple[str, ...]] = []
+        self._settings, self.requests = cycle.settings, Requests(plant.field.place)
+        self._face = cycle.face(self.surface)
         self.attempts, self.mirrors = Attempts(RECEIVER, tell), Attempts(MIRROR)
         #: When each heliostat was measured last, monotonic s.
         self._at = np.full(len(plant.field), -np.inf)
@@ -82,21 +86,7 @@ class ProductionVisits:
     @property
     def surface(self) -> str:
         """Name of the receiver."""
-        return self.cycle.settings.receiver
-
-    @property
-    def asked(self) -> tuple[str, ...]:
-        """Heliostats that persons want measured on the receiver."""
-        return tuple(name for names in self._asked for name in names)
-
-    def ask(self, heliostats: Sequence[str]) -> None:
-        """Measure heliostats together, as soon as all of them track the receiver."""
-        self._asked.append(tuple(dict.fromkeys(heliostats)))
-
-    def withdraw(self, heliostats: Collection[str]) -> None:
-        """Forget that persons wanted these heliostats measured."""
-        left = [tuple(n for n in names if n not in heliostats) for names in self._asked]
-        self._asked = [names for names in left if names]
+        return self._settings.receiver
 
     @property
     def lit(self) -> int:
@@ -105,19 +95,17 @@ class ProductionVisits:
 
     def _shining(self) -> Mask:
         tracking = self._plant.field.among((states.TRACKING,), self._plant.now())
-        return np.asarray(tracking & self.cycle.face.holds(self._plant.aims))
+        return np.asarray(tracking & self._face.holds(self._plant.aims))
 
     def chosen(self, ready: Mask) -> tuple[str, ...]:
         """Return the ready heliostats (N,) that are measured next; () if there are too few.
 
         Those that persons asked for come first, then those whose errors may be largest.
         """
-        field, settings, now = self._plant.field, self.cycle.settings, self._plant.now()
+        field, settings, now = self._plant.field, self._settings, self._plant.now()
         lit = ready & self._shining()
-        for i, names in enumerate(self._asked):
-            if lit[[field.place(name) for name in names]].all():
-                del self._asked[i]
-                return names
+        if names := self.requests.next(self.surface, lit):
+            return names
         # The book has errors of the normal; a beam is off by twice as much.
         due = lit & (2.0 * self._book.error <= _SURE * settings.known)
         due &= now - self._at >= settings.every
@@ -127,6 +115,10 @@ class ProductionVisits:
         rows = np.flatnonzero(due)
         first = rows[np.argsort(-self._book.error[rows], kind="stable")][: settings.most]
         return tuple(field.names[row] for row in first)
+
+    def retries(self, now: float) -> tuple[Retry, ...]:
+        """Return the visits that are tried again, or were given up."""
+        return *self.attempts.shown(now), *self.mirrors.shown(now)
 
     def concluded(self, results: Sequence[CycleResult]) -> tuple[str, ...]:
         """Note a visit's results; return the heliostats that are to be looked at on a target.
