@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import direction
@@ -218,7 +219,7 @@ def test_only_a_mirror_before_the_plane_of_a_target_sends_its_beam_there(before:
         sun_vector=lambda: direction(np.radians(180.0), np.radians(60.0)),
     )
     name = design.names[0]
-    sent, blocked = beams_of(plant, target, {name: 1e-3})
+    sent, blocked = beams_of(plant, target, {name: 1e-3}, JointSettings())
     assert list(sent if before > 0.0 else blocked) == [name]
     assert blocked.get(name, "").endswith("" if before > 0.0 else "the front of aside")
 
@@ -250,9 +251,9 @@ def test_a_mirror_with_steps_too_coarse_for_a_joint_visit_takes_no_part() -> Non
         sun_vector=lambda: direction(np.radians(80.0), np.radians(30.0)),
     )
     errors = {design.names[0]: 1e-3}
-    assert list(beams_of(plant, target, errors)[0]) == [design.names[0]]
+    assert list(beams_of(plant, target, errors, JointSettings())[0]) == [design.names[0]]
     beams.drives.table[0, :, SLOTS["rate"]] *= 200.0
-    blocked = beams_of(plant, target, errors)[1]
+    blocked = beams_of(plant, target, errors, JointSettings())[1]
     assert "its drives move its beam in steps of" in blocked[design.names[0]]
 
 

@@ -79,7 +79,7 @@ def test_beams_are_laid_out_together_as_each_alone(plant: Any) -> None:
     names, target = plant.design.names, plant.design.targets[0]
     errors = dict(zip(names, np.linspace(1e-3, 9e-3, len(names)).tolist(), strict=True))
     errors[names[3]] = np.nan
-    sent, blocked = beams_of(plant, target, errors)
+    sent, blocked = beams_of(plant, target, errors, JointSettings())
     assert tuple(sent) == (*names[:3], *names[4:])
     assert blocked == {names[3]: "out of its reach"}
     rows = np.array([plant.field.place(name) for name in sent])
@@ -87,7 +87,7 @@ def test_beams_are_laid_out_together_as_each_alone(plant: Any) -> None:
     counts = np.linspace(-500.0, 500.0, 2 * len(rows)).reshape(-1, 2)
     slopes = beam_slopes(plant, rows, target, SUN, counts)
     for k, (name, beam) in enumerate(sent.items()):
-        alone = beams_of(plant, target, {name: errors[name]})[0][name]
+        alone = beams_of(plant, target, {name: errors[name]}, JointSettings())[0][name]
         for one, other in zip(vars(beam).values(), vars(alone).values(), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9)
         np.testing.assert_array_equal(steps[k], beam.step)
@@ -100,7 +100,7 @@ def test_beams_are_laid_out_together_as_each_alone(plant: Any) -> None:
         np.testing.assert_allclose(
             beam.moments, moments_on(target, vertex, normal, *size), rtol=1e-9
         )
-    assert beams_of(plant, target, {}) == ({}, {})
+    assert beams_of(plant, target, {}, JointSettings()) == ({}, {})
 
 
 def test_the_light_of_a_beam_is_its_power() -> None:

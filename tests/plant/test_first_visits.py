@@ -304,8 +304,8 @@ def test_automatic_control_begins_with_them() -> None:
     ("wrong", "said"),
     [
         ({"first": 3}, "3 heliostats without a calibration; give 0, or 4 to 127"),
-        ({"first": 128}, "128 heliostats without a calibration"),
-        ({"first_movement": 6e-3}, "first movements of 6 mrad"),
+        ({"first": 128}, "first 128 .heliostats without a calibration.*; give 0 to 127$"),
+        ({"first_movement": 6e-3}, "first_movement_mrad 6 .*; give above 0 to 5$"),
     ],
 )
 def test_settings_of_first_visits_that_cannot_be_are_refused(

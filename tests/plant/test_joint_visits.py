@@ -313,9 +313,9 @@ def test_who_is_not_known_well_enough_or_would_be_too_bright_has_no_place() -> N
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"least": 9, "most": 8}, "9 to 8 heliostats"),
-        ({"movement": 0.0}, "movements of 0 mrad"),
-        ({"brightest": 0.0}, "up to 0 suns"),
+        ({"least": 9, "most": 8}, "least 9 is above most 8; give the smaller"),
+        ({"movement": 0.0}, "movement_mrad 0 .coded.*; give above 0 to 5$"),
+        ({"brightest": 0.0}, "brightest_suns 0 .*; give above 0$"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, float], said: str) -> None:

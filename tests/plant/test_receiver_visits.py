@@ -544,12 +544,14 @@ def test_a_beam_too_bright_or_too_dim_for_its_mirror_is_joined_with_other_light(
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"least": 9, "most": 8}, "9 to 8 heliostats"),
-        ({"movement": 0.003}, "movements of 3 mrad"),
-        ({"power": 0.02}, "cost 2 % of the power; give above 0 to 1 %"),
-        ({"known": 0.0}, "known to 0 mrad"),
-        ({"steady": 0.9}, "changes by 90 %"),
-        ({"again": 0.5}, "0.5 times the photographs"),
+        ({"least": 9, "most": 8}, "least 9 is above most 8; give the smaller"),
+        ({"movement": 0.003}, "movement_mrad 3 .coded.*; give above 0 to 2$"),
+        ({"power": 0.02}, "power 0.02 .*; give above 0 to 0.01$"),
+        ({"known": 0.0}, "known_mrad 0 .*; give above 0 to 20$"),
+        ({"steady": 0.9}, "steady 0.9 .*; give above 0 to 0.5$"),
+        ({"again": 0.5}, "again 0.5 .*; give 1 to 10$"),
+        ({"visit": -1e-3}, "visit_mrad -1 .*; give 0 or more$"),
+        ({"settle": float("nan")}, "settle_s nan .*; give 0 to 60$"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, float], said: str) -> None:

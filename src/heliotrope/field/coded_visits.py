@@ -1,122 +1,143 @@
 """Settings of coded visits: several heliostats measured at once, told apart by their movements.
 
-They belong to a plant: its targets and its receiver, its mirrors, its drives.
+They belong to a plant: its targets and its receiver, its mirrors, its drives. Each number stands
+once, here, with its unit in the plant file, its limits and its meaning.
 """
 
-from dataclasses import dataclass, field
-from typing import ClassVar
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar
 
 from heliotrope.errors import InputError
 
-#: Largest share of the power that the movements of a receiver visit may cost.
-MOST_POWER = 0.01
+
+@dataclass(frozen=True)
+class Setting:
+    """A number of the plant file.
+
+    Attributes
+    ----------
+    text
+        Its meaning, for people.
+    low, high
+        Its limits, in its unit.
+    unit
+        Its unit in the plant file: "mrad", "s" or "suns"; "" for a number or a share.
+    above
+        Whether it must be above ``low``.
+    """
+
+    text: str
+    low: float
+    high: float = math.inf
+    unit: str = ""
+    above: bool = False
+
+    @property
+    def scale(self) -> float:
+        """Its unit in the program's own, radians and seconds."""
+        return 1e-3 if self.unit == "mrad" else 1.0
+
+    def key(self, name: str) -> str:
+        """Return its key in the plant file."""
+        return f"{name}_{self.unit}" if self.unit else name
+
+    def check(self, kind: str, name: str, value: float) -> None:
+        """Raise InputError if a value is not within the limits."""
+        given = value / self.scale
+        if not self.low <= given <= self.high or (self.above and given == self.low):
+            least = f"{'above ' if self.above else ''}{self.low:g}"
+            most = (
+                f" to {self.high:g}" if self.high < math.inf else "" if self.above else " or more"
+            )
+            raise InputError(
+                f"{kind}: {self.key(name)} {given:g} ({self.text}); give {least}{most}"
+            )
+
+
+def _number(default: float, *given: Any, **named: Any) -> Any:
+    """Return a field for a number whose default is in the unit of the plant file; see `Setting`."""
+    setting = Setting(*given, **named)
+    value = default * setting.scale if setting.unit else default
+    return field(default=value, metadata={"setting": setting})
 
 
 @dataclass(frozen=True, kw_only=True)
 class CodedSettings:
     """Settings of all coded visits, to targets and to a receiver.
 
-    Attributes
-    ----------
-    most, least
-        Heliostats at once; and how many a visit needs that automatic control begins.
-    known
-        Largest expected beam error of a heliostat that takes part, rad RMS (2-D).
-    visit
-        Part of it that is drawn anew at each visit, rad per axis.
-    movement
-        Coded movement of a beam, either way along each axis, rad; a heliostat whose drives move its
-        beam in steps of more than half of it moves by two steps.
-    settle
-        Time from the moment that all have taken their aims until the photograph, s.
-    again
-        Photographs that are taken at most, as a multiple of those that a visit needs.
-    kind
-        Name of the visits, for people.
-    fewest
-        Least number of heliostats.
-    most_movement
-        Largest movement, rad.
+    Angles are in radians and times in seconds; `settings` has the meaning of each number.
     """
 
+    #: Name of the visits, for people.
     kind: ClassVar[str]
-    fewest: ClassVar[int]
-    most_movement: ClassVar[float]
 
     most: int
     least: int
-    known: float = 4e-3
-    visit: float = 5e-4
+    known: float = _number(
+        4.0, "largest expected beam error of one that takes part, RMS", 0, unit="mrad", above=True
+    )
+    visit: float = _number(
+        0.5, "part of it that is drawn anew at each visit, each axis", 0, unit="mrad"
+    )
     movement: float
-    settle: float = 1.0
+    settle: float = _number(
+        1.0, "from the moment that all stand at their aims until the photograph", 0, 60, "s"
+    )
     again: float
 
-    def _check(self) -> None:
-        """Refuse numbers that cannot be."""
-        if not self.fewest <= self.least <= self.most <= 127:
+    def __post_init__(self) -> None:
+        for name, setting in self.settings().items():
+            setting.check(self.kind, name, getattr(self, name))
+        if not self.least <= self.most:
             raise InputError(
-                f"{self.kind}: {self.least} to {self.most} heliostats; give {self.fewest} to 127, "
-                "the smaller number first"
+                f"{self.kind}: least {self.least} is above most {self.most}; give the smaller "
+                "number as least"
             )
-        if not 0.0 < self.movement <= self.most_movement or not 0.0 <= self.settle <= 60.0:
-            raise InputError(
-                f"{self.kind}: movements of {1e3 * self.movement:g} mrad that settle in "
-                f"{self.settle:g} s; give above 0 to {1e3 * self.most_movement:g} mrad, and 0 to "
-                "60 s"
-            )
-        if not (self.known > 0.0 and self.visit >= 0.0 and self.again >= 1.0):
-            raise InputError(
-                f"{self.kind}: beams known to {1e3 * self.known:g} mrad, {1e3 * self.visit:g} mrad "
-                f"of it drawn anew, {self.again:g} times the photographs; give above 0, 0 or more, "
-                "and 1 or more"
-            )
+
+    @classmethod
+    def settings(cls) -> dict[str, Setting]:
+        """Return what each number is, by its name here."""
+        found = {one.name: one.metadata.get("setting") for one in fields(cls)}
+        return {name: setting for name, setting in found.items() if setting is not None}
+
+    @property
+    def most_movement(self) -> float:
+        """Largest movement that a beam may make, rad."""
+        setting = self.settings()["movement"]
+        return setting.high * setting.scale
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointSettings(CodedSettings):
-    """Settings of joint visits: several heliostats on one target at once.
-
-    Attributes
-    ----------
-    brightest
-        Most light on a target, in suns.
-    first
-        Heliostats without a calibration on one target at once; 0: each goes alone.
-    first_movement
-        Coded movement of their beams, either way to the right, rad.
-    """
+    """Settings of joint visits: several heliostats on one target at once; see `CodedSettings`."""
 
     kind: ClassVar[str] = "joint visits"
-    fewest: ClassVar[int] = 2
-    most_movement: ClassVar[float] = 5e-3
 
-    most: int = 49
-    least: int = 4
-    movement: float = 5e-4
-    again: float = 2.5
-    brightest: float = 10.0
-    first: int = 63
-    first_movement: float = 2e-3
+    most: int = _number(49, "heliostats on one target at once", 2, 127)
+    least: int = _number(4, "heliostats that a visit of automatic control needs", 2, 127)
+    movement: float = _number(
+        0.5, "coded movement of a beam, either way along each axis", 0, 5, "mrad", above=True
+    )
+    again: float = _number(2.5, "photographs at most, over those that a visit needs", 1)
+    brightest: float = _number(10.0, "most light on a target", 0, unit="suns", above=True)
+    first: int = _number(63, "heliostats without a calibration at once; 0: each goes alone", 0, 127)
+    first_movement: float = _number(
+        2.0, "coded movement of their beams, either way to the right", 0, 5, "mrad", above=True
+    )
 
     def __post_init__(self) -> None:
-        self._check()
-        if not (self.first == 0 or self.least <= self.first <= 127):
+        super().__post_init__()
+        if 0 < self.first < self.least:
             raise InputError(
                 f"{self.kind}: {self.first} heliostats without a calibration; give 0, or "
                 f"{self.least} to 127"
             )
-        if not 0.0 < self.first_movement <= self.most_movement:
-            raise InputError(
-                f"{self.kind}: first movements of {1e3 * self.first_movement:g} mrad; give above "
-                f"0 to {1e3 * self.most_movement:g} mrad"
-            )
-        if not self.brightest > 0.0:
-            raise InputError(f"{self.kind}: up to {self.brightest:g} suns; give above 0")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReceiverSettings(CodedSettings):
-    """Settings of receiver visits: heliostats that shine on a receiver, measured there.
+    """Settings of receiver visits: heliostats measured where they shine; see `CodedSettings`.
 
     Attributes
     ----------
@@ -124,54 +145,29 @@ class ReceiverSettings(CodedSettings):
         Name of the camera that sees the whole receiver; its position is known.
     receiver
         Name of the receiver, which is planar.
-    exposures
-        Frames of the camera that are averaged for a photograph.
-    power
-        Largest share of the power on the receiver that the movements may cost.
-    steady
-        Largest change of the light on the receiver between photographs, as a share of it.
-    worth
-        Least change of a beam, rad RMS, for which its heliostat leaves the receiver for new
-        parameters.
-    every
-        Least time between two visits of a heliostat that automatic control begins, s.
     """
 
     kind: ClassVar[str] = "receiver visits"
-    fewest: ClassVar[int] = 1
-    most_movement: ClassVar[float] = 2e-3
 
     camera: str = field(kw_only=False)
     receiver: str = field(kw_only=False)
-    most: int = 50
-    least: int = 8
-    movement: float = 1e-3
-    again: float = 1.5
-    exposures: int = 1
-    power: float = 0.005
-    steady: float = 0.05
-    worth: float = 3e-4
-    every: float = 7200.0
-
-    def __post_init__(self) -> None:
-        self._check()
-        if not 0.0 < self.power <= MOST_POWER:
-            raise InputError(
-                f"{self.kind}: movements that cost {100.0 * self.power:g} % of the power; give "
-                f"above 0 to {100.0 * MOST_POWER:g} %"
-            )
-        if not (self.known <= 0.02 and self.again <= 10.0):
-            raise InputError(
-                f"{self.kind}: beams known to {1e3 * self.known:g} mrad, {self.again:g} times the "
-                "photographs; give up to 20 mrad, and up to 10"
-            )
-        if not (self.worth >= 0.0 and self.every >= 0.0):
-            raise InputError(
-                f"{self.kind}: new parameters from {1e3 * self.worth:g} mrad, a heliostat every "
-                f"{self.every:g} s; give 0 or more twice"
-            )
-        if not (1 <= self.exposures <= 100 and 0.0 < self.steady <= 0.5):
-            raise InputError(
-                f"{self.kind}: {self.exposures} frames for a photograph, light that changes by "
-                f"{100.0 * self.steady:g} %; give 1 to 100, and above 0 to 50 %"
-            )
+    most: int = _number(50, "heliostats at once", 1, 127)
+    least: int = _number(8, "heliostats that a visit of automatic control needs", 1, 127)
+    known: float = _number(
+        4.0, "largest expected beam error of one that takes part, RMS", 0, 20, "mrad", above=True
+    )
+    movement: float = _number(
+        1.0, "coded movement of a beam, either way along each axis", 0, 2, "mrad", above=True
+    )
+    again: float = _number(1.5, "photographs at most, over those that a visit needs", 1, 10)
+    exposures: int = _number(1, "frames that are averaged for a photograph", 1, 100)
+    power: float = _number(
+        0.005, "largest share of the power that the movements cost", 0, 0.01, above=True
+    )
+    steady: float = _number(
+        0.05, "largest change of the light between photographs, as a share", 0, 0.5, above=True
+    )
+    worth: float = _number(
+        0.3, "least change of a beam for which its mirror leaves the receiver", 0, unit="mrad"
+    )
+    every: float = _number(7200.0, "least time between two visits of a heliostat", 0, unit="s")

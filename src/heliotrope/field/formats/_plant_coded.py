@@ -1,8 +1,4 @@
-"""Settings of joint and of receiver visits in a plant's TOML file, read and written.
-
-A key is the name of a setting and its unit, so a new setting needs a field in the settings and a
-row in their table, and nothing here.
-"""
+"""Settings of joint and of receiver visits in a plant's TOML file, read and written."""
 
 from dataclasses import MISSING, fields
 from typing import Any
@@ -10,15 +6,10 @@ from typing import Any
 from heliotrope.errors import InputError
 from heliotrope.field.coded_visits import CodedSettings, JointSettings, ReceiverSettings
 from heliotrope.field.formats._plant_models import (
-    CodedVisitsTable,
     JointVisitsTable,
     ReceiverVisitsTable,
+    StrictTable,
 )
-
-#: Units at the end of a key, and what makes them the program's own.
-_UNITS = {"_mrad": 1e-3, "_rad": 1.0, "_s": 1.0, "_suns": 1.0}
-#: Units that the program writes: the last digit survives in them.
-_WRITTEN = ("", "_rad", "_s", "_suns")
 
 
 def build_joint(table: JointVisitsTable | None) -> JointSettings | None:
@@ -29,13 +20,13 @@ def build_joint(table: JointVisitsTable | None) -> JointSettings | None:
     InputError
         If its numbers cannot be.
     """
-    made = JointSettings(**_values(table, JointSettings.kind))
+    made = JointSettings(**_values(table, JointSettings))
     return made if table is None or table.allowed else None
 
 
 def build_receiver(table: ReceiverVisitsTable | None) -> ReceiverSettings | None:
     """Return the settings of a table, see `build_joint`; None without one."""
-    return None if table is None else ReceiverSettings(**_values(table, ReceiverSettings.kind))
+    return None if table is None else ReceiverSettings(**_values(table, ReceiverSettings))
 
 
 def coded_document(
@@ -45,31 +36,35 @@ def coded_document(
     tables = {}
     if joint is None:
         tables["joint_visits"] = {"allowed": False}
-    elif table := _table(joint, JointVisitsTable):
+    elif table := _table(joint):
         tables["joint_visits"] = table
     if receiver is not None:
-        tables["receiver_visits"] = _table(receiver, ReceiverVisitsTable)
+        tables["receiver_visits"] = _table(receiver)
     return tables
 
 
-def _values(table: CodedVisitsTable | None, kind: str) -> dict[str, Any]:
+def _values(table: StrictTable | None, made: type[CodedSettings]) -> dict[str, Any]:
     """Return the settings that a table gives, by name, in the program's own units."""
-    values: dict[str, Any] = {}
     given = {} if table is None else table.model_dump(exclude_none=True, exclude={"allowed"})
-    for key, value in given.items():
-        unit = next((unit for unit in _UNITS if key.endswith(unit)), "")
-        name = key.removesuffix(unit)
-        if name in values:
-            raise InputError(f"{kind}: {name} is given twice, the second time as {key}")
-        values[name] = value * _UNITS[unit] if unit else value
-    return values
+    values: dict[str, Any] = {}
+    for name, setting in made.settings().items():
+        key, written = setting.key(name), f"{name}_rad"
+        if key in given and written in given:
+            raise InputError(f"{made.kind}: {name} is given twice, the second time as {written}")
+        if key in given:
+            value = given.pop(key)
+            values[name] = value * setting.scale if setting.unit else value
+    return values | {key.removesuffix("_rad"): value for key, value in given.items()}
 
 
-def _table(settings: CodedSettings, model: type[CodedVisitsTable]) -> dict[str, Any]:
-    """Return the table of settings: those without a default, and those that differ from it."""
-    keys = model.model_fields
+def _table(settings: CodedSettings) -> dict[str, Any]:
+    """Return the table of settings: those without a default, and those that differ from it.
+
+    Angles are written in radians: the last digit survives in them.
+    """
+    keys = {name: setting.key(name) for name, setting in settings.settings().items()}
     return {
-        next(f.name + unit for unit in _WRITTEN if f.name + unit in keys): value
+        keys.get(f.name, f.name).replace("_mrad", "_rad"): value
         for f in fields(settings)
         if (value := getattr(settings, f.name)) != f.default or f.default is MISSING
     }

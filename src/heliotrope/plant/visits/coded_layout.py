@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.field.coded_visits import JointSettings
+from heliotrope.field.coded_visits import CodedSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, bisector, tangent_axes
 from heliotrope.imaging.coded import ExpectedBeam, coded_movements
@@ -143,8 +143,8 @@ def beams_of(
     plant: PlantController,
     target: Target,
     errors: Mapping[str, float],
+    settings: CodedSettings,
     aims: Mapping[str, FloatArray] | None = None,
-    most: float = JointSettings.most_movement,
 ) -> tuple[dict[str, SentBeam], dict[str, str]]:
     """Return what is known of beams, and why the others cannot be on a surface, by heliostat.
 
@@ -154,10 +154,10 @@ def beams_of(
         Knows mirrors and the sun; and the target, or the face of a receiver.
     errors
         Expected error of each beam, rad RMS (2-D); NaN where it does not reach the target.
+    settings
+        Of the visit: the movements may not need to be larger than they allow.
     aims
         Aims of the heliostats, ENU, m, each (3,); None: the middle.
-    most
-        Largest movement that the drives may need, rad.
     """
     field, at = plant.field, aims or dict.fromkeys(errors, np.asarray(target.center))
     paths = {n: at[n] - plant.beams.armature.origin_1[field.place(n)] for n in errors}
@@ -185,6 +185,7 @@ def beams_of(
         moments_on(target, aim - path, normal, width, height, flat) for flat in (1.0, _CURVED)
     )
     sent: dict[str, SentBeam] = {}
+    most = settings.most_movement
     for k, coarse in enumerate(LEAST_STEPS * step.max(axis=-1) * slanted / slant):
         if coarse > most:
             blocked[names[k]] = (

@@ -54,7 +54,9 @@ def newcomers(
     missed
         Joint first visits in which a beam was not found, by heliostat.
     """
-    sent, wrong = beams_of(plant, target, errors_on(plant, target, heliostats, settings, model))
+    sent, wrong = beams_of(
+        plant, target, errors_on(plant, target, heliostats, settings, model), settings
+    )
     for name in list(sent)[settings.first :]:
         wrong[name] = f"{settings.first} heliostats are on {target.name} already"
         del sent[name]

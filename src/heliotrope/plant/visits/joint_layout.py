@@ -51,7 +51,7 @@ def arranged(
         if (why := _unknown(plant, name, error, settings))
     }
     sure = {name: error for name, error in errors.items() if name not in blocked}
-    known, wrong = beams_of(plant, target, sure)
+    known, wrong = beams_of(plant, target, sure, settings)
     wrong |= blocked
     for name in list(known)[settings.most :]:
         wrong[name] = f"{settings.most} heliostats are on {target.name} already"
@@ -86,9 +86,8 @@ def verifying(
         Whether each has a code of its own.
     """
     again = np.sqrt(2.0) * settings.visit
-    known, wrong = beams_of(
-        plant, target, {name: float(np.hypot(error, again)) for name, error in errors.items()}
-    )
+    all_errors = {name: float(np.hypot(error, again)) for name, error in errors.items()}
+    known, wrong = beams_of(plant, target, all_errors, settings)
     places, dazzling = _darkened(target, known, settings)
     code = np.arange(len(known)) if own else _shared(known, places, along=_UP)
     return coded(target, known, places, code, settings.movement, along=_UP), wrong, dazzling

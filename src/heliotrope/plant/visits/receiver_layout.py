@@ -52,7 +52,7 @@ def arranged_on(
     points = np.array(list(aims.values())).reshape(-1, 3)
     found = np.hypot(expected_errors(plant, list(aims), points), sqrt(2.0) * settings.visit)
     errors = dict(zip(aims, found.tolist(), strict=True))
-    known, others = beams_of(plant, face, errors, aims, settings.most_movement)
+    known, others = beams_of(plant, face, errors, settings, aims)
     blocked |= others
     for name in list(known):
         size = known[name].movement(settings.movement)
