@@ -314,7 +314,7 @@ def test_a_span_without_sun_or_targets_is_refused(plant: Plant, fleet: Fleet) ->
         plan_commission([fleet], plant.site, (), START, START + DAY)
 
 
-# --- mirrors in production ------------------------------------------------------------------
+# --- mirrors on a receiver -------------------------------------------------------------------
 
 
 def _receiver(plant: Plant, known: float = 4e-3) -> ReceiverTerms:

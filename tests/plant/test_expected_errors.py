@@ -20,8 +20,7 @@ from heliotrope.plant.visits import coded_layout, joint_layout
 from heliotrope.plant.visits import expected_errors as module
 from heliotrope.plant.visits.coded_layout import beams_of, moments_on
 from heliotrope.plant.visits.expected_errors import expected_errors
-from heliotrope.plant.visits.first_layout import newcomers
-from heliotrope.plant.visits.joint_layout import arranged, bells
+from heliotrope.plant.visits.joint_layout import arranged, bells, newcomers
 from heliotrope.plant.visits.resolution import beam_slopes, beam_steps
 
 NOW = datetime(2026, 6, 21, 10, tzinfo=UTC)

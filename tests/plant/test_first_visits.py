@@ -15,8 +15,8 @@ from heliotrope.imaging.coded import Verdict
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.plant.visits.coded_layout import SentBeam
-from heliotrope.plant.visits.first_layout import _brightest, newcomers
 from heliotrope.plant.visits.fitting import first_model
+from heliotrope.plant.visits.joint_layout import _brightest, newcomers
 from heliotrope.plant.visits.settings import CycleSettings
 from support.joint_scene import Scene, joint, spoil
 from support.live import LiveOptions, LivePlant

@@ -28,7 +28,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.operations.calibrating import Calibrating, TrueErrors
-from heliotrope.plant.operations.joint_visits import JointVisits
+from heliotrope.plant.operations.coded_visits import JointVisits
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import PictureRow, Planned
 from heliotrope.plant.schedule.scheduler import VISITS

@@ -1,4 +1,4 @@
-"""Receiver visits: mirrors in production, measured on the receiver by small coded movements.
+"""Receiver visits: mirrors measured where they shine, on the receiver, by small coded movements.
 
 Mirrors drive, clusters poll and the plant commands as in operation; only the light is drawn by the
 simulated camera, from where the mirrors truly stand.
@@ -30,8 +30,8 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.coded_visits import ReceiverVisits
 from heliotrope.plant.operations.pictures import Pictures
-from heliotrope.plant.operations.receiver_visits import ReceiverVisits
 from heliotrope.plant.operations.views import PictureRow
 from heliotrope.plant.visits import CalibrationCycle, Centring, CycleResult, Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle

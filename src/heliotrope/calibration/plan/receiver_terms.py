@@ -1,4 +1,4 @@
-"""What a receiver visit costs and tells: mirrors in production, measured where they shine."""
+"""What a receiver visit costs and tells: mirrors measured where they shine."""
 
 from dataclasses import dataclass
 

@@ -28,10 +28,10 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.lockouts import Kind
 from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, TrueErrors
 from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.plant.operations.coded_visits import JointVisits, ReceiverVisits
 from heliotrope.plant.operations.errands import Step
 from heliotrope.plant.operations.flights import FlightIntake
 from heliotrope.plant.operations.foresight import POINT_EVERY, Foresight
-from heliotrope.plant.operations.joint_visits import JointVisits
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.learning import Learner, Learning
 from heliotrope.plant.operations.logbook import Logbook
@@ -39,7 +39,6 @@ from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.movement_checks import MovementChecks
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.raising import Raising
-from heliotrope.plant.operations.receiver_visits import ReceiverVisits
 from heliotrope.plant.operations.service import Service
 from heliotrope.plant.operations.timetable import Timetable
 from heliotrope.plant.operations.views import CalibrationView, Planned

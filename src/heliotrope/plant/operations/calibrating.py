@@ -16,13 +16,11 @@ from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
 from heliotrope.plant.authority import Person, RefusedError, TakenOutError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.plant.operations.coded_visits import JointVisits, ReceiverVisits, Requests
 from heliotrope.plant.operations.foresight import Foreseeing
-from heliotrope.plant.operations.joint_visits import JointVisits
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.pictures import Pictures
-from heliotrope.plant.operations.receiver_visits import ReceiverVisits
-from heliotrope.plant.operations.requests import Requests
 from heliotrope.plant.operations.views import CalibrationEntry, Planned, Running
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
 from heliotrope.plant.visits.coded_cycle import CodedCycle
@@ -489,7 +487,7 @@ class Calibrating:
         if self._joint is not None:
             self._joint.concluded(result)
         self._book.conclude(entry)
-        # The schedule plans visits to targets: one in production that brings nothing is no failure,
+        # The schedule plans visits to targets: a receiver visit that brings nothing is no failure,
         # nor is one that the camera, a cloud or an order of others has ended, and a beam that is
         # looked for in several joint visits has not failed yet.
         looked = joint and self._joint is not None and self._joint.again(result)

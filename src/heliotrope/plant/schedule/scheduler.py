@@ -57,7 +57,7 @@ VISITS = RetryLaw(
     alarm=alarms.CALIBRATION_GIVEN_UP,
 )
 #: Receiver visits to remember, some days of them.
-_SHINING = 100
+_RECEIVER_VISITS = 100
 #: Finished visits to remember.
 REMEMBERED = 20_000
 #: Step of a plan while there is nothing to do, s.
@@ -271,7 +271,7 @@ class Scheduler:
         self.reason = ""
         self.running: dict[str, Assignment] = {}
         self.finished: deque[Finished] = deque(maxlen=REMEMBERED)
-        self.receiver_visits: deque[ReceiverVisitTime] = deque(maxlen=_SHINING)
+        self.receiver_visits: deque[ReceiverVisitTime] = deque(maxlen=_RECEIVER_VISITS)
         begin, year = _unix(now), now.astimezone(UTC).year
         self._known = FieldKnowledge(design, self.settings, self.names, begin, year)
         self._judge = Judge(design, self.settings, self._known, self.names)

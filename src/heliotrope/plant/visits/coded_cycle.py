@@ -409,9 +409,11 @@ class CodedCycle(ABC):
 
 
 async def of_each(
-    heliostats: Iterable[str], result: Callable[[str], Awaitable[CycleResult]]
+    heliostats: Iterable[str],
+    result: Callable[[str], Awaitable[CycleResult]],
+    beside: Awaitable[None] | None = None,
 ) -> dict[str, CycleResult]:
-    """Return the results of heliostats, by name, that are computed side by side."""
+    """Return the results of heliostats, by name; all are computed side by side."""
     results: dict[str, CycleResult] = {}
 
     async def one(name: str) -> None:
@@ -420,6 +422,8 @@ async def of_each(
     async with asyncio.TaskGroup() as group:
         for name in heliostats:
             group.create_task(one(name))
+        if beside is not None:
+            await beside
     return results
 
 
