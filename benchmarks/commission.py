@@ -31,8 +31,8 @@ from heliotrope.calibration.plan.percentiles import error_percentiles
 from heliotrope.calibration.plan.planning import aim_at
 from heliotrope.calibration.sightings import Sightings, camera_target, drone, join, sightings
 from heliotrope.calibration.uncertainty import suns_of_year
+from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.example import roughly_installed
-from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, as_float, reflect, tangent_axes

@@ -33,10 +33,10 @@ from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAsse
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
-from heliotrope.plant.visits.joint_layout import moments_on
+from heliotrope.plant.visits.coded_layout import moments_on
 from heliotrope.plant.visits.neighbours import Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
-from heliotrope.plant.visits.receiver_layout import caught, production
+from heliotrope.plant.visits.receiver_layout import caught, sunlight_on
 from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.plant.workers import at_once
 from heliotrope.twin.live import World, WorldOptions
@@ -133,7 +133,8 @@ async def _measured(built: PlantAssembly, world: World, token: int, most: int) -
     unhidden = Unhidden(plant, at_once)
     whole = CalibrationCycle(plant, world.cameras, CYCLE, Centring(), unhidden)
     cycle = ReceiverCycle(plant, world.cameras, whole, settings)
-    light = Light(world, cycle.face)
+    face = built.design.receiver(settings.receiver).face
+    light = Light(world, face)
     before, begun, spent = light.now(), plant.now(), time.process_time()
     order = np.random.default_rng(1).permutation(plant.field.names)[:most]
     stages: list[tuple[str, float]] = []
@@ -142,7 +143,7 @@ async def _measured(built: PlantAssembly, world: World, token: int, most: int) -
         stages.append((stage, plant.now()))
         light.note(stage)
 
-    results = await cycle.run(ENGINEER, token, tuple(order.tolist()), tell)
+    results = await cycle.run(ENGINEER, token, tuple(order.tolist()), face.name, tell)
     after = light.now()
     error, inside = [], []
     for result in results:
@@ -164,7 +165,7 @@ async def _measured(built: PlantAssembly, world: World, token: int, most: int) -
         "worst_mrad": 1e3 * max(error),
         "within_90": float(np.mean(inside)),
         "power_lost_share": float(1.0 - np.mean(light.seen) / usual),
-        "production_m2": production(plant, cycle.face),
+        "production_m2": sunlight_on(plant, face),
         "stack_s": taken[-1] - taken[0],
         "visit_s": plant.now() - begun,
         "cpu_s": time.process_time() - spent,

@@ -27,10 +27,9 @@ from heliotrope.calibration.plan.on_target import (
 from heliotrope.calibration.plan.percentiles import error_percentiles
 from heliotrope.calibration.plan.receiver_terms import ReceiverTerms
 from heliotrope.errors import InputError
-from heliotrope.field.joint_visits import JointSettings
+from heliotrope.field.coded_visits import JointSettings, ReceiverSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
-from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import photographs_for
 
@@ -315,7 +314,7 @@ def test_a_span_without_sun_or_targets_is_refused(plant: Plant, fleet: Fleet) ->
         plan_commission([fleet], plant.site, (), START, START + DAY)
 
 
-# --- mirrors in production ------------------------------------------------------------------
+# --- mirrors on a receiver -------------------------------------------------------------------
 
 
 def _receiver(plant: Plant, known: float = 4e-3) -> ReceiverTerms:
@@ -353,7 +352,7 @@ def test_a_mirror_in_a_receiver_visit_is_nowhere_else(
         count = len(visit.heliostats)
         assert visit.joint
         assert (visit.own, visit.first, int(visit.missed.sum())) == (False, False, 0)
-        assert terms.settings.least <= count <= terms.party(60)
+        assert terms.settings.least <= count <= terms.at_once(60)
         # Nothing drives, and no more mirrors shine than there are.
         assert visit.end - visit.begin >= terms.span(count, 60) - 1e-6
         for i in visit.heliostats.tolist():
@@ -398,8 +397,8 @@ def test_receiver_visits_take_the_photographs_and_the_time_of_the_simulated_plan
     assert terms.span(50, 150) == pytest.approx(254.0 + 570.0, rel=0.1)
     # In a large field many are away at a time.
     assert terms.span(50, 10_000) < 300.0
-    assert (terms.party(150), terms.party(10_000)) == (50, 50)
-    assert 8 < terms.party(60) < 30
+    assert (terms.at_once(150), terms.at_once(10_000)) == (50, 50)
+    assert 8 < terms.at_once(60) < 30
     # Automatic control stays below the largest error, and part of that is drawn anew.
     assert terms.known == pytest.approx(3e-3)
     known = replace(terms, settings=replace(terms.settings, visit=2.5e-3)).known

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from heliotrope.cli import main
+from heliotrope.field.coded_visits import ReceiverSettings
 from heliotrope.field.formats.plant_file import write_plant
 from heliotrope.field.layouts import malan_plant
-from heliotrope.field.receiver_visits import ReceiverSettings
 
 SPAN = ("--from", "2026-09-01T22:00Z", "--days", "0.5", "--every", "1h")
 

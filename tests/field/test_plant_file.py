@@ -11,13 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.coded_visits import JointSettings, ReceiverSettings
 from heliotrope.field.example import example_plant
 from heliotrope.field.formats import paint, plant_file
 from heliotrope.field.heliostats import Heliostats
-from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
-from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.stellenbosch import prototype
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere
@@ -501,9 +500,13 @@ def test_joint_visits_are_read_and_survive(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "text"),
     [
-        ("most = 25", "most = 200", "joint_visits: joint visits: 4 to 200 heliostats; give 2 to"),
+        (
+            "most = 25",
+            "most = 200",
+            "joint_visits: joint visits: most 200 (heliostats on one target at once); give 2 to",
+        ),
         ("most = 25", "most = 2.5", "joint_visits.most: "),
-        ("known_mrad = 3", "known_mrad = 0", "beams known to 0 mrad"),
+        ("known_mrad = 3", "known_mrad = 0", "known_mrad 0 (largest"),
         ("known_mrad = 3", "known = 3", "joint_visits.known: "),
         ("most = 25", "known_rad = 0.003", "known is given twice, the second time as known_rad"),
     ],
@@ -610,7 +613,10 @@ def test_receiver_visits_are_read_and_survive(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "text"),
     [
-        ("power = 0.02", "receiver_visits: receiver visits: movements that cost 2 % of the power"),
+        (
+            "power = 0.02",
+            "receiver_visits: receiver visits: power 0.02 (largest share of the power",
+        ),
         ("movement = 1", "receiver_visits.movement: "),
         ("worth_mrad = 1\nworth_rad = 0.001", "worth is given twice"),
     ],

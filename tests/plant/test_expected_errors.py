@@ -10,17 +10,17 @@ import pytest
 
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.calibration.uncertainty import expected_error, precision
-from heliotrope.field.joint_visits import JointSettings
+from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import bisector, direction
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.visits import coded_layout, joint_layout
 from heliotrope.plant.visits import expected_errors as module
-from heliotrope.plant.visits import joint_layout
+from heliotrope.plant.visits.coded_layout import beams_of, moments_on
 from heliotrope.plant.visits.expected_errors import expected_errors
-from heliotrope.plant.visits.first_layout import newcomers
-from heliotrope.plant.visits.joint_layout import arranged, beams_of, bells, moments_on
+from heliotrope.plant.visits.joint_layout import arranged, bells, newcomers
 from heliotrope.plant.visits.resolution import beam_slopes, beam_steps
 
 NOW = datetime(2026, 6, 21, 10, tzinfo=UTC)
@@ -78,7 +78,7 @@ def test_beams_are_laid_out_together_as_each_alone(plant: Any) -> None:
     names, target = plant.design.names, plant.design.targets[0]
     errors = dict(zip(names, np.linspace(1e-3, 9e-3, len(names)).tolist(), strict=True))
     errors[names[3]] = np.nan
-    sent, blocked = beams_of(plant, target, errors)
+    sent, blocked = beams_of(plant, target, errors, JointSettings())
     assert tuple(sent) == (*names[:3], *names[4:])
     assert blocked == {names[3]: "out of its reach"}
     rows = np.array([plant.field.place(name) for name in sent])
@@ -86,7 +86,7 @@ def test_beams_are_laid_out_together_as_each_alone(plant: Any) -> None:
     counts = np.linspace(-500.0, 500.0, 2 * len(rows)).reshape(-1, 2)
     slopes = beam_slopes(plant, rows, target, SUN, counts)
     for k, (name, beam) in enumerate(sent.items()):
-        alone = beams_of(plant, target, {name: errors[name]})[0][name]
+        alone = beams_of(plant, target, {name: errors[name]}, JointSettings())[0][name]
         for one, other in zip(vars(beam).values(), vars(alone).values(), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9)
         np.testing.assert_array_equal(steps[k], beam.step)
@@ -99,7 +99,7 @@ def test_beams_are_laid_out_together_as_each_alone(plant: Any) -> None:
         np.testing.assert_allclose(
             beam.moments, moments_on(target, vertex, normal, *size), rtol=1e-9
         )
-    assert beams_of(plant, target, {}) == ({}, {})
+    assert beams_of(plant, target, {}, JointSettings()) == ({}, {})
 
 
 def test_the_light_of_a_beam_is_its_power() -> None:
@@ -129,8 +129,12 @@ def test_a_layout_computes_its_beams_at_once(plant: Any, monkeypatch: pytest.Mon
         monkeypatch.setattr(place, name, count)
 
     counted(module, "expected_error")
-    for name in ("beam_steps", "moments_on", "bells"):
-        counted(joint_layout, name)
+    for place, name in (
+        (coded_layout, "beam_steps"),
+        (coded_layout, "moments_on"),
+        (joint_layout, "bells"),
+    ):
+        counted(place, name)
     names, target = plant.design.names, plant.design.targets[0]
     settings = replace(JointSettings(), known=1.0)
 

@@ -8,15 +8,15 @@ import pytest
 
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.errors import FetchError, InputError
-from heliotrope.field.joint_visits import JointSettings
+from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import bisector, reflect
 from heliotrope.imaging.coded import Verdict
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism.board_items import differing, items_of
-from heliotrope.plant.visits.first_layout import _brightest, newcomers
+from heliotrope.plant.visits.coded_layout import SentBeam
 from heliotrope.plant.visits.fitting import first_model
-from heliotrope.plant.visits.joint_layout import SentBeam
+from heliotrope.plant.visits.joint_layout import _brightest, newcomers
 from heliotrope.plant.visits.settings import CycleSettings
 from support.joint_scene import Scene, joint, spoil
 from support.live import LiveOptions, LivePlant
@@ -304,8 +304,8 @@ def test_automatic_control_begins_with_them() -> None:
     ("wrong", "said"),
     [
         ({"first": 3}, "3 heliostats without a calibration; give 0, or 4 to 127"),
-        ({"first": 128}, "128 heliostats without a calibration"),
-        ({"first_movement": 6e-3}, "first movements of 6 mrad"),
+        ({"first": 128}, "first 128 .heliostats without a calibration.*; give 0 to 127$"),
+        ({"first_movement": 6e-3}, "first_movement_mrad 6 .*; give above 0 to 5$"),
     ],
 )
 def test_settings_of_first_visits_that_cannot_be_are_refused(

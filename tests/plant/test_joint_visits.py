@@ -18,7 +18,7 @@ from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.plan.on_target import LOOKS
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.errors import FetchError, InputError
-from heliotrope.field.joint_visits import JointSettings
+from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
@@ -28,7 +28,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.operations.calibrating import Calibrating, TrueErrors
-from heliotrope.plant.operations.parties import Parties
+from heliotrope.plant.operations.coded_visits import JointVisits
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import PictureRow, Planned
 from heliotrope.plant.schedule.scheduler import VISITS
@@ -36,7 +36,7 @@ from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits import CycleResult, JointCycle
 from heliotrope.plant.visits.joint_layout import arranged, errors_on
 from heliotrope.plant.visits.photographs import Shot
-from heliotrope.plant.visits.stacks import Exposed
+from heliotrope.plant.visits.target_light import Exposed
 from support.joint_scene import Scene, joint, spoil
 from support.live import LiveOptions, LivePlant
 from support.visit_scene import BIASES, ENGINEER, START, believe
@@ -162,7 +162,7 @@ def test_one_that_is_stowed_meanwhile_drops_out_and_the_others_go_on() -> None:
 
 def test_neighbours_count_as_they_stood_in_the_middle_of_the_stack() -> None:
     async def scene(here: Scene) -> None:
-        cycle, apart = here.cycle._cycle, list[float]()
+        cycle, apart = here.cycle.cycle, list[float]()
         alone = cycle.alone
 
         async def noted(target: Target, name: str, shot: Shot, standing: Any) -> Shot:
@@ -313,9 +313,9 @@ def test_who_is_not_known_well_enough_or_would_be_too_bright_has_no_place() -> N
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"least": 9, "most": 8}, "9 to 8 heliostats"),
-        ({"movement": 0.0}, "movements of 0 mrad"),
-        ({"brightest": 0.0}, "up to 0 suns"),
+        ({"least": 9, "most": 8}, "least 9 is above most 8; give the smaller"),
+        ({"movement": 0.0}, "movement_mrad 0 .coded.*; give above 0 to 5$"),
+        ({"brightest": 0.0}, "brightest_suns 0 .*; give above 0$"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, float], said: str) -> None:
@@ -400,9 +400,9 @@ class _Alarms(list):  # type: ignore[type-arg]
         return [(alarm.subject, alarm.active) for alarm in self]
 
 
-def parties(
+def joint_visits(
     known: float, first: int, together: int = 5, approaching: tuple[int, ...] = ()
-) -> tuple[Parties, _Alarms, np.ndarray]:
+) -> tuple[JointVisits, _Alarms, np.ndarray]:
     """Six heliostats, ``first`` of them without a calibration; three have a place at once.
 
     The others are known to ``known`` on the target, and hardly at all on the receiver.
@@ -424,7 +424,7 @@ def parties(
     settings = JointSettings(most=5, least=2, first=together)
     cycle = JointCycle(plant, None, None, settings)  # type: ignore[arg-type]
     cycle.having_place = lambda names, target: names[:3]  # type: ignore[method-assign, misc]
-    made = Parties(plant, book, cycle, told.append)  # type: ignore[arg-type]
+    made = JointVisits(plant, book, cycle, told.append)  # type: ignore[arg-type]
     return made, told, np.ones(6, dtype=np.bool_)
 
 
@@ -434,13 +434,13 @@ def follow(target: str, ready: np.ndarray, beside: bool) -> Planned | None:
     return Planned("ABCDEF"[row], target, 0.0, 1e-3, "") if ready[row] else None
 
 
-def test_parties_leave_every_second_visit_to_those_without_a_calibration() -> None:
-    made, _, ready = parties(2e-3, first=2, together=0)
+def test_joint_visits_leave_every_second_visit_to_those_without_a_calibration() -> None:
+    made, _, ready = joint_visits(2e-3, first=2, together=0)
     assert asyncio.run(made.chosen("left", ready, follow)) == ("C", "D", "E", "F")
     made.begun("left")
     assert asyncio.run(made.chosen("left", ready, follow)) == ()
     assert asyncio.run(made.chosen("left", ready, follow)) == ("C", "D", "E", "F")
-    made, _, ready = parties(2e-3, first=0)
+    made, _, ready = joint_visits(2e-3, first=0)
     made.begun("left")
     assert asyncio.run(made.chosen("left", ready, follow)) == ("A", "B", "C", "D", "E")
 
@@ -449,7 +449,7 @@ def test_parties_leave_every_second_visit_to_those_without_a_calibration() -> No
 def test_a_new_beam_that_leaves_the_target_dark_is_searched_at_another_place(
     verdict: Verdict,
 ) -> None:
-    made, _, _ = parties(2e-3, first=2)
+    made, _, _ = joint_visits(2e-3, first=2)
     unknown, known = (
         CycleResult(name, CalibrationOutcome.NOT_PROVEN, "x", verdict=verdict) for name in "AF"
     )
@@ -463,7 +463,7 @@ def test_a_new_beam_that_leaves_the_target_dark_is_searched_at_another_place(
 
 
 def test_a_party_is_chosen_while_the_target_waits_for_nothing() -> None:
-    made, _, ready = parties(2e-3, first=0)
+    made, _, ready = joint_visits(2e-3, first=0)
 
     async def main(clock: VirtualClock) -> None:
         begin = clock.monotonic()
@@ -475,19 +475,19 @@ def test_a_party_is_chosen_while_the_target_waits_for_nothing() -> None:
 
 def test_the_error_on_the_target_decides_who_shares_codes() -> None:
     """With what is drawn anew at each visit it may be 3.8 mrad; on the receiver it may be more."""
-    sure, _, ready = parties(3.7e-3, first=0)
+    sure, _, ready = joint_visits(3.7e-3, first=0)
     assert asyncio.run(sure.chosen("left", ready, follow)) == ("A", "B", "C", "D", "E")
-    vague, _, ready = parties(3.75e-3, first=0)
+    vague, _, ready = joint_visits(3.75e-3, first=0)
     assert asyncio.run(vague.chosen("left", ready, follow)) == ("A", "B", "C"), "codes of their own"
-    vague, _, ready = parties(3.75e-3, first=0, together=0)
+    vague, _, ready = joint_visits(3.75e-3, first=0, together=0)
     assert asyncio.run(vague.chosen("left", ready, follow)) == ()
     # A mirror that cannot reach the target is neither.
-    lost, _, ready = parties(np.nan, first=0)
+    lost, _, ready = joint_visits(np.nan, first=0)
     assert asyncio.run(lost.chosen("left", ready, follow)) == ()
 
 
-def test_parties_of_new_heliostats_come_first() -> None:
-    made, told, ready = parties(2e-3, first=4)
+def test_joint_visits_of_new_heliostats_come_first() -> None:
+    made, told, ready = joint_visits(2e-3, first=4)
     # Four are new, and three of them have a place; the other waits for the next visit.
     assert asyncio.run(made.chosen("left", ready, follow)) == ("A", "B", "C")
     for name in "ABC":
@@ -496,7 +496,7 @@ def test_parties_of_new_heliostats_come_first() -> None:
         made.concluded(joined)
     assert told.active() == [], "nobody knows where the beam of a new mirror ought to be"
     assert made.alone(ready).tolist() == [True, True, True, False, False, False]
-    # One new heliostat is no party: those that go alone are next, then those that are known.
+    # One new heliostat is no joint visit: those that go alone are next, then those that are known.
     assert asyncio.run(made.chosen("left", ready, follow)) == ()
     assert asyncio.run(made.chosen("left", ready, follow)) == ("E", "F")
 
@@ -512,7 +512,7 @@ def test_parties_of_new_heliostats_come_first() -> None:
     ids=["never seen", "light at its place that is another's", "joined", "exchanged"],
 )
 def test_the_search_for_a_beam_in_joint_visits_ends(verdicts: tuple[Verdict, ...]) -> None:
-    made, _, ready = parties(2e-3, first=4)
+    made, _, ready = joint_visits(2e-3, first=4)
     for verdict in verdicts:
         assert not made.alone(ready)[0]
         result = CycleResult("A", CalibrationOutcome.NOT_PROVEN, "x", verdict=verdict)
@@ -529,7 +529,7 @@ def test_the_search_for_a_beam_in_joint_visits_ends(verdicts: tuple[Verdict, ...
 
 
 def test_a_beam_that_is_looked_for_comes_again_and_a_cloud_is_no_mirrors_fault() -> None:
-    made, _, ready = parties(2e-3, first=4)
+    made, _, ready = joint_visits(2e-3, first=4)
     faint = CycleResult("A", CalibrationOutcome.NOT_PROVEN, "x", verdict=Verdict.FAINT)
     cloud = CycleResult("C", CalibrationOutcome.NOT_PROVEN, "x", verdict=Verdict.CLOUD)
     made.concluded(faint)
@@ -546,7 +546,7 @@ def test_a_beam_that_is_looked_for_comes_again_and_a_cloud_is_no_mirrors_fault()
 
 
 def test_two_targets_share_the_new_heliostats() -> None:
-    made, _, ready = parties(1e-3, first=6)
+    made, _, ready = joint_visits(1e-3, first=6)
     made._plant.design.targets = ("left", "right")
     asked: list[int] = []
 
@@ -559,17 +559,17 @@ def test_two_targets_share_the_new_heliostats() -> None:
 
 
 def test_a_target_waits_a_minute_for_heliostats_that_are_raised() -> None:
-    made, _, ready = parties(1e-3, first=6, approaching=(4, 5))
+    made, _, ready = joint_visits(1e-3, first=6, approaching=(4, 5))
     ready[3:] = False
     assert made.awaited("left", ready)
     assert made.awaited("left", ready), "40 s later"
     assert not made.awaited("left", ready)
-    assert not parties(1e-3, first=6, together=3, approaching=(4, 5))[0].awaited("left", ready)
-    assert not parties(1e-3, first=6)[0].awaited("left", ready), "nobody comes"
+    assert not joint_visits(1e-3, first=6, together=3, approaching=(4, 5))[0].awaited("left", ready)
+    assert not joint_visits(1e-3, first=6)[0].awaited("left", ready), "nobody comes"
 
 
 def test_who_was_disproved_goes_alone_and_has_an_alarm_until_it_is_seen() -> None:
-    made, told, ready = parties(1e-3, first=0)
+    made, told, ready = joint_visits(1e-3, first=0)
     bad = CycleResult("B", CalibrationOutcome.NOT_PROVEN, "unchanged: x", verdict=Verdict.STUCK)
     made.concluded(bad)
     assert told.active() == [("B", True)]
@@ -585,7 +585,7 @@ def test_who_was_disproved_goes_alone_and_has_an_alarm_until_it_is_seen() -> Non
 
 
 def calibrating_of(
-    made: Parties,
+    made: JointVisits,
     event: Callable[..., None],
     done: list[str],
     truth: Callable[[], np.ndarray] = lambda: np.full(6, np.nan),
@@ -607,12 +607,12 @@ def calibrating_of(
         silent,  # type: ignore[arg-type]
         TrueErrors(plant, truth),
         lambda: (),
-        parties=made,
+        joint=made,
     )
 
 
 def test_what_a_joint_visit_disproves_is_an_alarm_when_it_ends() -> None:
-    made, alarms, ready = parties(1e-3, first=0)
+    made, alarms, ready = joint_visits(1e-3, first=0)
     results = (
         CycleResult("A", _CALIBRATED, "calibrated", new=3),
         CycleResult("B", CalibrationOutcome.NOT_PROVEN, "unchanged: x", verdict=Verdict.STUCK),
@@ -640,7 +640,7 @@ def test_what_a_joint_visit_disproves_is_an_alarm_when_it_ends() -> None:
 
 
 def test_a_joint_visit_that_is_refused_is_one_event_and_not_one_of_each() -> None:
-    made, _, ready = parties(1e-3, first=0)
+    made, _, ready = joint_visits(1e-3, first=0)
 
     async def run(*_: object) -> tuple[CycleResult, ...]:
         raise refusals.OTHER_AUTHORITY.error(holder="Egon", person="automatic control")
@@ -661,12 +661,12 @@ def test_a_joint_visit_that_is_refused_is_one_event_and_not_one_of_each() -> Non
 
 
 def test_persons_wait_until_all_are_ready_and_can_withdraw() -> None:
-    made, _, ready = parties(1e-3, first=0)
-    made.ask(("A", "C", "E"), "left")
+    made, _, ready = joint_visits(1e-3, first=0)
+    made.requests.ask(("A", "C", "E"), "left")
     ready[2] = False
-    assert made.wanted("left", ready) == ()
+    assert made.requests.next("left", ready) == ()
     ready[2] = True
-    assert made.wanted("right", ready) == ()
-    made.withdraw(("C",))
-    assert made.wanted("left", ready) == ("A", "E")
-    assert made.asked == ()
+    assert made.requests.next("right", ready) == ()
+    made.requests.withdraw(("C",))
+    assert made.requests.next("left", ready) == ("A", "E")
+    assert made.requests.asked == ()

@@ -14,9 +14,9 @@ from benchmarks.days import Days
 
 from heliotrope.calibration.plan.receiver_terms import ReceiverTerms
 from heliotrope.errors import InputError
+from heliotrope.field.coded_visits import ReceiverSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
-from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.geometry import MRAD
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.controller import PlantController
@@ -25,7 +25,7 @@ from heliotrope.plant.operations.foresight import Foresight
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.outlook import FieldPoint, Outlook, day_of, end_of_day
 from heliotrope.plant.schedule.choice import Assignment
-from heliotrope.plant.schedule.prospect import FieldProspect, Shining, terms_of
+from heliotrope.plant.schedule.prospect import FieldProspect, ReceiverVisitTime, terms_of
 from heliotrope.plant.schedule.scheduler import (
     Comparison,
     Finished,
@@ -172,13 +172,13 @@ def test_joint_visits_are_those_of_the_plant_with_the_times_that_they_took() -> 
     sure, new = terms.span(count, own=False), terms.span(count, own=True)
     made = joint_visit(0.0, 1.5 * sure, 1e-3) + joint_visit(500.0, 1.5 * new, 1e-2)
     found = compare(made)
-    assert [party.mirrors for party in found.parties] == [count, count]
+    assert [visit.mirrors for visit in found.joint_visits] == [count, count]
     assert np.isnan(found.pace), "nobody went alone"
-    assert terms_of(settings, joint, found.pace, found.parties).joint == terms, (
+    assert terms_of(settings, joint, found.pace, found.joint_visits).joint == terms, (
         "few visits say nothing yet"
     )
     found = compare(made + joint_visit(1500.0, 1.5 * sure, 1e-3))
-    slow = terms_of(settings, joint, found.pace, found.parties).joint
+    slow = terms_of(settings, joint, found.pace, found.joint_visits).joint
     assert slow is not None
     assert slow.span(count, own=True) == pytest.approx(1.5 * new)
 
@@ -228,11 +228,11 @@ def test_receiver_visits_take_the_times_that_they_took() -> None:
     usual = seen().span(10, 60)
     for k in range(3):
         assert seen().pace == 1.0, f"{k} visits say nothing yet"
-        schedule.shining.append(Shining(10, 60, 1.5 * usual))
+        schedule.receiver_visits.append(ReceiverVisitTime(10, 60, 1.5 * usual))
     assert seen().span(10, 60) == pytest.approx(1.5 * usual)
     assert seen().span(30, 60) > 1.5 * usual
     # One visit that took for ever does not end all others.
-    schedule.shining.append(Shining(10, 60, 1e5))
+    schedule.receiver_visits.append(ReceiverVisitTime(10, 60, 1e5))
     assert seen().pace == 4.0
 
 

@@ -123,18 +123,18 @@ class Full:
 
 def test_those_of_a_joint_visit_are_kept_once_with_the_result_of_each(tmp_path: Path) -> None:
     pictures = Pictures(tmp_path)
-    pictures.begin_together("left")
-    pictures.take_together(CameraView("left", 1, NOW - 500.0, b"broken off"))
-    pictures.begin_together("left")
+    pictures.begin_coded("left")
+    pictures.take_coded(CameraView("left", 1, NOW - 500.0, b"broken off"))
+    pictures.begin_coded("left")
     for k in range(40):
-        pictures.take_together(CameraView("left", k + 2, NOW + k, bytes([k]) * 100, ("several",)))
+        pictures.take_coded(CameraView("left", k + 2, NOW + k, bytes([k]) * 100, ("several",)))
     stuck = replace(
         entry("B", NOW + 60.0),
         outcome=CalibrationOutcome.NOT_PROVEN,
         new=0,
         text="unchanged: stuck",
     )
-    pictures.conclude_together("left", [entry("A", NOW + 60.0), stuck])
+    pictures.conclude_coded("left", [entry("A", NOW + 60.0), stuck])
     again = Pictures(tmp_path)  # the plant was started again
     one, other = listed(again, "A"), listed(again, "B")
     # Of a long stack the last ones.
@@ -154,15 +154,15 @@ def test_those_of_a_joint_visit_are_kept_once_with_the_result_of_each(tmp_path: 
     visit(again, "A", NOW + 20.5)
     assert [row.at for row in listed(again, "A", 20)][19:] == [NOW + 20.5]
     # A visit without photographs keeps nothing.
-    again.conclude_together("right", [entry("A", NOW + 90.0)])
+    again.conclude_coded("right", [entry("A", NOW + 90.0)])
     assert len(listed(again, "A")) == 33
 
 
 def test_a_joint_visit_is_thinned_by_age_for_all_its_heliostats(tmp_path: Path) -> None:
     pictures = Pictures(tmp_path, PictureSettings(whole=1.0, last=10.0))
     for k in range(4):
-        pictures.take_together(CameraView("left", k + 1, NOW + k, b"x"))
-    pictures.conclude_together("left", [entry("A", NOW + 9.0), entry("B", NOW + 9.0)])
+        pictures.take_coded(CameraView("left", k + 1, NOW + k, b"x"))
+    pictures.conclude_coded("left", [entry("A", NOW + 9.0), entry("B", NOW + 9.0)])
     visit(pictures, "C", NOW + 3.0 * DAY)
     assert [len(listed(pictures, name)) for name in "AB"] == [1, 1]
     visit(pictures, "C", NOW + 20.0 * DAY)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import FetchError, InputError
+from heliotrope.field.coded_visits import ReceiverSettings
 from heliotrope.field.plant import Plant
-from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.stellenbosch import prototype
 from heliotrope.field.target import Receiver
 from heliotrope.geometry import normalize
@@ -32,7 +32,7 @@ from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.imaging.targets.view import posed_view
 from heliotrope.links.clock import SystemClock
 from heliotrope.plant.cameras import RealCameras, source_of
-from heliotrope.plant.visits.stacks import light_on
+from heliotrope.plant.visits.target_light import light_on
 from heliotrope.safety import Alarm
 from heliotrope.twin.cameras import FieldSnapshot, RenderedCamera
 from heliotrope.twin.drawing import Optics

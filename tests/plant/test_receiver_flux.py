@@ -15,10 +15,10 @@ import pytest
 
 from heliotrope.console.client import Client
 from heliotrope.errors import FetchError, FormatError, InputError
+from heliotrope.field.coded_visits import ReceiverSettings
 from heliotrope.field.example import example_plant
 from heliotrope.field.formats.plant_file import write_plant
 from heliotrope.field.plant import Plant
-from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.imaging.files import write_image
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.receiver_file import write_reference

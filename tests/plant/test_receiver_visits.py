@@ -1,4 +1,4 @@
-"""Receiver visits: mirrors in production, measured on the receiver by small coded movements.
+"""Receiver visits: mirrors measured where they shine, on the receiver, by small coded movements.
 
 Mirrors drive, clusters poll and the plant commands as in operation; only the light is drawn by the
 simulated camera, from where the mirrors truly stand.
@@ -22,6 +22,7 @@ from heliotrope.field.example import roughly_installed
 from heliotrope.field.layout_tower import watching_camera
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
+from heliotrope.field.target import Target
 from heliotrope.geometry import bisector, reflect
 from heliotrope.imaging.coded import SeparatedBeam, Verdict
 from heliotrope.lcu import states
@@ -29,12 +30,13 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.coded_visits import ReceiverVisits
 from heliotrope.plant.operations.pictures import Pictures
-from heliotrope.plant.operations.production import ProductionVisits
 from heliotrope.plant.operations.views import PictureRow
 from heliotrope.plant.visits import CalibrationCycle, Centring, CycleResult, Unhidden
-from heliotrope.plant.visits.receiver_cycle import ReceiverCycle, judged
+from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.receiver_layout import caught
+from heliotrope.plant.visits.target_light import judged
 from heliotrope.plant.workers import at_once
 from support.live import LiveOptions, LivePlant
 from support.visit_scene import CYCLE, ENGINEER, START, VisitScene, believe, in_command
@@ -59,8 +61,14 @@ class Scene(VisitScene):
 
     cycle: ReceiverCycle
 
+    @property
+    def face(self) -> Target:
+        return self.live.design.receivers[0].face
+
     async def run(self, *names: str) -> dict[str, CycleResult]:
-        found = await self.cycle.run(ENGINEER, self.token, names or self.names, self.tell)
+        found = await self.cycle.run(
+            ENGINEER, self.token, names or self.names, "receiver", self.tell
+        )
         return {result.heliostat: result for result in found}
 
     async def until(self, what: Callable[[], bool], limit: float = 600.0) -> None:
@@ -116,7 +124,7 @@ def production(
 async def _aimed(made: Scene, scene: Callable[[Scene], Awaitable[None]]) -> None:
     turn = 2.0 * np.pi * np.arange(len(made.names)) / len(made.names)
     places = 1.5 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    aims = dict(zip(made.names, made.cycle.face.point(places), strict=True))
+    aims = dict(zip(made.names, made.face.point(places), strict=True))
     await asyncio.sleep(3.0)  # the clusters hear of the command authority
     ticket = made.live.plant.aim(ENGINEER, made.token, aims)
     assert await ticket.end(60.0), ticket.text
@@ -170,7 +178,7 @@ def spoil(scene: Scene, stuck: str = "", traded: tuple[str, ...] = (), cloudy: s
 
     A cloud stands over a fourth one all the time: none of its light comes.
     """
-    live, face = scene.live, scene.cycle.face
+    live, face = scene.live, scene.face
     true, held = live.field.stand, {}
     aims = live.plant.aims.copy()
 
@@ -344,7 +352,7 @@ def test_an_emergency_while_parameters_are_written_leaves_none_locked() -> None:
 
 def test_a_movement_is_refused_that_leaves_the_receiver_or_its_neighbourhood() -> None:
     async def scene(here: Scene) -> None:
-        plant, face = here.live.plant, here.cycle.face
+        plant, face = here.live.plant, here.face
         name = here.names[0]
         row = plant.field.place(name)
         aim = plant.aims[row].copy()
@@ -409,7 +417,7 @@ def test_automatic_control_measures_those_that_track_the_receiver(tmp_path: Path
         # The prediction hears how long they took.
         schedule = here.live.assembly.schedule
         assert schedule is not None
-        first = schedule.scheduler.shining[0]
+        first = schedule.scheduler.receiver_visits[0]
         assert (first.mirrors, first.lit) == (3, len(names))
         assert 20.0 < first.seconds < 300.0
         # The last photographs are kept once; each of the heliostats finds them with its own result.
@@ -433,7 +441,7 @@ class Rows(SimpleNamespace):
         return 6
 
 
-def chooser(error: float = 1e-3, **chosen: float) -> tuple[ProductionVisits, SimpleNamespace]:
+def chooser(error: float = 1e-3, **chosen: float) -> tuple[ReceiverVisits, SimpleNamespace]:
     """Six heliostats that track the receiver, and the plant's clock."""
     names = tuple("ABCDEF")
     face = malan_plant(1).receivers[0].face
@@ -445,9 +453,9 @@ def chooser(error: float = 1e-3, **chosen: float) -> tuple[ProductionVisits, Sim
         now=lambda: clock.at,
     )
     settings = ReceiverSettings("eye", "receiver", **({"most": 4, "least": 2} | chosen))  # type: ignore[arg-type]
-    cycle = SimpleNamespace(settings=settings, face=face)
+    cycle = SimpleNamespace(settings=settings, face=lambda name: face)
     book = SimpleNamespace(error=np.full(6, error))
-    made = ProductionVisits(plant, book, cycle, lambda alarm: None)  # type: ignore[arg-type]
+    made = ReceiverVisits(plant, book, cycle, lambda alarm: None)  # type: ignore[arg-type]
     return made, clock
 
 
@@ -468,14 +476,14 @@ def test_those_whose_errors_may_be_largest_are_measured_first_and_then_wait() ->
     clock.at += 7200.0
     assert len(made.chosen(ready)) == 4
     ready[2:] = False
-    made.ask(("A", "F"))
+    made.requests.ask(("A", "F"), "")
     assert made.chosen(ready) == (), "persons wait until all of them track the receiver"
     ready[5] = True
     assert made.chosen(ready) == ("A", "F")
-    assert made.asked == ()
-    made.ask(("A", "B"))
-    made.withdraw(("B",))
-    assert made.asked == ("A",)
+    assert made.requests.asked == ()
+    made.requests.ask(("A", "B"), "")
+    made.requests.withdraw(("B",))
+    assert made.requests.asked == ("A",)
 
 
 def test_one_that_is_refused_again_and_again_goes_to_a_target() -> None:
@@ -536,12 +544,14 @@ def test_a_beam_too_bright_or_too_dim_for_its_mirror_is_joined_with_other_light(
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"least": 9, "most": 8}, "9 to 8 heliostats"),
-        ({"movement": 0.003}, "movements of 3 mrad"),
-        ({"power": 0.02}, "cost 2 % of the power; give above 0 to 1 %"),
-        ({"known": 0.0}, "known to 0 mrad"),
-        ({"steady": 0.9}, "changes by 90 %"),
-        ({"again": 0.5}, "0.5 times the photographs"),
+        ({"least": 9, "most": 8}, "least 9 is above most 8; give the smaller"),
+        ({"movement": 0.003}, "movement_mrad 3 .coded.*; give above 0 to 2$"),
+        ({"power": 0.02}, "power 0.02 .*; give above 0 to 0.01$"),
+        ({"known": 0.0}, "known_mrad 0 .*; give above 0 to 20$"),
+        ({"steady": 0.9}, "steady 0.9 .*; give above 0 to 0.5$"),
+        ({"again": 0.5}, "again 0.5 .*; give 1 to 10$"),
+        ({"visit": -1e-3}, "visit_mrad -1 .*; give 0 or more$"),
+        ({"settle": float("nan")}, "settle_s nan .*; give 0 to 60$"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, float], said: str) -> None:

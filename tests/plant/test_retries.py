@@ -88,6 +88,14 @@ class Scene:
     async def visit(self) -> tuple[str, ...]:
         return await self.calibrating.visit("target", self.ready, ENGINEER, self.token)
 
+    async def joint_visit(self, results: tuple[CycleResult, ...]) -> None:
+        async def run(*_: object) -> tuple[CycleResult, ...]:
+            return results
+
+        cycle: Any = SimpleNamespace(run=run, kind="joint visit")
+        names = tuple(result.heliostat for result in results)
+        await self.calibrating._coded_visit(cycle, names, "target", ENGINEER, self.token)
+
 
 def play(folder: Path, scene: Callable[[Scene], Awaitable[None]]) -> None:
     async def main(clock: VirtualClock) -> None:
@@ -174,11 +182,8 @@ def test_only_the_others_of_a_joint_visit_have_failed(tmp_path: Path, taken: boo
         out = CalibrationOutcome.TAKEN_OUT if taken else CalibrationOutcome.REFUSED
         outcomes = (out, CalibrationOutcome.NOT_VERIFIED, CalibrationOutcome.CALIBRATED)
 
-        async def work(tell: object) -> tuple[CycleResult, ...]:
-            del tell
-            return tuple(CycleResult(n, o, "x") for n, o in zip(names, outcomes, strict=True))
-
-        await here.calibrating._together(names, "target", here.token, work)
+        results = tuple(CycleResult(n, o, "x") for n, o in zip(names, outcomes, strict=True))
+        await here.joint_visit(results)
         assert [one.heliostat for one in here.schedule.entries] == list(names[taken:])
 
     play(tmp_path, scene)
@@ -276,11 +281,7 @@ def test_clouds_on_a_joint_visit_are_no_failure_of_its_heliostats(tmp_path: Path
             for name in names
         )
 
-        async def work(tell: object) -> tuple[CycleResult, ...]:
-            del tell
-            return clouded
-
-        await here.calibrating._together(names, "target", here.token, work)
+        await here.joint_visit(clouded)
         assert here.schedule.entries == []
         (retry,) = here.calibrating.retries()
         assert (retry.subject, retry.count) == ("target", 1)

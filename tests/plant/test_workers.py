@@ -20,7 +20,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
 from heliotrope.plant.schedule.scheduler import Scheduler
-from heliotrope.plant.visits import fitting, stacks
+from heliotrope.plant.visits import fitting, target_light
 from heliotrope.plant.workers import WorkerProcesses, at_once
 from heliotrope.processes import end, pool
 from support.joint_scene import Scene, joint
@@ -117,7 +117,7 @@ def _in_the_loop(*_: Any, **__: Any) -> Any:
 def test_a_joint_visit_is_evaluated_in_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """The gap of the loop is bounded: what takes long is not in its process at all."""
     for place, name in (
-        (stacks, "separate"),
+        (target_light, "separate"),
         (own_model, "fit"),
         (own_model, "fitting_present"),
         (fitting, "fit_common"),

@@ -20,7 +20,7 @@ from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.permission import Permission
 from heliotrope.plant.stepping import Stepping
 from heliotrope.plant.tickets import Ticket
-from heliotrope.plant.visits import joint_layout, receiver_layout
+from heliotrope.plant.visits import coded_layout
 from heliotrope.plant.visits.visit import Visit
 from heliotrope.twin.invariants.invariants import L1, L2, L3, L4
 from heliotrope.twin.world.crew import ANY_TIME, LOCKED, SCRIPT, CrewAct
@@ -68,8 +68,7 @@ def movements_below_the_resolution(patch: pytest.MonkeyPatch) -> None:
         del self, heliostats
         yield
 
-    patch.setattr(joint_layout, "LEAST_STEPS", 0.0)
-    patch.setattr(receiver_layout, "LEAST_STEPS", 0.0)
+    patch.setattr(coded_layout, "LEAST_STEPS", 0.0)
     patch.setattr(Stepping, "fine", rough)
     patch.setattr(Stepping, "coarse", lambda self, heliostats, now: ())
 

@@ -394,7 +394,7 @@ def calibrate(
         bool, typer.Option("--together", help="All at once on one target, in a joint visit.")
     ] = False,
     receiver: Annotated[
-        bool, typer.Option("--receiver", help="All at once where they shine, in production.")
+        bool, typer.Option("--receiver", help="All at once where they shine, in a receiver visit.")
     ] = False,
     wait: Wait = 3600.0,
 ) -> None:

@@ -142,7 +142,7 @@ def _joint(
     """Return the joint visits: those of the plant file, as far as no option says otherwise."""
     from heliotrope.calibration.plan.joint_terms import JointTerms
     from heliotrope.errors import InputError
-    from heliotrope.field.joint_visits import JointSettings
+    from heliotrope.field.coded_visits import JointSettings
 
     if together == 1 or (plant.joint_visits is None and together is None):
         if first:

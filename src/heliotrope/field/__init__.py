@@ -8,6 +8,10 @@ ones; `example_plant` has 18 heliostats, `prototype` is Malan's.
 from heliotrope.field.camera import (
     Camera,
 )
+from heliotrope.field.coded_visits import (
+    JointSettings,
+    ReceiverSettings,
+)
 from heliotrope.field.day import (
     TrackedDay,
     track_day,
@@ -23,17 +27,11 @@ from heliotrope.field.heliostats import (
     Facets,
     Heliostats,
 )
-from heliotrope.field.joint_visits import (
-    JointSettings,
-)
 from heliotrope.field.marks import (
     Mark,
 )
 from heliotrope.field.plant import (
     Plant,
-)
-from heliotrope.field.receiver_visits import (
-    ReceiverSettings,
 )
 from heliotrope.field.stellenbosch import (
     prototype,

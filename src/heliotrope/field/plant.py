@@ -9,10 +9,9 @@ import numpy as np
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.camera import Camera, check_unfolded
+from heliotrope.field.coded_visits import JointSettings, ReceiverSettings
 from heliotrope.field.heliostat import Heliostat
 from heliotrope.field.heliostats import Heliostats, rows_in
-from heliotrope.field.joint_visits import JointSettings
-from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.timetable import TimetableEntry, check_timetable
 from heliotrope.field.volumes import Volume
@@ -59,7 +58,7 @@ class Plant(Value, Framed):
         Settings of visits of several heliostats to one target at once; None: each is calibrated
         alone.
     receiver_visits
-        How heliostats in production are measured on the receiver; None: they are not.
+        How heliostats are measured on the receiver; None: they are not.
     timetable
         Calibrations at times of day and at intervals, as people want them.
     safety

@@ -17,7 +17,7 @@ from heliotrope.imaging.targets.rectify import LEAST_RIM, rectify, rim_of
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.photographs import Shot
-from heliotrope.plant.visits.stacks import TargetLight
+from heliotrope.plant.visits.target_light import TargetLight
 
 #: JPEG quality (0 to 100) and gamma of the pictures for people.
 _JPEG, _GAMMA = 80, 0.45

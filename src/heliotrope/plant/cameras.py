@@ -32,7 +32,7 @@ from heliotrope.links.clock import Clock
 from heliotrope.plant.camera_views import SEVERAL, Views, beam_of, light_of, picture_of, shot_of
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.photographs import Shot
-from heliotrope.plant.visits.stacks import Exposed, TargetLight
+from heliotrope.plant.visits.target_light import Exposed, TargetLight
 from heliotrope.plant.workers import Worker, at_once
 from heliotrope.safety import Alarm, alarms
 
@@ -299,7 +299,7 @@ class RealCameras:
         return shot
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
-        """Photograph a target; see `plant.visits.stacks.StackCamera`.
+        """Photograph a target; see `plant.visits.target_light.LightCamera`.
 
         Raises
         ------

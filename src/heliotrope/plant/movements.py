@@ -1,6 +1,6 @@
 """Aims that visits have moved, and the aims to which the beams go back.
 
-A measurement in production moves beams by a milliradian; a visit to a target gives heliostats an
+A receiver visit moves beams by a milliradian; a visit to a target gives heliostats an
 aim there. So that they come back whatever becomes of the visit, the plant itself sends each beam
 back to its aim (`giving_back`): when the visit says so, when a small movement was not renewed for a
 while, and when the mandate or the command authority under which it was moved is over. That needs a

@@ -26,7 +26,7 @@ from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.sensors import Sensors
 from heliotrope.plant.visits.photographs import Shot
-from heliotrope.plant.visits.stacks import Exposed
+from heliotrope.plant.visits.target_light import Exposed
 from heliotrope.plant.witnesses import Witness
 from heliotrope.plant.workers import Worker, at_once
 from heliotrope.safety import Alarm
@@ -67,7 +67,7 @@ class Cameras(Protocol):
         ...
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
-        """Photograph the target for a joint visit; see `StackCamera`.
+        """Photograph the target for a joint visit; see `LightCamera`.
 
         Raises
         ------

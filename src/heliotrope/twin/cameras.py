@@ -24,9 +24,9 @@ from heliotrope.imaging.targets.view import FaceView
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.plant.camera_views import SEVERAL, Views, beam_of, light_of, picture_of, shot_of
 from heliotrope.plant.operations.views import CameraView
-from heliotrope.plant.visits.joint_layout import moments_on
+from heliotrope.plant.visits.coded_layout import moments_on
 from heliotrope.plant.visits.photographs import Shot
-from heliotrope.plant.visits.stacks import Exposed, TargetLight
+from heliotrope.plant.visits.target_light import Exposed, TargetLight
 from heliotrope.plant.workers import Worker, at_once
 from heliotrope.safety import Alarm
 from heliotrope.twin.drawing import Drawer, Exposure, Optics, thrown
@@ -339,7 +339,7 @@ class RenderedCamera:
         return shot_of(seen, target.name, at)
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
-        """Photograph a target; see `plant.visits.stacks.StackCamera`.
+        """Photograph a target; see `plant.visits.target_light.LightCamera`.
 
         Raises
         ------

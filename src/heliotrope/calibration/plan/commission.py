@@ -61,7 +61,7 @@ class CommissionTerms:
     joint
         Visits of several mirrors at once; None: there are none.
     receiver
-        Visits of mirrors in production; None: there are none.
+        Visits of mirrors on a receiver; None: there are none.
     repeat
         Part of the beam error that is drawn anew at each visit and in operation, standard
         deviation in each direction, rad.
@@ -114,7 +114,7 @@ class CommissionTerms:
         Parameters
         ----------
         together, produces
-            Whether it is a joint stack, and one of mirrors in production.
+            Whether it is a coded visit, and one on a receiver.
         """
         terms = self.receiver if produces else self.joint if together else None
         noise = self.sigma / np.sqrt(self.shots) if terms is None else terms.sigma
@@ -128,7 +128,7 @@ class CommissionTerms:
 
 @dataclass(frozen=True)
 class Visit:
-    """Mirrors on a target, or in production on the receiver.
+    """Mirrors on a target, or where they shine on the receiver.
 
     Attributes
     ----------
@@ -505,13 +505,13 @@ class _Commissioning:
 
     @property
     def _shining(self) -> int:
-        """Number of mirrors in production."""
+        """Number of mirrors on the receiver."""
         return int((self._shines & self.visited & self.measured).sum())
 
     def _best(self, j: int, choices: _Choices, free: Mask) -> tuple[Rows, bool]:
         """Return the heliostats of the next visit to a place, and whether it is a joint one."""
         if j == len(self.targets) and (shining := self.terms.receiver) is not None:
-            many = choices.known.first(free, shining.party(self._shining))
+            many = choices.known.first(free, shining.at_once(self._shining))
             return (many if len(many) >= shining.settings.least else many[:0]), True
         alone, terms = choices.alone.first(free, 1), self.terms.joint
         if terms is None:

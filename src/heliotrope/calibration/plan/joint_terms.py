@@ -11,7 +11,7 @@ import numpy as np
 
 from heliotrope.calibration.plan.on_target import LOOKS
 from heliotrope.errors import InputError
-from heliotrope.field.joint_visits import JointSettings
+from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.optics.beam import beam_sigma

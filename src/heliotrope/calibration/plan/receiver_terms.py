@@ -1,4 +1,4 @@
-"""What a receiver visit costs and tells: mirrors in production, measured where they shine."""
+"""What a receiver visit costs and tells: mirrors measured where they shine."""
 
 from dataclasses import dataclass
 
@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
+from heliotrope.field.coded_visits import ReceiverSettings
 from heliotrope.field.plant import Plant
-from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 
@@ -80,7 +80,7 @@ class ReceiverTerms:
         known, again = self.settings.known, 2.0 * self.settings.visit**2
         return float(np.sqrt(max(0.0, min((_SURE * known) ** 2, known**2 - again))))
 
-    def party(self, lit: int) -> int:
+    def at_once(self, lit: int) -> int:
         """Return how many mirrors may move at once of those that shine on the receiver."""
         cost = _COST * self.settings.movement**2
         return min(self.settings.most, int(self.settings.power * lit / cost))

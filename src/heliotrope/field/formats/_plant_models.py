@@ -1,9 +1,12 @@
 """Tables of a plant's TOML file as pydantic models, used at the boundary only."""
 
-from typing import Annotated, Any, Literal
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema, create_model
 
+from heliotrope.field.coded_visits import CodedSettings, JointSettings, ReceiverSettings
 from heliotrope.safety import CONDITIONS
 from heliotrope.safety.limits import schema
 
@@ -44,6 +47,9 @@ class StrictTable(BaseModel):
     """A table that refuses unknown keys."""
 
     model_config = ConfigDict(extra="forbid", strict=False)
+
+
+Made = TypeVar("Made", bound=StrictTable)
 
 
 class PlantNameTable(StrictTable):
@@ -340,89 +346,39 @@ class GroupTable(StrictTable):
     )
 
 
+def _with_numbers(settings: type[CodedSettings]) -> Callable[[type[Made]], type[Made]]:
+    """Give a table a key for each number of settings: in its unit, and as the program writes it."""
+
+    def made(table: type[Made]) -> type[Made]:
+        keys: dict[str, Any] = {}
+        for one in fields(settings):
+            if (setting := one.metadata.get("setting")) is None:
+                continue
+            kind = int | None if one.type is int else Number | None
+            text = f"{setting.text[0].upper()}{setting.text[1:]}"
+            usual = f"{text}; default: {one.default / setting.scale:g}."
+            keys[setting.key(one.name)] = kind, Field(None, description=usual)
+            if setting.unit == "mrad":
+                written = Field(None, description="Instead, as the program writes it.")
+                keys[f"{one.name}_rad"] = kind, written
+        return create_model(table.__name__, __base__=table, __doc__=table.__doc__, **keys)
+
+    return made
+
+
+@_with_numbers(JointSettings)
 class JointVisitsTable(StrictTable):
     """``[joint_visits]``: several heliostats on one target at once, told apart by movements."""
 
     allowed: bool = Field(True, description="False: each heliostat is calibrated alone.")
-    most: int | None = Field(None, description="Heliostats on one target at once; default: 49.")
-    least: int | None = Field(
-        None, description="Heliostats that a visit of automatic control needs; default: 4."
-    )
-    known_mrad: Number | None = Field(
-        None, description="Largest expected beam error of one that takes part, RMS; default: 4."
-    )
-    known_rad: Number | None = Field(None, description="Instead, as the program writes it.")
-    visit_mrad: Number | None = Field(
-        None, description="Part of it that is drawn anew at each visit, each axis; default: 0.5."
-    )
-    visit_rad: Number | None = Field(None, description="Instead, as the program writes it.")
-    movement_mrad: Number | None = Field(
-        None, description="Coded movement of a beam, either way along each axis; default: 0.5."
-    )
-    movement_rad: Number | None = Field(None, description="Instead, as the program writes it.")
-    settle_s: Number | None = Field(
-        None, description="From the moment that all stand at their aims; default: 1."
-    )
-    brightest_suns: Number | None = Field(None, description="Most light on a target; default: 10.")
-    again: Number | None = Field(
-        None, description="Photographs at most, over those that a visit needs; default: 2.5."
-    )
-    first: int | None = Field(
-        None,
-        description="Heliostats without a calibration at once; 0: each goes alone; default: 63.",
-    )
-    first_movement_mrad: Number | None = Field(
-        None, description="Coded movement of their beams, either way to the right; default: 2."
-    )
-    first_movement_rad: Number | None = Field(
-        None, description="Instead, as the program writes it."
-    )
 
 
+@_with_numbers(ReceiverSettings)
 class ReceiverVisitsTable(StrictTable):
-    """``[receiver_visits]``: heliostats in production, measured where they shine."""
+    """``[receiver_visits]``: heliostats that shine on a receiver, measured there."""
 
     camera: str = Field(min_length=1, description="A camera with a place that sees the receiver.")
     receiver: str = Field(min_length=1, description="A planar receiver.")
-    most: int | None = Field(None, description="Heliostats at once; default: 50.")
-    least: int | None = Field(
-        None, description="Heliostats that a visit of automatic control needs; default: 8."
-    )
-    known_mrad: Number | None = Field(
-        None, description="Largest expected beam error of one that takes part, RMS; default: 4."
-    )
-    known_rad: Number | None = Field(None, description="Instead, as the program writes it.")
-    visit_mrad: Number | None = Field(
-        None, description="Part of it that is drawn anew at each visit, each axis; default: 0.5."
-    )
-    visit_rad: Number | None = Field(None, description="Instead, as the program writes it.")
-    movement_mrad: Number | None = Field(
-        None, description="Coded movement of a beam, either way along each axis; default: 1."
-    )
-    movement_rad: Number | None = Field(None, description="Instead, as the program writes it.")
-    settle_s: Number | None = Field(
-        None, description="From the moment that all stand at their aims; default: 1."
-    )
-    exposures: int | None = Field(
-        None, description="Frames that are averaged for a photograph; default: 1."
-    )
-    power: Number | None = Field(
-        None,
-        description="Largest share of the power that the movements cost; default: 0.005.",
-    )
-    steady: Number | None = Field(
-        None, description="Largest change of the light between photographs; default: 0.05."
-    )
-    again: Number | None = Field(
-        None, description="Photographs at most, over those that a visit needs; default: 1.5."
-    )
-    worth_mrad: Number | None = Field(
-        None, description="Least change of a beam that takes a mirror off; default: 0.3."
-    )
-    worth_rad: Number | None = Field(None, description="Instead, as the program writes it.")
-    every_s: Number | None = Field(
-        None, description="Least time between two visits of a heliostat; default: 7200."
-    )
 
 
 class TimetableTable(StrictTable):
@@ -459,7 +415,7 @@ class PlantDocument(StrictTable):
         None, description="Without: joint visits with the default settings."
     )
     receiver_visits: ReceiverVisitsTable | None = Field(
-        None, description="Without: no heliostat in production is measured."
+        None, description="Without: no heliostat is measured on a receiver."
     )
     timetable: list[TimetableTable] = Field(
         default_factory=list, description="Calibrations at times of day and at intervals."

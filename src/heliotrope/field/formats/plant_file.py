@@ -20,13 +20,8 @@ from heliotrope.field.formats._plant_cameras import (
     camera_document,
     mark_document,
 )
+from heliotrope.field.formats._plant_coded import build_joint, build_receiver, coded_document
 from heliotrope.field.formats._plant_groups import build_group, group_document
-from heliotrope.field.formats._plant_joint import (
-    build_joint,
-    build_receiver_visits,
-    joint_document,
-    receiver_visits_document,
-)
 from heliotrope.field.formats._plant_models import (
     PlantDocument,
     ReceiverTable,
@@ -143,7 +138,7 @@ def _assemble(
     eyes = {name: np.array(point) for name, point in document.eyes_m.items()}
     joint = _built(path, "joint_visits", document.joint_visits, build_joint, problems)
     settings = document.receiver_visits
-    receiver_visits = _built(path, "receiver_visits", settings, build_receiver_visits, problems)
+    receiver = _built(path, "receiver_visits", settings, build_receiver, problems)
     timetable = _all_built(path, "timetable", document.timetable, _timetable_entry, problems)
     _built(
         path,
@@ -165,7 +160,7 @@ def _assemble(
             keep_outs=keep_outs,
             eyes=eyes,
             joint_visits=joint,
-            receiver_visits=receiver_visits,
+            receiver_visits=receiver,
             timetable=timetable,
             safety=document.safety,
         )
@@ -312,8 +307,7 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
         "cameras": [camera_document(camera) for camera in plant.cameras],
         "keep_out": [volume_document(volume) for volume in plant.keep_outs],
         "eyes_m": {name: np.asarray(point).tolist() for name, point in plant.eyes.items()},
-        **joint_document(plant.joint_visits),
-        **receiver_visits_document(plant.receiver_visits),
+        **coded_document(plant.joint_visits, plant.receiver_visits),
         **({"timetable": [e.document for e in plant.timetable]} if plant.timetable else {}),
         **({"safety": {k: dict(v) for k, v in plant.safety.items()}} if plant.safety else {}),
         "groups": groups,

@@ -32,8 +32,7 @@ class Stack:
         Exposure times gain of each photograph, (K,); None: all alike.
     empty
         Brightness without beams at an exposure of 1 (of the photographs, if all are alike),
-        (H, W). None: other light than that of the coded beams is on the surface, as on a receiver
-        in production.
+        (H, W). None: other light than that of the coded beams is on the surface, as on a receiver.
     """
 
     values: FloatArray

@@ -91,7 +91,7 @@ class OneCalibration(Strict):
     """A heliostat to be calibrated next, and the target ("": any).
 
     Only its beam is searched; or others are calibrated together with it, in one joint visit; or all
-    are measured on the receiver, in production.
+    are measured on the receiver, where they shine.
     """
 
     heliostat: Name

@@ -28,6 +28,7 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.lockouts import Kind
 from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, TrueErrors
 from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.plant.operations.coded_visits import JointVisits, ReceiverVisits
 from heliotrope.plant.operations.errands import Step
 from heliotrope.plant.operations.flights import FlightIntake
 from heliotrope.plant.operations.foresight import POINT_EVERY, Foresight
@@ -36,9 +37,7 @@ from heliotrope.plant.operations.learning import Learner, Learning
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.movement_checks import MovementChecks
-from heliotrope.plant.operations.parties import Parties
 from heliotrope.plant.operations.pictures import Pictures
-from heliotrope.plant.operations.production import ProductionVisits
 from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.operations.service import Service
 from heliotrope.plant.operations.timetable import Timetable
@@ -229,10 +228,10 @@ class AutomaticControl:
                 self.truth,
                 self.flights.first,
                 pictures,
-                None if joint is None else Parties(plant, self.book, joint, logbook.take_alarm),
+                None if joint is None else JointVisits(plant, self.book, joint, logbook.take_alarm),
                 None
                 if receiver is None
-                else ProductionVisits(plant, self.book, receiver, logbook.take_alarm),
+                else ReceiverVisits(plant, self.book, receiver, logbook.take_alarm),
             )
             if settings.foresee > 0.0:
                 self._foresight = Foresight(
@@ -304,9 +303,9 @@ class AutomaticControl:
             )
             if why:
                 raise refusals.NO_CALIBRATION.error(heliostat=heliostat, why=why)
-            self._calibrating.ask_in_production(names)
+            self._calibrating.ask_together(names, self._calibrating.receiver)
         elif len(names) > 1:
-            if not self._calibrating.together:
+            if not self._calibrating.joint:
                 why = "the plant file allows no joint visits; ask for one heliostat at a time"
                 raise refusals.NO_CALIBRATION.error(heliostat=heliostat, why=why)
             self._calibrating.ask_together(names, target)
@@ -505,8 +504,8 @@ class AutomaticControl:
                     visits = self._visits(self._calibrating, target.name)
                     group.create_task(self._again(f"target {target.name}", visits, 1.0))
                 if self._calibrating.receiver:
-                    lit = self._in_production(self._calibrating)
-                    group.create_task(self._again(self._calibrating.receiver, lit, _LOOK_EVERY))
+                    visits = self._on_receiver(self._calibrating)
+                    group.create_task(self._again(self._calibrating.receiver, visits, _LOOK_EVERY))
             if self._foresight is not None:
                 look = self._foresee(self._foresight)
                 group.create_task(self._again("prediction", look, POINT_EVERY))
@@ -669,11 +668,11 @@ class AutomaticControl:
 
         return look
 
-    def _in_production(self, calibrating: Calibrating) -> Callable[[], Awaitable[None]]:
+    def _on_receiver(self, calibrating: Calibrating) -> Callable[[], Awaitable[None]]:
         async def visit() -> None:
             if self._why_not():
                 return
-            for name in await calibrating.in_production(self._ready(), AUTOMATIC, self._token):
+            for name in await calibrating.receiver_visit(self._ready(), AUTOMATIC, self._token):
                 self._raising.release(name)
 
         return visit

@@ -1,7 +1,7 @@
 """Calibrating the field: one visit after another to each target, as the schedule says."""
 
 import math
-from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Protocol
 
@@ -16,15 +16,14 @@ from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
 from heliotrope.plant.authority import Person, RefusedError, TakenOutError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.plant.operations.coded_visits import JointVisits, ReceiverVisits, Requests
 from heliotrope.plant.operations.foresight import Foreseeing
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
-from heliotrope.plant.operations.parties import Parties
 from heliotrope.plant.operations.pictures import Pictures
-from heliotrope.plant.operations.production import ProductionVisits
 from heliotrope.plant.operations.views import CalibrationEntry, Planned, Running
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
-from heliotrope.plant.visits.photographs import Tell
+from heliotrope.plant.visits.coded_cycle import CodedCycle
 from heliotrope.safety import alarms
 
 #: Visits to a target that failed through no fault of a heliostat: the camera, clouds, refusals.
@@ -137,10 +136,8 @@ class Calibrating:
         Returns the heliostats to be visited first, after those in doubt.
     pictures
         Keeps the photographs with the results; None: they are not kept.
-    parties
-        Heliostats of joint visits; None: there are none.
-    production
-        Heliostats of receiver visits; None: there are none.
+    joint, receiver
+        Heliostats of joint visits and of receiver visits; None: there are none.
     """
 
     def __init__(
@@ -154,10 +151,10 @@ class Calibrating:
         truth: TrueErrors,
         first: Callable[[], Collection[str]],
         pictures: Pictures | None = None,
-        parties: Parties | None = None,
-        production: ProductionVisits | None = None,
+        joint: JointVisits | None = None,
+        receiver: ReceiverVisits | None = None,
     ) -> None:
-        self._first, self._parties, self._production = first, parties, production
+        self._first, self._joint, self._receiver = first, joint, receiver
         self._plant, self._log, self._cycle, self._scheduler = plant, log, cycle, scheduler
         self._book, self._keeping, self._truth = book, keeping, truth
         self._pictures = pictures
@@ -175,9 +172,12 @@ class Calibrating:
     @property
     def asked(self) -> tuple[str, ...]:
         """Heliostats that persons want calibrated next, in the order in which they were asked."""
-        together = () if self._parties is None else self._parties.asked
-        lit = () if self._production is None else self._production.asked
-        return (*self._asked, *together, *lit)
+        return (*self._asked, *(name for each in self._requests for name in each.asked))
+
+    @property
+    def _requests(self) -> tuple[Requests, ...]:
+        """What persons want in joint visits and in receiver visits."""
+        return tuple(each.requests for each in (self._joint, self._receiver) if each is not None)
 
     def ask(self, heliostat: str, target: str, *, search: bool = False) -> None:
         """Calibrate a heliostat before all others, on a target or, for "", on the next free one.
@@ -193,34 +193,35 @@ class Calibrating:
             self._withdrawn.pop(name, None)
 
     @property
-    def together(self) -> bool:
+    def joint(self) -> bool:
         """Whether there are joint visits."""
-        return self._parties is not None
-
-    def ask_together(self, heliostats: Sequence[str], target: str) -> None:
-        """Calibrate heliostats in a joint visit before all others; see `ask`."""
-        if self._parties is not None:
-            self._forget(heliostats)
-            self._parties.ask(heliostats, target)
+        return self._joint is not None
 
     @property
     def receiver(self) -> str:
-        """Name of the receiver on which heliostats in production are measured; "" if none is."""
-        return "" if self._production is None else self._production.surface
+        """Name of the receiver on which heliostats are measured; "" if none is."""
+        return "" if self._receiver is None else self._receiver.surface
 
-    def ask_in_production(self, heliostats: Sequence[str]) -> None:
-        """Calibrate heliostats on the receiver as soon as all of them track it."""
-        if self._production is not None:
+    def ask_together(self, heliostats: Sequence[str], surface: str) -> None:
+        """Calibrate heliostats in a coded visit before all others.
+
+        Parameters
+        ----------
+        heliostats
+            Names.
+        surface
+            A target, or "" for the next free one; or the receiver.
+        """
+        visits = self._receiver if surface and surface == self.receiver else self._joint
+        if visits is not None:
             self._forget(heliostats)
-            self._production.ask(heliostats)
+            visits.requests.ask(heliostats, surface)
 
     def withdraw(self, heliostats: Collection[str], why: str) -> None:
         """Forget that persons wanted these heliostats calibrated, and why."""
         self._withdrawn |= dict.fromkeys(set(self.asked).intersection(heliostats), why)
-        if self._parties is not None:
-            self._parties.withdraw(heliostats)
-        if self._production is not None:
-            self._production.withdraw(heliostats)
+        for each in self._requests:
+            each.withdraw(heliostats)
         for name in heliostats:
             self._asked.pop(name, None)
 
@@ -238,12 +239,12 @@ class Calibrating:
 
     def retries(self) -> tuple[Retry, ...]:
         """Return the visits that are tried again, or were given up."""
-        now, joint, lit = self._plant.now(), self._parties, self._production
+        now, joint, receiver = self._plant.now(), self._joint, self._receiver
         return (
             *self._scheduler.attempts.shown(self._now()),
-            *(() if joint is None else joint.cycle.attempts.shown(now)),
+            *(() if joint is None else joint.retries(now)),
             *self._places.shown(now),
-            *(() if lit is None else (*lit.attempts.shown(now), *lit.mirrors.shown(now))),
+            *(() if receiver is None else receiver.retries(now)),
         )
 
     @property
@@ -266,15 +267,13 @@ class Calibrating:
         """
         if not self.asked and not self._places.due(target, self._plant.now()):
             return ()
-        if self._parties is not None and not self.asked and self._parties.awaited(target, ready):
-            return ()
-        if self._parties is not None and (names := await self._party(target, ready)):
-            cycle = self._parties.cycle
-            self._parties.begun(target)
-            await self._together(
-                names, target, token, lambda tell: cycle.run(person, token, names, target, tell)
-            )
-            return names
+        if self._joint is not None:
+            if not self.asked and self._joint.awaited(target, ready):
+                return ()
+            if names := await self._for_joint_visit(self._joint, target, ready):
+                self._joint.begun(target)
+                await self._coded_visit(self._joint.cycle, names, target, person, token)
+                return names
         name, search = self._chosen(target, ready)
         if not name:
             return ()
@@ -306,11 +305,11 @@ class Calibrating:
         self._conclude(target, result, (truth, after), begun, sigma, blameless=blameless)
         return (name,)
 
-    async def _party(self, target: str, ready: npt.NDArray[np.bool_]) -> tuple[str, ...]:
+    async def _for_joint_visit(
+        self, joint: JointVisits, target: str, ready: npt.NDArray[np.bool_]
+    ) -> tuple[str, ...]:
         """Return the heliostats of a joint visit; () if the next visit is of one alone."""
-        if self._parties is None:
-            return ()
-        if names := self._parties.wanted(target, ready):
+        if names := joint.requests.next(target, ready):
             return names
         alone = any(
             where in ("", target) and ready[self._plant.field.place(name)]
@@ -318,43 +317,42 @@ class Calibrating:
         )
         if alone or (ready & self._pressing() & self._fresh()).any():
             return ()
-        names = await self._parties.chosen(target, ready, self._scheduler.next)
+        names = await joint.chosen(target, ready, self._scheduler.next)
         # Another target's visit may have begun meanwhile.
         away = {name for run in self._running.values() for name in run.heliostats}
         free = tuple(name for name in names if name not in away)
         return free if len(free) > 1 else ()
 
-    async def in_production(
+    async def receiver_visit(
         self, ready: npt.NDArray[np.bool_], person: Person, token: int
     ) -> tuple[str, ...]:
         """Calibrate those of the ready heliostats (N,) on the receiver that are due; return which.
 
         One of which something is wrong there is looked at on a target next.
         """
-        if self._production is None:
+        if self._receiver is None:
             return ()
-        names, cycle = self._production.chosen(ready & ~self._pressing()), self._production.cycle
+        names = self._receiver.chosen(ready & ~self._pressing())
         if not names:
             return ()
-        begun, lit = self._now(), self._production.lit
-        results = await self._together(
-            names, self.receiver, token, lambda tell: cycle.run(person, token, names, tell)
-        )
+        begun, lit, cycle = self._now(), self._receiver.lit, self._receiver.cycle
+        results = await self._coded_visit(cycle, names, self.receiver, person, token)
         # One that is broken off, or came to nothing, does not tell how long a visit takes.
         if any(result.new > 0 for result in results):
             moved = sum(result.outcome not in _BROKEN for result in results)
             self._scheduler.shone(moved, lit, self._now() - begun)
-        odd = () if self._interrupted(token) else self._production.concluded(results)
+        odd = () if self._interrupted(token) else self._receiver.concluded(results)
         for name in odd:
             self.ask(name, "")
         return names
 
-    async def _together(
+    async def _coded_visit(
         self,
+        cycle: CodedCycle,
         names: tuple[str, ...],
         place: str,
+        person: Person,
         token: int,
-        visit: Callable[[Tell], Awaitable[tuple[CycleResult, ...]]],
     ) -> tuple[CycleResult, ...]:
         """Calibrate heliostats at one place at once."""
         begun, field = self._now(), self._plant.field
@@ -364,12 +362,12 @@ class Calibrating:
 
         tell("on the way")
         if self._pictures is not None:
-            self._pictures.begin_together(place)
+            self._pictures.begin_coded(place)
         rows = [field.place(name) for name in names]
         before, sigma = self._truth.now()[rows], self._book.error[rows]
         outcome, said = CalibrationOutcome.REFUSED, ""
         try:
-            results = await visit(tell)
+            results = await cycle.run(person, token, names, place, tell)
         except RefusedError as error:
             outcome, said = _outcome(error), str(error)
         except HeliotropeError as error:
@@ -391,11 +389,11 @@ class Calibrating:
             for result, truth, expected in zip(results, truths, sigma.tolist(), strict=True)
         ]
         if self._pictures is not None:
-            self._pictures.conclude_together(place, entries)
+            self._pictures.conclude_coded(place, entries)
         proven = sum(result.new > 0 for result in results)
         text = f"{proven} of {len(names)} heliostats proven together"
-        what = "receiver visit" if place == self.receiver else "joint visit"
-        self._log.event("calibration", place, f"{what}: {text}{said and f'; {said}'}")
+        said = f"{cycle.kind}: {text}{said and f'; {said}'}"
+        self._log.event("calibration", place, said)
         return results
 
     def _fresh(self) -> npt.NDArray[np.bool_]:
@@ -431,7 +429,7 @@ class Calibrating:
                 return name, search
         changed = np.isin(self._plant.field.names, list(self._first()))
         fresh = ready & self._fresh()
-        alone = fresh if self._parties is None else self._parties.alone(fresh)
+        alone = fresh if self._joint is None else self._joint.alone(fresh)
         doubted = fresh & self._plant.doubts.standing
         for rows in (doubted, fresh & changed, alone, fresh, ready):
             chosen = self._scheduler.next(target, rows) if rows.any() else None
@@ -486,13 +484,13 @@ class Calibrating:
         self._last[result.heliostat] = entry
         if not lit:
             self._visited[row] = entry.at
-        if self._parties is not None:
-            self._parties.concluded(result)
+        if self._joint is not None:
+            self._joint.concluded(result)
         self._book.conclude(entry)
-        # The schedule plans visits to targets: one in production that brings nothing is no failure,
+        # The schedule plans visits to targets: a receiver visit that brings nothing is no failure,
         # nor is one that the camera, a cloud or an order of others has ended, and a beam that is
         # looked for in several joint visits has not failed yet.
-        looked = joint and self._parties is not None and self._parties.again(result)
+        looked = joint and self._joint is not None and self._joint.again(result)
         blameless |= refused or result.verdict is Verdict.CLOUD
         blameless |= result.outcome is CalibrationOutcome.TAKEN_OUT
         if good or not (lit or looked or blameless):

@@ -133,7 +133,7 @@ class Operations:
     joint
         Calibrates several heliostats on one target; None: each is calibrated alone.
     receiver
-        Calibrates heliostats in production; None: they go to targets.
+        Calibrates heliostats on a receiver; None: they go to targets.
 
     Attributes
     ----------
@@ -374,7 +374,7 @@ class Operations:
         """Calibrate a heliostat, or only search its beam, on the next free target, before others.
 
         With others (``together``) it is calibrated in one joint visit, as soon as all are ready.
-        With ``receiver`` it is measured in production, as soon as all track the receiver. The
+        With ``receiver`` it is measured where it shines, as soon as all track the receiver. The
         ticket ends with the result of the visit.
 
         Raises
@@ -389,8 +389,8 @@ class Operations:
             heliostat, target, search=search, together=together, receiver=receiver
         )
         what = "search for the beam" if search else "calibration"
-        what = "joint calibration" if together else what
-        what = "calibration in production" if receiver else what
+        what = "joint visit" if together else what
+        what = "receiver visit" if receiver else what
         names = tuple(dict.fromkeys((heliostat, *together)))
         self._tell(person, f"asked for a {what} of {', '.join(names)}{target and f' on {target}'}")
         since = self.plant.clock.utc().timestamp()

@@ -2,7 +2,7 @@
 
 The pictures lie in a folder as JPEG, one row each in `pictures.sqlite` beside them. They are
 thinned by age, and the folder never grows beyond its limit by more than one visit: the oldest go
-first. A disk that fails costs pictures, never a calibration. The photographs of a joint visit are
+first. A disk that fails costs pictures, never a calibration. The photographs of a coded visit are
 kept once, and found by each of its heliostats.
 """
 
@@ -23,17 +23,17 @@ from heliotrope.files.disk import AtOnce, Disk, DiskBusyError
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.plant.operations.views import CalibrationEntry, CameraView, PictureRow
 from heliotrope.plant.visits.photographs import Shot
-from heliotrope.plant.visits.stacks import Exposed, StackCamera, TargetLight
+from heliotrope.plant.visits.target_light import Exposed, LightCamera, TargetLight
 
 #: Photographs of one visit that are kept at most: of a long search the last ones.
 _MOST = 24
-#: The same of a joint visit: of a long stack, or several, the last ones.
-_TOGETHER = 32
+#: The same of a coded visit: of a long series, or several, the last ones.
+_MOST_CODED = 32
 #: Time between two looks for pictures that are too old, s.
 _THIN_EVERY = 600.0
 _DAY = 86_400.0
 T = TypeVar("T")
-#: A heliostat of a joint visit, whether its beam was proven, its outcome, and that for people.
+#: A heliostat of a coded visit, whether its beam was proven, its outcome, and that for people.
 _Member = tuple[str, bool, str, str]
 _TABLE = """
 CREATE TABLE IF NOT EXISTS picture (
@@ -54,7 +54,7 @@ SELECT identity FROM (
         PARTITION BY heliostat, CAST(at / 86400 AS INTEGER) ORDER BY used DESC, at) AS place
     FROM picture WHERE at < ?) WHERE place > 1
 """
-#: Those of a heliostat's own visits, and of joint ones.
+#: Those of a heliostat's own visits, and of coded ones.
 _FOUND = """
 SELECT identity, heliostat, target, at, used, reading, outcome, text FROM picture
 WHERE heliostat = :name
@@ -128,7 +128,7 @@ class Pictures:
         self._folder, self._settings = folder, settings or PictureSettings()
         self._disk = disk or AtOnce()
         self._taken: dict[str, list[_Taken]] = {}
-        self._stacks: dict[str, deque[CameraView]] = {}
+        self._coded: dict[str, deque[CameraView]] = {}
         self._thinned = float("-inf")
         self.problem = ""
 
@@ -154,28 +154,28 @@ class Pictures:
         if taken:
             self._put(taken, entry.heliostat, entry.outcome.name.lower(), entry.text, entry.at)
 
-    def begin_together(self, target: str) -> None:
-        """Begin a joint visit to a target."""
-        self._stacks.pop(target, None)
+    def begin_coded(self, target: str) -> None:
+        """Begin a coded visit to a surface."""
+        self._coded.pop(target, None)
 
-    def take_together(self, view: CameraView) -> None:
-        """Take a photograph of a joint visit."""
-        self._stacks.setdefault(view.target, deque(maxlen=_TOGETHER)).append(view)
+    def take_coded(self, view: CameraView) -> None:
+        """Take a photograph of a coded visit."""
+        self._coded.setdefault(view.target, deque(maxlen=_MOST_CODED)).append(view)
 
-    def conclude_together(self, target: str, entries: Sequence[CalibrationEntry]) -> None:
-        """Keep the photographs of a joint visit once, with the result of each heliostat."""
-        stack = self._stacks.pop(target, None)
-        if not stack or not entries:
+    def conclude_coded(self, target: str, entries: Sequence[CalibrationEntry]) -> None:
+        """Keep the photographs of a coded visit once, with the result of each heliostat."""
+        views = self._coded.pop(target, None)
+        if not views or not entries:
             return
         proven = sum(entry.new > 0 for entry in entries)
         text = f"{proven} of {len(entries)} heliostats proven together"
-        party = [
+        members = [
             (entry.heliostat, entry.new > 0, entry.outcome.name.lower(), entry.text)
             for entry in entries
         ]
         reasons = () if proven else (text,)
-        taken = [_Taken(view, Shot(np.full(3, np.nan), view.at, 0.0, reasons)) for view in stack]
-        self._put(taken, f"together on {target}", "joint visit", text, entries[-1].at, party)
+        taken = [_Taken(view, Shot(np.full(3, np.nan), view.at, 0.0, reasons)) for view in views]
+        self._put(taken, f"together on {target}", "joint visit", text, entries[-1].at, members)
 
     def keep(self, view: CameraView, shot: Shot, who: str) -> None:
         """Keep a photograph that a person has asked for, under no heliostat."""
@@ -188,13 +188,13 @@ class Pictures:
         outcome: str,
         text: str,
         now: float,
-        party: Sequence[_Member] = (),
+        members: Sequence[_Member] = (),
     ) -> None:
         def done(error: Exception | None) -> None:
             self.problem = "" if error is None else str(error)
 
         try:
-            self._disk.do(lambda: self._write(taken, heliostat, outcome, text, now, party), done)
+            self._disk.do(lambda: self._write(taken, heliostat, outcome, text, now, members), done)
         except DiskBusyError as error:
             done(error)
 
@@ -205,7 +205,7 @@ class Pictures:
         outcome: str,
         text: str,
         now: float,
-        party: Sequence[_Member],
+        members: Sequence[_Member],
     ) -> None:
         with self._table() as table:
             for one in taken:
@@ -226,7 +226,7 @@ class Pictures:
                 identity = int(row.lastrowid or 0)
                 table.executemany(
                     "INSERT INTO party VALUES (?, ?, ?, ?, ?)",
-                    [(identity, *member) for member in party],
+                    [(identity, *member) for member in members],
                 )
                 self._path(identity).write_bytes(one.view.jpeg)
             self._thin(table, now)
@@ -348,13 +348,13 @@ class KeptCamera:
             taken = self._camera.view(target.name)
             if taken.version not in (before, self._kept.get(target.name)):
                 self._kept[target.name] = taken.version
-                self._pictures.take_together(taken)
+                self._pictures.take_coded(taken)
             return seen
 
         return Exposed(exposed.at, asyncio.create_task(kept()))
 
 
-class ViewedCamera(StackCamera, Protocol):
+class ViewedCamera(LightCamera, Protocol):
     """A camera of targets that shows the last photograph of each."""
 
     def view(self, target: str) -> CameraView:

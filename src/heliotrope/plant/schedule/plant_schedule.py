@@ -15,7 +15,7 @@ from heliotrope.lcu import states
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import CalibrationEntry, Planned
 from heliotrope.plant.schedule.choice import Assignment
-from heliotrope.plant.schedule.prospect import FieldProspect, Shining
+from heliotrope.plant.schedule.prospect import FieldProspect, ReceiverVisitTime
 from heliotrope.plant.schedule.scheduler import Scheduler, Visited
 from heliotrope.plant.schedule.settings import Settings, Weather
 from heliotrope.plant.visits.settings import CycleSettings
@@ -141,7 +141,7 @@ class PlantSchedule:
 
     def shone(self, mirrors: int, lit: int, seconds: float) -> None:
         """Take the time of a receiver visit, in which some of the mirrors lit there took part."""
-        self.scheduler.shining.append(Shining(mirrors, lit, seconds))
+        self.scheduler.receiver_visits.append(ReceiverVisitTime(mirrors, lit, seconds))
 
     def _states(self, ready: npt.NDArray[np.bool_]) -> _Ready:
         rows = self._plant.field.rows

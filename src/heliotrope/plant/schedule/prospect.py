@@ -23,7 +23,7 @@ from heliotrope.calibration.plan.percentiles import error_percentiles
 from heliotrope.calibration.plan.receiver_terms import ReceiverTerms
 from heliotrope.calibration.plan.scaled_field import ScaledField
 from heliotrope.errors import InputError
-from heliotrope.field.joint_visits import JointSettings
+from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.plant.operations.outlook import FieldPoint, Outlook, end_of_day
@@ -35,11 +35,11 @@ _SHORT, _LONG = 120.0, 600.0
 #: A visit takes at most this many times as long as the schedule expects, or the inverse.
 _MOST_PACE = 4.0
 #: Joint visits, and receiver visits, from which their true times count.
-_PARTIES = 3
+_KNOWN = 3
 
 
 @dataclass(frozen=True)
-class Party:
+class JointVisitTime:
     """A joint visit that has ended.
 
     Attributes
@@ -58,7 +58,7 @@ class Party:
 
 
 @dataclass(frozen=True)
-class Shining:
+class ReceiverVisitTime:
     """A receiver visit that has ended.
 
     Attributes
@@ -78,9 +78,9 @@ def terms_of(
     settings: Settings,
     joint: JointSettings | None,
     pace: float = np.nan,
-    parties: Sequence[Party] = (),
+    joint_visits: Sequence[JointVisitTime] = (),
     receiver: ReceiverTerms | None = None,
-    shining: Sequence[Shining] = (),
+    receiver_visits: Sequence[ReceiverVisitTime] = (),
 ) -> CommissionTerms:
     """Return the terms of a plan whose visits are those of a schedule.
 
@@ -92,11 +92,11 @@ def terms_of(
         Of the joint visits; None: there are none.
     pace
         Time of a visit alone that gives parameters, as a share of the expected time; NaN: unknown.
-    parties
+    joint_visits
         Joint visits: once there are some, their times take the place of the expected ones.
     receiver
         Of the receiver visits; None: there are none.
-    shining
+    receiver_visits
         Receiver visits: their times count as those of joint visits do.
     """
     share = _share(pace)
@@ -111,24 +111,26 @@ def terms_of(
         sigma=settings.sigma,
         worth=settings.worth,
         limits=settings.limits,
-        joint=None if joint is None else _joint_terms(settings, joint, parties),
-        receiver=None if receiver is None else _receiver_terms(receiver, shining),
+        joint=None if joint is None else _joint_terms(settings, joint, joint_visits),
+        receiver=None if receiver is None else _receiver_terms(receiver, receiver_visits),
     )
 
 
-def _joint_terms(settings: Settings, joint: JointSettings, made: Sequence[Party]) -> JointTerms:
+def _joint_terms(
+    settings: Settings, joint: JointSettings, made: Sequence[JointVisitTime]
+) -> JointTerms:
     """Return the joint visits; after some of them, with their true times."""
     terms = JointTerms.of(joint, settings.sigma)
-    if len(made) < _PARTIES:
+    if len(made) < _KNOWN:
         return terms
     expected = sum(terms.span(one.mirrors, own=one.worst > terms.known) for one in made)
     share = _share(sum(one.seconds for one in made) / expected)
     return replace(terms, step=share * terms.step, beside=share * terms.beside)
 
 
-def _receiver_terms(terms: ReceiverTerms, made: Sequence[Shining]) -> ReceiverTerms:
+def _receiver_terms(terms: ReceiverTerms, made: Sequence[ReceiverVisitTime]) -> ReceiverTerms:
     """Return the receiver visits; after some of them, with their true times."""
-    if len(made) < _PARTIES:
+    if len(made) < _KNOWN:
         return terms
     expected = sum(terms.span(one.mirrors, one.lit) for one in made)
     return replace(terms, pace=_share(sum(one.seconds for one in made) / expected))

@@ -30,7 +30,12 @@ from heliotrope.lcu import states as lcu_states
 from heliotrope.plant.attempts import Attempts, RetryLaw
 from heliotrope.plant.schedule.choice import Assignment, Judge, Mask
 from heliotrope.plant.schedule.knowledge import FieldKnowledge
-from heliotrope.plant.schedule.prospect import FieldProspect, Party, Shining, terms_of
+from heliotrope.plant.schedule.prospect import (
+    FieldProspect,
+    JointVisitTime,
+    ReceiverVisitTime,
+    terms_of,
+)
 from heliotrope.plant.schedule.settings import Settings, Weather
 from heliotrope.safety import alarms
 
@@ -50,7 +55,7 @@ VISITS = RetryLaw(
     alarm=alarms.CALIBRATION_GIVEN_UP,
 )
 #: Receiver visits to remember, some days of them.
-_SHINING = 100
+_RECEIVER_VISITS = 100
 #: Finished visits to remember.
 REMEMBERED = 20_000
 #: Step of a plan while there is nothing to do, s.
@@ -117,7 +122,7 @@ class Comparison:
         Heliostats found more than `SURPRISE` times as far off as expected.
     alone
         Number of visits of one heliostat, and number of those that brought a new calibration.
-    parties
+    joint_visits
         Joint visits.
     """
 
@@ -128,7 +133,7 @@ class Comparison:
     longer: float
     surprises: tuple[str, ...]
     alone: tuple[int, int]
-    parties: tuple[Party, ...] = ()
+    joint_visits: tuple[JointVisitTime, ...] = ()
 
     @property
     def ratio(self) -> float:
@@ -182,17 +187,17 @@ def compare(finished: Iterable[Finished]) -> Comparison:
         longer=float(np.mean(spans)) if spans else nan,
         surprises=tuple(f.planned.heliostat for f in both if f.surprise),
         alone=(len(alone), sum(f.visited.calibrated for f in alone)),
-        parties=tuple(_parties(f for f in made if f.visited.together)),
+        joint_visits=tuple(_joint_visits(f for f in made if f.visited.together)),
     )
 
 
-def _parties(made: Iterable[Finished]) -> Iterator[Party]:
+def _joint_visits(made: Iterable[Finished]) -> Iterator[JointVisitTime]:
     """Yield the joint visits: those of one target that end at once."""
     for _, group in groupby(made, key=lambda f: (f.visited.target, round(f.visited.ended))):
         visits = list(group)
         begin = min(f.planned.at for f in visits)
         worst = max(f.planned.predicted for f in visits)
-        yield Party(len(visits), worst, visits[0].visited.ended - begin)
+        yield JointVisitTime(len(visits), worst, visits[0].visited.ended - begin)
 
 
 class States(Protocol):
@@ -233,7 +238,7 @@ class Scheduler:
         Assignments under way, by heliostat.
     finished
         The last visits, each with its assignment.
-    shining
+    receiver_visits
         The last receiver visits; they are not chosen here.
     attempts
         Visits that failed, by heliostat; in POSIX s.
@@ -264,7 +269,7 @@ class Scheduler:
         self.reason = ""
         self.running: dict[str, Assignment] = {}
         self.finished: deque[Finished] = deque(maxlen=REMEMBERED)
-        self.shining: deque[Shining] = deque(maxlen=_SHINING)
+        self.receiver_visits: deque[ReceiverVisitTime] = deque(maxlen=_RECEIVER_VISITS)
         begin, year = _unix(now), now.astimezone(UTC).year
         self._known = FieldKnowledge(design, self.settings, self.names, begin, year)
         self._judge = Judge(design, self.settings, self._known, self.names)
@@ -469,9 +474,9 @@ class Scheduler:
                 self.settings,
                 self.design.joint_visits,
                 made.pace,
-                made.parties,
+                made.joint_visits,
                 ReceiverTerms.of(self.design, self.settings.sigma),
-                tuple(self.shining),
+                tuple(self.receiver_visits),
             ),
         )
 

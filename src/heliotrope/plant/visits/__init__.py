@@ -3,7 +3,7 @@
 Begin with `CalibrationCycle`: it sends a heliostat to a target, takes photographs (plainly, or with
 a search for the beam: `Centring`), fits them, and lets the plant believe a better calibration.
 `JointCycle` calibrates several on one target at once, told apart by their movements;
-`ReceiverCycle` does so on a receiver, in production.
+`ReceiverCycle` does so where they shine, on a receiver.
 `Visit` is the way there and back; `TargetCamera` is the protocol of a camera.
 """
 

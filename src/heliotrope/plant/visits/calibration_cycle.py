@@ -34,6 +34,7 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.authority import Mandate, Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.drive_checks import PHOTOGRAPH
+from heliotrope.plant.visits.coded_visit import Returned
 from heliotrope.plant.visits.fitting import (
     Believed,
     JudgedFit,
@@ -41,7 +42,6 @@ from heliotrope.plant.visits.fitting import (
     fit_heliostat,
     surprise_of,
 )
-from heliotrope.plant.visits.joint_visit import Returned
 from heliotrope.plant.visits.model_of_each import ModelOfEach
 from heliotrope.plant.visits.neighbours import Standing, Unhidden, UnhiddenCamera
 from heliotrope.plant.visits.photographs import (
@@ -125,20 +125,17 @@ def refused(mandate: Mandate, heliostat: str, text: str) -> CycleResult:
 
 
 @dataclass(frozen=True)
-class Production:
-    """A heliostat that was seen on a receiver, and leaves it for nothing but new parameters.
+class Leaving:
+    """How a heliostat that tracks a receiver leaves it: for nothing but new parameters.
 
     Attributes
     ----------
-    surface
-        Name of the receiver.
     worth
         Least change of its beam for which it leaves, rad.
     leave
         Brings it to standby.
     """
 
-    surface: str
     worth: float
     leave: Callable[[Visit], Awaitable[None]]
 
@@ -306,7 +303,7 @@ class CalibrationCycle:
         *,
         confirming: Confirming | None = None,
         least: int | None = None,
-        production: Production | None = None,
+        leaving: Leaving | None = None,
     ) -> CycleResult:
         """Learn from the photographs of a heliostat that is at standby; see `run`.
 
@@ -320,7 +317,7 @@ class CalibrationCycle:
             Confirms new parameters; None: a photograph of this heliostat alone.
         least
             Sightings that the fit needs; None: as in the settings.
-        production
+        leaving
             It tracks a receiver, and leaves it if its parameters change. A change that a photograph
             must confirm is left to a visit to a target; None: it is at standby.
         """
@@ -328,7 +325,7 @@ class CalibrationCycle:
         confirm, say = confirming or self.verification.problem, tell or _nobody
         if why := self._witness(visit.heliostat, taken):
             return CycleResult(visit.heliostat, CalibrationOutcome.UNCHANGED, why)
-        result = await self._learn(visit, taken, say, confirm, fewest, production)
+        result = await self._learn(visit, taken, say, confirm, fewest, leaving)
         proof = self.verification.confirmed(visit.heliostat)
         if proof is not None and result.outcome.calibrated:
             say("learning from the verification")
@@ -353,11 +350,10 @@ class CalibrationCycle:
         tell: Tell,
         confirming: Confirming,
         least: int,
-        production: Production | None,
+        leaving: Leaving | None,
     ) -> CycleResult:
         """Fit all sightings once; push, verify and take a better fit."""
         name, beliefs = visit.heliostat, self._plant.beliefs
-        surface = visit.target.name if production is None else production.surface
         new, rejected = self._plausible(name, taken)
         known = beliefs.seen(name)
         old = [] if known is None else [known.sightings]
@@ -371,7 +367,7 @@ class CalibrationCycle:
         count = len(every) + beliefs.flights.count(name)
         measured = root_mean_square(beam_errors(beliefs.present(name), here).beam)
         if count < least:
-            beliefs.note(name, surface, here)
+            beliefs.note(name, visit.target.name, here)
             return CycleResult(
                 name,
                 CalibrationOutcome.TOO_FEW_SIGHTINGS,
@@ -386,8 +382,8 @@ class CalibrationCycle:
             fit_heliostat, Believed.of(beliefs, name), self.settings, model, every
         )
         pushed: tuple[str, ...] = ()
-        if not found.problem and production is not None:
-            found = await self._leaving(visit, found, here, production)
+        if not found.problem and leaving is not None:
+            found = await self._left(visit, found, here, leaving)
         if not found.problem:
             with self._plant.unverified(name):
                 found, pushed = await self._try(visit, found, here, taken, tell, confirming)
@@ -399,7 +395,7 @@ class CalibrationCycle:
             return CycleResult(
                 name, found.outcome, text, rejected, count, 0, np.nan, found.before, found.after
             )
-        beliefs.note(name, surface, here)
+        beliefs.note(name, visit.target.name, here)
         record = None if found.problem else self._take(visit, found, pushed)
         return CycleResult(
             name,
@@ -424,20 +420,21 @@ class CalibrationCycle:
         sure = last is not None and surprise_of(last, found.nominal, here) <= settings.agreement
         return sure and change_of(present, found.mechanism, found.seen) <= settings.large
 
-    async def _leaving(
-        self, visit: Visit, found: JudgedFit, here: Sightings, production: Production
+    async def _left(
+        self, visit: Visit, found: JudgedFit, here: Sightings, leaving: Leaving
     ) -> JudgedFit:
-        """Return a fit for whose parameters a heliostat has left production, or why it has not."""
+        """Return a fit for whose parameters a heliostat has left a receiver, or why it has not."""
         if not self._sure(found, here):
             text = "a photograph on a target must confirm the new parameters; calibrate it there"
             return replace(found, outcome=CalibrationOutcome.NOT_VERIFIED, problem=text)
         present = self._plant.beliefs.present(found.name)
         change = change_of(present, found.mechanism, here)
-        if change >= production.worth:
-            await production.leave(visit)
+        if change >= leaving.worth:
+            await leaving.leave(visit)
             return found
         text = (
-            f"new parameters would move its beam by {1e3 * change:.2f} mrad; it stays in production"
+            f"new parameters would move its beam by {1e3 * change:.2f} mrad; it stays on "
+            f"{visit.target.name}"
         )
         return replace(found, outcome=CalibrationOutcome.UNCHANGED, problem=text)
 

@@ -1,36 +1,32 @@
-"""Where the beams of a joint visit stand on their target, and which codes they move by.
+"""Where the beams of a joint visit stand on their target, and which codes they share.
 
-Each beam gets a place in a grid that leaves room to the border, and a movement of a few tenths of a
-milliradian, or of two of the steps in which its drives move it if that is more. Beams that do not
-overlap share a code, so that few photographs are needed. The light of all of them together stays
-below what the target may take.
+Each beam gets a place in a grid that leaves room to the border. Beams that do not overlap share a
+code, so that few photographs are needed. The light of all of them together stays below what the
+target may take.
+
+The beam of a mirror that was never calibrated misses by metres, so that places cannot be kept
+apart: each mirror has a code of its own, and moves widely to the right and left, which needs half
+as many photographs as movements along both axes. Mirrors that may miss by more aim nearer to the
+middle; one that was missed before aims beside the target, so that its beam comes onto it. The
+target must not become too bright wherever the beams truly are: the expected light and twice its
+standard deviation count.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.field.joint_visits import MOST_MOVEMENT, JointSettings
+from heliotrope.calibration.plan.on_target import LOOKS, search_places
+from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.target import Target
-from heliotrope.geometry import FloatArray, bisector, tangent_axes
-from heliotrope.imaging.coded import (
-    ExpectedBeam,
-    coded_movements,
-    shared_codes,
-)
-from heliotrope.optics.beam import beam_sigma
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.coded import shared_codes
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.visits.coded_layout import Layout, SentBeam, beams_of, coded
 from heliotrope.plant.visits.expected_errors import expected_errors
-from heliotrope.plant.visits.resolution import LEAST_STEPS, beam_steps
 
-#: Slope error of a mirror's surface that is assumed for the width of its beam, rad.
-_SLOPE = 1e-3
-#: Likely share of a mirror's size in its beam: between flat mirrors and well canted ones.
-_CURVED = 0.5
-#: Share of the light that a mirror is assumed to reflect.
-_REFLECTED = 0.9
 #: A beam keeps this many of its standard deviations from the border, and those of its place.
 _BORDER, _PLACED = 2.0, 3.0
 #: Numbers of codes, for 8 to 256 photographs with movements along both axes, for 8 to 128 along
@@ -38,108 +34,14 @@ _BORDER, _PLACED = 2.0, 3.0
 _CODES = (3, 7, 15, 31, 63, 127)
 #: The verification's movements are up and down; those of first visits are to the right and left.
 _UP = 1
-
-
-def moments_on(
-    target: Target,
-    vertex: FloatArray,
-    normal: FloatArray,
-    width: npt.ArrayLike,
-    height: npt.ArrayLike,
-    flat: float = 1.0,
-) -> FloatArray:
-    """Return the second moments of beams on a target, m², (..., 2, 2).
-
-    The image of the sun, widened by the mirror's slopes, and the mirror itself, seen along the
-    beam.
-
-    Parameters
-    ----------
-    target
-        The target.
-    vertex, normal
-        Of the mirrors, ENU, m, and their unit normals, (..., 3).
-    width, height
-        Of the mirrors, m, (...).
-    flat
-        Share of its size that each beam has: 1 for a flat mirror, near 0 for one that is canted and
-        curved for this distance.
-    """
-    path = np.asarray(target.center) - vertex
-    slant = np.linalg.norm(path, axis=-1)
-    ray = path / slant[..., None]
-    size = flat * np.stack([np.asarray(width), np.asarray(height)], axis=-1) / np.sqrt(12.0)
-    sides = size[..., None] * tangent_axes(normal)
-    sun = beam_sigma(slant, slope=_SLOPE)[..., None, None]
-    across = np.eye(3) - ray[..., :, None] * ray[..., None, :]
-    spread = sun**2 * across + np.swapaxes(sides, -1, -2) @ sides
-    # Along the beam onto the plane of the target.
-    along = ray[..., :, None] * target.normal / (ray @ target.normal)[..., None, None]
-    onto = target.axes @ (np.eye(3) - along)
-    return np.asarray(onto @ spread @ np.swapaxes(onto, -1, -2))
-
-
-@dataclass(frozen=True)
-class Layout:
-    """M beams on a target.
-
-    Attributes
-    ----------
-    beams
-        Each beam as it is expected.
-    aims
-        Aims without movement, ENU, m, (M, 3).
-    moves
-        Movements over K photographs, m right and up, (K, M, 2).
-    codes
-        Number of different codes.
-    """
-
-    target: Target
-    beams: tuple[ExpectedBeam, ...]
-    aims: FloatArray
-    moves: FloatArray
-    codes: int
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The heliostats."""
-        return tuple(beam.heliostat for beam in self.beams)
-
-    def points(self, photograph: int) -> dict[str, FloatArray]:
-        """Return the aim of each heliostat in a photograph, ENU, m, by name."""
-        move = self.moves[photograph % len(self.moves)]
-        return dict(zip(self.names, self.aims + move @ self.target.axes, strict=True))
-
-    def start(self) -> dict[str, FloatArray]:
-        """Return the aims without movement, by name."""
-        return dict(zip(self.names, self.aims, strict=True))
-
-
-@dataclass(frozen=True)
-class SentBeam:
-    """What is known of a beam before it is sent.
-
-    Attributes
-    ----------
-    slant
-        Slant range, m.
-    moments, likely
-        Its widest and its likely second moments, m², (2, 2).
-    variance
-        Of its place along each axis, m².
-    power
-        Of its light, in suns m².
-    step
-        Steps in which it follows its aim, m right and up, (2,); see `beam_steps`.
-    """
-
-    slant: float
-    moments: FloatArray
-    likely: FloatArray
-    variance: float
-    power: float
-    step: FloatArray
+#: The same in a first visit.
+_FIRST_BORDER, _FIRST_PLACED = 1.5, 1.5
+#: Standard deviations by which the light may exceed its expectation.
+_ABOVE = 2.0
+#: Points across the target where its light is computed.
+_ACROSS = 15
+#: First visits move to the right and left.
+_RIGHT = 0
 
 
 def arranged(
@@ -166,7 +68,7 @@ def arranged(
         if (why := _unknown(plant, name, error, settings))
     }
     sure = {name: error for name, error in errors.items() if name not in blocked}
-    known, wrong = beams_of(plant, target, sure)
+    known, wrong = beams_of(plant, target, sure, settings)
     wrong |= blocked
     for name in list(known)[settings.most :]:
         wrong[name] = f"{settings.most} heliostats are on {target.name} already"
@@ -201,9 +103,8 @@ def verifying(
         Whether each has a code of its own.
     """
     again = np.sqrt(2.0) * settings.visit
-    known, wrong = beams_of(
-        plant, target, {name: float(np.hypot(error, again)) for name, error in errors.items()}
-    )
+    all_errors = {name: float(np.hypot(error, again)) for name, error in errors.items()}
+    known, wrong = beams_of(plant, target, all_errors, settings)
     places, dazzling = _darkened(target, known, settings)
     code = np.arange(len(known)) if own else _shared(known, places, along=_UP)
     return coded(target, known, places, code, settings.movement, along=_UP), wrong, dazzling
@@ -255,55 +156,6 @@ def errors_on(
     known = np.array([plant.beliefs.record(name) is not None for name in heliostats])
     found = np.hypot(found, known * np.sqrt(2.0) * settings.visit)
     return dict(zip(heliostats, found.tolist(), strict=True))
-
-
-def beams_of(
-    plant: PlantController, target: Target, errors: Mapping[str, float]
-) -> tuple[dict[str, SentBeam], dict[str, str]]:
-    """Return what is known of beams, and why the others cannot be on a target, by heliostat.
-
-    Parameters
-    ----------
-    plant, target
-        Knows mirrors and the sun; and the target.
-    errors
-        Expected error of each beam, rad RMS (2-D); NaN where it does not reach the target.
-    """
-    field, center = plant.field, np.asarray(target.center)
-    paths = {n: center - plant.beams.armature.origin_1[field.place(n)] for n in errors}
-    blocked = {
-        name: f"it does not see the front of {target.name}"
-        for name, path in paths.items()
-        if not float(path @ target.normal) < 0.0
-    }
-    lost = (name for name, error in errors.items() if not np.isfinite(error))
-    blocked |= dict.fromkeys(lost, "out of its reach")
-    names = [name for name in errors if name not in blocked]
-    if not names:
-        return {}, blocked
-    rows = np.array([field.place(name) for name in names], dtype=np.intp)
-    path, error = np.stack([paths[n] for n in names]), np.array([errors[n] for n in names])
-    slant, sun = np.linalg.norm(path, axis=-1), plant.sun_vector()
-    slanted = np.abs(path @ target.normal) / slant
-    step = beam_steps(plant, rows, target, sun, np.broadcast_to(center, path.shape))
-    normal = bisector(sun, path / slant[:, None])
-    width, height = plant.beams.mirrors.width[rows], plant.beams.mirrors.height[rows]
-    variance = 0.5 * (error * slant / slanted) ** 2
-    power = _REFLECTED * width * height * (normal @ sun)
-    wide, likely = (
-        moments_on(target, center - path, normal, width, height, flat) for flat in (1.0, _CURVED)
-    )
-    sent: dict[str, SentBeam] = {}
-    for k, coarse in enumerate(LEAST_STEPS * step.max(axis=-1) * slanted / slant):
-        if coarse > MOST_MOVEMENT:
-            blocked[names[k]] = (
-                f"its drives move its beam in steps of {1e3 * coarse / LEAST_STEPS:.1f} mrad, the "
-                f"limit is {1e3 * MOST_MOVEMENT / LEAST_STEPS:g} mrad; it is calibrated alone"
-            )
-        else:
-            figures = float(variance[k]), float(power[k])
-            sent[names[k]] = SentBeam(float(slant[k]), wide[k], likely[k], *figures, step[k])
-    return sent, blocked
 
 
 def _places(target: Target, known: Mapping[str, SentBeam]) -> FloatArray:
@@ -366,38 +218,78 @@ def _shared(
     return np.arange(len(known), dtype=np.intp)
 
 
-def coded(
+def newcomers(
+    plant: PlantController,
     target: Target,
-    known: Mapping[str, SentBeam],
-    places: FloatArray,
-    code: npt.NDArray[np.intp],
-    movement: float,
-    along: int | None = None,
-) -> Layout:
-    """Return the layout of beams at places (M, 2) that move by codes (M,).
+    heliostats: Sequence[str],
+    settings: JointSettings,
+    model: Mapping[str, tuple[str, ...]],
+    missed: Mapping[str, int] | None = None,
+) -> tuple[Layout, dict[str, str]]:
+    """Return the layout of a joint first visit, and why some heliostats have no place in it.
 
     Parameters
     ----------
-    target, known
-        The target, and what is known of the M beams, by name.
-    places, code
-        m right of and above the centre; numbers of the codes.
-    movement
-        Either way, rad; more for a beam that follows its aim in coarse steps.
-    along
-        The only axis of the movements; None: both.
+    plant
+        Knows mirrors and the sun.
+    target, heliostats
+        The target, and names of heliostats that are known badly, or were never calibrated.
+    settings
+        See `JointSettings`.
+    model
+        Names of the parameters whose priors say how far each beam may miss, by heliostat.
+    missed
+        Joint first visits in which a beam was not found, by heliostat.
     """
-    count = int(code.max(initial=0)) + 1
-    axes = slice(None) if along is None else slice(along, along + 1)
-    size = np.array(
-        [
-            max(movement * beam.slant, LEAST_STEPS * float(beam.step[axes].max()))
-            for beam in known.values()
-        ]
+    sent, wrong = beams_of(
+        plant, target, errors_on(plant, target, heliostats, settings, model), settings
     )
-    moves = coded_movements(count, along=along)[:, code] * size[:, None]
-    beams = tuple(
-        ExpectedBeam(name, place, beam.variance * np.eye(2), beam.likely)
-        for (name, beam), place in zip(known.items(), places, strict=True)
-    )
-    return Layout(target, beams, target.center + places @ target.axes, moves, count)
+    for name in list(sent)[settings.first :]:
+        wrong[name] = f"{settings.first} heliostats are on {target.name} already"
+        del sent[name]
+    suns, too_bright = settings.brightest, f"the light on {target.name} might exceed"
+    while len(sent) > 1 and _brightest(target, sent, _first_places(target, sent)) > suns:
+        wrong[sent.popitem()[0]] = f"{too_bright} {suns:g} suns"
+    code = np.arange(len(sent), dtype=np.intp)
+    looks = search_places(target, LOOKS)
+    count = [min((missed or {}).get(name, 0), LOOKS - 1) for name in sent]
+    places = _first_places(target, sent) + looks[count]
+    layout = coded(target, sent, places, code, settings.first_movement, along=_RIGHT)
+    return replace(layout, first=True), wrong
+
+
+def _first_places(target: Target, sent: Mapping[str, SentBeam]) -> FloatArray:
+    """Return places, right of and above the centre, m, (M, 2); the surest go far out."""
+    if not sent:
+        return np.zeros((0, 2))
+    half = np.abs(target.plane_coordinates(target.corners)).min(axis=0)
+    size = np.sqrt([np.diag(beam.moments) for beam in sent.values()])
+    placed = np.sqrt([beam.variance for beam in sent.values()])[:, None]
+    room = np.maximum(half - _FIRST_BORDER * size - _FIRST_PLACED * placed, 0.0)
+    across = int(np.ceil(np.sqrt(len(sent))))
+    line = np.linspace(-1.0, 1.0, across) if across > 1 else np.zeros(1)
+    grid = np.array([(a, b) for b in line for a in line])
+    out = np.argsort(np.abs(grid).max(axis=1), kind="stable")[: len(sent)]
+    near: npt.NDArray[np.intp] = np.argsort(room.min(axis=1), kind="stable")
+    places = np.empty((len(sent), 2))
+    places[near] = grid[out] * room.max(axis=0)
+    return np.asarray(np.clip(places, -room, room))
+
+
+def _brightest(target: Target, sent: Mapping[str, SentBeam], places: FloatArray) -> float:
+    """Return the most light at a place of the target that is to be reckoned with, in suns."""
+    corners = target.plane_coordinates(target.corners)
+    x, y = (np.linspace(low, high, _ACROSS) for low, high in zip(*_ends(corners), strict=True))
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    beams = tuple(sent.values())
+    power = np.array([beam.power for beam in beams])
+    likely = np.array([beam.likely for beam in beams])
+    spread = np.array([beam.variance for beam in beams])[:, None, None] * np.eye(2)
+    own = power**2 / (4.0 * np.pi * np.sqrt(np.linalg.det(likely)))
+    mean = power @ bells(points, places, likely + spread)
+    variance = own @ bells(points, places, 0.5 * likely + spread)
+    return float((mean + _ABOVE * np.sqrt(variance)).max())
+
+
+def _ends(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return corners.min(axis=0), corners.max(axis=0)

@@ -288,7 +288,7 @@ class World:
 
     @property
     def _faces(self) -> tuple[Target, ...]:
-        """The face of the receiver on which mirrors in production are measured."""
+        """The face of the receiver on which mirrors are measured."""
         visits = self.design.receiver_visits
         return () if visits is None else (self.design.receiver(visits.receiver).face,)
 

@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from heliotrope.field.coded_visits import JointSettings, ReceiverSettings
 from heliotrope.field.heliostats import Heliostats
-from heliotrope.field.joint_visits import JointSettings
 from heliotrope.field.layout_tower import watching_camera
 from heliotrope.field.plant import Plant
-from heliotrope.field.receiver_visits import ReceiverSettings
 from heliotrope.field.target import Receiver
 from heliotrope.field.volumes import Sphere
 from heliotrope.mechanism.board_items import Wanted, items_of

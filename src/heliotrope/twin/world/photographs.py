@@ -17,7 +17,7 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.plant.visits import Shot
-from heliotrope.plant.visits.stacks import Exposed, TargetLight
+from heliotrope.plant.visits.target_light import Exposed, TargetLight
 from heliotrope.twin.cameras import ExactCamera, FieldSnapshot
 
 T = TypeVar("T")

@@ -1,4 +1,4 @@
-"""Step counts of a heliostat during a stack of photographs, each at a place beside one aim."""
+"""Step counts of a heliostat in a coded visit, while it stands beside its aim for photographs."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

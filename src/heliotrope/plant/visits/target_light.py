@@ -1,8 +1,8 @@
-"""Photographs of a target for a stack: its light, seen from the front, without a reading."""
+"""The light on a surface, seen from its front, and the beams that it is made of."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from heliotrope.errors import HeliotropeError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.coded import ExpectedBeam, Separation, Stack, separate
+from heliotrope.imaging.coded import ExpectedBeam, SeparatedBeam, Stack, Verdict, separate
 from heliotrope.imaging.frame import Image
 from heliotrope.imaging.targets.rectify import Mask, Rectified
 from heliotrope.imaging.targets.view import FaceView
@@ -19,6 +19,9 @@ from heliotrope.plant.visits.photographs import TargetCamera
 T = TypeVar("T")
 #: A pixel is left out that is at full scale by this share in any photograph.
 _FULL = 0.01
+#: A beam is joined whose power differs from that of the others, for its mirror's size, by this
+#: share, and by this many of their standard deviations.
+_OTHER, _SIGMAS = 0.4, 4.0
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,11 @@ class TargetLight:
         seen = picture.paint & own & (picture.clipped < _FULL)
         return cls(picture.values, picture.step, first, seen, exposure, at, picture.view, shift)
 
+    @property
+    def brightness(self) -> float:
+        """Mean brightness over full scale, at an exposure of 1."""
+        return float(self.values[self.seen].mean()) / self.exposure
+
     def covariance_at(self, place: FloatArray) -> FloatArray:
         """Return the covariance of a place (2,) on the target by the view's error, m², (2, 2)."""
         if self.view is None:
@@ -75,27 +83,62 @@ class TargetLight:
         return self.view.covariance_at(np.asarray(place) + self.shift)
 
 
-def stack_of(pictures: Sequence[TargetLight], empty: TargetLight) -> Stack:
-    """Return photographs of one target, and of the empty target, as a stack."""
-    seen = np.logical_and.reduce([picture.seen for picture in (*pictures, empty)])
-    return Stack(
+def separated(
+    pictures: Sequence[TargetLight],
+    empty: TargetLight | None,
+    moves: FloatArray,
+    beams: Sequence[ExpectedBeam],
+    powers: FloatArray | None,
+) -> Sequence[SeparatedBeam]:
+    """Return the M beams in photographs of one surface; see `separate`.
+
+    Parameters
+    ----------
+    pictures, empty
+        The light in K photographs, and that of the surface without beams; None: it is never seen.
+    moves, beams
+        Movements, m right and up, (K, M, 2), and the beams as they are expected.
+    powers
+        See `judged`; None: the powers of beams are not compared.
+    """
+    known = pictures if empty is None else (*pictures, empty)
+    stack = Stack(
         np.stack([picture.values for picture in pictures]).astype(np.float64),
         pictures[0].step,
         pictures[0].first,
-        seen,
+        np.logical_and.reduce([picture.seen for picture in known]),
         np.array([picture.exposure for picture in pictures]),
-        np.asarray(empty.values, dtype=np.float64) / empty.exposure,
+        None if empty is None else np.asarray(empty.values, dtype=np.float64) / empty.exposure,
     )
+    found = separate(stack, moves, beams).beams
+    return found if powers is None else judged(found, powers)
 
 
-def separated(
-    pictures: Sequence[TargetLight],
-    empty: TargetLight,
-    moves: FloatArray,
-    beams: Sequence[ExpectedBeam],
-) -> Separation:
-    """Return the beams in photographs of one target and the empty target; see `separate`."""
-    return separate(stack_of(pictures, empty), moves, beams)
+def judged(beams: Sequence[SeparatedBeam], powers: FloatArray) -> list[SeparatedBeam]:
+    """Return beams (M,); those are joined whose power does not fit the size of their mirrors.
+
+    How bright a mirror shows is not known before, but it is alike for all of them.
+
+    Parameters
+    ----------
+    beams
+        As they were separated.
+    powers
+        Expected, in any one unit, (M,).
+    """
+    proven = np.array([beam.verdict is Verdict.PROVEN for beam in beams], dtype=np.bool_)
+    if not proven.any():
+        return list(beams)
+    ratio = np.array([beam.power for beam in beams]) / powers
+    gains = ratio / np.median(ratio[proven])
+    spread = 1.4826 * float(np.median(np.abs(gains[proven] - 1.0)))
+    wrong = proven & (np.abs(gains - 1.0) > max(_OTHER, _SIGMAS * spread))
+    return [
+        replace(beam, gain=float(gain), verdict=Verdict.JOINED)
+        if bad
+        else replace(beam, gain=float(gain))
+        for beam, gain, bad in zip(beams, gains, wrong, strict=True)
+    ]
 
 
 @dataclass(frozen=True)
@@ -121,7 +164,7 @@ class Exposed:
         return cls(light.at, done)
 
 
-class StackCamera(TargetCamera, Protocol):
+class LightCamera(TargetCamera, Protocol):
     """A camera that gives the light on targets."""
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
@@ -133,9 +176,9 @@ class StackCamera(TargetCamera, Protocol):
 
 
 async def light_on(
-    camera: StackCamera, target: Target, view: FaceView | None = None
+    camera: LightCamera, target: Target, view: FaceView | None = None
 ) -> TargetLight:
-    """Return the light on a target in a new photograph; see `StackCamera.expose`."""
+    """Return the light on a target in a new photograph; see `LightCamera.expose`."""
     return await (await camera.expose(target, view)).light
 
 

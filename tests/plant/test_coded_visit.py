@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import direction
@@ -16,8 +17,9 @@ from heliotrope.plant import refusals
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.authority import Mandate, Person, Role
 from heliotrope.plant.beam_watch import BeamError
-from heliotrope.plant.visits.joint_layout import SentBeam, _places, _too_bright, beams_of, coded
-from heliotrope.plant.visits.joint_visit import JointVisit
+from heliotrope.plant.visits.coded_layout import SentBeam, beams_of, coded
+from heliotrope.plant.visits.coded_visit import CodedVisit
+from heliotrope.plant.visits.joint_layout import _places, _too_bright
 from heliotrope.plant.visits.visit import ARRIVED, SILENT
 
 NAMES = ("A", "B", "C")
@@ -58,7 +60,7 @@ class Order:
 
 def visit_of(clock: VirtualClock, left: dict[str, float]) -> Any:
     """A visit of a plant that reports a row of step counts each second."""
-    found = object.__new__(JointVisit)
+    found = object.__new__(CodedVisit)
     counted = SimpleNamespace(counted_at=np.zeros(len(NAMES)))
 
     def now() -> float:
@@ -217,7 +219,7 @@ def test_only_a_mirror_before_the_plane_of_a_target_sends_its_beam_there(before:
         sun_vector=lambda: direction(np.radians(180.0), np.radians(60.0)),
     )
     name = design.names[0]
-    sent, blocked = beams_of(plant, target, {name: 1e-3})
+    sent, blocked = beams_of(plant, target, {name: 1e-3}, JointSettings())
     assert list(sent if before > 0.0 else blocked) == [name]
     assert blocked.get(name, "").endswith("" if before > 0.0 else "the front of aside")
 
@@ -249,9 +251,9 @@ def test_a_mirror_with_steps_too_coarse_for_a_joint_visit_takes_no_part() -> Non
         sun_vector=lambda: direction(np.radians(80.0), np.radians(30.0)),
     )
     errors = {design.names[0]: 1e-3}
-    assert list(beams_of(plant, target, errors)[0]) == [design.names[0]]
+    assert list(beams_of(plant, target, errors, JointSettings())[0]) == [design.names[0]]
     beams.drives.table[0, :, SLOTS["rate"]] *= 200.0
-    blocked = beams_of(plant, target, errors)[1]
+    blocked = beams_of(plant, target, errors, JointSettings())[1]
     assert "its drives move its beam in steps of" in blocked[design.names[0]]
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from heliotrope.plant.visits.receiver_layout import production
+from heliotrope.plant.visits.receiver_layout import sunlight_on
 
 
 def test_production_is_the_area_that_the_sun_sees_of_the_mirrors_that_track_it() -> None:
@@ -26,6 +26,6 @@ def test_production_is_the_area_that_the_sun_sees_of_the_mirrors_that_track_it()
         sun_vector=lambda: np.array([0.0, 0.0, 1.0]),
     )
     face: Any = SimpleNamespace(holds=lambda aims: np.array([True, True, True, True, False]))
-    assert production(plant, face) == pytest.approx(3.0 * np.cos(0.5 * turns[:3]).sum())
+    assert sunlight_on(plant, face) == pytest.approx(3.0 * np.cos(0.5 * turns[:3]).sum())
     face.holds = lambda aims: np.zeros(5, dtype=bool)
-    assert production(plant, face) == 0.0
+    assert sunlight_on(plant, face) == 0.0

@@ -1,4 +1,4 @@
-"""Many heliostats on one target: their way there, their aims, and their way back.
+"""Many heliostats on one target or receiver: their way there, their aims, and their way back.
 
 One that is refused, is lost or leaves its aim drops out: it is brought to standby, or its beam is
 taken off the target, and the others go on. So do they when a person's order takes one out of the
@@ -39,7 +39,7 @@ _ON = (states.IDLE, *states.ON_AIM)
 _OFF = (states.DEFOCUSED, states.STOWING, states.STOWED, states.LOCKED, states.APPROACHING)
 
 
-class JointVisit(BroughtHome):
+class CodedVisit(BroughtHome):
     """Several heliostats on their way to, at, and from one target.
 
     Parameters
@@ -247,7 +247,7 @@ class Returned:
     Parameters
     ----------
     plant, mandate, heliostats, target
-        As for `JointVisit`.
+        As for `CodedVisit`.
     """
 
     def __init__(
@@ -283,6 +283,6 @@ class Returned:
             if name in self._mandate.heliostats and idle[plant.field.place(name)]
         }
         if back:
-            joint = JointVisit(plant, self._mandate, back, self._target)
+            joint = CodedVisit(plant, self._mandate, back, self._target)
             await joint.aim(back)
             await joint.track()

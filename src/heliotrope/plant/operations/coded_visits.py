@@ -1,4 +1,4 @@
-"""Joint visits of automatic calibration: which heliostats go to a target together."""
+"""Coded visits of automatic calibration: which heliostats are measured at once, and where."""
 
 import asyncio
 from collections.abc import Callable, Collection, Sequence
@@ -6,14 +6,17 @@ from collections.abc import Callable, Collection, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.lcu import states
+from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.views import Planned
 from heliotrope.plant.visits.calibration_cycle import CycleResult
 from heliotrope.plant.visits.joint_cycle import JointCycle
+from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import Alarm, alarms
 
 Mask = npt.NDArray[np.bool_]
@@ -22,16 +25,77 @@ Next = Callable[[str, Mask, bool], Planned | None]
 
 #: Share of the largest expected error that a heliostat may have which automatic control sends: the
 #: sun moves on until the visit begins.
-_SURE = 0.95
+_JOINT_SURE = 0.95
 #: Longest wait of a target for a joint first visit while the field is raised, s.
 _PATIENCE = 60.0
 #: Heliostats that are judged at a time, some 10 ms.
 _PART = 500
 #: Verdicts that say that something is wrong with a mirror or with what is believed of it.
 _WRONG = (Verdict.STUCK, Verdict.EXCHANGED, Verdict.ELSEWHERE)
+#: Share of the largest expected error that a heliostat may have which automatic control measures.
+_RECEIVER_SURE = 0.75
+#: Receiver visits that came to nothing: mostly the light is to blame, and not a mirror.
+RECEIVER = RetryLaw(
+    "visits on this receiver",
+    5,
+    600.0,
+    "a person looks at its camera and its light; one visit an hour until then",
+    growth=1.5,
+    longest=3600.0,
+    rest=3600.0,
+    alarm=alarms.VISITS_FAIL,
+)
+#: Receiver visits that a heliostat was refused for, or that an error broke off, while they measured
+#: others.
+MIRROR = RetryLaw(
+    "receiver visit",
+    3,
+    0.0,
+    "it goes to a target alone; one receiver visit a day until then",
+    rest=16.0 * 3600.0,
+)
+_BROKEN = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)
+#: Verdicts after which a heliostat is looked at on a target.
+_ODD = (Verdict.STUCK, Verdict.EXCHANGED, Verdict.ELSEWHERE, Verdict.JOINED, Verdict.FAINT)
 
 
-class Parties:
+class Requests:
+    """Heliostats that persons want measured together, in the order in which they were asked.
+
+    Parameters
+    ----------
+    place
+        Returns the row of a heliostat.
+    """
+
+    def __init__(self, place: Callable[[str], int]) -> None:
+        self._place = place
+        self._asked: list[tuple[tuple[str, ...], str]] = []
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """The heliostats."""
+        return tuple(name for names, _ in self._asked for name in names)
+
+    def ask(self, heliostats: Sequence[str], surface: str) -> None:
+        """Measure heliostats together on a surface or, for "", on the next free one."""
+        self._asked.append((tuple(dict.fromkeys(heliostats)), surface))
+
+    def withdraw(self, heliostats: Collection[str]) -> None:
+        """Forget that persons wanted these heliostats measured."""
+        left = [(tuple(n for n in names if n not in heliostats), s) for names, s in self._asked]
+        self._asked = [(names, surface) for names, surface in left if names]
+
+    def next(self, surface: str, ready: Mask) -> tuple[str, ...]:
+        """Return the next for a surface, once all of them are ready (N,); () if none are."""
+        for i, (names, where) in enumerate(self._asked):
+            if where in ("", surface) and ready[[self._place(name) for name in names]].all():
+                del self._asked[i]
+                return names
+        return ()
+
+
+class JointVisits:
     """The heliostats of joint visits.
 
     Parameters
@@ -47,6 +111,8 @@ class Parties:
     ----------
     cycle
         As given.
+    requests
+        What persons want.
     """
 
     def __init__(
@@ -57,36 +123,13 @@ class Parties:
         tell: Callable[[Alarm], None],
     ) -> None:
         self._plant, self._book, self.cycle, self._tell = plant, book, cycle, tell
-        self._asked: list[tuple[list[str], str]] = []
+        self.requests = Requests(plant.field.place)
         self._disproved: set[str] = set()
         #: Targets whose last visit was a joint one.
         self._last: set[str] = set()
         #: Since when a target has waited for a joint first visit.
         self._waited: dict[str, float] = {}
         self._choosing = asyncio.Lock()
-
-    @property
-    def asked(self) -> tuple[str, ...]:
-        """Heliostats that persons want calibrated together."""
-        return tuple(name for names, _ in self._asked for name in names)
-
-    def ask(self, heliostats: Sequence[str], target: str) -> None:
-        """Calibrate heliostats together, on a target or, for "", on the next free one."""
-        self._asked.append((list(dict.fromkeys(heliostats)), target))
-
-    def withdraw(self, heliostats: Collection[str]) -> None:
-        """Forget that persons wanted these heliostats calibrated."""
-        left = [([n for n in names if n not in heliostats], t) for names, t in self._asked]
-        self._asked = [(names, target) for names, target in left if names]
-
-    def wanted(self, target: str, ready: Mask) -> tuple[str, ...]:
-        """Return the heliostats that persons want on a target together; () until all are ready."""
-        for i, (names, where) in enumerate(self._asked):
-            rows = [self._plant.field.place(name) for name in names]
-            if where in ("", target) and ready[rows].all():
-                del self._asked[i]
-                return tuple(names)
-        return ()
 
     async def chosen(self, target: str, ready: Mask, following: Next) -> tuple[str, ...]:
         """Return the ready heliostats (N,) that go to a target together; () if too few would.
@@ -98,7 +141,7 @@ class Parties:
         settings, able = self.cycle.settings, ready & ~self.alone(ready)
         first = ready & ~np.isfinite(self._book.calibrated_at)
         error = await self._error_on(target, able & ~first)
-        limit = _SURE * settings.known
+        limit = _JOINT_SURE * settings.known
         # Those that are known too badly on this target keep a code of their own, as new ones do.
         new = able & (first | (error > limit))
         if settings.first and int(new.sum()) >= settings.least:
@@ -170,6 +213,10 @@ class Parties:
             return False
         return now - self._waited.setdefault(target, now) < _PATIENCE
 
+    def retries(self, now: float) -> tuple[Retry, ...]:
+        """Return the heliostats that come again, or were given up."""
+        return self.cycle.attempts.shown(now)
+
     def begun(self, target: str) -> None:
         """Note that a joint visit to a target begins."""
         self._last.add(target)
@@ -190,3 +237,109 @@ class Parties:
         elif result.new and name in self._disproved:
             self._disproved.discard(name)
             self._tell(kind.ended(name))
+
+
+class ReceiverVisits:
+    """The heliostats of receiver visits.
+
+    Parameters
+    ----------
+    plant, book
+        The controller, and the predicted errors.
+    cycle
+        Makes a receiver visit.
+    tell
+        Called with each alarm.
+
+    Attributes
+    ----------
+    cycle
+        As given.
+    requests
+        What persons want.
+    attempts
+        Visits that came to nothing, by receiver.
+    mirrors
+        Visits from which a heliostat was left out, by heliostat.
+    """
+
+    def __init__(
+        self,
+        plant: PlantController,
+        book: CalibrationBook,
+        cycle: ReceiverCycle,
+        tell: Callable[[Alarm], None],
+    ) -> None:
+        self._plant, self._book, self.cycle = plant, book, cycle
+        self._settings, self.requests = cycle.settings, Requests(plant.field.place)
+        self._face = cycle.face(self.surface)
+        self.attempts, self.mirrors = Attempts(RECEIVER, tell), Attempts(MIRROR)
+        #: When each heliostat was measured last, monotonic s.
+        self._at = np.full(len(plant.field), -np.inf)
+
+    @property
+    def surface(self) -> str:
+        """Name of the receiver."""
+        return self._settings.receiver
+
+    @property
+    def lit(self) -> int:
+        """Number of heliostats that track the receiver."""
+        return int(self._shining().sum())
+
+    def _shining(self) -> Mask:
+        tracking = self._plant.field.among((states.TRACKING,), self._plant.now())
+        return np.asarray(tracking & self._face.holds(self._plant.aims))
+
+    def chosen(self, ready: Mask) -> tuple[str, ...]:
+        """Return the ready heliostats (N,) that are measured next; () if there are too few.
+
+        Those that persons asked for come first, then those whose errors may be largest.
+        """
+        field, settings, now = self._plant.field, self._settings, self._plant.now()
+        lit = ready & self._shining()
+        if names := self.requests.next(self.surface, lit):
+            return names
+        # The book has errors of the normal; a beam is off by twice as much.
+        due = lit & (2.0 * self._book.error <= _RECEIVER_SURE * settings.known)
+        due &= now - self._at >= settings.every
+        due[[field.place(name) for name in self.mirrors.waiting(now)]] = False
+        if not self.attempts.due(self.surface, now) or int(due.sum()) < settings.least:
+            return ()
+        rows = np.flatnonzero(due)
+        first = rows[np.argsort(-self._book.error[rows], kind="stable")][: settings.most]
+        return tuple(field.names[row] for row in first)
+
+    def retries(self, now: float) -> tuple[Retry, ...]:
+        """Return the visits that are tried again, or were given up."""
+        return *self.attempts.shown(now), *self.mirrors.shown(now)
+
+    def concluded(self, results: Sequence[CycleResult]) -> tuple[str, ...]:
+        """Note a visit's results; return the heliostats that are to be looked at on a target.
+
+        Where less than half of the beams are proven, the light is to blame and not the mirrors.
+        One that was refused too often while others were measured goes to a target, too.
+        """
+        results = [r for r in results if r.outcome is not CalibrationOutcome.TAKEN_OUT]
+        now, seen = self._plant.now(), [r.heliostat for r in results if r.verdict is None]
+        good = [r for r in results if r.new > 0 or r.outcome is CalibrationOutcome.NOT_VERIFIED]
+        if good:
+            self.attempts.done(self.surface)
+        elif results:
+            self.attempts.failed(self.surface, results[0].text, now)
+        self._at[[self._plant.field.place(name) for name in seen]] = now
+        if 2 * len(good) < len(results):
+            return ()
+        for result in results:
+            if result.outcome in _BROKEN:
+                self.mirrors.failed(result.heliostat, result.text, now)
+            else:
+                self.mirrors.done(result.heliostat)
+        given_up = self.mirrors.given_up
+        return tuple(
+            result.heliostat
+            for result in results
+            if result.verdict in _ODD
+            or result.outcome is CalibrationOutcome.NOT_VERIFIED
+            or result.heliostat in given_up
+        )

@@ -1,0 +1,173 @@
+"""Settings of coded visits: several heliostats measured at once, told apart by their movements.
+
+They belong to a plant: its targets and its receiver, its mirrors, its drives. Each number stands
+once, here, with its unit in the plant file, its limits and its meaning.
+"""
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar
+
+from heliotrope.errors import InputError
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A number of the plant file.
+
+    Attributes
+    ----------
+    text
+        Its meaning, for people.
+    low, high
+        Its limits, in its unit.
+    unit
+        Its unit in the plant file: "mrad", "s" or "suns"; "" for a number or a share.
+    above
+        Whether it must be above ``low``.
+    """
+
+    text: str
+    low: float
+    high: float = math.inf
+    unit: str = ""
+    above: bool = False
+
+    @property
+    def scale(self) -> float:
+        """Its unit in the program's own, radians and seconds."""
+        return 1e-3 if self.unit == "mrad" else 1.0
+
+    def key(self, name: str) -> str:
+        """Return its key in the plant file."""
+        return f"{name}_{self.unit}" if self.unit else name
+
+    def check(self, kind: str, name: str, value: float) -> None:
+        """Raise InputError if a value is not within the limits."""
+        given = value / self.scale
+        if not self.low <= given <= self.high or (self.above and given == self.low):
+            least = f"{'above ' if self.above else ''}{self.low:g}"
+            most = (
+                f" to {self.high:g}" if self.high < math.inf else "" if self.above else " or more"
+            )
+            raise InputError(
+                f"{kind}: {self.key(name)} {given:g} ({self.text}); give {least}{most}"
+            )
+
+
+def _number(default: float, *given: Any, **named: Any) -> Any:
+    """Return a field for a number whose default is in the unit of the plant file; see `Setting`."""
+    setting = Setting(*given, **named)
+    value = default * setting.scale if setting.unit else default
+    return field(default=value, metadata={"setting": setting})
+
+
+@dataclass(frozen=True, kw_only=True)
+class CodedSettings:
+    """Settings of all coded visits, to targets and to a receiver.
+
+    Angles are in radians and times in seconds; `settings` has the meaning of each number.
+    """
+
+    #: Name of the visits, for people.
+    kind: ClassVar[str]
+
+    most: int
+    least: int
+    known: float = _number(
+        4.0, "largest expected beam error of one that takes part, RMS", 0, unit="mrad", above=True
+    )
+    visit: float = _number(
+        0.5, "part of it that is drawn anew at each visit, each axis", 0, unit="mrad"
+    )
+    movement: float
+    settle: float = _number(
+        1.0, "from the moment that all stand at their aims until the photograph", 0, 60, "s"
+    )
+    again: float
+
+    def __post_init__(self) -> None:
+        for name, setting in self.settings().items():
+            setting.check(self.kind, name, getattr(self, name))
+        if not self.least <= self.most:
+            raise InputError(
+                f"{self.kind}: least {self.least} is above most {self.most}; give the smaller "
+                "number as least"
+            )
+
+    @classmethod
+    def settings(cls) -> dict[str, Setting]:
+        """Return what each number is, by its name here."""
+        found = {one.name: one.metadata.get("setting") for one in fields(cls)}
+        return {name: setting for name, setting in found.items() if setting is not None}
+
+    @property
+    def most_movement(self) -> float:
+        """Largest movement that a beam may make, rad."""
+        setting = self.settings()["movement"]
+        return setting.high * setting.scale
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointSettings(CodedSettings):
+    """Settings of joint visits: several heliostats on one target at once; see `CodedSettings`."""
+
+    kind: ClassVar[str] = "joint visits"
+
+    most: int = _number(49, "heliostats on one target at once", 2, 127)
+    least: int = _number(4, "heliostats that a visit of automatic control needs", 2, 127)
+    movement: float = _number(
+        0.5, "coded movement of a beam, either way along each axis", 0, 5, "mrad", above=True
+    )
+    again: float = _number(2.5, "photographs at most, over those that a visit needs", 1)
+    brightest: float = _number(10.0, "most light on a target", 0, unit="suns", above=True)
+    first: int = _number(63, "heliostats without a calibration at once; 0: each goes alone", 0, 127)
+    first_movement: float = _number(
+        2.0, "coded movement of their beams, either way to the right", 0, 5, "mrad", above=True
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if 0 < self.first < self.least:
+            raise InputError(
+                f"{self.kind}: {self.first} heliostats without a calibration; give 0, or "
+                f"{self.least} to 127"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReceiverSettings(CodedSettings):
+    """Settings of receiver visits: heliostats measured where they shine; see `CodedSettings`.
+
+    Attributes
+    ----------
+    camera
+        Name of the camera that sees the whole receiver; its position is known.
+    receiver
+        Name of the receiver, which is planar.
+    """
+
+    kind: ClassVar[str] = "receiver visits"
+
+    camera: str = field(kw_only=False)
+    receiver: str = field(kw_only=False)
+    most: int = _number(50, "heliostats at once", 1, 127)
+    least: int = _number(8, "heliostats that a visit of automatic control needs", 1, 127)
+    known: float = _number(
+        4.0, "largest expected beam error of one that takes part, RMS", 0, 20, "mrad", above=True
+    )
+    movement: float = _number(
+        1.0, "coded movement of a beam, either way along each axis", 0, 2, "mrad", above=True
+    )
+    again: float = _number(1.5, "photographs at most, over those that a visit needs", 1, 10)
+    exposures: int = _number(1, "frames that are averaged for a photograph", 1, 100)
+    power: float = _number(
+        0.005, "largest share of the power that the movements cost", 0, 0.01, above=True
+    )
+    steady: float = _number(
+        0.05, "largest change of the light between photographs, as a share", 0, 0.5, above=True
+    )
+    worth: float = _number(
+        0.3, "least change of a beam for which its mirror leaves the receiver", 0, unit="mrad"
+    )
+    every: float = _number(7200.0, "least time between two visits of a heliostat", 0, unit="s")

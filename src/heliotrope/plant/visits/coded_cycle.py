@@ -1,0 +1,432 @@
+"""The coded visit: many mirrors on one surface at once, each told apart by its own movements.
+
+Over a series of photographs each beam moves by its code (`imaging.coded`); a photograph is taken
+only when all have settled. Each proven beam is a sighting, which takes the path of an ordinary
+visit's: one fit, its safeguards, verification. What is not proven is named, and nothing is learnt
+from it.
+
+A visit to a target is a *joint visit*, one of mirrors that shine on a receiver a *receiver visit*.
+They differ in how beams come and leave, in their light, and in what is done with new parameters.
+"""
+
+import asyncio
+import contextlib
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from heliotrope.calibration.record import CalibrationOutcome
+from heliotrope.errors import HeliotropeError
+from heliotrope.field.coded_visits import CodedSettings
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.coded import Verdict
+from heliotrope.imaging.targets.view import FaceView
+from heliotrope.lcu import states
+from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.visits.calibration_cycle import (
+    CalibrationCycle,
+    CycleResult,
+    Leaving,
+    refused,
+)
+from heliotrope.plant.visits.coded_layout import Layout
+from heliotrope.plant.visits.coded_visit import CodedVisit, Returned
+from heliotrope.plant.visits.counts_at_rest import CountsHeard, counts_at_rest
+from heliotrope.plant.visits.neighbours import Standing
+from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
+from heliotrope.plant.visits.target_light import (
+    Exposed,
+    LightCamera,
+    TargetLight,
+    noting,
+    separated,
+)
+from heliotrope.plant.visits.verification import Confirming
+
+#: Moves beams to points on the surface, ENU, m, by heliostat.
+Move = Callable[[Mapping[str, FloatArray]], Awaitable[None]]
+
+#: Photographs that may wait to be read while the next is taken.
+_UNREAD = 2
+#: Share of the way from the usual light to that of a new photograph.
+_FOLLOW = 0.2
+
+
+@dataclass
+class Light:
+    """The light on a surface that is known before the photographs of a visit are taken.
+
+    Attributes
+    ----------
+    view
+        How the face lies in the camera's frames; None: unknown.
+    empty
+        The light without beams; None: the surface is never without.
+    usual, steady
+        Mean brightness of photographs, and its largest change as a share; None: it may be any.
+    """
+
+    view: FaceView | None = None
+    empty: TargetLight | None = None
+    usual: float | None = None
+    steady: float = 0.0
+
+    async def shown(self, picture: Exposed) -> bool:
+        """Return whether a photograph is as bright as usual; follow the sun."""
+        if self.usual is None:
+            return True
+        level = (await picture.light).brightness
+        if not abs(level - self.usual) <= self.steady * self.usual:
+            return False
+        self.usual += _FOLLOW * (level - self.usual)
+        return True
+
+
+@dataclass
+class _Taken:
+    """The photographs of a visit, and when the mirrors stood still for each.
+
+    Attributes
+    ----------
+    needed
+        Photographs in a turn of the codes.
+    pictures
+        Those of the present turn, each with its number; they are read while the beams move on.
+    still
+        From when to when all stood at the aims of a photograph, and its number.
+    count, first
+        Photographs in all; and the number with which the present turn began.
+    standing
+        How the field stood in the middle of the turn.
+    """
+
+    needed: int
+    pictures: list[tuple[int, Exposed]] = field(default_factory=list)
+    still: list[tuple[float, float, int]] = field(default_factory=list)
+    count: int = 0
+    first: int = 0
+    standing: Standing | None = None
+
+    @classmethod
+    @contextlib.contextmanager
+    def of(cls, layout: Layout) -> "Iterator[_Taken]":
+        """Give a place for the photographs of a layout; those unread at the end are forgotten."""
+        taken = cls(len(layout.moves))
+        try:
+            yield taken
+        finally:
+            taken.forget()
+
+    @property
+    def number(self) -> int:
+        """Number of the next photograph."""
+        return (self.first + len(self.pictures)) % self.needed
+
+    async def read(self) -> list[tuple[int, TargetLight]]:
+        """Return the light in the photographs, each with its number."""
+        return [(number, await one.light) for number, one in self.pictures]
+
+    def forget(self) -> None:
+        """Forget the photographs, read or not: a whole turn begins with the next number."""
+        self.first = self.number
+        for _, one in self.pictures:
+            one.light.cancel()
+        self.pictures.clear()
+
+
+class CodedCycle(ABC):
+    """Calibration of several heliostats of a plant at once: `JointCycle`, `ReceiverCycle`.
+
+    Parameters
+    ----------
+    plant
+        Running.
+    camera
+        Camera of the surfaces.
+    cycle
+        Learns from sightings as from those of its own visits.
+
+    Attributes
+    ----------
+    cycle
+        As given.
+    kind
+        Name of a visit, for people.
+    comes
+        Whether heliostats come to the surface, and return to their aims at the end; else they track
+        it, and their beams move a little.
+    settings
+        Numbers of the plant file.
+    """
+
+    kind: ClassVar[str]
+    comes: ClassVar[bool]
+    settings: CodedSettings
+
+    def __init__(
+        self, plant: PlantController, camera: LightCamera, cycle: CalibrationCycle
+    ) -> None:
+        self._plant, self._camera, self.cycle = plant, camera, cycle
+
+    # -- what differs between the surfaces -------------------------------------------------
+
+    @abstractmethod
+    def face(self, name: str) -> Target:
+        """Return the face of a surface; raise UnknownNameError if there is none of that name."""
+
+    @abstractmethod
+    def _arranged(self, face: Target, names: tuple[str, ...]) -> tuple[Layout, dict[str, str]]:
+        """Return the layout of a visit, and why some heliostats take no part."""
+
+    @abstractmethod
+    def _stay(
+        self, visit: CodedVisit, layout: Layout, light: Light, tell: Tell
+    ) -> AbstractAsyncContextManager[Move]:
+        """Give what moves beams, once they are there and the light is known; bring them away."""
+
+    @abstractmethod
+    async def _exposed(self, face: Target, light: Light) -> Exposed:
+        """Photograph the surface."""
+
+    @abstractmethod
+    async def _learn(
+        self,
+        visit: CodedVisit,
+        layout: Layout,
+        proven: Mapping[str, Photographs],
+        light: Light,
+        tell: Tell,
+    ) -> dict[str, CycleResult]:
+        """Learn from proven beams; return the results by heliostat."""
+
+    # -- a visit ---------------------------------------------------------------------------
+
+    async def run(
+        self,
+        person: Person,
+        token: int,
+        heliostats: Sequence[str],
+        where: str,
+        tell: Tell = lambda _: None,
+    ) -> tuple[CycleResult, ...]:
+        """Calibrate heliostats together, and bring each back to where it was.
+
+        It works under a mandate of its own: whoever takes the command authority meanwhile, it goes
+        on. A heliostat that a person commands leaves the visit.
+
+        Parameters
+        ----------
+        person, token
+            An engineer, with the token of the command authority.
+        heliostats, where
+            Names, and the name of the surface.
+        tell
+            Called with the name of each step.
+
+        Returns
+        -------
+            One for each heliostat, in the order given.
+
+        Raises
+        ------
+        RefusedError
+            If the plant refuses every motion, too few heliostats are left, or the light changes.
+        FetchError, InputError
+            No usable photograph comes.
+        UnknownNameError
+            If there is no such heliostat or surface.
+        """
+        plant, names = self._plant, tuple(dict.fromkeys(heliostats))
+        face = self.face(where)
+        layout, blocked = self._arranged(face, names)
+        moving, light = layout.names, Light()
+        with plant.authority.mandate(person, token, moving, face.name) as mandate:
+            results = {name: refused(mandate, name, text) for name, text in blocked.items()}
+            if moving:
+                async with Returned(plant, mandate, moving if self.comes else (), face):
+                    visit = CodedVisit(plant, mandate, moving, face)
+                    proven, others = await self.photographed(visit, layout, light, tell)
+                    results |= others
+                    if proven:
+                        tell(f"learning from {len(proven)} proven beams")
+                        results |= await self._learn(visit, layout, proven, light, tell)
+        return tuple(results[name] for name in names)
+
+    # -- photographs -----------------------------------------------------------------------
+
+    async def photographed(
+        self, visit: CodedVisit, layout: Layout, light: Light, tell: Tell
+    ) -> tuple[dict[str, Photographs], dict[str, CycleResult]]:
+        """Bring beams to their places, photograph them, bring them away, and tell them apart.
+
+        Returns
+        -------
+            The sighting of each proven beam, and the results of the others, by heliostat.
+        """
+        with _Taken.of(layout) as taken:
+            async with self._stay(visit, layout, light, tell) as move:
+                await self._photograph(visit, layout, light, taken, move, tell)
+            lost = {name: refused(visit.mandate, name, text) for name, text in visit.lost.items()}
+            if len(taken.pictures) < taken.needed:
+                cloud = Verdict.CLOUD
+                return {}, lost | {name: _not_proven(name, cloud) for name in visit.names}
+            proven, others = await self._separated(visit, layout, light, taken, tell)
+        return proven, lost | others
+
+    async def _photograph(
+        self,
+        visit: CodedVisit,
+        layout: Layout,
+        light: Light,
+        taken: _Taken,
+        move: Move,
+        tell: Tell,
+    ) -> None:
+        """Take the photographs, until their number is at its limit for changes of the light.
+
+        When a beam leaves, a whole turn of the codes begins anew. A photograph in other light than
+        the usual is taken again.
+        """
+        plant, settle, spoiled = self._plant, self.settings.settle, False
+        while len(taken.pictures) < taken.needed:
+            if not self.comes:
+                plant.movements.end(tuple(visit.lost))
+            elif await visit.leave():
+                taken.forget()
+            self._check(visit)
+            if taken.count >= int(self.settings.again * taken.needed):
+                if spoiled:
+                    return
+                raise RefusedError(
+                    f"{self.kind} to {visit.target.name}: {taken.count} photographs were taken, "
+                    f"and heliostats dropped out before {taken.needed} of them in a row were"
+                )
+            number, count = taken.number, len(taken.pictures)
+            tell(f"photograph {count + 1} of {taken.needed}, {len(visit.names)} beams")
+            await move(layout.points(number))
+            begin = plant.now()
+            while plant.now() < begin + settle:
+                await visit.look()
+            picture = await noting(visit.look, self._next(visit, light, taken))
+            visit.drop(visit.missing(states.TRACKING))
+            taken.count += 1
+            if not await light.shown(picture):
+                spoiled = True
+                continue
+            if count == taken.needed // 2:
+                taken.standing = Standing.of(plant.field)
+            taken.still.append((begin + 0.5 * settle, picture.at, number))
+            taken.pictures.append((number, picture))
+            if visit.astray:
+                taken.forget()
+        self._check(visit)
+
+    def _check(self, visit: CodedVisit) -> None:
+        """Refuse to go on without a heliostat."""
+        if not visit.visits:
+            why = next(iter(visit.lost.values()), "")
+            raise RefusedError(f"{self.kind} to {visit.target.name}: nobody is left; {why}")
+
+    async def _next(self, visit: CodedVisit, light: Light, taken: _Taken) -> Exposed:
+        """Take a photograph; few wait to be read, so that an unreadable one ends the visit soon."""
+        if len(taken.pictures) >= _UNREAD:
+            await asyncio.shield(taken.pictures[-_UNREAD][1].light)
+        return await self._exposed(visit.target, light)
+
+    async def _separated(
+        self, visit: CodedVisit, layout: Layout, light: Light, taken: _Taken, tell: Tell
+    ) -> tuple[dict[str, Photographs], dict[str, CycleResult]]:
+        """Return the sightings of proven beams, and the results of the others."""
+        chosen = [layout.names.index(name) for name in visit.names]
+        pictures = await taken.read()
+        moves = layout.moves[[number for number, _ in pictures]][:, chosen]
+        tell("taking the beams apart")
+        lights, worker = [one for _, one in pictures], self.cycle.worker
+        middle, axes = float(np.mean([one.at for one in lights])), layout.target.axes
+        beams = await worker(
+            separated,
+            lights,
+            light.empty,
+            moves,
+            [layout.beams[i] for i in chosen],
+            None if layout.powers is None else layout.powers[chosen],
+        )
+        heard = []
+        for i, beam in zip(chosen, beams, strict=True):
+            if beam.verdict is Verdict.PROVEN:
+                still = [
+                    (begin, end, layout.aims[i] + layout.moves[number, i] @ axes)
+                    for begin, end, number in taken.still
+                ]
+                one = visit.visits[beam.heliostat]
+                heard.append(CountsHeard.of(one, layout.aims[i], still, middle))
+        at_rest = await worker(counts_at_rest, heard)
+        results: dict[str, CycleResult] = {}
+        proven: dict[str, Photographs] = {}
+        for beam in beams:
+            name, counts = beam.heliostat, at_rest.get(beam.heliostat)
+            if counts is None:
+                results[name] = _not_proven(name, beam.verdict, beam.other)
+            elif isinstance(counts, str):
+                text = f"unchanged: {counts}"
+                results[name] = CycleResult(name, CalibrationOutcome.NOT_PROVEN, text)
+            else:
+                by_view = (light.empty or lights[0]).covariance_at(beam.centroid)
+                covariance = axes.T @ (beam.covariance + by_view) @ axes
+                shot = Shot(np.asarray(layout.target.point(beam.centroid)), middle, covariance)
+                shot = await self.cycle.alone(layout.target, name, shot, taken.standing)
+                proven[name] = Photographs([(shot, counts)])
+        return proven, results
+
+    # -- learning --------------------------------------------------------------------------
+
+    async def _learnt(
+        self,
+        visit: CodedVisit,
+        name: str,
+        taken: Photographs,
+        *,
+        confirming: Confirming | None = None,
+        least: int | None = None,
+        leaving: Leaving | None = None,
+    ) -> CycleResult:
+        """Learn from a proven beam, see `CalibrationCycle.learn`; an error is a result, too."""
+        try:
+            return await self.cycle.learn(
+                visit.visits[name], taken, confirming=confirming, least=least, leaving=leaving
+            )
+        except RefusedError as error:
+            return refused(visit.mandate, name, str(error))
+        except HeliotropeError as error:
+            text = f"{type(error).__name__}: {error}"
+            return CycleResult(name, CalibrationOutcome.ERROR, text)
+
+
+async def of_each(
+    heliostats: Iterable[str],
+    result: Callable[[str], Awaitable[CycleResult]],
+    beside: Awaitable[None] | None = None,
+) -> dict[str, CycleResult]:
+    """Return the results of heliostats, by name; all are computed side by side."""
+    results: dict[str, CycleResult] = {}
+
+    async def one(name: str) -> None:
+        results[name] = await result(name)
+
+    async with asyncio.TaskGroup() as group:
+        for name in heliostats:
+            group.create_task(one(name))
+        if beside is not None:
+            await beside
+    return results
+
+
+def _not_proven(name: str, verdict: Verdict, other: str = "") -> CycleResult:
+    text = f"unchanged: {verdict.value}{other and f' ({other})'}"
+    return CycleResult(name, CalibrationOutcome.NOT_PROVEN, text, verdict=verdict)
