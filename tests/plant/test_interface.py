@@ -20,13 +20,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from heliotrope.cli._at_plant import URGENT
 from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.field.example import example_plant
 from heliotrope.lcu import states
 from heliotrope.local import EMERGENCY, ORDINARY, CallError, LocalConnection, ask_once
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.interface import CALLS, frame_of, frame_parts, kind_of, plain, remade
-from heliotrope.plant.interface.calls import Call
+from heliotrope.plant.interface.calls import Call, Later, asked
 from heliotrope.plant.interface.console_process import CONSOLE, ConsoleProcess, Patience
 from heliotrope.plant.interface.desk import SAME, Desk
 from heliotrope.plant.interface.orders import AimOrder, EmergencyCall
@@ -424,7 +425,7 @@ def test_the_tower_is_shown_between_its_receivers_or_in_the_middle_of_the_site()
     middle = (receiver.center + [2.0, 0.0, -3.0]).tolist()
     for receivers, tower in (((receiver, beside), middle), ((), [0.0, 0.0, 0.0])):
         here.design = replace(example_plant(), receivers=receivers)
-        assert Desk(cast("Operations", here)).field()["tower"] == pytest.approx(tower)
+        assert Desk(cast("Operations", here)).field().tower == pytest.approx(tower)
 
 
 @pytest.mark.parametrize(
@@ -447,9 +448,23 @@ def test_an_aim_names_at_most_200_000_heliostats() -> None:
 
 
 def test_every_urgent_call_takes_beams_away() -> None:
-    assert {name for name, call in CALLS.items() if call.urgent} == {
-        "order_emergency", "stow", "defocus"
-    }  # fmt: skip
+    urgent = {name: call.request for name, call in CALLS.items() if call.urgent}
+    assert urgent.keys() == {"order_emergency", "stow", "defocus"}
+    assert set(urgent.values()) == URGENT
+
+
+def test_a_request_of_the_api_is_the_call_of_its_row() -> None:
+    assert asked("GET heliostats/A%2F1/parameters") == ("parameters", {"name": "A/1"})
+    assert asked("GET heliostats/A1") == ("heliostat", {"name": "A1"})
+    assert asked("GET photographs?heliostat=A1&limit=5") == (
+        "kept_photographs", {"heliostat": "A1", "limit": "5"}
+    )  # fmt: skip
+    for name, call in CALLS.items():
+        if call.request:
+            assert asked(call.request)[0] == name
+    for request in ("GET accounts", "PUT stow", "GET heliostats/A/B/parameters", "GET heliostats/"):
+        with pytest.raises(InputError, match="only known to the console; leave out --data"):
+            asked(request)
 
 
 def test_a_console_that_cannot_begin_is_tried_again_after_pauses_that_double(
@@ -507,14 +522,16 @@ def test_a_photograph_that_is_known_is_not_sent_again() -> None:
 
 
 def test_an_aim_is_a_place_or_points_and_never_both() -> None:
+    aimed = list[Any]()
     here = {
-        "aim_at": lambda who, token, heliostats, where: (token, heliostats, where),
-        "aim": lambda who, token, points: (token, {n: p.tolist() for n, p in points.items()}),
+        "aim_at": lambda who, token, heliostats, where: aimed.append((token, heliostats, where)),
+        "aim": lambda who, token, points: aimed.append((token, points["A"].tolist())),
     }
     point = np.array([1.0, 2.0, 3.0])
     place = {"heliostats": ["A"], "where": "left"}
-    assert _done(here, "aim", place) == (7, ["A"], "left")
-    assert _done(here, "aim", {"points": ["A"]}, point.tobytes()) == (7, {"A": [1.0, 2.0, 3.0]})
+    assert isinstance(_done(here, "aim", place), Later)
+    assert isinstance(_done(here, "aim", {"points": ["A"]}, point.tobytes()), Later)
+    assert aimed == [(7, ["A"], "left"), (7, [1.0, 2.0, 3.0])]
     for given, blob in ((place | {"points": ["A"]}, point.tobytes()), ({"heliostats": ["A"]}, b"")):
         with pytest.raises(InputError, match="give either where"):
             _done(here, "aim", given, blob)

@@ -15,7 +15,7 @@ from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, Redirect
 from starlette.staticfiles import StaticFiles
 
 from heliotrope import __version__
-from heliotrope.console import accounts, api, commands, factor
+from heliotrope.console import accounts, api, factor
 from heliotrope.console._attempts import Attempts
 from heliotrope.console._files import CLICKING, KEPT, PLAIN, STATIC, Files
 from heliotrope.console.auth import Caller, Console, introduced
@@ -41,7 +41,7 @@ ABOUT = (
     "word that the answer to the sign-in gave."
 )
 
-ROUTERS = (api.router, commands.router, accounts.router, factor.router)
+ROUTERS = (api.router, accounts.router, factor.router)
 #: Errors of a request that the answer lists, and their longest texts, characters.
 MOST_ERRORS, LONGEST_TEXT, LONGEST_WORD = 5, 200, 64
 
