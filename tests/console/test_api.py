@@ -457,7 +457,7 @@ def test_a_command_has_one_record(console: LiveConsole, ask: Ask) -> None:
         assert time.monotonic() < until, seen
         time.sleep(0.2)
     assert seen["good"], seen
-    assert console.until(lambda: console.live.operations.heliostat(name).state == "LOCKED")
+    assert console.until(lambda: console.live.operations.viewer.heliostat(name).state == "LOCKED")
     records, torn = audit.read(console.folder / "audit.jsonl")
     mine = [record for record in records if record.identity == identity]
     assert torn == 0

@@ -319,17 +319,17 @@ def test_one_heliostat_in_detail_says_why_it_is_locked(tmp_path: Path) -> None:
             plant, work = bench.plant, AutomaticSettings(calibrate=False)
             shown = Operations(plant, Logbook(clock), settings=work)
             await bench.wait(2.0)
-            assert shown.heliostat(NAME).locked == ""
-            assert shown.calibration().choice == "", "it calibrates nothing"
+            assert shown.viewer.heliostat(NAME).locked == ""
+            assert shown.automatic.view().choice == "", "it calibrates nothing"
             kept = await locked_by_a_visit(bench)
             await bench.wait(2.0)
-            text = shown.heliostat(NAME).locked
+            text = shown.viewer.heliostat(NAME).locked
             assert text.startswith("the visit to left of Egon has locked it since ")
             assert text.endswith(" UTC, until its parameters are written and read back")
             assert kept
             bench.cluster_of(NAME).mute = True
             await bench.wait(30.0)
-            assert shown.heliostat(NAME).locked == "", "its state is not known"
+            assert shown.viewer.heliostat(NAME).locked == "", "its state is not known"
 
     run_virtual(main)
 

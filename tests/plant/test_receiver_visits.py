@@ -385,15 +385,15 @@ def test_automatic_control_measures_those_that_track_the_receiver(tmp_path: Path
         plant.release_authority(ENGINEER, here.token)
         operations.automatic.want(names, wanted=True)
         operations.automatic.switch(on=True)
-        await here.until(lambda: operations.calibration().on)
+        await here.until(lambda: operations.automatic.view().on)
         operations.calibrate(ENGINEER, names[4], together=names[2:4], receiver=True)
-        assert operations.calibration().asked == (names[4], *names[2:4])
+        assert operations.automatic.view().asked == (names[4], *names[2:4])
         with pytest.raises(RefusedError, match="no beam is searched for"):
             operations.calibrate(ENGINEER, names[0], search=True, receiver=True)
         seen: set[str] = set()
 
         def told() -> list[str]:
-            for one in operations.calibration().running:
+            for one in operations.automatic.view().running:
                 if one.target == "receiver":
                     seen.update(one.heliostats)
             events = here.live.assembly.logbook.events(100)

@@ -1166,7 +1166,7 @@ def test_automatic_control_raises_those_with_a_free_way_and_names_the_others() -
                 await asyncio.sleep(0.1)
                 beams_in = inside(plant.beams, *live.field.stand(), live.world.sun(), 0.0)
                 lit.update(live.names[i] for i in np.flatnonzero(beams_in))
-            told = [a for a in live.operations.alarms() if a.condition == "beam_blocked"]
+            told = [a for a in live.operations.logbook.alarms() if a.condition == "beam_blocked"]
             blocked = {a.subject for a in told}
             now = plant.now()
             state = {name: plant.field.of(name, now).state for name in live.names}

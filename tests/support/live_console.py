@@ -234,7 +234,7 @@ class LiveConsole:
         here = self.live.operations
 
         def quiet() -> bool:
-            for alarm in here.alarms():
+            for alarm in here.logbook.alarms():
                 if not alarm.acknowledged_by:
                     with contextlib.suppress(RefusedError):
                         here.acknowledge(who, alarm.condition, alarm.subject)

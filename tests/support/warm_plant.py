@@ -48,7 +48,7 @@ async def work(clock: VirtualClock, worker: Callable[..., Any]) -> None:
     async with live.running():
         await asyncio.sleep(WORKING)
         live.operations.receiver_flux()
-        assert live.operations.calibration().done
+        assert live.operations.automatic.view().done
         live.operations.emergency(Person("engineer", Role.ENGINEER))
         await asyncio.sleep(STOWING)
         assert live.plant.emergency_on

@@ -97,15 +97,15 @@ def plant(**more: Any) -> Any:
     order = SimpleNamespace(emergency=None, emergency_on=False, beliefs=SimpleNamespace())
     order.beliefs.record = lambda name: None
     order.__dict__.update(more.pop("plant", {}))
-    found = SimpleNamespace(
-        plant=order,
-        alarms=lambda: (),
-        holds=lambda: (),
-        automatic=SimpleNamespace(waits=""),
-        calibration=lambda: SimpleNamespace(running=(), results=()),
+    automatic = SimpleNamespace(
+        waits="",
+        service=SimpleNamespace(out=()),
+        view=lambda: SimpleNamespace(running=(), results=()),
     )
-    found.__dict__.update(more)
-    return found
+    automatic.__dict__.update(more)
+    return SimpleNamespace(
+        plant=order, logbook=SimpleNamespace(alarms=lambda: ()), automatic=automatic
+    )
 
 
 def progress(state: int, seconds: float, *, miss: float = 0.0, begins: Any = None) -> Any:
@@ -157,7 +157,7 @@ def watched(stage: str, *, rough: int = 0, gone: bool = False, touched: bool = F
     one.node = SimpleNamespace(controller=SimpleNamespace(motion=SimpleNamespace(rough=rough)))
     run = SimpleNamespace(target=target.name, heliostats=("H1",), heliostat="H1", stage=stage)
     seen = SimpleNamespace(running=(run,), results=())
-    operations = plant(calibration=lambda: seen)
+    operations = plant(view=lambda: seen)
     observer = ProgressObserver(0.0, [one], (target,), together=True, across=False)
     observer.given(("H1",))
     observer.took(operations, 0.0)
@@ -196,10 +196,10 @@ def test_a_persons_emergency_and_what_is_out_of_service_outlive_a_restart() -> N
         observer.ended()
         observer.look(new, set(), ZENITH, 1.0, governs=False)
 
-    waits = SimpleNamespace(waits="an emergency held")
+    out = SimpleNamespace(out=(SimpleNamespace(name="H1"),))
     restarted(plant(), called=False, out=False)
-    restarted(plant(automatic=waits), called=True, out=False)
-    restarted(plant(holds=lambda: (SimpleNamespace(name="H1"),)), called=False, out=True)
+    restarted(plant(waits="an emergency held"), called=True, out=False)
+    restarted(plant(service=out), called=False, out=True)
     with pytest.raises(InvariantError, match=r"invariant L4 .* the new one goes on"):
         restarted(plant(), called=True, out=False)
     with pytest.raises(InvariantError, match=r"invariant L4 .* back in service: H1"):

@@ -6,6 +6,7 @@ API lists it. The model of its ``order``, the type of its answer and its docstri
 stand.
 """
 
+import asyncio
 import functools
 import inspect
 import re
@@ -16,7 +17,7 @@ from urllib.parse import parse_qsl, unquote
 
 from pydantic import BaseModel
 
-from heliotrope.calibration.flights import FlightDocument
+from heliotrope.calibration.flights import FlightDocument, parse_flight
 from heliotrope.errors import InputError
 from heliotrope.field.timetable import TimetableEntry
 from heliotrope.optics import FluxView
@@ -201,19 +202,19 @@ def heliostat(desk: Desk, order: orders.Named) -> views.HeliostatView:
 
     `locked`: if it is LOCKED, by whose order or visit, since when, and until when.
     """
-    return desk.operations.heliostat(order.name)
+    return desk.operations.viewer.heliostat(order.name)
 
 
 @_call("GET clusters", "field", fresh=FRESH)
 def clusters(desk: Desk) -> tuple[views.ClusterRow, ...]:
     """Return the health of each cluster."""
-    return desk.operations.cluster_rows()
+    return desk.operations.logbook.cluster_rows(desk.operations.plant)
 
 
 @_call(console=True)
 def live(desk: Desk) -> WithBlob:
     """Return the field and the plant at one moment."""
-    head, blob = frame_parts(desk.operations.frame())
+    head, blob = frame_parts(desk.operations.viewer.frame())
     return WithBlob({"frame": head, "overview": overview(desk.operations)}, blob)
 
 
@@ -223,7 +224,7 @@ def live(desk: Desk) -> WithBlob:
 @_call("GET emergency", "safety")
 def emergency(desk: Desk) -> views.EmergencyView:
     """Return the last emergency order with its proof."""
-    return desk.operations.emergency_view()
+    return desk.operations.viewer.emergency()
 
 
 @_call("POST emergency", "safety", bare=True, urgent=True)
@@ -239,7 +240,7 @@ def withdraw_emergency(desk: Desk, who: Person, order: orders.Withdrawal) -> vie
     The emergency goes on while another person's order stands (`calls`).
     """
     desk.operations.withdraw(who, order.owner)
-    return desk.operations.emergency_view()
+    return desk.operations.viewer.emergency()
 
 
 @_call("PUT readings/{name}", "safety", ENGINEER, body=orders.Reading)
@@ -254,7 +255,7 @@ def give_reading(desk: Desk, who: Person, order: orders.NamedReading) -> None:
 @_call("GET alarms", "alarms", fresh=FRESH)
 def alarms(desk: Desk) -> tuple[views.AlarmRow, ...]:
     """Return the alarms, those that need attention first."""
-    return desk.operations.alarms()
+    return desk.operations.logbook.alarms()
 
 
 @_call("POST alarms/acknowledge", "alarms", OPERATOR)
@@ -266,13 +267,13 @@ def acknowledge(desk: Desk, who: Person, order: orders.Acknowledged) -> None:
 @_call("GET events", "logs", fresh=FRESH)
 def events(desk: Desk, order: orders.Some) -> tuple[views.EventRow, ...]:
     """Return the last events, newest first."""
-    return desk.operations.events(order.limit)
+    return desk.operations.logbook.events(order.limit)
 
 
 @_call("GET packets", "logs", fresh=FRESH)
 def packets(desk: Desk, order: orders.SomePackets) -> tuple[views.PacketRow, ...]:
     """Return the last messages between plant and clusters, newest first."""
-    return desk.operations.packets(order.limit, order.cluster)
+    return desk.operations.logbook.packets(order.limit, order.cluster)
 
 
 @_call("POST clusters/{name}/frames", "logs", ENGINEER)
@@ -416,7 +417,7 @@ def holds(desk: Desk) -> tuple[Lockout, ...]:
 
     A locked heliostat is out of service.
     """
-    return desk.operations.holds()
+    return desk.operations.automatic.service.out
 
 
 @_call("POST holds", "commands", OPERATOR)
@@ -437,7 +438,7 @@ def unhold(desk: Desk, who: Person, order: orders.GivenBack) -> tuple[Lockout, .
     again when nobody's lock is left.
     """
     desk.operations.unhold(who, **order.model_dump())
-    return desk.operations.holds()
+    return desk.operations.automatic.service.out
 
 
 # -- calibration ---------------------------------------------------------------------------------
@@ -451,14 +452,14 @@ def calibration(desk: Desk) -> views.CalibrationView:
     the field's errors for this day; `field`: what has come true; `choice`: why automatic control
     chose the last visit, or begins none.
     """
-    return desk.operations.calibration()
+    return desk.operations.automatic.view()
 
 
 @_call("PUT calibration", "calibration", OPERATOR)
 def switch_calibration(desk: Desk, who: Person, order: orders.Switch) -> views.CalibrationView:
     """Switch automatic calibration on or off."""
     desk.operations.switch_calibration(who, order.on)
-    return desk.operations.calibration()
+    return desk.operations.automatic.view()
 
 
 @_call("POST calibration/next", "calibration", OPERATOR)
@@ -478,7 +479,7 @@ def calibrate(desk: Desk, who: Person, order: orders.OneCalibration) -> TicketSt
 @_call("GET schedule", "calibration", fresh=FRESH)
 def schedule(desk: Desk, order: orders.SomeVisits) -> tuple[views.Planned, ...]:
     """Return the planned next measurements."""
-    return desk.operations.schedule(order.limit)
+    return desk.operations.automatic.plan(order.limit)
 
 
 @_call("GET timetable", "calibration")
@@ -487,7 +488,7 @@ def timetable(desk: Desk) -> tuple[views.TimetableRow, ...]:
 
     Each entry comes with its next and last time, and what came of that.
     """
-    return desk.operations.timetable()
+    return desk.operations.automatic.timetable.rows()
 
 
 @_call("PUT timetable", "calibration", OPERATOR)
@@ -500,8 +501,8 @@ def put_timetable(
     """
     entries = order.model_dump()["entries"]
     made = None if entries is None else [TimetableEntry.of(entry) for entry in entries]
-    desk.operations.put_timetable(who, made)
-    return desk.operations.timetable()
+    desk.operations.automatic.timetable.put(who, made)
+    return desk.operations.automatic.timetable.rows()
 
 
 @_call("GET retries", "calibration")
@@ -511,7 +512,7 @@ def retries(desk: Desk) -> tuple[Retry, ...]:
     Each row gives the work, of what, failures, the last reason, seconds until the next try (null:
     none by itself), and what follows.
     """
-    return desk.operations.retries()
+    return desk.operations.automatic.retries()
 
 
 @_call("GET heliostats/{name}/parameters", "calibration")
@@ -618,7 +619,7 @@ def flights(desk: Desk) -> tuple[views.FlightView, ...]:
 
     Each gives what became of its heliostats, and the errors that its rows share.
     """
-    return desk.operations.flights()
+    return desk.operations.automatic.flights.views()
 
 
 @_call("POST flights", "calibration", ENGINEER, body=FlightDocument, pack=_flight_text)
@@ -628,13 +629,14 @@ async def take_flight(desk: Desk, who: Person, blob: bytes) -> views.FlightView:
     The body is the [`flight.json`](formats.md#flightjson) of `heliotrope drone evaluate`, at most
     8 MiB and 20,000 rows.
     """
-    return await desk.operations.take_flight(who, blob)
+    document = await asyncio.to_thread(parse_flight, blob)
+    return await desk.operations.automatic.flights.take(who, document, blob.decode())
 
 
 @_call("GET learning", "calibration", fresh=FRESH)
 def learning(desk: Desk) -> tuple[views.LearningView, ...]:
     """Return what was learnt of each group of mirrors, when and from what, and what is in force."""
-    return desk.operations.learning()
+    return desk.operations.automatic.learning.views()
 
 
 @_call("POST learning", "calibration", ENGINEER)
@@ -644,7 +646,7 @@ def learn(desk: Desk, who: Person, order: orders.OneGroup) -> tuple[views.Learni
     Nothing moves; it runs beside the plant, and `GET learning` says how it ended.
     """
     desk.operations.learn(who, order.group)
-    return desk.operations.learning()
+    return desk.operations.automatic.learning.views()
 
 
 _REQUESTS = [

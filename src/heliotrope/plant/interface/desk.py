@@ -143,7 +143,7 @@ class Desk:
             if grant is None:
                 continue
             if time.monotonic() - self._present.get(grant.holder.name, -math.inf) < PRESENT:
-                self.operations.keep_authority(grant.holder, grant.token)
+                self.operations.plant.authority.keep(grant.holder, grant.token)
 
     # -- the authority ---------------------------------------------------------------------
 
@@ -174,7 +174,7 @@ class Desk:
         """Take the command authority, or renew it; return whether its token is new."""
         grant = self.operations.plant.authority.grant
         if grant is not None and grant.holder == person:
-            self.operations.keep_authority(person, grant.token)
+            self.operations.plant.authority.keep(person, grant.token)
             return False
         self.operations.take_authority(person)
         return True
@@ -191,7 +191,7 @@ class Desk:
 
     def keep(self, person: Person) -> AuthorityState:
         """Renew the command authority."""
-        self.operations.keep_authority(person, self.token_of(person))
+        self.operations.plant.authority.keep(person, self.token_of(person))
         return self._is_present(person)
 
     def release(self, person: Person) -> AuthorityState:
@@ -215,7 +215,7 @@ class Desk:
                 while len(self._called) >= _MOST_CALLED:
                     self._called.pop(next(iter(self._called)))
                 self._called[key] = now
-        return self.operations.emergency_view()
+        return self.operations.viewer.emergency()
 
     async def recorded(self, ticket: Ticket) -> TicketState:
         """Keep a ticket; return its progress once it is recorded, or once that has failed.
@@ -268,22 +268,22 @@ class Desk:
     def field(self) -> FieldDesign:
         """Return everything about the field that does not change."""
         here = self.operations
-        design, plant = here.design, here.plant.field
+        design, plant = here.plant.design, here.plant.field
         centers = [receiver.center for receiver in design.receivers]
-        sizes = np.sort(here.sizes.max(axis=1))
+        sizes = np.sort(here.viewer.sizes.max(axis=1))
         volumes = here.plant.beams.volumes
         return FieldDesign(
             design.name,
             here.names,
-            here.positions.round(3),
-            here.clusters,
+            here.viewer.positions.round(3),
+            plant.clusters,
             plant.cluster,
             float(sizes[len(sizes) // 2]),
             np.mean(centers, axis=0) if centers else np.zeros(3),
             here.receivers,
             here.targets,
             tuple(KeepOutOutline(each.name, outline(each).round(2)) for each in volumes),
-            here.aim_names,
+            here.viewer.aim_names,
             states.STATES,
             meanings.FAULTS,
         )

@@ -164,7 +164,7 @@ class Acts:
         until = self.now() + self.chance.uniform(_LEAST_DUTY, most)
         with contextlib.suppress(RefusedError):
             while self.now() < until and self.present() is operations:
-                operations.keep_authority(person, token)
+                operations.plant.authority.keep(person, token)
                 self._observer.kept(self.now())
                 self._watch.day.on_duty(self.now())
                 if self.chance.random() < 0.2:
