@@ -14,10 +14,10 @@ from heliotrope.links.messages import Command, Emergency
 from heliotrope.plant.assigned import HELD, AssignedFile, Points
 from heliotrope.plant.audit import read
 from heliotrope.plant.authority import Person, Role
-from heliotrope.plant.lockouts import Kind, Lockout
 from heliotrope.plant.locks import CERTAIN
 from heliotrope.plant.operations import Logbook, Operations
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.store.records import Kind, Lockout
 from support.plant_bench import OPERATOR, Bench, running
 
 ENGINEER = Person("Egon", Role.ENGINEER)

@@ -28,7 +28,6 @@ from heliotrope.plant.interface.desk import AuthorityState, CameraReading, Desk,
 from heliotrope.plant.interface.encoding import frame_parts
 from heliotrope.plant.interface.overview import overview
 from heliotrope.plant.interface.tickets import TicketState
-from heliotrope.plant.lockouts import Lockout
 from heliotrope.plant.operations import bus_frames as bus
 from heliotrope.plant.operations import views
 from heliotrope.plant.operations.marking import MarksView, PictureToMark
@@ -36,6 +35,7 @@ from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.operations.typed_parameters import ParametersView
 from heliotrope.plant.operations.zero import lock_position, zero
 from heliotrope.plant.tickets import Ticket
+from heliotrope.store.records import Lockout
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])

@@ -25,7 +25,6 @@ from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.lockouts import Kind
 from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, TrueErrors
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.errands import Step
@@ -48,7 +47,7 @@ from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.safety import alarms
-from heliotrope.store.records import Records
+from heliotrope.store.records import Kind, Records
 
 #: The person under whose name it commands.
 AUTOMATIC = Person("automatic control", Role.ENGINEER)

@@ -30,7 +30,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.authority import Grant, Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
-from heliotrope.plant.lockouts import TOWER, Kind
+from heliotrope.plant.lockouts import TOWER
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.errands import Errands
@@ -52,7 +52,7 @@ from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import Act
-from heliotrope.store.records import Records
+from heliotrope.store.records import Kind, Records
 
 #: People's commands after which automatic control leaves heliostats alone, and those that give them
 #: to it until they are lost.

@@ -10,7 +10,6 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.lockouts import Kind
 from heliotrope.plant.operations.automatic import AutomaticControl
 from heliotrope.plant.operations.views import (
     STALE_STATE,
@@ -21,6 +20,7 @@ from heliotrope.plant.operations.views import (
     ParameterView,
 )
 from heliotrope.safety import FluxProof
+from heliotrope.store.records import Kind
 
 #: Life of a frame, s of the plant's clock.
 _EVERY = 1.0
