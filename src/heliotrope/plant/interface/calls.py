@@ -40,9 +40,12 @@ from heliotrope.store.records import Lockout
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 VIEWER, OPERATOR, ENGINEER = Role
-#: Time for which all viewers share a view; of one that never changes; and for which a browser keeps
-#: a photograph, s.
-FRESH, ALWAYS, DAY = 0.5, float("inf"), 86_400.0
+#: Time for which all viewers share a view, s.
+FRESH = 0.5
+#: The same of a view that never changes.
+ALWAYS = float("inf")
+#: Time for which a browser keeps a photograph, s.
+DAY = 86_400.0
 _LINK = re.compile(r"\[([^\]]+)\]\([^)]+\)")
 
 
