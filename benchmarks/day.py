@@ -122,7 +122,7 @@ async def _live(count: int, minutes: float, looks: int) -> list[Row]:
         before = time.process_time()
         for look in range(1, looks + 1):
             await asyncio.sleep(60.0 * minutes / looks)
-            now, summary = time.process_time(), live.operations.calibration()
+            now, summary = time.process_time(), live.operations.automatic.view()
             hours = minutes / looks / 60.0
             last = summary.quality[-1].truth_median if summary.quality else float("nan")
             rows.append(

@@ -69,7 +69,7 @@ def outcome(seed: int, hour: float, length: float = LENGTH) -> Outcome:
         begin, busy_at, idle, reached = clock.monotonic(), None, 0.0, None
         async with plant.running():
             while (now := clock.monotonic()) < begin + length:
-                view = plant.operations.calibration()
+                view = plant.operations.automatic.view()
                 if view.running:
                     busy_at = now
                 elif busy_at is not None:
@@ -85,7 +85,9 @@ def outcome(seed: int, hour: float, length: float = LENGTH) -> Outcome:
 def _outcome(plant: PlantAssembly, world: World, reached: float | None, idle: float) -> Outcome:
     names, beliefs = plant.plant.field.names, plant.plant.beliefs
     known = np.array([beliefs.record(name) is not None for name in names])
-    last = {entry.heliostat: entry.text for entry in plant.operations.calibration().results[::-1]}
+    last = {
+        entry.heliostat: entry.text for entry in plant.operations.automatic.view().results[::-1]
+    }
     left = {name: last.get(name, "") for name, good in zip(names, known, strict=True) if not good}
     error = 1e3 * float(np.nanmedian(world.errors()[known])) if known.any() else None
     return Outcome(len(names), int(known.sum()), error, reached, idle, left)

@@ -90,13 +90,13 @@ class Gauges:
         who, operations, over = Person("gauges", Role.ENGINEER), self.operations, Future[bool]()
 
         def work() -> None:
-            for call in operations.plant.calls:
+            for call in operations.plant.sentinel.calls:
                 operations.withdraw(who, call.who)
-            for alarm in operations.alarms():
+            for alarm in operations.logbook.alarms():
                 if not alarm.acknowledged_by:
                     with contextlib.suppress(HeliotropeError):
                         operations.acknowledge(who, alarm.condition, alarm.subject)
-            over.set_result(not operations.emergency_view().on)
+            over.set_result(not operations.viewer.emergency().on)
 
         self.loop.call_soon_threadsafe(work)
         if over.result(60.0):

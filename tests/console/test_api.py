@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import logging
 import re
+import runpy
 import shutil
 import ssl
 import subprocess
@@ -105,12 +106,15 @@ def test_the_field_shows_where_no_beam_may_be(ask: Ask) -> None:
 
 
 def test_the_page_of_the_api_has_every_route() -> None:
-    page = Path(__file__).parents[2] / "docs" / "reference" / "api-http.md"
-    rows = re.findall(r"^\| `([A-Z]+) (\S+)` \| (\w+) \| \S", page.read_text("utf-8"), re.MULTILINE)
+    place = Path(__file__).parents[2] / "docs" / "reference" / "api-http.md"
+    page = place.read_text("utf-8")
+    rows = re.findall(r"^\| `([A-Z]+) (\S+)` \| (\w+) \| \S", page, re.MULTILINE)
     assert {(method, path): role for method, path, role in rows} == {
         route: role or "none" for route, role in NEEDED.items()
     }
     assert len(rows) == len(NEEDED)
+    script = runpy.run_path(str(Path(__file__).parents[2] / "scripts" / "api_page.py"))
+    assert page == script["page"](), "run scripts/api_page.py to write the table again"
 
 
 def test_what_a_session_needs(console: LiveConsole, signed_in: httpx.Client) -> None:
@@ -456,7 +460,7 @@ def test_a_command_has_one_record(console: LiveConsole, ask: Ask) -> None:
         assert time.monotonic() < until, seen
         time.sleep(0.2)
     assert seen["good"], seen
-    assert console.until(lambda: console.live.operations.heliostat(name).state == "LOCKED")
+    assert console.until(lambda: console.live.operations.viewer.heliostat(name).state == "LOCKED")
     records, torn = audit.read(console.folder / "audit.jsonl")
     mine = [record for record in records if record.identity == identity]
     assert torn == 0

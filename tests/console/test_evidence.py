@@ -104,7 +104,7 @@ def test_refused_orders_raise_an_alarm(console: LiveConsole, ask: Ask) -> None:
     for _ in range(5):
         assert ask("viewer", "POST", "stow", {"heliostats": []}).status_code == 403
     recorded(console, "viewer: order refused: the role is too low: POST /api/v1/stow by token")
-    alarms = {row.condition: row for row in console.call(console.live.operations.alarms)}
+    alarms = {row.condition: row for row in console.call(console.live.operations.logbook.alarms)}
     assert alarms["orders_refused"].active
     assert "viewer from 127.0.0.1 has too low a role" in alarms["orders_refused"].text
 
@@ -115,7 +115,7 @@ def test_a_lockout_raises_an_alarm(console: LiveConsole) -> None:
         answers = [client.post("session", json=wrong).status_code for _ in range(12)]
     assert 429 in answers
     recorded(console, "viewer: sign-ins refused after too many failures")
-    alarms = {row.condition: row for row in console.call(console.live.operations.alarms)}
+    alarms = {row.condition: row for row in console.call(console.live.operations.logbook.alarms)}
     assert alarms["sign_in_lockout"].active
     attempts = console.server.app.state.console.attempts
     console.call(lambda: attempts.good("viewer", "127.0.0.1"))

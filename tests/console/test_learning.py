@@ -16,7 +16,7 @@ Ask = Callable[..., httpx.Response]
 def test_what_is_in_force_is_shown_and_an_order_without_a_learner_is_refused(
     console: LiveConsole, ask: Ask, tokens: dict[str, str], tmp_path: Path
 ) -> None:
-    groups = list(console.live.operations.design.groups)
+    groups = list(console.live.operations.plant.design.groups)
     rows = ask("viewer", "GET", "learning").json()
     assert [(row["group"], row["version"], row["at"]) for row in rows] == [
         (group, 0, None) for group in groups

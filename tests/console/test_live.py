@@ -134,11 +134,11 @@ def test_ctl_commands(ctl: Callable[..., Any], console: LiveConsole) -> None:
     given = ctl("operator", "command", "lock", name)
     assert given.exit_code == 0, given.output
     assert given.stdout == "LOCK: 1 done\n"
-    assert console.call(lambda: console.live.operations.heliostat(name).state) == "LOCKED"
+    assert console.call(lambda: console.live.operations.viewer.heliostat(name).state) == "LOCKED"
     assert ctl("operator", "command", "unlock", name).exit_code == 0
     stowed = ctl("operator", "stow", name, "--wait", "60")
     assert stowed.exit_code == 0, stowed.output
-    assert console.until(lambda: console.live.operations.heliostat(name).state == "STOWED")
+    assert console.until(lambda: console.live.operations.viewer.heliostat(name).state == "STOWED")
 
 
 def test_ctl_says_what_a_proof_has_measured_and_what_it_believes(
@@ -147,7 +147,7 @@ def test_ctl_says_what_a_proof_has_measured_and_what_it_believes(
     try:
         given = ctl("operator", "emergency")
         assert given.exit_code == 0, given.output
-        assert console.until(lambda: console.live.operations.emergency_view().measured)
+        assert console.until(lambda: console.live.operations.viewer.emergency().measured)
         shown = ctl("viewer", "status").stdout
         (line,) = [line for line in shown.splitlines() if line.startswith("EMERGENCY (DEFOCUS): ")]
         assert "measured: the flux is below its limit" in line
@@ -192,7 +192,7 @@ def test_ctl_at_the_plant_itself(ctl: Callable[..., Any], console: LiveConsole) 
     out = ctl("operator", *where, "out-of-service", name, "--reason", "washing")
     assert out.exit_code == 0, out.output
     assert f"OUT_OF_SERVICE: 1 done ({name}: parked in stow and locked out; " in out.stdout
-    assert console.call(lambda: console.live.operations.heliostat(name).hold)
+    assert console.call(lambda: console.live.operations.viewer.heliostat(name).hold)
     left = ctl("operator", *where, "automatic", name)
     assert left.exit_code == 1
     assert left.stdout.startswith(f"AUTOMATIC: 1 refused ({name}: out of service: washing (")
@@ -224,14 +224,14 @@ def test_ctl_at_the_plant_itself(ctl: Callable[..., Any], console: LiveConsole) 
 def test_frames_of_the_bus_are_recorded_for_an_engineer(
     ctl: Callable[..., Any], console: LiveConsole, way: str
 ) -> None:
-    cluster, name = next(iter(console.live.operations.clusters)), console.live.names[0]
+    cluster, name = next(iter(console.live.operations.plant.field.clusters)), console.live.names[0]
     where = () if way == "console" else ("--data", str(console.folder))
     shown = ctl("engineer", *where, "frames", cluster, "--heliostat", name)
     assert shown.exit_code == 0, shown.output
     assert {"QUERY_STATUS", "STATUS", "SUN"} <= set(shown.stdout.split())
     assert name in shown.stdout
     assert console.live.names[1] not in shown.stdout
-    rows = console.call(lambda: console.live.operations.events(5))
+    rows = console.call(lambda: console.live.operations.logbook.events(5))
     assert any("frames of its bus" in row.text and row.text.startswith(cluster) for row in rows)
     assert "engineer" in str(ctl("operator", *where, "frames", cluster).exception)
     assert "nobody" in str(ctl("engineer", *where, "frames", "nobody").exception)

@@ -215,7 +215,7 @@ def test_a_password_is_taken_where_the_proxy_signs_nobody_in(front: Front) -> No
             assert client.get("/api/v1/session").json()["name"] == "viewer"
         opened = [
             e.text
-            for e in front.console.call(lambda: front.console.live.operations.events(200))
+            for e in front.console.call(lambda: front.console.live.operations.logbook.events(200))
             if e.kind == "security" and "127.0.0.21" in e.text
         ]
         assert opened

@@ -39,7 +39,7 @@ _COLOURS = {
 
 def test_the_page_tells_what_is_predicted(field: LiveConsole, enter: Callable[..., Any]) -> None:
     def two() -> bool:
-        return len(field.live.operations.calibration().outlooks) == 2
+        return len(field.live.operations.automatic.view().outlooks) == 2
 
     field.until(two, 240.0)
     page = enter("viewer")
@@ -128,7 +128,7 @@ def test_a_joint_visit_shows_its_first_heliostats_and_all_on_a_click(
 def test_the_curve_is_in_the_answer_of_the_api_and_in_the_store(
     field: LiveConsole, enter: Callable[..., Any]
 ) -> None:
-    field.until(lambda: field.live.operations.calibration().outlooks, 240.0)
+    field.until(lambda: field.live.operations.automatic.view().outlooks, 240.0)
     page = enter("viewer")
     told = page.evaluate("async () => (await fetch('/api/v1/calibration')).json()")
     first = told["outlooks"][0]
@@ -165,7 +165,7 @@ _RESULT = {
 def test_the_last_measurements_fit_into_every_window(
     field: LiveConsole, enter: Callable[..., Any]
 ) -> None:
-    field.until(lambda: field.live.operations.calibration().quality, 240.0)
+    field.until(lambda: field.live.operations.automatic.view().quality, 240.0)
     page = enter("viewer")
 
     _answering(page, {"results": [_RESULT] * 3})

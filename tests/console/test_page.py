@@ -332,7 +332,7 @@ def test_calibration_is_seen(field: LiveConsole, enter: Callable[[str], Any]) ->
 def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page = enter("engineer")
     page.click("#emergency")
-    order = field.until(lambda: field.live.operations.plant.emergency)
+    order = field.until(lambda: field.live.operations.plant.sentinel.order)
     assert order.who == "engineer"
     page.wait_for_selector(".hx-alert.on")
     until(
@@ -349,7 +349,7 @@ def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any])
         if button.count():
             button.click(force=True)
         page.wait_for_timeout(1000)
-    assert not field.call(lambda: field.live.operations.plant.emergency_on)
+    assert not field.call(lambda: field.live.operations.plant.sentinel.on)
 
 
 @pytest.mark.parametrize("path", ["", "emergency"])
@@ -357,13 +357,13 @@ def test_emergency_needs_its_own_script_only(
     field: LiveConsole, enter: Callable[[str], Any], path: str
 ) -> None:
     page = enter("viewer")
-    before = field.call(lambda: field.live.operations.plant.emergency)
+    before = field.call(lambda: field.live.operations.plant.sentinel.order)
     page.route("**/live.js", lambda route: route.abort())
     page.goto(f"{field.address}{path}")
     page.click("#emergency")
     page.wait_for_selector("#emergency-said:has-text('ordered')")
     assert not page.evaluate("window.heliotrope")
-    order = field.call(lambda: field.live.operations.plant.emergency)
+    order = field.call(lambda: field.live.operations.plant.sentinel.order)
     assert order is not before
     field.calm()
 

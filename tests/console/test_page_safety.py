@@ -119,7 +119,7 @@ def test_after_a_loss_of_many_a_person_presses_resume(
         return found.get("IDLE", 0) + found.get("TRACKING", 0) > 40
 
     field.until(up)
-    link = live.links[live.operations.clusters[0]]
+    link = live.links[live.operations.plant.field.clusters[0]]
     field.call(lambda: setattr(link, "plugged", False))
     until(page, "heliotrope.store.state.filter(s => s === 255).length === 32")
     page.wait_for_timeout(3000)
@@ -147,7 +147,7 @@ def test_an_emergency_is_withdrawn_after_one_question_and_its_text_ends(
     page.wait_for_selector("dialog[open] h2:has-text('Withdraw')")
     page.click("dialog >> text=Cancel")
     page.wait_for_timeout(1000)
-    assert field.call(lambda: field.live.plant.emergency_on)
+    assert field.call(lambda: field.live.plant.sentinel.on)
     page.click(".hx-alert button >> text=Withdraw")
     page.click("dialog >> text='Withdraw'")
     field.calm()
@@ -241,7 +241,7 @@ def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
         assert each.evaluate("[...heliotrope.store.out].indexOf(1)") == 3
     said(page, f"OUT_OF_SERVICE: 1 acknowledged ({name}: on its way to stow: ")
     said(page, f"OUT_OF_SERVICE: 1 done ({name}: parked in stow and locked out")
-    assert field.live.operations.heliostat(name).state == "STOWED"
+    assert field.live.operations.viewer.heliostat(name).state == "STOWED"
     page.click(".hx-tabs >> text=Heliostat")
     page.wait_for_selector(".hx-heliostat dd:has-text('washing (operator, since')")
     page.wait_for_selector(".hx-heliostat dd:has-text('expected back'):has-text('in stow')")
@@ -249,9 +249,9 @@ def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
     operations = field.live.operations
     with pytest.MonkeyPatch.context() as patch:
         shown = replace(
-            operations.heliostat(name), state="LOCKED", flags=("AT_STOW", "LOCAL_SWITCH")
+            operations.viewer.heliostat(name), state="LOCKED", flags=("AT_STOW", "LOCAL_SWITCH")
         )
-        patch.setattr(operations, "heliostat", lambda _: shown)
+        patch.setattr(operations.viewer, "heliostat", lambda _: shown)
         page.wait_for_selector(".hx-heliostat dd:has-text('in stow; confirmed at the mirror')")
         page.wait_for_selector(".hx-heliostat dd:has-text('drives off: nothing moves it')")
     # The whole field is given to automatic control: it stays where it is.
@@ -259,7 +259,7 @@ def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
     page.click(".hx-orders >> text=Automatic")
     page.click("dialog >> text='Give to automatic control'")
     said(page, f"{name}: out of service: washing")
-    assert field.call(lambda: field.live.operations.heliostat(name).state) == "STOWED"
+    assert field.call(lambda: field.live.operations.viewer.heliostat(name).state) == "STOWED"
     page.click(".hx-tabs >> text=Schedule")
     row = page.locator(f".hx-schedule tr:has-text('{name}'):has-text('washing')")
     assert "STOWED" in row.inner_text()
@@ -290,7 +290,7 @@ def test_a_target_is_locked_and_the_lock_returned(
     page.locator(row).locator("text=Return lock").click()
     page.click("dialog >> text='Return lock'")
     page.wait_for_selector(row, state="detached")
-    assert field.live.operations.holds() == ()
+    assert field.live.operations.automatic.service.out == ()
 
 
 # -- scope -------------------------------------------------------------------------------------

@@ -30,11 +30,11 @@ def test_an_entry_is_added_and_removed(field: LiveConsole, enter: Callable[..., 
     page.fill("dialog [name=every]", "90")
     page.click("dialog >> text='Put in force'")
     page.wait_for_selector("td:has-text('12:00Z, 14:30+02:00, every 90 min')")
-    (row,) = field.live.operations.timetable()
+    (row,) = field.live.operations.automatic.timetable.rows()
     assert (row.name, row.heliostats, row.every_s) == ("noon", tuple(names[:2]), 5400.0)
     page.click("text=Remove…")
     page.click("dialog >> text='Remove'")
-    field.until(lambda: not field.live.operations.timetable())
+    field.until(lambda: not field.live.operations.automatic.timetable.rows())
     page.wait_for_selector("text=Empty.")
 
 

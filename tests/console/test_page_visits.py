@@ -22,7 +22,7 @@ def field(tmp_path: Path) -> Iterator[LiveConsole]:
 
 def photographed(field: LiveConsole) -> Any:
     """Return a joint visit whose photographs are being taken, None if there is none."""
-    running = field.live.operations.calibration().running
+    running = field.live.operations.automatic.view().running
     return next((run for run in running if run.others and "photograph" in run.stage), None)
 
 
@@ -45,12 +45,12 @@ def test_taking_command_lets_a_joint_visit_end(
 
     def ended() -> bool:
         lost.extend(["turned away"] if away(field) else [])
-        return not field.live.operations.calibration().running
+        return not field.live.operations.automatic.view().running
 
     field.until(ended)
     assert not lost
     assert not page.locator(".hx-alert.on").count()
-    results = field.call(lambda: field.live.operations.calibration().results)
+    results = field.call(lambda: field.live.operations.automatic.view().results)
     mine = [entry for entry in results if entry.heliostat in run.heliostats]
     assert len(mine) == len(run.heliostats)
     assert sum(entry.good for entry in mine) >= len(mine) - 1, [entry.text for entry in mine]

@@ -36,10 +36,10 @@ def ctl(console: LiveConsole, tokens: dict[str, str], tmp_path: Path) -> Ctl:
 def test_an_engineer_sets_a_parameter_at_stow(console: LiveConsole, ctl: Ctl, data: bool) -> None:
     name = console.live.names[40 + data]
     assert ctl("stow", name, data=data)
-    console.until(lambda: console.live.operations.heliostat(name).state == "STOWED")
+    console.until(lambda: console.live.operations.viewer.heliostat(name).state == "STOWED")
     reason = ("--reason", "levelled with an inclinometer")
     ctl("parameters", name, "tilt_east_mrad=0.5", *reason, data=data)
-    console.until(lambda: console.live.operations.heliostat(name).calibration is not None)
+    console.until(lambda: console.live.operations.viewer.heliostat(name).calibration is not None)
     shown = ctl("parameters", name, data=data)
     assert "version 1" in shown
     (line,) = (line for line in shown.splitlines() if line.startswith(" tilt_east "))

@@ -31,7 +31,7 @@ def way(console: LiveConsole) -> Iterator[httpx.Client]:
 
 def ordered(console: LiveConsole) -> int:
     """Return how many emergencies were ordered so far."""
-    events = console.call(lambda: console.live.operations.events(1000))
+    events = console.call(lambda: console.live.operations.logbook.events(1000))
     return sum("EMERGENCY" in event.text for event in events)
 
 

@@ -181,18 +181,18 @@ def test_out_of_service_is_confirmed_by_the_switch_at_the_mirror() -> None:
         board = live.field.boards[0]
         operations.hold(OPERATOR, [name], "washing")
         await asyncio.sleep(3.0)
-        assert rows_of(operations.frame())["held"][row] == 1
+        assert rows_of(operations.viewer.frame())["held"][row] == 1
         board.switch(plant.now(), off=True)
         await asyncio.sleep(3.0)
-        assert rows_of(operations.frame())["held"][row] == 2
-        seen = operations.heliostat(name)
+        assert rows_of(operations.viewer.frame())["held"][row] == 2
+        seen = operations.viewer.heliostat(name)
         assert {"LOCAL_SWITCH", "AT_STOW"} <= set(seen.flags)
         assert (seen.state, seen.fault) == ("LOCKED", "none")
         # At stow, standing there is to obey.
         assert await plant.defocus("Vera", [name]).end(20.0)
         board.switch(plant.now(), off=False)
         await asyncio.sleep(3.0)
-        assert rows_of(operations.frame())["held"][row] == 1
-        assert operations.heliostat(name).state == "LOCKED"
+        assert rows_of(operations.viewer.frame())["held"][row] == 1
+        assert operations.viewer.heliostat(name).state == "LOCKED"
 
     _live(work)

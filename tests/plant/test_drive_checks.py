@@ -189,7 +189,7 @@ def test_a_proof_says_which_mirrors_were_seen_to_follow_and_which_are_believed(
         bench.cluster_of("P1A").set(states.TRACKING, "P1A")
         plant.raise_emergency("Olga", Act.STOW)
         await bench.wait(10.0)
-        view = work.emergency_view()
+        view = work.viewer.emergency()
         assert (view.done, view.not_done) == (17, ("P1A",))
         assert view.followed == {TILT_SENSOR: 1, PHOTOGRAPH: 2}
         assert view.believed_count == len(view.believed) == 14
@@ -203,7 +203,7 @@ def test_a_proof_says_which_mirrors_were_seen_to_follow_and_which_are_believed(
         assert view.text.endswith(view.basis)
         # What was seen yesterday says nothing of today.
         plant.drive_checks._shown["P5B"] = (plant.drive_checks._today().replace(year=2000), "x")
-        assert work.emergency_view().followed == {TILT_SENSOR: 1, PHOTOGRAPH: 1}
+        assert work.viewer.emergency().followed == {TILT_SENSOR: 1, PHOTOGRAPH: 1}
 
     play(tmp_path, scene)
 
@@ -216,7 +216,7 @@ def test_a_measured_flux_is_said_to_be_measured_and_hides_single_beams(tmp_path:
         for _ in range(10):
             await bench.wait(1.0)
             plant.put("receiver_flux_nominal", 0.0)
-        view = work.emergency_view()
+        view = work.viewer.emergency()
         assert view.measured
         assert (
             "measured: the flux is below its limit (10% of nominal, where single be" in view.basis

@@ -51,7 +51,7 @@ async def locked(plant: LivePlant, *names: str) -> None:
         plant.operations.command(PERSON, token, "IDLE", names)
         for _ in range(20):
             await asyncio.sleep(1.0)
-            plant.operations.keep_authority(PERSON, token)
+            plant.operations.plant.authority.keep(PERSON, token)
     plant.operations.command(PERSON, token, "LOCK", names)
     await asyncio.sleep(3.0)
 

@@ -44,7 +44,7 @@ async def until(condition: Callable[[], bool], limit: float = 600.0) -> None:
 def test_a_calibration_ends_with_its_result_and_says_what_it_waits_for() -> None:
     async def work(plant: LivePlant) -> None:
         shown, name = plant.operations, plant.names[0]
-        await until(lambda: shown.calibration().on)
+        await until(lambda: shown.automatic.view().on)
         ticket = shown.calibrate(OPERATOR, name)
         assert not ticket.finished
         assert ticket.steps[name].startswith("it waits: "), ticket
@@ -73,13 +73,13 @@ def test_a_calibration_that_cannot_be_made_any_more_is_refused(
 ) -> None:
     async def work(plant: LivePlant) -> None:
         shown, name = plant.operations, plant.names[-1]
-        await until(lambda: shown.calibration().on)
+        await until(lambda: shown.automatic.view().on)
         ticket = shown.calibrate(OPERATOR, name)
         act(shown, name)
         await followed(ticket, 120.0)
         assert ticket.stage(name) is Stage.REFUSED
         assert ticket.refusals[name].startswith(f"withdrawn: {reason}")
-        assert shown.calibration().asked == ()
+        assert shown.automatic.view().asked == ()
 
     live(work, WORK)
 
@@ -87,7 +87,7 @@ def test_a_calibration_that_cannot_be_made_any_more_is_refused(
 def test_out_of_service_is_done_when_it_is_parked_and_names_who_is_not() -> None:
     async def work(plant: LivePlant) -> None:
         shown, names = plant.operations, plant.names[:2]
-        await until(lambda: shown.heliostat(names[1]).state == "TRACKING")
+        await until(lambda: shown.viewer.heliostat(names[1]).state == "TRACKING")
         ticket = shown.hold(OPERATOR, names, "washing")
         assert ticket.counted() == {"acknowledged": 2}
         assert ticket.steps[names[0]] == "on its way to stow: TRACKING"
@@ -96,7 +96,7 @@ def test_out_of_service_is_done_when_it_is_parked_and_names_who_is_not() -> None
         assert ticket.good
         assert any("on its way to stow: STOWING" in text for text in said), said
         assert "parked in stow and locked out" in ticket.text
-        assert [shown.heliostat(name).state for name in names] == ["STOWED", "STOWED"]
+        assert [shown.viewer.heliostat(name).state for name in names] == ["STOWED", "STOWED"]
         shown.unhold(OPERATOR, names)
         again = shown.hold(OPERATOR, names[:1], "washing")
         shown.unhold(OPERATOR, names[:1])
@@ -109,22 +109,22 @@ def test_out_of_service_is_done_when_it_is_parked_and_names_who_is_not() -> None
 def test_one_that_does_not_come_to_stow_is_named_with_an_alarm_and_the_ticket_ends() -> None:
     async def work(plant: LivePlant) -> None:
         shown, name = plant.operations, plant.names[0]
-        await until(lambda: shown.heliostat(name).state == "TRACKING")
+        await until(lambda: shown.viewer.heliostat(name).state == "TRACKING")
         plant.links["C1"].plugged = False
         await asyncio.sleep(5.0)
         ticket = shown.hold(OPERATOR, (name,), "washing")
         await asyncio.sleep(60.0)
         assert ticket.steps[name].startswith("on its way to stow: not heard for ")
-        (retry,) = (one for one in shown.retries() if one.subject == name)
+        (retry,) = (one for one in shown.automatic.retries() if one.subject == name)
         assert retry.work == "stow of a heliostat out of service"
         await followed(ticket)
         assert ticket.refusals[name].startswith("not ended within 600 s: on its way to stow: not h")
-        found = [a for a in shown.alarms() if a.condition == "not_parked" and a.active]
+        found = [a for a in shown.logbook.alarms() if a.condition == "not_parked" and a.active]
         assert [alarm.subject for alarm in found] == [name]
         plant.links["C1"].plugged = True
-        await until(lambda: shown.heliostat(name).state == "STOWED")
+        await until(lambda: shown.viewer.heliostat(name).state == "STOWED")
         await asyncio.sleep(20.0)
-        assert not [a for a in shown.alarms() if a.condition == "not_parked" and a.active]
+        assert not [a for a in shown.logbook.alarms() if a.condition == "not_parked" and a.active]
 
     live(work, BY_HAND)
 
@@ -133,7 +133,7 @@ def test_automatic_is_done_where_it_follows_and_says_why_where_it_does_not() -> 
     async def work(plant: LivePlant) -> None:
         shown = plant.operations
         first, second, third, fourth = plant.names
-        await until(lambda: shown.heliostat(first).state == "TRACKING")
+        await until(lambda: shown.viewer.heliostat(first).state == "TRACKING")
         shown.hold(OPERATOR, (second,), "washing")
         token = shown.take_authority(ENGINEER).token
         await asyncio.sleep(3.0)
@@ -150,7 +150,7 @@ def test_automatic_is_done_where_it_follows_and_says_why_where_it_does_not() -> 
         await followed(ticket)
         assert ticket.stage(first) is Stage.DONE
         assert ticket.stage(fourth) is Stage.DONE
-        assert shown.heliostat(fourth).state in ("APPROACHING", "IDLE", "TRACKING")
+        assert shown.viewer.heliostat(fourth).state in ("APPROACHING", "IDLE", "TRACKING")
         assert ticket.refusals[third] == "it is LOCKED: unlock it"
 
     live(work, BY_HAND)
@@ -159,9 +159,9 @@ def test_automatic_is_done_where_it_follows_and_says_why_where_it_does_not() -> 
 def test_automatic_at_dusk_and_in_an_emergency_says_that_nothing_follows() -> None:
     async def work(plant: LivePlant) -> None:
         shown = plant.operations
-        await until(lambda: shown.calibration().on)
+        await until(lambda: shown.automatic.view().on)
         asked = shown.calibrate(OPERATOR, plant.names[0])
-        await until(lambda: shown.calibration().reason == "the sun is too low")
+        await until(lambda: shown.automatic.view().reason == "the sun is too low")
         await followed(asked, 30.0)
         assert asked.refusals == {
             plant.names[0]: "withdrawn: the sun is too low; ask again tomorrow"

@@ -82,7 +82,7 @@ def test_new_mirrors_are_calibrated_and_verified_together() -> None:
         after = here.live.errors()[rows]
         assert np.median(after) < 1.8 * MRAD
         await asyncio.sleep(2.0)  # until the next frame
-        stated = here.live.operations.frame().error[rows]
+        stated = here.live.operations.viewer.frame().error[rows]
         assert (after < 1.3 * stated).all(), (after, stated)
         for name in good:
             assert len(plant.beliefs.seen(name)) == 2  # type: ignore[arg-type]
@@ -286,15 +286,15 @@ def test_automatic_control_begins_with_them() -> None:
                 together: set[str] = set()
                 done: set[str] = set()
                 while len(together & done) < 4:
-                    assert clock.monotonic() < until, operations.events(30)
-                    for one in operations.calibration().running:
+                    assert clock.monotonic() < until, operations.logbook.events(30)
+                    for one in operations.automatic.view().running:
                         together |= set(one.heliostats) if one.others else set()
                     done = {record.heliostat for record in live.plant.beliefs}
                     await asyncio.sleep(1.0)
             finally:
                 await operations.automatic.halt()
                 await live.end()
-            told = [event.text for event in operations.events(100)]
+            told = [event.text for event in operations.logbook.events(100)]
             assert any(text.startswith("joint visit: ") for text in told), told
 
     run_virtual(main, start=START)

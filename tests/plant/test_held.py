@@ -14,10 +14,10 @@ from heliotrope.links.messages import Command, Emergency
 from heliotrope.plant.assigned import HELD, AssignedFile, Points
 from heliotrope.plant.audit import read
 from heliotrope.plant.authority import Person, Role
-from heliotrope.plant.lockouts import Kind, Lockout
 from heliotrope.plant.locks import CERTAIN
 from heliotrope.plant.operations import Logbook, Operations
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.store.records import Kind, Lockout
 from support.plant_bench import OPERATOR, Bench, running
 
 ENGINEER = Person("Egon", Role.ENGINEER)
@@ -262,7 +262,9 @@ def test_a_new_program_ends_a_small_movement(store: AssignedFile) -> None:
         mandate = entered.__enter__()
         kept.append(entered)
         for east in (0.01, -0.01):
-            assert await plant.move(ENGINEER, mandate.token, {NAME: (east, 0.0, 16.5)}).end(5.0)
+            assert await plant.commands.move(
+                ENGINEER, mandate.token, {NAME: (east, 0.0, 16.5)}
+            ).end(5.0)
         assert (store.read()["LENT"], store.read()["AIM"]) == ({NAME: base}, {NAME: base})
 
     async def after(bench: Bench) -> None:
@@ -319,17 +321,17 @@ def test_one_heliostat_in_detail_says_why_it_is_locked(tmp_path: Path) -> None:
             plant, work = bench.plant, AutomaticSettings(calibrate=False)
             shown = Operations(plant, Logbook(clock), settings=work)
             await bench.wait(2.0)
-            assert shown.heliostat(NAME).locked == ""
-            assert shown.calibration().choice == "", "it calibrates nothing"
+            assert shown.viewer.heliostat(NAME).locked == ""
+            assert shown.automatic.view().choice == "", "it calibrates nothing"
             kept = await locked_by_a_visit(bench)
             await bench.wait(2.0)
-            text = shown.heliostat(NAME).locked
+            text = shown.viewer.heliostat(NAME).locked
             assert text.startswith("the visit to left of Egon has locked it since ")
             assert text.endswith(" UTC, until its parameters are written and read back")
             assert kept
             bench.cluster_of(NAME).mute = True
             await bench.wait(30.0)
-            assert shown.heliostat(NAME).locked == "", "its state is not known"
+            assert shown.viewer.heliostat(NAME).locked == "", "its state is not known"
 
     run_virtual(main)
 
@@ -393,7 +395,7 @@ def test_a_cluster_that_may_begin_no_motion_keeps_nothing_from_the_others(
                 each = [(home, m) for home in homes for m in home.of((Command, Emergency))]
                 return {n for h, m in each if m.name == what for n in m.heliostats or h.names}
 
-            monkeypatch.setattr(plant._sentinel, "refusal", refusal)
+            monkeypatch.setattr(plant.sentinel, "refusal", refusal)
             if what == "ROUGH":
                 for home in homes:
                     home.rows["flags"][0] = ROUGH

@@ -20,13 +20,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from heliotrope.cli._at_plant import URGENT
 from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.field.example import example_plant
 from heliotrope.lcu import states
 from heliotrope.local import EMERGENCY, ORDINARY, CallError, LocalConnection, ask_once
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.interface import CALLS, frame_of, frame_parts, kind_of, plain, remade
-from heliotrope.plant.interface.calls import Call
+from heliotrope.plant.interface.calls import Call, Later, asked
 from heliotrope.plant.interface.console_process import CONSOLE, ConsoleProcess, Patience
 from heliotrope.plant.interface.desk import SAME, Desk
 from heliotrope.plant.interface.orders import AimOrder, EmergencyCall
@@ -68,7 +69,7 @@ class Watch:
     async def _look(self) -> None:
         here = self._plant.live.operations
         while True:
-            rows = here.cluster_rows()
+            rows = here.logbook.cluster_rows(here.plant)
             self.least_lease = min(self.least_lease, *(row.lease_left for row in rows))
             up = here.plant.field.among(UP, here.plant.now())
             self.up = min(self.up, int(up.sum()))
@@ -105,7 +106,7 @@ def _raised(plant: LiveConsole) -> None:
     plant.call(lambda: here.switch_calibration(who, on=False))
     plant.call(lambda: here.resume(who))
     plant.call(lambda: here.give_back(who))
-    plant.until(lambda: not here.calibration().running, 240.0)
+    plant.until(lambda: not here.automatic.view().running, 240.0)
     plant.until(lambda: here.plant.field.among(UP, here.plant.now()).all(), 240.0)
 
 
@@ -140,7 +141,7 @@ def _console_alarm(plant: LiveConsole, *, active: bool) -> str:
     """Wait for the alarm about the console, or for its end; return its text."""
 
     def found() -> list[str]:
-        rows = plant.live.operations.alarms()
+        rows = plant.live.operations.logbook.alarms()
         return [r.text for r in rows if r.condition == "console" and r.active == active]
 
     return str(plant.until(found, 240.0)[0])
@@ -240,7 +241,7 @@ def test_a_wrong_key_is_refused_and_noted(plant: LiveConsole) -> None:
         for hello in ({"key": "0" * 64}, {"key": ""}, {"token": "x"}, {}, {"key": None}):
             with pytest.raises(CallError, match="not valid"):
                 ask_once(plant.interface.folder / name, hello, "summary", {})
-    plant.until(lambda: [e for e in plant.live.operations.events() if e.kind == "security"])
+    plant.until(lambda: [e for e in plant.live.operations.logbook.events() if e.kind == "security"])
 
 
 @pytest.mark.parametrize(
@@ -280,7 +281,9 @@ def test_what_a_token_may_see_and_order(plant: LiveConsole, tokens: dict[str, st
         ask_once(folder / EMERGENCY, viewer, "stow", {"heliostats": [plant.live.names[0]]})
     name = plant.live.names[0]
     plant.until(
-        lambda: [e for e in plant.live.operations.events() if "stow on this machine" in e.text]
+        lambda: [
+            e for e in plant.live.operations.logbook.events() if "stow on this machine" in e.text
+        ]
     )
     ticket = ask_once(folder / EMERGENCY, operator, "defocus", {"heliostats": [name]})
     assert (ticket["command"], ticket["heliostats"]) == ("DEFOCUS", 1)
@@ -404,7 +407,7 @@ def test_an_emergency_does_not_wait_for_the_store(
 
 
 def test_a_frame_of_the_field_there_and_back(plant: LiveConsole) -> None:
-    frame = plant.call(plant.live.operations.frame)
+    frame = plant.call(plant.live.operations.viewer.frame)
     head, blob = frame_parts(frame)
     again = frame_of(plain(head), blob)
     assert again.number == frame.number
@@ -415,16 +418,16 @@ def test_a_frame_of_the_field_there_and_back(plant: LiveConsole) -> None:
 def test_the_tower_is_shown_between_its_receivers_or_in_the_middle_of_the_site() -> None:
     (receiver,) = example_plant().receivers
     beside = replace(receiver, name="other", center=receiver.center + [4.0, 0.0, -6.0])
-    field = SimpleNamespace(cluster=(0,))
+    field = SimpleNamespace(cluster=(0,), clusters=("C1",))
     plant = SimpleNamespace(field=field, beams=SimpleNamespace(volumes=()))
+    viewer = SimpleNamespace(positions=np.zeros((1, 3)), sizes=np.ones((1, 2)), aim_names=())
     here = SimpleNamespace(
-        plant=plant, logbook=None, names=("A",), positions=np.zeros((1, 3)), clusters=("C1",),
-        sizes=np.ones((1, 2)), receivers=(), targets=(), aim_names=(),
-    )  # fmt: skip
+        plant=plant, viewer=viewer, logbook=None, names=("A",), receivers=(), targets=()
+    )
     middle = (receiver.center + [2.0, 0.0, -3.0]).tolist()
     for receivers, tower in (((receiver, beside), middle), ((), [0.0, 0.0, 0.0])):
-        here.design = replace(example_plant(), receivers=receivers)
-        assert Desk(cast("Operations", here)).field()["tower"] == pytest.approx(tower)
+        plant.design = replace(example_plant(), receivers=receivers)
+        assert Desk(cast("Operations", here)).field().tower == pytest.approx(tower)
 
 
 @pytest.mark.parametrize(
@@ -447,9 +450,23 @@ def test_an_aim_names_at_most_200_000_heliostats() -> None:
 
 
 def test_every_urgent_call_takes_beams_away() -> None:
-    assert {name for name, call in CALLS.items() if call.urgent} == {
-        "order_emergency", "stow", "defocus"
-    }  # fmt: skip
+    urgent = {name: call.request for name, call in CALLS.items() if call.urgent}
+    assert urgent.keys() == {"order_emergency", "stow", "defocus"}
+    assert set(urgent.values()) == URGENT
+
+
+def test_a_request_of_the_api_is_the_call_of_its_row() -> None:
+    assert asked("GET heliostats/A%2F1/parameters") == ("parameters", {"name": "A/1"})
+    assert asked("GET heliostats/A1") == ("heliostat", {"name": "A1"})
+    assert asked("GET photographs?heliostat=A1&limit=5") == (
+        "kept_photographs", {"heliostat": "A1", "limit": "5"}
+    )  # fmt: skip
+    for name, call in CALLS.items():
+        if call.request:
+            assert asked(call.request)[0] == name
+    for request in ("GET accounts", "PUT stow", "GET heliostats/A/B/parameters", "GET heliostats/"):
+        with pytest.raises(InputError, match="only known to the console; leave out --data"):
+            asked(request)
 
 
 def test_a_console_that_cannot_begin_is_tried_again_after_pauses_that_double(
@@ -493,7 +510,8 @@ def _done(operations: dict[str, Any], name: str, given: dict[str, Any], blob: by
 
 def test_an_emergency_is_withdrawn_in_the_name_of_who_asks() -> None:
     by = list[tuple[Person, str]]()
-    here = {"withdraw": lambda *given: by.append(given), "emergency_view": lambda: not by}
+    viewer = SimpleNamespace(emergency=lambda: not by)
+    here = {"withdraw": lambda *given: by.append(given), "viewer": viewer}
     assert _done(here, "withdraw_emergency", {}) is False
     assert _done(here, "withdraw_emergency", {"owner": "Otto"}) is False
     assert by == [(OLGA, ""), (OLGA, "Otto")]
@@ -507,14 +525,16 @@ def test_a_photograph_that_is_known_is_not_sent_again() -> None:
 
 
 def test_an_aim_is_a_place_or_points_and_never_both() -> None:
+    aimed = list[Any]()
     here = {
-        "aim_at": lambda who, token, heliostats, where: (token, heliostats, where),
-        "aim": lambda who, token, points: (token, {n: p.tolist() for n, p in points.items()}),
+        "aim_at": lambda who, token, heliostats, where: aimed.append((token, heliostats, where)),
+        "aim": lambda who, token, points: aimed.append((token, points["A"].tolist())),
     }
     point = np.array([1.0, 2.0, 3.0])
     place = {"heliostats": ["A"], "where": "left"}
-    assert _done(here, "aim", place) == (7, ["A"], "left")
-    assert _done(here, "aim", {"points": ["A"]}, point.tobytes()) == (7, {"A": [1.0, 2.0, 3.0]})
+    assert isinstance(_done(here, "aim", place), Later)
+    assert isinstance(_done(here, "aim", {"points": ["A"]}, point.tobytes()), Later)
+    assert aimed == [(7, ["A"], "left"), (7, [1.0, 2.0, 3.0])]
     for given, blob in ((place | {"points": ["A"]}, point.tobytes()), ({"heliostats": ["A"]}, b"")):
         with pytest.raises(InputError, match="give either where"):
             _done(here, "aim", given, blob)
@@ -542,7 +562,7 @@ def test_a_word_orders_one_emergency_however_often_it_is_sent(
         plant=None,
         logbook=None,
         emergency=lambda who, act, reason: given.append((who.name, reason)),
-        emergency_view=lambda: len(given),
+        viewer=SimpleNamespace(emergency=lambda: len(given)),
     )
     desk = Desk(cast("Operations", operations))
     vera, olga = Person("Vera", Role.VIEWER), Person("Olga", Role.OPERATOR)

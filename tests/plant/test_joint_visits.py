@@ -334,11 +334,11 @@ def test_automatic_control_sends_those_that_are_known_together(tmp_path: Path) -
         operations.automatic.want(names, wanted=True)
         operations.automatic.switch(on=True)
         until = here.live.clock.monotonic() + 400.0
-        while not operations.calibration().on:
+        while not operations.automatic.view().on:
             assert here.live.clock.monotonic() < until
             await asyncio.sleep(0.5)
         operations.calibrate(ENGINEER, names[5], "right", together=names[3:5])
-        assert operations.calibration().asked == (names[5], *names[3:5])
+        assert operations.automatic.view().asked == (names[5], *names[3:5])
         seen: dict[str, set[str]] = {}
         log = here.live.assembly.logbook
         told: list[str] = []
@@ -347,7 +347,7 @@ def test_automatic_control_sends_those_that_are_known_together(tmp_path: Path) -
         ):
             told = [e.text for e in log.events(50) if e.who == "right"]
             assert here.live.clock.monotonic() < until
-            for one in operations.calibration().running:
+            for one in operations.automatic.view().running:
                 if one.others:
                     seen.setdefault(one.target, set()).update(one.heliostats)
             await asyncio.sleep(1.0)
@@ -379,15 +379,15 @@ def test_a_plant_file_without_joint_visits_refuses_them() -> None:
         async with live.running():
             try:
                 until = clock.monotonic() + 600.0
-                while not live.operations.calibration().on:
+                while not live.operations.automatic.view().on:
                     assert clock.monotonic() < until
                     await asyncio.sleep(1.0)
                 first, second = live.names[:2]
                 with pytest.raises(RefusedError, match="allows no joint visits; ask for one"):
                     live.operations.calibrate(ENGINEER, first, together=[second])
-                assert not live.operations.calibration().asked
+                assert not live.operations.automatic.view().asked
                 live.operations.calibrate(ENGINEER, first)
-                assert live.operations.calibration().asked == (first,)
+                assert live.operations.automatic.view().asked == (first,)
             finally:
                 await live.operations.automatic.halt()
                 await live.end()
@@ -646,7 +646,7 @@ def test_a_joint_visit_that_is_refused_is_one_event_and_not_one_of_each() -> Non
         raise refusals.OTHER_AUTHORITY.error(holder="Egon", person="automatic control")
 
     made.cycle.run = run  # type: ignore[method-assign]
-    made._plant.emergency_on = True  # type: ignore[misc]
+    made._plant.sentinel.on = True  # type: ignore[misc]
     made._plant.authority = SimpleNamespace(grant=None)  # type: ignore[assignment]
     noted, done = list[tuple[str, ...]](), list[str]()
     calibrating = calibrating_of(made, lambda *words: noted.append(words), done)

@@ -270,7 +270,7 @@ def test_automatic_control_learns_at_night_and_the_audit_has_it(tmp_path: Path) 
             live.plant.beliefs.note(name, "left", history(design, name, 10, 6))
         async with live.running() as plant:
             await asyncio.sleep(30.0)
-            (view,) = plant.operations.learning()
+            (view,) = plant.operations.automatic.learning.views()
             assert (view.version, view.person) == (1, AUTOMATIC.name)
             plant.operations.learn(ENGINEER)
             await asyncio.sleep(10.0)

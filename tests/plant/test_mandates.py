@@ -192,16 +192,16 @@ def test_an_emergency_leaves_nothing_locked_and_the_field_goes_up_again(stage: s
         await asyncio.sleep(25.0)
         assert order.report(plant.now()).complete, order.report(plant.now()).text
         await asyncio.sleep(120.0)
-        assert plant.emergency is not None
-        report = plant.emergency.report(plant.now())
+        assert plant.sentinel.order is not None
+        report = plant.sentinel.order.report(plant.now())
         assert report.complete, report.text
         assert not report.unknown
         assert set(here.states().values()) <= {"STOWED", "LOCKED"}
         assert here.live.assembly.left() == "", "all stand at stow, locked there or not"
-        (call,) = operations.plant.calls
+        (call,) = operations.plant.sentinel.calls
         operations.withdraw(ENGINEER, call.who)
         await asyncio.sleep(6.0)
-        for alarm in operations.alarms():
+        for alarm in operations.logbook.alarms():
             with contextlib.suppress(RefusedError):
                 operations.acknowledge(ENGINEER, alarm.condition, alarm.subject)
         await asyncio.sleep(60.0)
@@ -267,18 +267,18 @@ def test_automatic_control_goes_on_after_a_person_and_its_visits_are_no_losses(w
         await until(here, lambda: any(_stages(here, word)))
         token = operations.take_authority(VERA).token
         here.staying = stays(here, VERA, token)  # type: ignore[attr-defined]
-        assert operations.calibration().running
-        await until(here, lambda: not operations.calibration().running, 400.0)
+        assert operations.automatic.view().running
+        await until(here, lambda: not operations.automatic.view().running, 400.0)
         assert not operations.automatic.waits
         assert set(here.states().values()) <= {"TRACKING", "IDLE"}
         await kept(here)
         await asyncio.sleep(30.0)
-        assert not operations.calibration().running, "a person has command: nothing new begins"
-        results = operations.calibration().results
+        assert not operations.automatic.view().running, "a person has command: nothing new begins"
+        results = operations.automatic.view().results
         assert any(result.outcome is CALIBRATED for result in results), results
         here.staying.cancel()  # type: ignore[attr-defined]
         operations.release_authority(VERA, token)
-        await until(here, lambda: bool(operations.calibration().on))
+        await until(here, lambda: bool(operations.automatic.view().on))
         await until(here, lambda: set(here.states().values()) == {"TRACKING"})
         assert plant.authority.grant is not None
         assert plant.authority.grant.holder == AUTOMATIC
@@ -288,7 +288,7 @@ def test_automatic_control_goes_on_after_a_person_and_its_visits_are_no_losses(w
 
 
 def _stages(here: Scene, word: str) -> list[str]:
-    running = here.live.operations.calibration().running
+    running = here.live.operations.automatic.view().running
     return [one.stage for one in running if word in one.stage]
 
 
@@ -402,10 +402,10 @@ def test_a_loss_of_many_ends_the_visits_of_automatic_control() -> None:
         left_to_work(here)
         await until(here, lambda: any(_stages(here, "photograph 2 ")))
         operations.automatic._losses._wait("many were lost")
-        await until(here, lambda: not operations.calibration().running, 30.0)
+        await until(here, lambda: not operations.automatic.view().running, 30.0)
         await asyncio.sleep(5.0)
         assert "TRACKING" not in {here.states()[name] for name in here.names}
-        results = operations.calibration().results
+        results = operations.automatic.view().results
         assert all("waits for Resume" in result.text for result in results), results
         operations.automatic.switch(on=False)
 

@@ -288,22 +288,22 @@ def test_whose_beam_has_no_way_is_named_and_the_others_join() -> None:
         found = {each: field.of(each, plant.plant.now()).state for each in plant.names}
         assert found.pop(name) == "IDLE"
         assert set(found.values()) == {"TRACKING"}
-        (alarm,) = [a for a in shown.alarms() if a.condition == "beam_blocked"]
+        (alarm,) = [a for a in shown.logbook.alarms() if a.condition == "beam_blocked"]
         assert alarm.subject == name
         assert "the beam enters mast" in alarm.text
         # Whoever takes it elsewhere has seen to it; it comes back, and is named again.
         shown.stow(VIEWER, (name,))
         await asyncio.sleep(60.0)
-        assert not [a for a in shown.alarms() if a.condition == "beam_blocked" and a.active]
+        assert not [a for a in shown.logbook.alarms() if a.condition == "beam_blocked" and a.active]
         shown.give_back(OPERATOR, (name,))
         await asyncio.sleep(900.0)
         assert field.of(name, plant.plant.now()).state == "IDLE"
-        assert [a for a in shown.alarms() if a.condition == "beam_blocked" and a.active]
+        assert [a for a in shown.logbook.alarms() if a.condition == "beam_blocked" and a.active]
         # What was in the way is gone: within five minutes it joins, and the alarm is over.
         plant.plant.beams.volumes = ()
         await asyncio.sleep(330.0)
         assert field.of(name, plant.plant.now()).state == "TRACKING"
-        assert not [a for a in shown.alarms() if a.condition == "beam_blocked" and a.active]
+        assert not [a for a in shown.logbook.alarms() if a.condition == "beam_blocked" and a.active]
 
     live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0))
 
@@ -311,8 +311,8 @@ def test_whose_beam_has_no_way_is_named_and_the_others_join() -> None:
 def test_what_a_plant_shows() -> None:
     async def work(plant: LivePlant) -> None:
         shown = plant.operations
-        frame = shown.frame()
-        assert shown.frame() is frame
+        frame = shown.viewer.frame()
+        assert shown.viewer.frame() is frame
         assert (frame.state == 1).all()
         assert frame.truth_error is not None
         assert frame.error.dtype == np.float32
@@ -320,36 +320,36 @@ def test_what_a_plant_shows() -> None:
         with pytest.raises(ValueError, match="read-only"):
             frame.state[0] = 3
         await asyncio.sleep(1.5)
-        assert shown.frame().number == frame.number + 1
-        assert shown.aim_names == ("", "receiver", "left", "right", "elsewhere")
-        assert shown.clusters == ("C1", "C2")
-        assert shown.sizes.shape == (4, 2)
+        assert shown.viewer.frame().number == frame.number + 1
+        assert shown.viewer.aim_names == ("", "receiver", "left", "right", "elsewhere")
+        assert shown.plant.field.clusters == ("C1", "C2")
+        assert shown.viewer.sizes.shape == (4, 2)
         summary = shown.summary()
         assert summary.states == {"STOWED": 4}
         assert summary.clusters_alive == 2
-        rows = shown.cluster_rows()
+        rows = shown.logbook.cluster_rows(shown.plant)
         assert [row.alive and row.connected and row.live == 2 for row in rows] == [True, True]
-        one = shown.heliostat(shown.names[1])
+        one = shown.viewer.heliostat(shown.names[1])
         assert (one.state, one.cluster, one.on, len(one.drives)) == ("STOWED", "C1", "", 2)
         assert one.parameters["tilt_north"].sigma == pytest.approx(10 * MRAD)
         assert one.truth_error == pytest.approx(float(plant.errors()[1]), rel=0.05)
         node = shown.plant.field.rows[1:2]
         node["supply_mv"], node["temperature_degc"], node["boots"] = 23_850, -7, 3
-        one = shown.heliostat(shown.names[1])
+        one = shown.viewer.heliostat(shown.names[1])
         assert (one.supply, one.temperature, one.boots) == (pytest.approx(23.85), -7.0, 3)
         light = shown.sun()
         assert light.elevation == pytest.approx(math.asin(light.direction[2]), abs=1e-6)
         assert shown.receiver_flux().power == 0.0
         assert shown.camera("left").version == 0
-        for wrong in (shown.heliostat, shown.camera, shown.receiver_flux):
+        for wrong in (shown.viewer.heliostat, shown.camera, shown.receiver_flux):
             with pytest.raises(UnknownNameError):
                 wrong("nobody")
         # A cluster that falls silent is shown as that, and its heliostats as stale.
         plant.links["C2"].plugged = False
         await asyncio.sleep(6.0)
-        assert list(shown.frame().state) == [1, 1, 255, 255]
-        assert [row.alive for row in shown.cluster_rows()] == [True, False]
-        assert shown.heliostat(shown.names[3]).state == ""
+        assert list(shown.viewer.frame().state) == [1, 1, 255, 255]
+        assert [row.alive for row in shown.logbook.cluster_rows(shown.plant)] == [True, False]
+        assert shown.viewer.heliostat(shown.names[3]).state == ""
         assert shown.summary().states == {"STOWED": 2, "stale": 2}
 
     live(work, AutomaticSettings(calibrate=False))
@@ -373,43 +373,43 @@ def test_persons_come_before_the_automat() -> None:
         with pytest.raises(RefusedError, match="a reason is needed"):
             shown.hold(OPERATOR, names[:1], " ")
         shown.hold(OPERATOR, names[:1], "painted")
-        assert list(shown.frame().held) == [True, False, False, False]
+        assert list(shown.viewer.frame().held) == [True, False, False, False]
         shown.unhold(OPERATOR, names[:1])
-        assert shown.holds() == ()
+        assert shown.automatic.service.out == ()
         # An operator takes over although the automat is an engineer, and gives back.
         grant = shown.take_authority(OPERATOR)
         assert shown.summary().holder == "Olga"
-        assert shown.calibration().reason == "it is switched off"
+        assert shown.automatic.view().reason == "it is switched off"
         # The heliostat that was out of service for a moment is on its way back to stow.
         await asyncio.sleep(10.0)
-        shown.keep_authority(OPERATOR, grant.token)
+        shown.plant.authority.keep(OPERATOR, grant.token)
         shown.command(OPERATOR, grant.token, "APPROACH", names[:1])
         for _ in range(9):
             await asyncio.sleep(5.0)
-            shown.keep_authority(OPERATOR, grant.token)
-        assert shown.heliostat(names[0]).state == "IDLE"
+            shown.plant.authority.keep(OPERATOR, grant.token)
+        assert shown.viewer.heliostat(names[0]).state == "IDLE"
         shown.stow(OPERATOR, names[:2])
         shown.release_authority(OPERATOR, grant.token)
         with pytest.raises(RefusedError):
-            shown.keep_authority(OPERATOR, grant.token)
+            shown.plant.authority.keep(OPERATOR, grant.token)
         # What she stowed stays stowed, the others are raised.
         await asyncio.sleep(75.0)
-        states = [shown.heliostat(name).state for name in names]
+        states = [shown.viewer.heliostat(name).state for name in names]
         assert states == ["STOWED", "STOWED", "TRACKING", "TRACKING"]
-        assert shown.frame().on[2] == 1
+        assert shown.viewer.frame().on[2] == 1
         assert shown.receiver_flux("receiver").heliostats == 2
         shown.give_back(OPERATOR, names[1:2])
         await asyncio.sleep(60.0)
-        assert shown.heliostat(names[1]).state in ("IDLE", "TRACKING")
+        assert shown.viewer.heliostat(names[1]).state in ("IDLE", "TRACKING")
         # After an emergency nothing moves by itself.
         shown.emergency(VIEWER, "STOW", "a fire")
         await asyncio.sleep(60.0)
-        view = shown.emergency_view()
+        view = shown.viewer.emergency()
         assert (view.on, view.act, view.done) == (True, "STOW", 4)
         assert shown.summary().emergency
         # Two persons have their reasons; each withdraws their own, an engineer another's by name.
         shown.emergency(OPERATOR, reason="somebody on the tower")
-        calls = [(call.who, call.act, call.reason) for call in shown.emergency_view().calls]
+        calls = [(call.who, call.act, call.reason) for call in shown.viewer.emergency().calls]
         assert calls == [("Vera", "STOW", "a fire"), ("Olga", "DEFOCUS", "somebody on the tower")]
         shown.withdraw(ENGINEER, "Vera")
         await asyncio.sleep(40.0)
@@ -419,12 +419,12 @@ def test_persons_come_before_the_automat() -> None:
         with pytest.raises(RefusedError, match="withdraw the emergency of Olga: Otto is operator"):
             shown.withdraw(Person("Otto", Role.OPERATOR), "Olga")
         shown.withdraw(ENGINEER, "Olga")
-        assert shown.emergency_view().calls == ()
+        assert shown.viewer.emergency().calls == ()
         await asyncio.sleep(20.0)
         assert shown.summary().states == {"STOWED": 4}
         with pytest.raises(UnknownNameError, match="act of an emergency"):
             shown.emergency(VIEWER, "DANCE")
-        assert any("EMERGENCY STOW: a fire" in event.text for event in shown.events())
+        assert any("EMERGENCY STOW: a fire" in event.text for event in shown.logbook.events())
 
     live(work, AutomaticSettings(wanted=True, calibrate=False))
 
@@ -435,11 +435,11 @@ def test_a_heliostat_out_of_service_is_moved_by_nobody() -> None:
         await asyncio.sleep(200.0)
         assert _states(plant) == ["TRACKING"] * 4
         shown.hold(OPERATOR, (name,), "washing", 2.0)
-        (lockout,) = shown.holds()
+        (lockout,) = shown.automatic.service.out
         assert lockout.until - lockout.since == 7200.0
-        assert "washing (Olga, since 21 Oct 07:03 UTC" in shown.heliostat(name).hold
+        assert "washing (Olga, since 21 Oct 07:03 UTC" in shown.viewer.heliostat(name).hold
         await asyncio.sleep(120.0)
-        assert list(shown.frame().held) == [True, False, False, False]
+        assert list(shown.viewer.frame().held) == [True, False, False, False]
         assert _states(plant) == ["STOWED", "TRACKING", "TRACKING", "TRACKING"]
         # Neither automatic control nor a group's command nor a person's moves it.
         shown.give_back(OPERATOR)
@@ -460,7 +460,7 @@ def test_a_heliostat_out_of_service_is_moved_by_nobody() -> None:
             shown.aim_at(ENGINEER, token, (name,), "left")
         # Nor is anything written by which the next STOW would go elsewhere.
         with pytest.raises(RefusedError, match=f"ZERO {name}: out of service: washing"):
-            plant.plant.zero(ENGINEER, token, name, (0, 0))
+            plant.plant.commands.zero(ENGINEER, token, name, (0, 0))
         with pytest.raises(RefusedError, match=f"PARAMETERS {name}: out of service: washing"):
             plant.plant.parameters(ENGINEER, token, name, {"stow": struct.pack("<ii", 9, 9)})
         assert _states(plant) == ["STOWED", "IDLE", "IDLE", "IDLE"]
@@ -475,8 +475,8 @@ def test_a_heliostat_out_of_service_is_moved_by_nobody() -> None:
             shown.unhold(other, (name,))
         shown.hold(other, (name,), "a new gear")
         shown.unhold(OPERATOR, (name,))
-        assert [(lock.name, lock.who) for lock in shown.holds()] == [(name, "Otto")]
-        assert shown.heliostat(name).hold.startswith("a new gear (Otto")
+        assert [(lock.name, lock.who) for lock in shown.automatic.service.out] == [(name, "Otto")]
+        assert shown.viewer.heliostat(name).hold.startswith("a new gear (Otto")
         with pytest.raises(RefusedError, match="out of service: a new gear"):
             shown.command(ENGINEER, token, "UNLOCK", (name,))
         with pytest.raises(RefusedError, match=r"remove Otto's lock: Olga is"):
@@ -484,8 +484,8 @@ def test_a_heliostat_out_of_service_is_moved_by_nobody() -> None:
         with pytest.raises(RefusedError, match="a reason is needed"):
             shown.unhold(ENGINEER, (name,), owner="Otto")
         shown.unhold(ENGINEER, (name,), owner="Otto", reason="he has gone home")
-        assert any("removed Otto's lock (a new gear" in e.text for e in shown.events())
-        assert shown.holds() == ()
+        assert any("removed Otto's lock (a new gear" in e.text for e in shown.logbook.events())
+        assert shown.automatic.service.out == ()
         shown.release_authority(ENGINEER, token)
         shown.give_back(OPERATOR)
         await asyncio.sleep(200.0)
@@ -503,7 +503,7 @@ def test_a_lock_on_a_target_receiver_or_the_tower_keeps_beams_away() -> None:
         async def held(seconds: float) -> None:
             """Let time pass while a person keeps the command."""
             for _ in range(int(seconds / 3.0)):
-                shown.keep_authority(ENGINEER, token)
+                shown.plant.authority.keep(ENGINEER, token)
                 await asyncio.sleep(3.0)
 
         await held(3.0)
@@ -561,7 +561,7 @@ def test_out_of_service_outlasts_a_restart_and_its_time(tmp_path: Path) -> None:
 
     async def stay(plant: LivePlant) -> None:
         await asyncio.sleep(200.0)
-        (lockout,) = plant.operations.holds()
+        (lockout,) = plant.operations.automatic.service.out
         assert lockout.until < plant.clock.utc().timestamp()
         assert _states(plant) == ["STOWED", "TRACKING", "TRACKING", "TRACKING"]
 
@@ -585,7 +585,7 @@ def test_a_restored_store_leaves_the_field_in_stow_until_an_engineer_confirms(
         shown = plant.operations
         await asyncio.sleep(200.0)
         assert _states(plant) == ["STOWED"] * 4
-        (lock,) = shown.holds()
+        (lock,) = shown.automatic.service.out
         assert (lock.kind, lock.who) == ("tower", OWNER)
         assert "a backup of" in lock.reason
         with pytest.raises(RefusedError, match=f"has no lock on tower.*{OWNER}"):
@@ -619,11 +619,13 @@ async def _cut(plant: LivePlant, cluster: str, seconds: float) -> None:
 
 
 def _states(plant: LivePlant) -> list[str]:
-    return [plant.operations.heliostat(name).state for name in plant.names]
+    return [plant.operations.viewer.heliostat(name).state for name in plant.names]
 
 
 def _waits(plant: LivePlant) -> bool:
-    found = [a for a in plant.operations.alarms() if a.condition == "resume_needed" and a.active]
+    found = [
+        a for a in plant.operations.logbook.alarms() if a.condition == "resume_needed" and a.active
+    ]
     assert bool(found) == bool(plant.operations.summary().resume)
     return bool(found)
 
@@ -692,7 +694,7 @@ def test_what_a_person_raised_and_lost_is_left_to_people() -> None:
             shown.command(OPERATOR, token, name)
             for _ in range(12):
                 await asyncio.sleep(5.0)
-                shown.keep_authority(OPERATOR, token)
+                shown.plant.authority.keep(OPERATOR, token)
         assert _states(plant) == ["TRACKING"] * 4
         shown.release_authority(OPERATOR, token)
         await asyncio.sleep(10.0)
@@ -717,7 +719,7 @@ def test_losses_one_after_the_other_count_together_although_people_raised_them()
             shown.command(OPERATOR, token, name)
             for _ in range(12):
                 await asyncio.sleep(5.0)
-                shown.keep_authority(OPERATOR, token)
+                shown.plant.authority.keep(OPERATOR, token)
         assert _states(plant) == ["TRACKING"] * 4
         shown.release_authority(OPERATOR, token)
         await asyncio.sleep(10.0)
@@ -740,11 +742,11 @@ def test_a_mirror_left_on_a_target_goes_back_to_the_receiver() -> None:
         token = shown.take_authority(OPERATOR).token
         shown.aim_at(OPERATOR, token, (name,), shown.targets[0])
         await asyncio.sleep(10.0)
-        assert shown.heliostat(name).on == shown.targets[0]
+        assert shown.viewer.heliostat(name).on == shown.targets[0]
         shown.release_authority(OPERATOR, token)
         shown.give_back(OPERATOR, (name,))
         await asyncio.sleep(60.0)
-        assert shown.heliostat(name).on == "receiver"
+        assert shown.viewer.heliostat(name).on == "receiver"
         assert _states(plant) == ["TRACKING"] * 4
 
     live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0))
@@ -768,7 +770,7 @@ def test_after_a_restart_in_an_emergency_a_person_resumes(tmp_path: Path) -> Non
         await asyncio.sleep(100.0)
         assert _states(plant) == ["STOWED"] * 4
         # The order stands until it is withdrawn and acknowledged, whatever program runs.
-        (call,) = shown.emergency_view().calls
+        (call,) = shown.viewer.emergency().calls
         assert (call.who, call.act, call.reason) == ("Vera", "STOW", "a fire")
         shown.withdraw(ENGINEER, "Vera")
         await asyncio.sleep(5.0)
@@ -795,8 +797,8 @@ def test_the_night_is_no_emergency_and_people_work_at_the_mirrors() -> None:
         await asyncio.sleep(400.0)
         assert shown.sun().elevation < 0.0
         assert not shown.summary().emergency
-        assert shown.emergency_view().text == "no emergency so far"
-        alarms_ = {(a.condition, a.severity) for a in shown.alarms()}
+        assert shown.viewer.emergency().text == "no emergency so far"
+        alarms_ = {(a.condition, a.severity) for a in shown.logbook.alarms()}
         assert ("sun_below_horizon", Severity.INFO) in alarms_
         assert Severity.EMERGENCY not in {severity for _, severity in alarms_}
         token = shown.take_authority(ENGINEER).token
@@ -804,7 +806,7 @@ def test_the_night_is_no_emergency_and_people_work_at_the_mirrors() -> None:
         for command in ("LOCK", "UNLOCK"):
             ticket = shown.command(ENGINEER, token, command, (name,))
             for _ in range(3):
-                shown.keep_authority(ENGINEER, token)
+                shown.plant.authority.keep(ENGINEER, token)
                 await asyncio.sleep(3.0)
             assert ticket.good, ticket.text
         for command in ("APPROACH", "IDLE", "TRACK"):
@@ -812,7 +814,7 @@ def test_the_night_is_no_emergency_and_people_work_at_the_mirrors() -> None:
                 shown.command(ENGINEER, token, command, (name,))
         # The plant passes what serves work at a mirror; this board is at stow, and says so.
         for command, values in (("ROUGH", (1,)), ("GOTO", (0, 0)), ("DIAGNOSE", ())):
-            shown.keep_authority(ENGINEER, token)
+            shown.plant.authority.keep(ENGINEER, token)
             moved = shown.command(ENGINEER, token, command, (name,), values)
             await asyncio.sleep(6.0)
             assert "not in this state (STOWED)" in moved.text
@@ -932,15 +934,15 @@ def test_the_text_of_an_emergency_ends_with_it() -> None:
         shown = plant.operations
         shown.emergency(OPERATOR, "DEFOCUS", "smoke")
         await asyncio.sleep(5.0)
-        assert "over" not in shown.emergency_view().text
+        assert "over" not in shown.viewer.emergency().text
         shown.withdraw(OPERATOR)
         for _ in range(40):
             await asyncio.sleep(2.0)
-            for alarm in shown.alarms():
+            for alarm in shown.logbook.alarms():
                 if not alarm.acknowledged_by:
                     with contextlib.suppress(RefusedError):
                         shown.acknowledge(ENGINEER, alarm.condition, alarm.subject)
-        view = shown.emergency_view()
+        view = shown.viewer.emergency()
         assert (view.on, view.text) == (False, "over: DEFOCUS of the field, ordered by Olga")
 
     live(work, AutomaticSettings(calibrate=False))
@@ -960,13 +962,13 @@ def test_the_work_survives_a_camera_that_fails() -> None:
 
         eye.photograph = broken  # type: ignore[method-assign]
         await asyncio.sleep(160.0)
-        events = [event.text for event in plant.operations.events(1000)]
+        events = [event.text for event in plant.operations.logbook.events(1000)]
         assert any("OSError: the cable is loose" in text for text in events)
         # It has worked again since.
-        assert not any(row.active for row in plant.operations.alarms())
-        view = plant.operations.calibration()
+        assert not any(row.active for row in plant.operations.logbook.alarms())
+        view = plant.operations.automatic.view()
         assert view.done >= 1
-        one = plant.operations.heliostat(view.results[-1].heliostat)
+        one = plant.operations.viewer.heliostat(view.results[-1].heliostat)
         assert one.history
         assert one.results
         assert one.error < 6 * MRAD

@@ -20,7 +20,7 @@ from heliotrope.mechanism.tracking import track
 from heliotrope.plant.audit import read
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.beam_watch import BeamError
-from heliotrope.plant.lockouts import Kind, Lockout
+from heliotrope.store.records import Kind, Lockout
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 NAME, OTHER = "P1A", "P2A"

@@ -228,19 +228,19 @@ def test_a_heliostat_is_calibrated_when_it_is_asked_for(tmp_path: Path) -> None:
                 operations.calibrate(OPERATOR, *wrong[0])
         for name in plant.names[:-1]:  # so that the schedule would not choose it
             operations.automatic.want([name], wanted=name == plant.names[0])
-        while not operations.calibration().on:
+        while not operations.automatic.view().on:
             await asyncio.sleep(1.0)
         operations.calibrate(OPERATOR, last, plant.design.targets[0].name)
-        assert operations.calibration().asked == (last,)
-        while not operations.calibration().results:
+        assert operations.automatic.view().asked == (last,)
+        while not operations.automatic.view().results:
             await asyncio.sleep(1.0)
-        while last not in {found.heliostat for found in operations.calibration().results}:
+        while last not in {found.heliostat for found in operations.automatic.view().results}:
             await asyncio.sleep(1.0)
-        (result, *_) = [r for r in operations.calibration().results if r.heliostat == last]
-        assert operations.calibration().asked == ()
+        (result, *_) = [r for r in operations.automatic.view().results if r.heliostat == last]
+        assert operations.automatic.view().asked == ()
         # Its photographs are found from the sightings that they gave.
         rows = listed(pictures, last)
-        times = [sighting.at for sighting in operations.heliostat(last).history]
+        times = [sighting.at for sighting in operations.viewer.heliostat(last).history]
         assert times
         for at in times:
             (one,) = [row for row in rows if abs(row.at - at) < 0.5]
@@ -252,7 +252,7 @@ def test_a_heliostat_is_calibrated_when_it_is_asked_for(tmp_path: Path) -> None:
         # A person who takes it over takes the wish back.
         operations.calibrate(OPERATOR, last)
         operations.stow(OPERATOR, [last])
-        assert operations.calibration().asked == ()
+        assert operations.automatic.view().asked == ()
         with pytest.raises(RefusedError, match="automatic control does not have it"):
             operations.calibrate(OPERATOR, last)
         operations.take_authority(OPERATOR)
@@ -269,13 +269,13 @@ def test_a_beam_is_searched_when_it_is_asked_for(tmp_path: Path) -> None:
         operations, last = plant.operations, plant.names[-1]
         for name in plant.names[:-1]:
             operations.automatic.want([name], wanted=name == plant.names[0])
-        while not operations.calibration().on:
+        while not operations.automatic.view().on:
             await asyncio.sleep(1.0)
         operations.calibrate(OPERATOR, last, plant.design.targets[0].name, search=True)
         found: list[CalibrationEntry] = []
         while not found:
             await asyncio.sleep(1.0)
-            found = [r for r in operations.calibration().results if r.heliostat == last]
+            found = [r for r in operations.automatic.view().results if r.heliostat == last]
         text = found[0].text
         assert text.startswith("searched: the beam misses its aim by "), text
         # As far as the true mirror of the twin stands off.
@@ -283,7 +283,7 @@ def test_a_beam_is_searched_when_it_is_asked_for(tmp_path: Path) -> None:
         assert said == pytest.approx(2e3 * found[0].truth_before, rel=0.2, abs=1.0)
         rows = [row for row in listed(pictures, last) if row.text == text]
         assert len(rows) >= 2
-        assert operations.heliostat(last).history == ()
+        assert operations.viewer.heliostat(last).history == ()
         assert plant.plant.beliefs.record(last) is None
 
     live(work, tmp_path)

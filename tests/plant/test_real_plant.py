@@ -81,7 +81,7 @@ def test_a_real_plant_learns_from_its_cameras(tmp_path: Path) -> None:
         async with PlantAssembly(design, ports, settings).running() as plant:
             before = world.errors()
             async with asyncio.timeout(PATIENCE):
-                while plant.operations.calibration().done < LEARNT:
+                while plant.operations.automatic.view().done < LEARNT:
                     await asyncio.sleep(0.5)
             after = world.errors()
             said = plant.operations.automatic.book.error

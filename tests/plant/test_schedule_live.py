@@ -68,7 +68,7 @@ def _what_came_of_it(live: LivePlant, schedule: PlantSchedule) -> None:
 
 def _what_was_chosen(live: LivePlant, schedule: PlantSchedule) -> None:
     """The page says why the last visit was chosen."""
-    shown = live.operations.calibration().choice
+    shown = live.operations.automatic.view().choice
     assert shown
     assert shown == schedule.reason
 
@@ -76,7 +76,7 @@ def _what_was_chosen(live: LivePlant, schedule: PlantSchedule) -> None:
 def _what_is_to_come(live: LivePlant, schedule: PlantSchedule) -> None:
     """The plan is made a little at each look, and names nobody who is under way."""
     for _ in range(60):
-        coming = live.operations.schedule(6)
+        coming = live.operations.automatic.plan(6)
         if len(coming) == 6:
             break
     assert len(coming) == 6

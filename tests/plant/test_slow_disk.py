@@ -18,8 +18,8 @@ from heliotrope.links.messages import Command, Emergency, Lease, Stage
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.assigned import AssignedFile
 from heliotrope.plant.audit import read
-from heliotrope.plant.lockouts import Kind, Lockout
 from heliotrope.safety import Act
+from heliotrope.store.records import Kind, Lockout
 from support.midsummer import DayClock
 from support.plant_bench import ENGINEER, OPERATOR, Bench, SlowDisk, running
 

@@ -128,19 +128,19 @@ async def until(plant: LivePlant, true: Callable[[], bool], limit: float) -> Non
     """Wait until something is true."""
     end = plant.clock.monotonic() + limit
     while not true():
-        assert plant.clock.monotonic() < end, plant.operations.events(20)
+        assert plant.clock.monotonic() < end, plant.operations.logbook.events(20)
         await asyncio.sleep(0.5)
 
 
 def photographing(plant: LivePlant) -> bool:
     """Return whether a visit takes its photographs."""
-    running = plant.operations.calibration().running
+    running = plant.operations.automatic.view().running
     return any(entry.stage.startswith("photograph") for entry in running)
 
 
 def calibrated(plant: LivePlant) -> set[str]:
     """Return the heliostats with a new calibration."""
-    return {entry.heliostat for entry in plant.operations.calibration().results if entry.good}
+    return {entry.heliostat for entry in plant.operations.automatic.view().results if entry.good}
 
 
 def precise(plant: LivePlant) -> int:
@@ -201,7 +201,7 @@ def test_mirrors_of_unlike_resolution_are_calibrated_in_one_visit() -> None:
 
     async def work(plant: LivePlant) -> None:
         await until(plant, lambda: len(calibrated(plant)) == 6, 240.0)
-        good = [entry.at for entry in plant.operations.calibration().results if entry.good]
+        good = [entry.at for entry in plant.operations.automatic.view().results if entry.good]
         assert np.ptp(good) < 10.0, "one visit calibrates all"
         await until(plant, lambda: precise(plant) >= 4, 60.0)
 

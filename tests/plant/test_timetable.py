@@ -26,7 +26,7 @@ def design(*entries: TimetableEntry) -> Plant:
 
 
 def said(plant: LivePlant) -> list[str]:
-    return [e.text for e in plant.operations.events(500) if e.text.startswith("timetable")]
+    return [e.text for e in plant.operations.logbook.events(500) if e.text.startswith("timetable")]
 
 
 async def until(plant: LivePlant, hour: int, minute: int) -> None:
@@ -42,25 +42,25 @@ def test_heliostats_are_calibrated_at_their_time() -> None:
         plant = LivePlant(design(entry), clock, LiveOptions(threads=0))
         async with plant.running():
             operations = plant.operations
-            (row,) = operations.timetable()
+            (row,) = operations.automatic.timetable.rows()
             assert row.next == START.replace(hour=10).timestamp()
             assert row.text == ""
             await until(plant, 9, 59)
-            assert last not in operations.calibration().asked
+            assert last not in operations.automatic.view().asked
             assert not said(plant)
             await until(plant, 10, 1)
             assert said(plant) == ["timetable: 1 of 1 heliostats asked for"]
             begun = START.replace(hour=10).timestamp()
 
             def results() -> list[str]:
-                found = operations.calibration().results
+                found = operations.automatic.view().results
                 return [r.target for r in found if r.heliostat == last and r.at > begun]
 
             while not results():
                 await asyncio.sleep(1.0)
             # It stood on the target of the entry, whatever the schedule would have chosen.
             assert results() == ["right"]
-            (row,) = operations.timetable()
+            (row,) = operations.automatic.timetable.rows()
             assert row.next == begun + 86_400.0
             assert begun <= row.last < begun + 10.0
             await plant.end()
@@ -77,7 +77,7 @@ def test_what_cannot_be_calibrated_is_named_once() -> None:
         async with plant.running():
             plant.operations.switch_calibration(OPERATOR, on=False)
             await until(plant, 9, 5)
-            (row,) = plant.operations.timetable()
+            (row,) = plant.operations.automatic.timetable.rows()
             assert row.text.startswith("0 of 2 heliostats asked for; not ")
             assert "it is switched off" in row.text
             assert len(said(plant)) == 1
@@ -98,9 +98,9 @@ def test_a_person_replaces_the_timetable_and_it_outlasts_a_restart(tmp_path: Pat
             plant = LivePlant(design(filed), clock, LiveOptions(threads=0), records=keeper)
             async with plant.running():
                 operations = plant.operations
-                assert [row.name for row in operations.timetable()] == expected
+                assert [row.name for row in operations.automatic.timetable.rows()] == expected
                 if put:
-                    operations.put_timetable(OPERATOR, entries)
+                    operations.automatic.timetable.put(OPERATOR, entries)
                 await plant.end()
 
         run_virtual(main, start=START)
@@ -122,7 +122,7 @@ def test_a_kept_timetable_of_other_heliostats_gives_way_to_the_file(tmp_path: Pa
     async def main(clock: VirtualClock) -> None:
         plant = LivePlant(design(filed), clock, LiveOptions(threads=0), records=keeper)
         async with plant.running():
-            assert [row.name for row in plant.operations.timetable()] == ["file"]
+            assert [row.name for row in plant.operations.automatic.timetable.rows()] == ["file"]
             (text,) = said(plant)
             assert "timetable of olga: there is no heliostat 'gone'" in text
             await plant.end()
@@ -138,13 +138,13 @@ def test_only_people_who_may_command_change_it_and_only_to_what_can_be() -> None
         plant = LivePlant(design(), clock, LiveOptions(threads=0))
         async with plant.running():
             with pytest.raises(RefusedError, match="vera is viewer"):
-                plant.operations.put_timetable(VIEWER, ())
+                plant.operations.automatic.timetable.put(VIEWER, ())
             with pytest.raises(UnknownNameError, match="gone"):
-                plant.operations.put_timetable(OPERATOR, (entry,))
+                plant.operations.automatic.timetable.put(OPERATOR, (entry,))
             good = replace(entry, heliostats=design().names[:1])
             with pytest.raises(InputError, match="timetable entry"):
-                plant.operations.put_timetable(OPERATOR, (good, good))
-            assert plant.operations.timetable() == ()
+                plant.operations.automatic.timetable.put(OPERATOR, (good, good))
+            assert plant.operations.automatic.timetable.rows() == ()
             await plant.end()
 
     run_virtual(main, start=START)

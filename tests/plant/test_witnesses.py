@@ -242,9 +242,13 @@ def test_a_common_wrong_time_keeps_a_calibrated_field_off_the_receiver(
 
     async def look(plant: LivePlant) -> None:
         await asyncio.sleep(400.0)
-        on = [one for one in map(plant.operations.heliostat, plant.names) if one.on == "receiver"]
+        on = [
+            one
+            for one in map(plant.operations.viewer.heliostat, plant.names)
+            if one.on == "receiver"
+        ]
         joined.append(len([one for one in on if one.state == "TRACKING"]))
-        told = {a.condition for a in plant.operations.alarms() if a.active}
+        told = {a.condition for a in plant.operations.logbook.alarms() if a.active}
         assert ("sun_contradicted" in told) is bool(late), told
         assert "beam_blocked" not in told, "it is no matter of single heliostats"
         versions.append([plant.plant.beliefs.record(name).version for name in plant.names])

@@ -24,7 +24,8 @@ from heliotrope.store.records import (
     AuditEntry,
     CampaignEntry,
     Event,
-    Hold,
+    Kind,
+    Lockout,
     PlannedVisit,
     VisitEntry,
 )
@@ -127,10 +128,10 @@ def fill(keeper: Keeper) -> None:
     keeper.record_alarm("wind", "mast", "warning", "", 2.5, active=False)
     keeper.record_acknowledgement("wind", "mast", "anna", 3.0)
     keeper.record_alarm("rain", "", Severity.ALARM, "rain", 4.0, active=True)
-    holds = [Hold("heliostat", name, "broken", "anna", 5.0, 50.0) for name in NAMES]
+    holds = [Lockout(Kind.HELIOSTAT, name, "anna", "broken", 5.0, 50.0) for name in NAMES]
     keeper.hold(holds)
     keeper.unhold(holds[:1], "ben", 6.0)
-    keeper.hold([Hold("heliostat", "B", "for good", "ben", 7.0)])
+    keeper.hold([Lockout(Kind.HELIOSTAT, "B", "ben", "for good", 7.0)])
     keeper.do(lambda c: audit.begin(c, AUDIT))
     keeper.do(lambda c: audit.finish(c, "p-1", "done", "t2"))
     keeper.do(lambda c: audit.change_points(c, POINTS, {}))

@@ -27,8 +27,9 @@ from heliotrope.store.records import (
     CampaignEntry,
     Event,
     FlightEntry,
-    Hold,
+    Kind,
     LearningEntry,
+    Lockout,
     OutlookEntry,
     PlannedVisit,
     StoreError,
@@ -68,7 +69,7 @@ def fill(keeper: Keeper, seen: Sightings, key_file: Path) -> None:
     keeper.record_timetable(TimetableRecord(1.0, "anna", "[]"))
     keeper.record_event(Event(1.0, "test", "hello", values={"x": float("nan")}))
     keeper.record_alarm("wind", "", "alarm", "too much", 1.0, active=True)
-    keeper.hold([Hold("heliostat", "B", "broken", "anna", 5.0)])
+    keeper.hold([Lockout(Kind.HELIOSTAT, "B", "anna", "broken", 5.0)])
     keeper.writer.do(lambda c: begin(c, AuditEntry("p-1", "anna", "operator", "AIM", "t", (1.0,))))
     keeper.writer.do(lambda c: change_points(c, {"AIM": {"A": (1.0, 2.0, 3.0)}}, {}))
     keeper.writer.do(lambda c: c.execute(tables.about.insert().values(name="plant", value="x")))
@@ -152,8 +153,8 @@ def test_a_backup_knows_that_it_is_one(
     backups.restore(tmp_path / "backup", other)
     again = Keeper(other)
     own, lock = sorted(again.holds(), key=lambda hold: hold.kind)
-    assert own.person == "anna"
-    assert (lock.kind, lock.name, lock.person) == ("tower", "tower", backups.OWNER)
+    assert own.who == "anna"
+    assert (lock.kind, lock.name, lock.who) == ("tower", "tower", backups.OWNER)
     assert "a backup of 21 Jun 2026 12:00 UTC" in lock.reason
     with again.database.reading() as connection:
         assert points(connection) == {kind: {"A": (1.0, 2.0, 3.0)} for kind in ("AIM", "AIM-1")}
@@ -163,7 +164,7 @@ def test_a_backup_knows_that_it_is_one(
     again.close()
     backups.restore(tmp_path / "second", tmp_path / "third")
     third = Keeper(tmp_path / "third")
-    assert [hold.since for hold in third.holds() if hold.person == backups.OWNER] == [
+    assert [hold.since for hold in third.holds() if hold.who == backups.OWNER] == [
         later.timestamp()
     ]
     third.close()

@@ -11,7 +11,7 @@ from tests.store import old_store
 
 from heliotrope.store import audit
 from heliotrope.store.keeper import Keeper
-from heliotrope.store.records import AlarmEntry, Hold
+from heliotrope.store.records import AlarmEntry, Kind, Lockout
 
 
 @pytest.fixture
@@ -57,8 +57,8 @@ def test_the_schedule_reads_back(old: Keeper) -> None:
     assert_same(old.plan(), old_store.PLAN)
     assert_same(old.campaigns(), old_store.CAMPAIGNS)
     assert set(old.holds()) == {
-        Hold("heliostat", "Größe/2", "broken", "anna", 5.0, 50.0),
-        Hold("heliostat", "B", "for good", "ben", 7.0),
+        Lockout(Kind.HELIOSTAT, "Größe/2", "anna", "broken", 5.0, 50.0),
+        Lockout(Kind.HELIOSTAT, "B", "ben", "for good", 7.0),
     }
 
 

@@ -35,7 +35,7 @@ def test_alarms_of_clusters_are_stored_from_their_beginning_to_their_end(tmp_pat
             await asyncio.sleep(20.0)
             plant.field.restore(np.array([0]))
             await asyncio.sleep(10.0)
-            shown = {(row.condition, row.subject): row for row in plant.operations.alarms()}
+            shown = {(row.condition, row.subject): row for row in plant.operations.logbook.alarms()}
             await plant.end()
         assert "records" not in {condition for condition, _ in shown}
         kept = {(entry.condition, entry.subject): entry for entry in keeper.alarms()}

@@ -27,7 +27,8 @@ from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import (
     CampaignEntry,
     Event,
-    Hold,
+    Kind,
+    Lockout,
     PlannedVisit,
     StoreError,
     VisitEntry,
@@ -273,14 +274,15 @@ class TestSchedule:
     ) -> None:
         keeper = opened(place)
         annas = [
-            Hold("heliostat", name, "drive replaced", "anna", 10.0, 50.0) for name in ("A", "B")
+            Lockout(Kind.HELIOSTAT, name, "anna", "drive replaced", 10.0, 50.0)
+            for name in ("A", "B")
         ]
-        bens = Hold("heliostat", "B", "mirror broken", "ben", 20.0)
-        later = Hold("heliostat", "A", "a new gear", "anna", 25.0)
-        tower = Hold("tower", "tower", "for a moment", "ben", 20.0)
+        bens = Lockout(Kind.HELIOSTAT, "B", "ben", "mirror broken", 20.0)
+        later = Lockout(Kind.HELIOSTAT, "A", "anna", "a new gear", 25.0)
+        tower = Lockout(Kind.TOWER, "tower", "ben", "for a moment", 20.0)
         keeper.hold([*annas, bens, tower])
         keeper.hold([later])
-        keeper.unhold([tower, Hold("heliostat", "never held", "", "ben", 0.0)], "anna", 30.0)
+        keeper.unhold([tower, Lockout(Kind.HELIOSTAT, "never held", "ben", "", 0.0)], "anna", 30.0)
         wanted = {later, annas[1], bens}
         assert set(keeper.holds()) == wanted
         keeper.close()

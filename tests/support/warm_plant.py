@@ -48,10 +48,10 @@ async def work(clock: VirtualClock, worker: Callable[..., Any]) -> None:
     async with live.running():
         await asyncio.sleep(WORKING)
         live.operations.receiver_flux()
-        assert live.operations.calibration().done
+        assert live.operations.automatic.view().done
         live.operations.emergency(Person("engineer", Role.ENGINEER))
         await asyncio.sleep(STOWING)
-        assert live.plant.emergency_on
+        assert live.plant.sentinel.on
         await live.end()
     print("calibrated and in an emergency")
 

@@ -94,18 +94,19 @@ def board(state: int, miss: float = 0.0) -> Any:
 
 def plant(**more: Any) -> Any:
     """Return the operations of a plant at which nothing is under way."""
-    order = SimpleNamespace(emergency=None, emergency_on=False, beliefs=SimpleNamespace())
+    sentinel = SimpleNamespace(order=None, on=False)
+    order = SimpleNamespace(sentinel=sentinel, beliefs=SimpleNamespace())
     order.beliefs.record = lambda name: None
     order.__dict__.update(more.pop("plant", {}))
-    found = SimpleNamespace(
-        plant=order,
-        alarms=lambda: (),
-        holds=lambda: (),
-        automatic=SimpleNamespace(waits=""),
-        calibration=lambda: SimpleNamespace(running=(), results=()),
+    automatic = SimpleNamespace(
+        waits="",
+        service=SimpleNamespace(out=()),
+        view=lambda: SimpleNamespace(running=(), results=()),
     )
-    found.__dict__.update(more)
-    return found
+    automatic.__dict__.update(more)
+    return SimpleNamespace(
+        plant=order, logbook=SimpleNamespace(alarms=lambda: ()), automatic=automatic
+    )
 
 
 def progress(state: int, seconds: float, *, miss: float = 0.0, begins: Any = None) -> Any:
@@ -157,7 +158,7 @@ def watched(stage: str, *, rough: int = 0, gone: bool = False, touched: bool = F
     one.node = SimpleNamespace(controller=SimpleNamespace(motion=SimpleNamespace(rough=rough)))
     run = SimpleNamespace(target=target.name, heliostats=("H1",), heliostat="H1", stage=stage)
     seen = SimpleNamespace(running=(run,), results=())
-    operations = plant(calibration=lambda: seen)
+    operations = plant(view=lambda: seen)
     observer = ProgressObserver(0.0, [one], (target,), together=True, across=False)
     observer.given(("H1",))
     observer.took(operations, 0.0)
@@ -196,10 +197,10 @@ def test_a_persons_emergency_and_what_is_out_of_service_outlive_a_restart() -> N
         observer.ended()
         observer.look(new, set(), ZENITH, 1.0, governs=False)
 
-    waits = SimpleNamespace(waits="an emergency held")
+    out = SimpleNamespace(out=(SimpleNamespace(name="H1"),))
     restarted(plant(), called=False, out=False)
-    restarted(plant(automatic=waits), called=True, out=False)
-    restarted(plant(holds=lambda: (SimpleNamespace(name="H1"),)), called=False, out=True)
+    restarted(plant(waits="an emergency held"), called=True, out=False)
+    restarted(plant(service=out), called=False, out=True)
     with pytest.raises(InvariantError, match=r"invariant L4 .* the new one goes on"):
         restarted(plant(), called=True, out=False)
     with pytest.raises(InvariantError, match=r"invariant L4 .* back in service: H1"):
@@ -215,7 +216,7 @@ def test_an_emergency_that_a_person_has_acknowledged_need_not_outlive_a_restart(
         acts: Any = Acts.__new__(Acts)
         acts._operator = SimpleNamespace(clear=lambda _: set(acknowledged))
         acts._watch = SimpleNamespace(emergency=lambda *, on: heard.append(on))
-        acts.tidies(SimpleNamespace(plant=SimpleNamespace(emergency_on=True)))
+        acts.tidies(SimpleNamespace(plant=SimpleNamespace(sentinel=SimpleNamespace(on=True))))
         return heard
 
     assert tidied("clock_jump") == []

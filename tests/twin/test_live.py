@@ -213,7 +213,7 @@ def test_a_simulated_plant_tracks_at_any_time(at: datetime, longitude: float) ->
         async with LivePlant(design, clock, replace(EXACT, work=work)).running() as plant:
             await asyncio.sleep(60.0)
             assert plant.operations.summary().states == {"TRACKING": 3}
-            assert not plant.operations.alarms()
+            assert not plant.operations.logbook.alarms()
             await plant.end()
 
     run_virtual(main, start=at)
@@ -242,7 +242,7 @@ def test_a_small_plant_raises_itself_learns_and_is_stowed(key: bytes) -> None:
         # Further visits would go on without end; one that has begun is finished first.
         plant.operations.switch_calibration(Person("operator", Role.OPERATOR), on=False)
         await asyncio.sleep(VISIT)
-        view = plant.operations.calibration()
+        view = plant.operations.automatic.view()
         assert not view.running
         seen = {(entry.heliostat, entry.target) for entry in view.results if entry.good}
         assert seen == {(name, target) for name in plant.names for target in ("left", "right")}
@@ -255,7 +255,9 @@ def test_a_small_plant_raises_itself_learns_and_is_stowed(key: bytes) -> None:
         kept = [plant.field.journals.items(row).get("bus_keys", b"")[:16] for row in range(3)]
         assert kept == [key] * 3
         # Mirrors that rose before they had the key are named until they stand again.
-        assert not [r for r in plant.operations.alarms() if "bus" in r.condition and r.active]
+        assert not [
+            r for r in plant.operations.logbook.alarms() if "bus" in r.condition and r.active
+        ]
 
     play(work, lay_out("radial", 3), replace(EXACT, bus_key=key))
 
@@ -269,7 +271,7 @@ def test_step_counts_that_come_seldom_are_not_taken_for_new(
 
     async def work(plant: LivePlant) -> None:
         await asyncio.sleep(240.0)
-        results = plant.operations.calibration().results
+        results = plant.operations.automatic.view().results
         assert len(results) >= 3
         assert all(entry.text.startswith("calibrated") for entry in results), results
         assert max(entry.after for entry in results) < 0.5 * MRAD
@@ -300,7 +302,7 @@ def test_anothers_beam_is_not_taken_for_its_own(count: int) -> None:
         plant.cameras.photograph = camera.photograph  # type: ignore[method-assign]
         await asyncio.sleep(150.0)
         assert camera.left == 0
-        first = plant.operations.calibration().results[-1]
+        first = plant.operations.automatic.view().results[-1]
         assert first.text.startswith("calibrated"), first
         assert "another heliostat's beam" in first.text
         assert first.after < 0.5 * MRAD
@@ -321,7 +323,7 @@ def test_heliostats_of_the_default_plant_fall_below_half_a_milliradian() -> None
         before = plant.errors()
         assert 10 * MRAD < np.sqrt(np.mean(before**2)) < 20 * MRAD
         await asyncio.sleep(600.0)
-        results = plant.operations.calibration().results
+        results = plant.operations.automatic.view().results
         seen = {(entry.heliostat, entry.target) for entry in results if entry.good}
         both = {name for name, _ in seen if {(name, "left"), (name, "right")} <= seen}
         assert len(both) >= 8
@@ -338,8 +340,8 @@ def test_boards_learn_as_a_vectorised_field_does() -> None:
 
     async def work(plant: LivePlant) -> None:
         await asyncio.sleep(110.0)
-        view = plant.operations.calibration()
-        assert view.done >= 1, plant.operations.events(20)
+        view = plant.operations.automatic.view()
+        assert view.done >= 1, plant.operations.logbook.events(20)
         assert view.results[-1].text.startswith("calibrated: ")
         assert await plant.stowed()
 
@@ -355,16 +357,16 @@ def test_what_was_learnt_outlasts_the_program(tmp_path: Path) -> None:
         first = LivePlant(design, clock, EXACT, records=keeper)
         async with first.running():
             await asyncio.sleep(100.0)
-            known = {entry.heliostat for entry in first.operations.calibration().results}
+            known = {entry.heliostat for entry in first.operations.automatic.view().results}
             first.operations.hold(Person("Olga", Role.OPERATOR), ["R001-002"], "painted")
-            errors.append(float(np.nanmax(first.operations.frame().error)))
+            errors.append(float(np.nanmax(first.operations.viewer.frame().error)))
             await first.end()
         assert known
         # The next program, and boards that know nothing.
         idle = replace(EXACT, work=AutomaticSettings(calibrate=True))
         second = LivePlant(design, clock, idle, records=keeper)
-        assert [hold.name for hold in second.operations.holds()] == ["R001-002"]
-        assert second.operations.calibration().done == len(known)
+        assert [hold.name for hold in second.operations.automatic.service.out] == ["R001-002"]
+        assert second.operations.automatic.view().done == len(known)
         rows = [second.plant.field.place(name) for name in known]
         async with second.running():
             before = second.errors()[rows]
@@ -403,13 +405,15 @@ def test_the_limits_of_the_site_hold_and_their_change_is_recorded(tmp_path: Path
             design = replace(lay_out("radial", 3), safety=safety)
             audit = KeptAudit(keeper, clock, START)
             plant = LivePlant(design, clock, feeding, records=keeper, audit=audit)
-            events = plant.operations.events(50)
+            events = plant.operations.logbook.events(50)
             assert {event.text for event in events if event.kind == "safety"} == changes
             async with plant.running():
                 await asyncio.sleep(5.0)
                 plant.plant.put("wind_gust", 13.0)
                 await asyncio.sleep(1.0)
-                active = [alarm.condition for alarm in plant.operations.alarms() if alarm.active]
+                active = [
+                    alarm.condition for alarm in plant.operations.logbook.alarms() if alarm.active
+                ]
                 assert ("wind_gust_stow" in active) == bool(safety)
                 await plant.end()
         with keeper.database.reading() as connection:
@@ -485,7 +489,7 @@ def test_an_emergency_of_the_twin_is_proven_with_its_flux(boards: bool, key: byt
     async def work(live: LivePlant) -> None:
         plant, sensor = live.plant, live.world.flux
         assert sensor is not None
-        assert "flux_after_emergency" not in plant.unwatched
+        assert "flux_after_emergency" not in plant.sentinel.table.unwatched
         await asyncio.sleep(100.0)
         assert plant.field.among((states.TRACKING,), plant.now()).all(), plant.field.counted()
         assert sensor.share() > 0.9
@@ -497,7 +501,7 @@ def test_an_emergency_of_the_twin_is_proven_with_its_flux(boards: bool, key: byt
         assert report.complete
         assert "as it reports; measured: the flux is below its limit" in report.text
         await asyncio.sleep(10.0)
-        assert not [row for row in live.operations.alarms() if "flux" in row.condition]
+        assert not [row for row in live.operations.logbook.alarms() if "flux" in row.condition]
 
     play(work, two, idle)
 

@@ -33,7 +33,7 @@ def test_every_kind_of_mechanism_is_learnt_live(tmp_path: Path) -> None:
             end = clock.monotonic() + 1200.0
             while min(done[name] for name in plant.names) < 2 and clock.monotonic() < end:
                 await asyncio.sleep(10.0)
-                results = plant.operations.calibration().results
+                results = plant.operations.automatic.view().results
                 done = Counter(entry.heliostat for entry in results if entry.good)
             assert min(done[name] for name in plant.names) >= 2, [e.text for e in results]
             plant.operations.switch_calibration(Person("operator", Role.OPERATOR), on=False)
@@ -42,7 +42,9 @@ def test_every_kind_of_mechanism_is_learnt_live(tmp_path: Path) -> None:
             assert np.median(before) > 5 * MRAD
             assert np.median(plant.errors()) < 0.1 * np.median(before)
             for name in plant.names:
-                assert any(k.endswith("_bias") for k in plant.operations.heliostat(name).parameters)
+                assert any(
+                    k.endswith("_bias") for k in plant.operations.viewer.heliostat(name).parameters
+                )
 
     run_virtual(main, start=START)
 

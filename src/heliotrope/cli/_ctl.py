@@ -330,11 +330,7 @@ def aim(
             raise InputError("ctl: a point needs named heliostats, not --all")
         order = {"points": dict.fromkeys(names, parse_point(where, "aim"))}
     with _client(context) as client:
-        client.ask("POST", "authority")
-        try:
-            _follow(client, client.ask("POST", "aim", order), wait)
-        finally:
-            client.ask("DELETE", "authority")
+        _follow_with_authority(client, "aim", order, wait)
 
 
 @app.command()
@@ -450,11 +446,7 @@ def error_parameters(
             found = client.get(f"heliostats/{quote(heliostat, safe='')}/parameters")
             units = {one["name"]: one["unit"] for one in found["parameters"]}
         order["values"] = dict(_parameter(text, units) for text in values or ())
-        client.ask("POST", "authority")
-        try:
-            _follow(client, client.ask("POST", "parameters", order), wait)
-        finally:
-            client.ask("DELETE", "authority")
+        _follow_with_authority(client, "parameters", order, wait)
 
 
 #: Units on the screen: name, and its size in the unit of the API.
@@ -768,15 +760,23 @@ def _names(heliostats: list[str] | None, everybody: bool) -> list[str]:
 def _give(
     context: typer.Context, name: str, heliostats: list[str], values: tuple[float, ...], wait: float
 ) -> None:
-    safe = name in ("STOW", "DEFOCUS")
+    order = {"command": name, "heliostats": heliostats, "values": list(values)}
     with _client(context) as client:
-        if not safe:
-            client.ask("POST", "authority")
-        try:
-            _follow(client, client.command(name, heliostats, values), wait)
-        finally:
-            if not safe:
-                client.ask("DELETE", "authority")
+        if name in ("STOW", "DEFOCUS"):
+            _follow(client, client.ask("POST", name.lower(), {"heliostats": heliostats}), wait)
+        else:
+            _follow_with_authority(client, "commands", order, wait)
+
+
+def _follow_with_authority(
+    client: "Client | AtPlant", path: str, order: dict[str, Any], wait: float
+) -> None:
+    """Give an order that needs the command authority, and follow it to its end."""
+    client.ask("POST", "authority")
+    try:
+        _follow(client, client.ask("POST", path, order), wait)
+    finally:
+        client.ask("DELETE", "authority")
 
 
 def _follow_all(client: "Client | AtPlant", tickets: list[dict[str, Any]], wait: float) -> None:

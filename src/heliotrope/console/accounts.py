@@ -100,7 +100,10 @@ async def own_password(
 async def reset_password(
     console: Here, who: Engineer, request: Request, name: Named, given: models.Confirmed
 ) -> models.GivenPassword:
-    """Give a person a new password, to be changed at first use; sessions and tokens end."""
+    """Give a person a new password, shown once; all their sessions and tokens end.
+
+    It must be changed at first use.
+    """
     await confirm(console, who, request, given.own_password)
     if name == who.person.name:
         raise HTTPException(409, f"{name}: change your own password with PUT session/password")

@@ -1,13 +1,18 @@
-"""The HTTP API, version 1: reading the plant."""
+"""The HTTP API, version 1: a route for each call of the plant's table, and the live stream.
+
+Every order is given as the caller, with the role that the store has for them now, through the one
+command authority; an accepted command has its record in the audit before it is sent.
+"""
 
 import asyncio
 import contextlib
 import gzip
-import math
 import time
-from typing import Annotated, Any
+from collections.abc import Callable, Iterator
+from inspect import Parameter, Signature
+from typing import Annotated, Any, get_type_hints
 
-from fastapi import APIRouter, Path, Query, Request, Response, WebSocket
+from fastapi import APIRouter, HTTPException, Path, Query, Request, Response, WebSocket
 from fastapi.responses import JSONResponse
 from starlette.websockets import WebSocketDisconnect
 
@@ -16,14 +21,22 @@ from heliotrope.console import models
 from heliotrope.console._files import SMALL, takes_gzip
 from heliotrope.console.auth import (
     DUES,
-    FIXED,
     Anyone,
+    Caller,
     Console,
+    Engineer,
     Here,
+    Operator,
     console_of,
     find_caller,
+    refused,
     same_origin,
+    settle,
 )
+from heliotrope.console.models import json_type
+from heliotrope.local.frames import REQUEST_BLOB
+from heliotrope.plant.authority import OPERATOR_COMMANDS, Role
+from heliotrope.plant.interface import CALLS, Call, WithBlob, orders
 from heliotrope.plant.operations.security import SecurityEvent
 
 #: Answers that any route behind the sign-in may give.
@@ -35,14 +48,10 @@ REFUSALS: dict[int | str, dict[str, Any]] = {
     422: {"model": models.Problem, "description": "The request cannot be used"},
     503: {"model": models.Problem, "description": "It cannot be recorded now; nothing was sent"},
 }
-#: Age of a view that all viewers share, s.
-FRESH = 0.5
 MOST_SHARED = 100
 router = APIRouter(prefix="/api/v1", responses=REFUSALS)
 
 Named = Annotated[str, Path(max_length=64)]
-Limit = Annotated[int, Query(ge=1, le=2000)]
-Identity = Annotated[int, Path(ge=1, le=2**53)]
 
 
 def answer(value: Any) -> JSONResponse:
@@ -51,7 +60,7 @@ def answer(value: Any) -> JSONResponse:
 
 
 async def shared(
-    console: Console, request: Request, call: str, fresh: float = FRESH, **arguments: Any
+    console: Console, request: Request, call: str, fresh: float, **arguments: Any
 ) -> Response:
     """Return an answer that is the same for everybody, encoded once for all callers of a moment.
 
@@ -79,60 +88,11 @@ async def health(console: Here) -> dict[str, Any]:
     return {"ok": True, "version": __version__}
 
 
-@router.get("/field", response_model=models.FieldDesign, tags=["field"])
-async def field(console: Here, request: Request, who: Anyone) -> Response:
-    """Return everything about the field that does not change."""
-    del who
-    return await shared(console, request, FIXED, math.inf)
-
-
-@router.get("/summary", response_model=models.Summary, tags=["plant"])
-async def summary(console: Here, request: Request, who: Anyone) -> Response:
-    """Return a summary of the plant."""
-    del who
-    return await shared(console, request, "summary")
-
-
-@router.get("/sun", response_model=models.SunView, tags=["plant"])
-async def where_the_sun_is(console: Here, request: Request, who: Anyone) -> Response:
-    """Return the position of the sun."""
-    del who
-    return await shared(console, request, "sun")
-
-
-@router.get("/heliostats/{name}", response_model=models.HeliostatView, tags=["field"])
-async def heliostat(console: Here, who: Anyone, name: Named) -> JSONResponse:
-    """Return one heliostat in detail."""
-    del who
-    return answer(await console.plant.ask("heliostat", name=name))
-
-
-@router.get("/clusters", response_model=models.many(models.ClusterRow), tags=["field"])
-async def clusters(console: Here, request: Request, who: Anyone) -> Response:
-    """Return the health of each cluster."""
-    del who
-    return await shared(console, request, "clusters")
-
-
-@router.get("/receivers/{name}/flux", response_model=models.FluxView, tags=["plant"])
-async def flux(console: Here, request: Request, who: Anyone, name: Named) -> Response:
-    """Return the predicted flux on a receiver."""
-    del who
-    return await shared(console, request, "flux", name=name)
-
-
-@router.get(
-    "/targets/{name}/photograph",
-    tags=["calibration"],
-    response_class=Response,
-    responses={200: {"content": {"image/jpeg": {}}}, 204: {"description": "No photograph yet"}},
-)
 async def photograph(console: Here, request: Request, who: Anyone, name: Named) -> Response:
-    """Return the last photograph of a target, annotated with the findings of the software."""
-    del who
+    """Send a photograph only where the browser does not have it."""
     known = request.headers.get("if-none-match", "").strip('"')
     version = int(known) if known.isdecimal() and len(known) < 16 else -1
-    view, jpeg = await console.plant.fetch("photograph", name=name, known=version)
+    view, jpeg = await console.plant.fetch("photograph", who.person, name=name, known=version)
     headers = {"ETag": f'"{view["version"]}"', "Cache-Control": "private, no-cache"}
     if not jpeg:
         seen = view["version"] == version
@@ -140,129 +100,100 @@ async def photograph(console: Here, request: Request, who: Anyone, name: Named) 
     return Response(jpeg, media_type="image/jpeg", headers=headers)
 
 
-@router.get("/targets/{name}", response_model=models.CameraReading, tags=["calibration"])
-async def target(console: Here, who: Anyone, name: Named) -> JSONResponse:
-    """Return the findings of the software in the last photograph of a target."""
-    del who
-    return answer(await console.plant.ask("target", name=name))
-
-
-@router.get(
-    "/heliostats/{name}/parameters", response_model=models.ParametersView, tags=["calibration"]
-)
-async def parameters(console: Here, who: Anyone, name: Named) -> JSONResponse:
-    """Return the error parameters of a heliostat: in use, stored by it, and earlier versions."""
-    del who
-    return answer(await console.plant.ask("parameters", name=name))
-
-
-@router.get("/photographs", response_model=models.many(models.PictureRow), tags=["calibration"])
-async def kept(
-    console: Here,
-    who: Anyone,
-    heliostat: Annotated[str, Query(max_length=64)] = "",
-    limit: Limit = 50,
-) -> JSONResponse:
-    """Return the newest kept photographs of a heliostat; without one, those asked for."""
-    del who
-    return answer(await console.plant.ask("kept_photographs", heliostat=heliostat, limit=limit))
-
-
-@router.get(
-    "/photographs/{identity}",
-    tags=["calibration"],
-    response_class=Response,
-    responses={200: {"content": {"image/jpeg": {}}}},
-)
-async def kept_photograph(console: Here, who: Anyone, identity: Identity) -> Response:
-    """Return a kept photograph, annotated with the findings of the software."""
-    del who
-    _, jpeg = await console.plant.fetch("kept_photograph", identity=identity)
-    headers = {"Cache-Control": "private, max-age=86400, immutable"}
-    return Response(jpeg, media_type="image/jpeg", headers=headers)
-
-
-@router.get("/alarms", response_model=models.many(models.AlarmRow), tags=["alarms"])
-async def alarms(console: Here, request: Request, who: Anyone) -> Response:
-    """Return the alarms, those that need attention first."""
-    del who
-    return await shared(console, request, "alarms")
-
-
-@router.get("/events", response_model=models.many(models.EventRow), tags=["logs"])
-async def events(console: Here, request: Request, who: Anyone, limit: Limit = 200) -> Response:
-    """Return the last events, newest first."""
-    del who
-    return await shared(console, request, "events", limit=limit)
-
-
-@router.get("/packets", response_model=models.many(models.PacketRow), tags=["logs"])
-async def packets(
-    console: Here,
-    request: Request,
-    who: Anyone,
-    limit: Limit = 200,
-    cluster: Annotated[str, Query(max_length=64)] = "",
+async def command(
+    console: Here, who: Operator, request: Request, order: orders.CommandOrder
 ) -> Response:
-    """Return the last messages between plant and clusters, newest first."""
-    del who
-    return await shared(console, request, "packets", limit=limit, cluster=cluster)
+    """Give STOW and DEFOCUS as what they are; some others need an engineer."""
+    name = order.command
+    if name in ("STOW", "DEFOCUS"):
+        return answer(
+            await console.plant.ask(name.lower(), who.person, heliostats=order.heliostats)
+        )
+    settle(who, request)
+    if name not in OPERATOR_COMMANDS and who.person.role < Role.ENGINEER:
+        await refused(console, request, who)
+        raise HTTPException(403, f"{name}: {who.person.name} is operator; this needs engineer")
+    return answer(await console.plant.ask("command", who.person, **order.model_dump()))
 
 
-@router.get("/calibration", response_model=models.CalibrationView, tags=["calibration"])
-async def calibration(console: Here, request: Request, who: Anyone) -> Response:
-    """Return the progress of calibration."""
-    del who
-    return await shared(console, request, "calibration")
+def _endpoint(name: str, call: Call) -> Callable[..., Any]:
+    """Return the function of a route: it makes a call with the arguments of the request."""
+
+    async def endpoint(
+        console: Console, request: Request, who: Caller, order: Any = None, **given: Any
+    ) -> Response:
+        arguments, blob = {} if order is None else order.model_dump(), b""
+        if call.pack is not None:
+            arguments, blob = call.pack(order)
+            if len(blob) > REQUEST_BLOB:
+                raise HTTPException(413, f"it is longer than {REQUEST_BLOB >> 20} MiB; divide it")
+        if call.fresh and call.answer is not WithBlob:
+            return await shared(console, request, name, call.fresh, **given)
+        value, data = await console.plant.fetch(name, who.person, blob, **arguments, **given)
+        if call.answer is None:
+            return Response(status_code=204)
+        if call.answer is not WithBlob:
+            return answer(value)
+        kept = f"private, max-age={call.fresh:.0f}, immutable" if call.fresh else "no-store"
+        return Response(data, media_type="image/jpeg", headers={"Cache-Control": kept})
+
+    fixed = {"console": Here, "request": Request, "who": _AT_LEAST[call.role]}
+    found = [_argument(key, hint) for key, hint in fixed.items()]
+    vars(endpoint)["__signature__"] = Signature([*found, *_arguments(call)])
+    return endpoint
 
 
-@router.get("/schedule", response_model=models.many(models.Planned), tags=["calibration"])
-async def schedule(console: Here, request: Request, who: Anyone, limit: Limit = 20) -> Response:
-    """Return the planned next measurements."""
-    del who
-    return await shared(console, request, "schedule", limit=limit)
+def _arguments(call: Call) -> Iterator[Parameter]:
+    """Yield the arguments of a request: those in its path, in its query, and its body."""
+    method, path = call.request.split()
+    hints = get_type_hints(call.arguments, include_extras=True)
+    for key, field in call.arguments.model_fields.items():
+        if f"{{{key}}}" in path:
+            yield _argument(key, hints[key], Path())
+        elif method == "GET":
+            yield _argument(key, hints[key], Query(field.default))
+    body: Any = call.arguments if method != "GET" and "{" not in path else orders.Nothing
+    body = call.body or body
+    if call.bare:
+        yield _argument("order", body | None, None)
+    elif body is not orders.Nothing:
+        yield _argument("order", body)
 
 
-@router.get("/flights", response_model=models.many(models.FlightView), tags=["calibration"])
-async def flights(console: Here, request: Request, who: Anyone) -> Response:
-    """Return the flights of a drone that the plant has taken, the last first."""
-    del who
-    return await shared(console, request, "flights")
+def _argument(name: str, hint: Any, default: Any = Parameter.empty) -> Parameter:
+    return Parameter(name, Parameter.KEYWORD_ONLY, annotation=hint, default=default)
 
 
-@router.get("/learning", response_model=models.many(models.LearningView), tags=["calibration"])
-async def learning(console: Here, request: Request, who: Anyone) -> Response:
-    """Return what was learnt of each group of mirrors, and is in force."""
-    del who
-    return await shared(console, request, "learning")
+#: Routes that do more than make a call.
+_OWN: dict[str, Callable[..., Any]] = {"photograph": photograph, "command": command}
+_AT_LEAST = {Role.VIEWER: Anyone, Role.OPERATOR: Operator, Role.ENGINEER: Engineer}
+_JPEG: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/jpeg": {}}},
+    204: {"description": "No photograph yet"},
+}
 
 
-@router.get("/timetable", response_model=models.many(models.TimetableRow), tags=["calibration"])
-async def timetable(console: Here, who: Anyone) -> JSONResponse:
-    """Return the calibrations at times of day and at intervals that people want."""
-    del who
-    return answer(await console.plant.ask("timetable"))
+def _add(name: str, call: Call) -> None:
+    """Add the route of a call."""
+    method, path = call.request.split()
+    picture = call.answer is WithBlob
+    router.add_api_route(
+        f"/{path}",
+        _OWN.get(name) or _endpoint(name, call),
+        methods=[method],
+        name=name,
+        tags=[call.group],
+        description=call.plain_text,
+        status_code=204 if call.answer is None else 200,
+        response_class=Response if picture else JSONResponse,
+        response_model=None if picture or call.answer is None else json_type(call.answer),
+        responses=_JPEG if picture else None,
+    )
 
 
-@router.get("/holds", response_model=models.many(models.Lockout), tags=["calibration"])
-async def holds(console: Here, who: Anyone) -> JSONResponse:
-    """Return the heliostats that are out of service."""
-    del who
-    return answer(await console.plant.ask("holds"))
-
-
-@router.get("/retries", response_model=models.many(models.Retry), tags=["calibration"])
-async def retries(console: Here, who: Anyone) -> JSONResponse:
-    """Return what automatic control tries again or has given up, and why."""
-    del who
-    return answer(await console.plant.ask("retries"))
-
-
-@router.get("/emergency", response_model=models.EmergencyView, tags=["safety"])
-async def emergency(console: Here, who: Anyone) -> JSONResponse:
-    """Return the last emergency order with its proof."""
-    del who
-    return answer(await console.plant.ask("emergency"))
+for _name, _each in CALLS.items():
+    if _each.request:
+        _add(_name, _each)
 
 
 @router.websocket("/live")

@@ -15,7 +15,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 
 from heliotrope import __version__
-from heliotrope.console import accounts, api, commands, factor
+from heliotrope.console import accounts, api, factor
 from heliotrope.console._attempts import Attempts
 from heliotrope.console._files import Files, page
 from heliotrope.console.auth import Caller, Console, introduced
@@ -41,7 +41,7 @@ ABOUT = (
     "word that the answer to the sign-in gave."
 )
 
-ROUTERS = (api.router, commands.router, accounts.router, factor.router)
+ROUTERS = (api.router, accounts.router, factor.router)
 #: Address and file of each page but the sign-in's.
 PAGES = {"/": "console", "/emergency": "emergency", "/account": "account"}
 #: Errors of a request that the answer lists, and their longest texts, characters.

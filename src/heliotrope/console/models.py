@@ -2,8 +2,8 @@
 
 Those of orders stand in `plant.interface.orders`: the plant checks them again.
 
-The views of `plant.operations` are frozen dataclasses of plain values and arrays. Their models have
-the same names and fields, so each has one description. Unknown numbers (NaN, infinite) are null.
+The views of the plant are frozen dataclasses of plain values and arrays. Their models have the same
+names and fields, so each has one description. Unknown numbers (NaN, infinite) are null.
 """
 
 import dataclasses
@@ -16,10 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, Field, create_model
 
-from heliotrope.optics import flux
-from heliotrope.plant import attempts, lockouts
 from heliotrope.plant.interface.orders import Name, Strict
-from heliotrope.plant.operations import marking, typed_parameters, views
 
 _MADE: dict[type, type[BaseModel]] = {}
 
@@ -29,7 +26,7 @@ def model_of(view: type) -> type[BaseModel]:
     if view not in _MADE:
         hints = typing.get_type_hints(view)
         fields: dict[str, Any] = {
-            f.name: (_type(hints[f.name]), ...) for f in dataclasses.fields(view)
+            f.name: (json_type(hints[f.name]), ...) for f in dataclasses.fields(view)
         }
         made = create_model(view.__name__, **fields)
         made.__doc__ = view.__doc__
@@ -37,8 +34,8 @@ def model_of(view: type) -> type[BaseModel]:
     return _MADE[view]
 
 
-def _type(hint: Any) -> Any:
-    """Return the JSON type of a field's type."""
+def json_type(hint: Any) -> Any:
+    """Return the type that describes the JSON of a value of a type."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if dataclasses.is_dataclass(hint):
         return model_of(typing.cast("type", hint))
@@ -47,13 +44,12 @@ def _type(hint: Any) -> Any:
     if origin is np.ndarray:
         return list[Any]
     if origin is tuple:
-        if len(inner) == 2 and inner[1] is Ellipsis:
-            return list[_type(inner[0])]  # type: ignore[misc]  # made at run time
-        return list[Any]
+        alike = len(set(inner) - {Ellipsis}) == 1
+        return list[json_type(inner[0]) if alike else Any]  # type: ignore[misc]  # at run time
     if isinstance(origin, type) and issubclass(origin, Mapping):
-        return dict[str, _type(inner[1])]  # type: ignore[misc]  # made at run time
+        return dict[str, json_type(inner[1])]  # type: ignore[misc]  # made at run time
     if origin in (typing.Union, types.UnionType):
-        kinds = [_type(kind) for kind in inner]
+        kinds = [json_type(kind) for kind in inner]
         return typing.Union[tuple(kinds)]  # noqa: UP007 - made at run time
     if hint in (str, int, bool, datetime):
         return hint
@@ -155,73 +151,10 @@ class NewToken(Confirmed):
     days: Annotated[float, Field(gt=0, le=365)] = 30.0
 
 
-class TicketState(BaseModel):
-    """Progress of an accepted command."""
-
-    identity: str
-    command: str
-    heliostats: int
-    counted: dict[str, int] = Field(description="Number of heliostats at each stage")
-    finished: bool
-    good: bool = Field(description="Whether every heliostat is done")
-    text: str
-    refusals: dict[str, str] = Field(description="Reasons of the first hundred")
-    steps: dict[str, str] = Field(
-        description="What the first hundred of an operation do or wait for now, or their results"
-    )
-
-
-class AuthorityState(BaseModel):
-    """Holder of the command authority."""
-
-    holder: str
-    role: str
-    mine: bool
-    lifetime: float = Field(description="Life without renewal, s")
-
-
-Place = Annotated[list[float], Field(min_length=3, max_length=3)]
-
-
-class KeepOutOutline(BaseModel):
-    """A keep-out volume, as seen on a map."""
-
-    name: str
-    outline: list[tuple[float, float]] = Field(description="East and north of its corners, m")
-
-
-class FieldDesign(BaseModel):
-    """Everything about the field that does not change, in the order of all its rows."""
-
-    plant: str
-    names: list[str]
-    positions: list[Place] = Field(description="ENU, m")
-    clusters: list[str]
-    cluster: list[int] = Field(description="Place in clusters")
-    size: float = Field(description="Larger side of a mirror, m, the median")
-    tower: Place = Field(description="Centre of the receivers, ENU, m")
-    receivers: list[str]
-    targets: list[str]
-    keep_outs: list[KeepOutOutline]
-    surfaces: list[str] = Field(description="Places that `on` of a row names")
-    states: list[str]
-    faults: list[str]
-
-
 class Problem(BaseModel):
     """Reason of a refusal."""
 
     detail: str | list[Any]
-
-
-class CameraReading(BaseModel):
-    """Findings of the software in the last photograph of a target."""
-
-    target: str
-    version: int = Field(description="Rises with each photograph; 0 before the first")
-    at: float | None
-    reading: list[str]
-    centroid: list[float] | None = Field(description="Right of and above its centre, m")
 
 
 class AccountState(BaseModel):
@@ -245,23 +178,3 @@ class TokenState(BaseModel):
     expires: float | None
     last_used: float | None
     secret: str = ""
-
-
-def many(model: type[BaseModel]) -> Any:
-    """Return the model of a list."""
-    return list[model]  # type: ignore[valid-type]  # models of views are made at run time
-
-
-#: Answers with the data of views.
-Summary, SunView = model_of(views.Summary), model_of(views.SunView)
-FluxView, HeliostatView = model_of(flux.FluxView), model_of(views.HeliostatView)
-ClusterRow, AlarmRow = model_of(views.ClusterRow), model_of(views.AlarmRow)
-EventRow, PacketRow = model_of(views.EventRow), model_of(views.PacketRow)
-BusFrame, FlightView = model_of(views.BusFrame), model_of(views.FlightView)
-LearningView, TimetableRow = model_of(views.LearningView), model_of(views.TimetableRow)
-CalibrationView, Planned = model_of(views.CalibrationView), model_of(views.Planned)
-PictureRow = model_of(views.PictureRow)
-PictureToMark, MarksView = model_of(marking.PictureToMark), model_of(marking.MarksView)
-ParametersView = model_of(typed_parameters.ParametersView)
-Retry = model_of(attempts.Retry)
-Lockout, EmergencyView = model_of(lockouts.Lockout), model_of(views.EmergencyView)

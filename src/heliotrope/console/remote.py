@@ -5,11 +5,8 @@ connection of their own.
 """
 
 import asyncio
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from heliotrope.local import EMERGENCY, INTERNAL, ORDINARY, CallError, LocalConnection
 from heliotrope.plant.authority import Person
@@ -73,13 +70,6 @@ class RemotePlant:
             if error.kind == INTERNAL:
                 raise RuntimeError(f"{call}: {error}") from None
             raise remade(error) from None
-
-    async def point(
-        self, call: str, who: Person, points: Mapping[str, Sequence[float]], /, **arguments: Any
-    ) -> Any:
-        """Make a call with points by heliostat, ENU, m; see `ask`."""
-        blob = np.array(list(points.values()), "<f8").tobytes()
-        return (await self.fetch(call, who, blob, points=list(points), **arguments))[0]
 
     async def note(self, kind: SecurityEvent, who: str, address: str, detail: str) -> None:
         """Record a security event in the plant; see `SecurityLog.note`."""

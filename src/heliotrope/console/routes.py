@@ -90,14 +90,14 @@ def _of(route: BaseRoute) -> Found:
         return Found(404)
     field = route.body_field
     model = None if field is None else field.field_info.annotation
-    role = _role(route.dependant)
+    role = least_role(route.dependant)
     largest = TINY if model is None or role is None else _largest(model)
     return Found(200, role, largest, EACH_FLOWN if model is FlightDocument else EACH)
 
 
-def _role(dependant: Any) -> Role | None:
-    """Return the least role that the dependencies of a route ask for."""
-    roles = [_role(one) for one in dependant.dependencies]
+def least_role(dependant: Any) -> Role | None:
+    """Return the least role that the dependencies of a route ask for; None: open to all."""
+    roles = [least_role(one) for one in dependant.dependencies]
     if isinstance(dependant.call, AtLeast):
         roles.append(dependant.call.role)
     elif dependant.call is caller:

@@ -8,9 +8,6 @@ sent; under a locked tower no heliostat leaves stow. EMERGENCY, DEFOCUS and STOW
 
 import math
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass
-from datetime import UTC, datetime
-from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
@@ -18,49 +15,12 @@ import numpy.typing as npt
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages
+from heliotrope.store.records import Kind, Lockout
 
 #: Name of the tower among what is locked.
 TOWER = "tower"
 #: A beam whose aim is this close to the edge of a locked surface counts as on it, m.
 _BESIDE = 2.0
-
-
-class Kind(StrEnum):
-    """What a person locks."""
-
-    HELIOSTAT = "heliostat"
-    TARGET = "target"
-    RECEIVER = "receiver"
-    TOWER = "tower"
-
-
-@dataclass(frozen=True)
-class Lockout:
-    """One person's lock on a heliostat, a target, a receiver or the tower.
-
-    Attributes
-    ----------
-    kind, name
-        What is locked; the tower's name is "tower".
-    who, reason
-        Person who locked it, and why.
-    since, until
-        When, and the time at which it is expected back, POSIX s; NaN if none was given. It stays
-        locked after that time too.
-    """
-
-    kind: Kind
-    name: str
-    who: str
-    reason: str
-    since: float
-    until: float = math.nan
-
-    @property
-    def text(self) -> str:
-        """One line: reason, person, since, expected back."""
-        back = f", expected back {_time(self.until)}" if math.isfinite(self.until) else ""
-        return f"{self.reason} ({self.who}, since {_time(self.since)}{back})"
 
 
 class Lockouts:
@@ -154,7 +114,3 @@ class Lockouts:
             for name in heliostats
             if name in self
         }
-
-
-def _time(at: float) -> str:
-    return f"{datetime.fromtimestamp(at, UTC):%d %b %H:%M} UTC"

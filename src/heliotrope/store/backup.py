@@ -31,7 +31,7 @@ from heliotrope.errors import FormatError
 from heliotrope.store import _rows as rows
 from heliotrope.store import audit, tables
 from heliotrope.store.database import FILE, HEAD, PRIVATE, Database, cause, make_private
-from heliotrope.store.records import Hold, StoreError
+from heliotrope.store.records import Kind, Lockout, StoreError
 from heliotrope.store.signing import PublicKey, SigningKey
 
 MANIFEST, SIGNATURE = "manifest.json", "manifest.sig"
@@ -336,15 +336,15 @@ def _copy_file(source: Path, target: Path) -> None:
 
 def _lock(copy: Database, now: datetime) -> None:
     """Lock the tower in a backup made at a time, and doubt its assigned points."""
-    hold = Hold(
+    hold = Lockout(
+        Kind.TOWER,
         "tower",
-        "tower",
+        OWNER,
         f"this store is a backup of {now:%d %b %Y %H:%M} UTC: locks taken and points assigned "
         "since then are not in it",
-        OWNER,
         now.timestamp(),
     )
-    own = (tables.hold.c.person == OWNER) & tables.hold.c.ended.is_(None)
+    own = (tables.hold.c.who == OWNER) & tables.hold.c.ended.is_(None)
     try:
         with copy.connect() as connection, connection.begin():
             connection.execute(delete(tables.hold).where(own))

@@ -29,9 +29,9 @@ from heliotrope.store.records import (
     CampaignEntry,
     Event,
     FlightEntry,
-    Hold,
     KeptSightings,
     LearningEntry,
+    Lockout,
     OutlookEntry,
     PlannedVisit,
     StoreError,
@@ -434,7 +434,7 @@ class Keeper:
 
     # -- holds ---------------------------------------------------------------------------
 
-    def hold(self, holds: Sequence[Hold]) -> None:
+    def hold(self, holds: Sequence[Lockout]) -> None:
         """Keep locks; a person's new lock replaces their own one before."""
         new = {_locked(hold): hold for hold in holds}
         first = self._take_numbers(tables.hold, len(new))
@@ -445,7 +445,7 @@ class Keeper:
 
         def work(connection: Connection) -> None:
             for hold in new.values():
-                _end_hold(connection, hold, hold.person, hold.since)
+                _end_hold(connection, hold, hold.who, hold.since)
             rows.insert(connection, tables.hold, made)
 
         with self._mine:
@@ -453,7 +453,7 @@ class Keeper:
             # A new dictionary: a reader of the old one sees one consistent state.
             self._holds = {**self._holds, **new}
 
-    def unhold(self, holds: Sequence[Hold], person: str, at: float) -> None:
+    def unhold(self, holds: Sequence[Lockout], person: str, at: float) -> None:
         """End locks; ``person`` is who has removed them, ``at`` when, POSIX s."""
         gone = {_locked(hold): hold for hold in holds}
 
@@ -465,7 +465,7 @@ class Keeper:
             self.writer.put(work)
             self._holds = {k: hold for k, hold in self._holds.items() if k not in gone}
 
-    def holds(self) -> tuple[Hold, ...]:
+    def holds(self) -> tuple[Lockout, ...]:
         """Return the locks that stand."""
         return tuple(self._holds.values())
 
@@ -540,19 +540,19 @@ def _last_versions(connection: Connection) -> dict[str, int]:
     return {name: int(version) for name, version in connection.execute(query)}
 
 
-def _locked(hold: Hold) -> tuple[str, str, str]:
+def _locked(hold: Lockout) -> tuple[str, str, str]:
     """Return what is locked, and by whom: of these there is one standing lock."""
-    return hold.kind, hold.name, hold.person
+    return hold.kind, hold.name, hold.who
 
 
-def _standing_holds(connection: Connection) -> dict[tuple[str, str, str], Hold]:
+def _standing_holds(connection: Connection) -> dict[tuple[str, str, str], Lockout]:
     query = select(tables.hold).where(tables.hold.c.ended.is_(None))
-    return {_locked(held): held for held in rows.records(connection, Hold, query)}
+    return {_locked(held): held for held in rows.records(connection, Lockout, query)}
 
 
-def _end_hold(connection: Connection, hold: Hold, person: str, at: float) -> None:
+def _end_hold(connection: Connection, hold: Lockout, person: str, at: float) -> None:
     h = tables.hold.c
-    same = and_(h.kind == hold.kind, h.name == hold.name, h.person == hold.person)
+    same = and_(h.kind == hold.kind, h.name == hold.name, h.who == hold.who)
     part = and_(same, h.ended.is_(None))
     connection.execute(update(tables.hold).where(part).values(ended=at, ended_by=person))
 

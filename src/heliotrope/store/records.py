@@ -10,8 +10,11 @@ are sure to survive a crash.
     └── StoreError            a record that could not be kept, or a store that cannot be used
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from enum import StrEnum
 from typing import Protocol
 
 from heliotrope.calibration.record import (
@@ -122,28 +125,46 @@ class AlarmEntry:
     number: int = 0
 
 
+class Kind(StrEnum):
+    """What a person locks."""
+
+    HELIOSTAT = "heliostat"
+    TARGET = "target"
+    RECEIVER = "receiver"
+    TOWER = "tower"
+
+
 @dataclass(frozen=True)
-class Hold:
+class Lockout:
     """One person's lock on a heliostat, a target, a receiver or the tower.
 
     Attributes
     ----------
     kind, name
-        What is locked: "heliostat", "target", "receiver" or "tower", and its name.
-    reason, person
-        Why, and whose lock it is.
-    since
-        POSIX s.
-    until
-        When it is expected back, POSIX s; None if unknown. It stands until `Records.unhold`.
+        What is locked; the tower's name is "tower".
+    who, reason
+        Person who locked it, and why.
+    since, until
+        When, and the time at which it is expected back, POSIX s; NaN if none was given. It stands
+        after that time too, until `Records.unhold`.
     """
 
-    kind: str
+    kind: Kind
     name: str
+    who: str
     reason: str
-    person: str
     since: float
-    until: float | None = None
+    until: float = math.nan
+
+    @property
+    def text(self) -> str:
+        """One line: reason, person, since, expected back."""
+        back = f", expected back {_time(self.until)}" if math.isfinite(self.until) else ""
+        return f"{self.reason} ({self.who}, since {_time(self.since)}{back})"
+
+
+def _time(at: float) -> str:
+    return f"{datetime.fromtimestamp(at, UTC):%d %b %H:%M} UTC"
 
 
 @dataclass(frozen=True)
@@ -441,15 +462,15 @@ class Records(Protocol):
         """Record that a person acknowledged an alarm."""
         ...
 
-    def hold(self, holds: Sequence[Hold]) -> None:
+    def hold(self, holds: Sequence[Lockout]) -> None:
         """Keep locks; a person's new lock replaces their own one before."""
         ...
 
-    def unhold(self, holds: Sequence[Hold], person: str, at: float) -> None:
+    def unhold(self, holds: Sequence[Lockout], person: str, at: float) -> None:
         """End locks; ``person`` is who has removed them, ``at`` when, POSIX s."""
         ...
 
-    def holds(self) -> tuple[Hold, ...]:
+    def holds(self) -> tuple[Lockout, ...]:
         """Return the locks that stand."""
         ...
 

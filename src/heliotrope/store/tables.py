@@ -36,6 +36,7 @@ from heliotrope.calibration.fit.estimator import FitOutcome
 from heliotrope.calibration.record import CalibrationOutcome, Provenance
 from heliotrope.geometry import FloatArray
 from heliotrope.safety import Severity
+from heliotrope.store.records import Kind
 
 metadata = MetaData(
     naming_convention={
@@ -348,12 +349,12 @@ hold = Table(
     "hold",
     metadata,
     _number(),
-    _text("kind"),
+    Column("kind", Name(Kind), nullable=False),
     _text("name"),
     _text("reason"),
-    _text("person"),
+    Column("person", Text, nullable=False, key="who"),
     _real("since", needed=True),
-    _real("until"),
+    _figure_of("until"),
     _real("ended"),
     _text("ended_by"),
 )
@@ -361,7 +362,7 @@ Index(
     "uq_hold_standing",
     hold.c.kind,
     hold.c.name,
-    hold.c.person,
+    hold.c.who,
     unique=True,
     sqlite_where=hold.c.ended.is_(None),
     postgresql_where=hold.c.ended.is_(None),

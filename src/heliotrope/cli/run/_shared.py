@@ -267,7 +267,7 @@ async def archive(live: PlantAssembly, shown: Shown) -> AsyncIterator[None]:
 
     async def look() -> None:
         while True:
-            frame = live.operations.frame()
+            frame = live.operations.viewer.frame()
             flags = frame.flags.astype(np.uint16)
             kept.take(
                 frame.at, Look(frame.state, frame.fault, flags, frame.counts, as_float(frame.age))
@@ -413,7 +413,7 @@ def _on_the_way(live: PlantAssembly) -> str:
 
 def line(live: PlantAssembly) -> str:
     """Return one line about a plant."""
-    summary, work = live.operations.summary(), live.operations.calibration()
+    summary, work = live.operations.summary(), live.operations.automatic.view()
     counts = ", ".join(f"{count:,} {name.lower()}" for name, count in summary.states.items())
     parts = [f"{summary.at:%H:%M:%S} UTC", counts, f"{work.done} calibrated"]
     if summary.clusters_alive < summary.clusters:
@@ -436,7 +436,7 @@ def line(live: PlantAssembly) -> str:
 
 def _silent(live: PlantAssembly) -> str:
     """Return the silent clusters, and the reason of the first."""
-    rows = live.operations.cluster_rows()
+    rows = live.operations.logbook.cluster_rows(live.operations.plant)
     away = [row for row in rows if not row.alive]
     names = ", ".join(row.name for row in away[:3]) + (", …" if len(away) > 3 else "")
     why = f" ({away[0].problem})" if away and away[0].problem else ""

@@ -7,7 +7,7 @@ own; only the call itself runs in the plant's loop. `calls` is the table of the 
 """
 
 from heliotrope.plant.interface.admission import BusyError
-from heliotrope.plant.interface.calls import CALLS, Call
+from heliotrope.plant.interface.calls import CALLS, Call, WithBlob
 from heliotrope.plant.interface.console_process import CONSOLE, EMERGENCY_WAY, ConsoleProcess
 from heliotrope.plant.interface.encoding import frame_of, frame_parts, plain
 from heliotrope.plant.interface.errors import kind_of, remade
@@ -21,6 +21,7 @@ __all__ = [
     "Call",
     "ConsoleProcess",
     "PlantInterface",
+    "WithBlob",
     "frame_of",
     "frame_parts",
     "kind_of",

@@ -13,15 +13,6 @@ from heliotrope.plant.authority import Person
 
 #: Orders of one person, and of all: 1/s, and at once.
 OWN, ALL = (10.0, 100.0), (30.0, 200.0)
-#: Calls that give an order and are counted.
-ORDERS = frozenset(
-    (
-        "withdraw_emergency", "acknowledge", "take_authority", "seize_authority", "command", "aim",
-        "standby", "automatic", "resume", "switch_calibration", "calibrate", "take_photograph",
-        "hold", "unhold", "put_timetable", "take_flight", "learn", "bus_frames", "set_parameters",
-        "begin_marks", "mark_corners", "picture_to_mark", "give_reading",
-    )
-)  # fmt: skip
 
 
 class BusyError(HeliotropeError):
@@ -48,15 +39,13 @@ class Admission:
         self._own, self._all = Buckets(*own, monotonic), Buckets(*everybody, monotonic)
 
     def admit(self, call: str, person: Person) -> None:
-        """Admit a call.
+        """Admit an order.
 
         Raises
         ------
         BusyError
-            If it is an order, and there were too many of this person or of all.
+            If there were too many of this person or of all.
         """
-        if call not in ORDERS:
-            return
         whose, wait = f"of {person.name}", self._own.take(person.name)
         if wait == 0.0:
             whose, wait = "of all persons", self._all.take("")

@@ -1,31 +1,70 @@
-"""The table of calls: least role, arguments, and the work done in the plant's loop."""
+"""The table of calls: request of the API, least role, arguments, answer, and work of each.
 
+A function with its row is the one definition of an operation: the console makes the routes of the
+HTTP API from it, `heliotrope ctl` at the plant asks by the same requests, and the reference of the
+API lists it. The model of its ``order``, the type of its answer and its docstring are taken as they
+stand.
+"""
+
+import asyncio
+import functools
+import inspect
+import re
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar, get_args, get_origin, get_type_hints
+from urllib.parse import parse_qsl, unquote
 
+from pydantic import BaseModel
+
+from heliotrope.calibration.flights import FlightDocument, parse_flight
 from heliotrope.errors import InputError
 from heliotrope.field.timetable import TimetableEntry
+from heliotrope.optics import FluxView
+from heliotrope.plant.attempts import Retry
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.interface import orders
-from heliotrope.plant.interface.desk import Desk, reading_of
+from heliotrope.plant.interface.desk import AuthorityState, CameraReading, Desk, FieldDesign
 from heliotrope.plant.interface.encoding import frame_parts
 from heliotrope.plant.interface.overview import overview
+from heliotrope.plant.interface.tickets import TicketState
+from heliotrope.plant.operations import bus_frames as bus
+from heliotrope.plant.operations import views
+from heliotrope.plant.operations.marking import MarksView, PictureToMark
 from heliotrope.plant.operations.security import SecurityEvent
+from heliotrope.plant.operations.typed_parameters import ParametersView
 from heliotrope.plant.operations.zero import lock_position, zero
 from heliotrope.plant.tickets import Ticket
+from heliotrope.store.records import Lockout
+
+T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
+VIEWER, OPERATOR, ENGINEER = Role
+#: Time for which all viewers share a view, s.
+FRESH = 0.5
+#: The same of a view that never changes.
+ALWAYS = float("inf")
+#: Time for which a browser keeps a photograph, s.
+DAY = 86_400.0
+_LINK = re.compile(r"\[([^\]]+)\]\([^)]+\)")
 
 
 @dataclass(frozen=True)
 class WithBlob:
-    """A value, and the bytes that go with it."""
+    """A value, and the bytes that go with it: for the API those of a JPEG."""
 
     value: Any
     blob: bytes
 
 
-Work = Callable[[Desk, Person, Any, bytes], Any]
-Then = Callable[[Desk, Person, Any], Coroutine[Any, Any, Any]]
+@dataclass(frozen=True)
+class Later(Generic[T]):
+    """An answer that has to be waited for in the plant's loop, once it has done the work."""
+
+    wait: Callable[[], Coroutine[Any, Any, T]]
+
+
+Pack = Callable[[Any], tuple[dict[str, Any], bytes]]
 
 
 @dataclass(frozen=True)
@@ -34,257 +73,603 @@ class Call:
 
     Attributes
     ----------
+    function
+        Does it in the plant's loop; it names which of ``desk``, ``who``, ``order`` and ``blob`` it
+        needs.
+    request
+        Method and path of the HTTP API, with arguments in braces; "": only the local interface has
+        it.
+    group
+        Heading under which the API describes it.
     role
         Least role of the person on whose behalf it is made.
     arguments
         Model of the arguments.
-    work
-        Does it in the plant's loop; the value is made plain elsewhere.
-    then
-        Turns the result of the work into the value where that has to wait in the plant's loop.
+    answer
+        Type of the value; None: there is none.
+    body
+        Model of a request's body where that is not all the arguments.
+    pack
+        Makes arguments and blob of a body; None: it takes no blob.
+    bare
+        Whether a request may come without a body.
+    fresh
+        Time for which all callers share an answer, or a browser keeps a picture, s; 0: none.
     urgent
         Whether it belongs to the socket for EMERGENCY, DEFOCUS and STOW.
     console
         Whether only a console may make it.
-    blob
-        Whether it takes a blob.
+    unlimited
+        Whether it is not counted as an order; see `counted`.
     """
 
+    function: Callable[..., Any]
+    request: str
+    group: str
     role: Role
     arguments: type[orders.Strict]
-    work: Work
-    then: Then | None = None
+    answer: Any
+    body: type[BaseModel] | None = None
+    pack: Pack | None = None
+    bare: bool = False
+    fresh: float = 0.0
     urgent: bool = False
     console: bool = False
-    blob: bool = False
+    unlimited: bool = False
+
+    @property
+    def counted(self) -> bool:
+        """Whether it is an order, of which only so many are admitted."""
+        return self.role >= Role.OPERATOR and not (self.urgent or self.unlimited)
+
+    @property
+    def text(self) -> str:
+        """What it does or returns, in Markdown."""
+        return " ".join((inspect.getdoc(self.function) or "").split())
+
+    @property
+    def plain_text(self) -> str:
+        """The same without links."""
+        return _LINK.sub(r"\1", self.text)
+
+    def work(self, desk: Desk, who: Person, order: Any, blob: bytes) -> Any:
+        """Do it; the value is made plain elsewhere, and that of a `Later` has to be waited for."""
+        given = {"desk": desk, "who": who, "order": order, "blob": blob}
+        named = inspect.signature(self.function).parameters
+        ready = functools.partial(self.function, **{name: given[name] for name in named})
+        return Later(ready) if inspect.iscoroutinefunction(self.function) else ready()
 
 
-def _see(look: Callable[[Desk], Any]) -> Call:
-    return Call(Role.VIEWER, orders.Nothing, lambda desk, *_: look(desk))
+#: All calls that are done in the plant's loop, by name.
+CALLS: dict[str, Call] = {}
 
 
-def _live(desk: Desk, *_: Any) -> WithBlob:
-    head, blob = frame_parts(desk.operations.frame())
+def _call(request: str = "", group: str = "", role: Role = VIEWER, **more: Any) -> Callable[[F], F]:
+    """Put a function into the table, under its name; see `Call`."""
+
+    def add(function: F) -> F:
+        hints = get_type_hints(function)
+        answer = hints["return"]
+        if get_origin(answer) is Later:
+            (answer,) = get_args(answer)
+        CALLS[function.__name__] = Call(
+            function,
+            request,
+            group,
+            role,
+            hints.get("order", orders.Nothing),
+            None if answer is type(None) else answer,
+            **more,
+        )
+        return function
+
+    return add
+
+
+# -- the plant and its field ---------------------------------------------------------------------
+
+
+@_call("GET summary", "plant", fresh=FRESH)
+def summary(desk: Desk) -> views.Summary:
+    """Return a summary of the plant."""
+    return desk.operations.summary()
+
+
+@_call("GET sun", "plant", fresh=FRESH)
+def sun(desk: Desk) -> views.SunView:
+    """Return the position of the sun."""
+    return desk.operations.sun()
+
+
+@_call("GET receivers/{name}/flux", "plant", fresh=FRESH)
+def flux(desk: Desk, order: orders.Named) -> FluxView:
+    """Return the predicted flux on a receiver."""
+    return desk.operations.receiver_flux(order.name)
+
+
+@_call("GET field", "field", fresh=ALWAYS)
+def field(desk: Desk) -> FieldDesign:
+    """Return everything about the field that does not change."""
+    return desk.field()
+
+
+@_call()
+def size(desk: Desk) -> int:
+    """Return the number of heliostats."""
+    return len(desk.operations.names)
+
+
+@_call("GET heliostats/{name}", "field")
+def heliostat(desk: Desk, order: orders.Named) -> views.HeliostatView:
+    """Return one heliostat in detail.
+
+    `locked`: if it is LOCKED, by whose order or visit, since when, and until when.
+    """
+    return desk.operations.viewer.heliostat(order.name)
+
+
+@_call("GET clusters", "field", fresh=FRESH)
+def clusters(desk: Desk) -> tuple[views.ClusterRow, ...]:
+    """Return the health of each cluster."""
+    return desk.operations.logbook.cluster_rows(desk.operations.plant)
+
+
+@_call(console=True)
+def live(desk: Desk) -> WithBlob:
+    """Return the field and the plant at one moment."""
+    head, blob = frame_parts(desk.operations.viewer.frame())
     return WithBlob({"frame": head, "overview": overview(desk.operations)}, blob)
 
 
-def _photograph(desk: Desk, _: Person, given: orders.Picture, __: bytes) -> WithBlob:
-    view = desk.operations.camera(given.name)
-    return WithBlob({"version": view.version}, b"" if view.version == given.known else view.jpeg)
+# -- safety, alarms and logs ---------------------------------------------------------------------
 
 
-def _target(desk: Desk, _: Person, given: orders.Named, __: bytes) -> dict[str, Any]:
-    return reading_of(desk.operations.camera(given.name))
+@_call("GET emergency", "safety")
+def emergency(desk: Desk) -> views.EmergencyView:
+    """Return the last emergency order with its proof."""
+    return desk.operations.viewer.emergency()
 
 
-async def _kept_one(desk: Desk, _: Person, identity: int) -> WithBlob:
-    return WithBlob({"identity": identity}, await desk.kept_picture(identity))
+@_call("POST emergency", "safety", bare=True, urgent=True)
+def order_emergency(desk: Desk, who: Person, order: orders.EmergencyCall) -> views.EmergencyView:
+    """Order DEFOCUS (or STOW) of the whole field, with proof; open to everybody signed in."""
+    return desk.order_emergency(who, order)
 
 
-async def _to_mark(desk: Desk, _: Person, identity: int) -> WithBlob:
-    return WithBlob({"number": identity}, await desk.marking.picture(identity))
+@_call("DELETE emergency", "safety", OPERATOR, bare=True)
+def withdraw_emergency(desk: Desk, who: Person, order: orders.Withdrawal) -> views.EmergencyView:
+    """Withdraw your emergency order, or as an engineer that of an `owner`; nothing moves.
+
+    The emergency goes on while another person's order stands (`calls`).
+    """
+    desk.operations.withdraw(who, order.owner)
+    return desk.operations.viewer.emergency()
 
 
-def _withdraw(desk: Desk, who: Person, given: orders.Withdrawal, _: bytes) -> Any:
-    desk.operations.withdraw(who, given.owner)
-    return desk.operations.emergency_view()
+@_call("PUT readings/{name}", "safety", ENGINEER, body=orders.Reading)
+def give_reading(desk: Desk, who: Person, order: orders.NamedReading) -> None:
+    """Give a reading of the safety table: its `value`, and `at`, when it was made.
+
+    Only where the links file says [`"api"`](../how-to/integrate.md#sensors).
+    """
+    desk.readings.take(who, order.name, order.value, order.at)
 
 
-def _command(desk: Desk, who: Person, given: orders.CommandOrder, _: bytes) -> Ticket:
+@_call("GET alarms", "alarms", fresh=FRESH)
+def alarms(desk: Desk) -> tuple[views.AlarmRow, ...]:
+    """Return the alarms, those that need attention first."""
+    return desk.operations.logbook.alarms()
+
+
+@_call("POST alarms/acknowledge", "alarms", OPERATOR)
+def acknowledge(desk: Desk, who: Person, order: orders.Acknowledged) -> None:
+    """Acknowledge an alarm."""
+    desk.operations.acknowledge(who, order.condition, order.subject)
+
+
+@_call("GET events", "logs", fresh=FRESH)
+def events(desk: Desk, order: orders.Some) -> tuple[views.EventRow, ...]:
+    """Return the last events, newest first."""
+    return desk.operations.logbook.events(order.limit)
+
+
+@_call("GET packets", "logs", fresh=FRESH)
+def packets(desk: Desk, order: orders.SomePackets) -> tuple[views.PacketRow, ...]:
+    """Return the last messages between plant and clusters, newest first."""
+    return desk.operations.logbook.packets(order.limit, order.cluster)
+
+
+@_call("POST clusters/{name}/frames", "logs", ENGINEER)
+async def bus_frames(desk: Desk, who: Person, order: orders.Named) -> tuple[views.BusFrame, ...]:
+    """Record the frames of a cluster's bus for five seconds, decoded; nothing moves."""
+    found = await bus.record(desk.operations.plant, order.name)
+    text = f"{order.name}: recorded {len(found)} frames of its bus"
+    desk.operations.logbook.event("command", who.name, text)
+    return found
+
+
+@_call(console=True)
+def note(desk: Desk, order: orders.Note) -> None:
+    """Record a security event."""
+    kind = SecurityEvent[order.kind]
+    desk.operations.security.note(kind, order.who, order.address, order.detail)
+
+
+# -- the command authority -----------------------------------------------------------------------
+
+
+@_call("GET authority", "authority")
+def authority(desk: Desk, who: Person) -> AuthorityState:
+    """Return the holder of the command authority."""
+    return desk.authority_of(who)
+
+
+@_call("POST authority", "authority", OPERATOR)
+def take_authority(desk: Desk, who: Person) -> Later[AuthorityState]:
+    """Take the command authority, or renew it; automatic control gives way."""
+    new = desk.take(who)
+    return Later(lambda: desk.told(who, new))
+
+
+@_call("POST authority/seize", "authority", OPERATOR)
+def seize_authority(desk: Desk, who: Person, order: orders.GivenReason) -> Later[AuthorityState]:
+    """Break another person's command authority and take it."""
+    desk.operations.seize_authority(who, order.reason)
+    return Later(lambda: desk.told(who, True))
+
+
+@_call("PUT authority", "authority", OPERATOR, unlimited=True)
+def keep_authority(desk: Desk, who: Person) -> AuthorityState:
+    """Renew the command authority: every few seconds, while somebody is present."""
+    return desk.keep(who)
+
+
+@_call("DELETE authority", "authority", OPERATOR, unlimited=True)
+def release_authority(desk: Desk, who: Person) -> AuthorityState:
+    """Release the command authority; automatic control continues."""
+    return desk.release(who)
+
+
+# -- commands ------------------------------------------------------------------------------------
+
+
+@_call("POST stow", "commands", OPERATOR, urgent=True)
+def stow(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketState:
+    """Send heliostats to stow; needs no authority."""
+    return desk.tickets.put(desk.operations.stow(who, order.heliostats))
+
+
+@_call("POST defocus", "commands", OPERATOR, urgent=True)
+def defocus(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketState:
+    """Take beams off the receiver; needs no authority."""
+    return desk.tickets.put(desk.operations.defocus(who, order.heliostats))
+
+
+@_call("POST commands", "commands", OPERATOR)
+def command(desk: Desk, who: Person, order: orders.CommandOrder) -> Later[TicketState]:
+    """Give a command of the wire.
+
+    APPROACH, TRACK, IDLE, REFOCUS, LOCK, UNLOCK, SEARCH, JOG, ZERO and more.
+    """
     here, token = desk.operations, desk.token_of(who)
-    if given.command not in ("ZERO", "LOCK_POSITION"):
-        return here.command(who, token, given.command, given.heliostats, given.values)
     ticket: Ticket
-    if given.command == "LOCK_POSITION":
-        if given.values:
+    if order.command == "LOCK_POSITION":
+        if order.values:
             raise InputError("LOCK_POSITION: it takes no values; they are those of the aim")
-        ticket, text = lock_position(here.plant, who, token, given.heliostats)
+        ticket, text = lock_position(here.plant, who, token, order.heliostats)
         here.logbook.event("command", who.name, text)
-        return ticket
-    ticket = zero(here.plant, who, token, given.heliostats, given.values)
-    here.logbook.event("command", who.name, f"ZERO {given.heliostats[0]}")
-    return ticket
+    elif order.command == "ZERO":
+        ticket = zero(here.plant, who, token, order.heliostats, order.values)
+        here.logbook.event("command", who.name, f"ZERO {order.heliostats[0]}")
+    else:
+        ticket = here.command(who, token, order.command, order.heliostats, order.values)
+    return Later(lambda: desk.recorded(ticket))
 
 
-def _aim(desk: Desk, who: Person, given: orders.PointsOrder, blob: bytes) -> Ticket:
-    if bool(given.where) == bool(given.points):
+@_call("GET commands", "commands")
+def commands(desk: Desk) -> tuple[TicketState, ...]:
+    """Return the last commands given through the console, newest first."""
+    return desk.tickets.last()
+
+
+@_call("GET commands/{identity}", "commands")
+def one_command(desk: Desk, order: orders.OneCommand) -> TicketState:
+    """Return the progress of a command."""
+    return desk.tickets.get(order.identity)
+
+
+@_call("POST aim", "commands", OPERATOR, body=orders.AimOrder, pack=orders.pack_points)
+def aim(desk: Desk, who: Person, order: orders.PointsOrder, blob: bytes) -> Later[TicketState]:
+    """Aim heliostats at a receiver or a target by name, or at points."""
+    if bool(order.where) == bool(order.points):
         raise InputError("aim: give either where (a receiver or target) or points")
     here, token = desk.operations, desk.token_of(who)
-    if given.where:
-        return here.aim_at(who, token, given.heliostats, given.where)
-    return here.aim(who, token, orders.points_of(given, blob))
+    if order.where:
+        ticket = here.aim_at(who, token, order.heliostats, order.where)
+    else:
+        ticket = here.aim(who, token, orders.points_of(order, blob))
+    return Later(lambda: desk.recorded(ticket))
 
 
-def _standby(desk: Desk, who: Person, given: orders.PointsOrder, blob: bytes) -> Ticket:
-    points = orders.points_of(given, blob)
-    return desk.operations.standby(who, desk.token_of(who), points)
+@_call("POST standby", "commands", OPERATOR, body=orders.StandbyOrder, pack=orders.pack_points)
+def standby(desk: Desk, who: Person, order: orders.PointsOrder, blob: bytes) -> Later[TicketState]:
+    """Set standby points."""
+    points = orders.points_of(order, blob)
+    ticket = desk.operations.standby(who, desk.token_of(who), points)
+    return Later(lambda: desk.recorded(ticket))
 
 
-def _switch(desk: Desk, who: Person, given: orders.Switch, _: bytes) -> Any:
-    desk.operations.switch_calibration(who, given.on)
-    return desk.operations.calibration()
+@_call("POST automatic", "commands", OPERATOR)
+def automatic(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketState:
+    """Give heliostats to automatic control, which raises and calibrates them.
+
+    Answers with a ticket, done where a heliostat follows, and with the reason where it does not.
+    """
+    return desk.tickets.put(desk.operations.give_back(who, order.heliostats))
 
 
-def _calibrate(desk: Desk, who: Person, given: orders.OneCalibration, _: bytes) -> Any:
-    return desk.tickets.put(
-        desk.operations.calibrate(
-            who,
-            given.heliostat,
-            given.target,
-            search=given.search,
-            together=given.together,
-            receiver=given.receiver,
-        )
-    )
+@_call("POST automatic/resume", "commands", OPERATOR)
+def resume(desk: Desk, who: Person) -> None:
+    """Let automatic control go on after a loss of many heliostats."""
+    desk.operations.resume(who)
 
 
-def _learn(desk: Desk, who: Person, given: orders.OneGroup, _: bytes) -> Any:
-    desk.operations.learn(who, given.group)
-    return desk.operations.learning()
+@_call("GET holds", "calibration")
+def holds(desk: Desk) -> tuple[Lockout, ...]:
+    """Return the locks of persons on heliostats, targets, receivers and the tower.
+
+    A locked heliostat is out of service.
+    """
+    return desk.operations.automatic.service.out
 
 
-def _hold(desk: Desk, who: Person, given: orders.HoldOrder, _: bytes) -> Any:
-    order = given.model_dump(exclude_none=True)
-    return desk.tickets.put(desk.operations.hold(who, **order))
+@_call("POST holds", "commands", OPERATOR)
+def hold(desk: Desk, who: Person, order: orders.HoldOrder) -> TicketState:
+    """Put your lock on `heliostats`, `targets`, `receivers` or the `tower`.
+
+    Heliostats concerned go to stow, and nobody moves them. Answers with a ticket, done where a
+    heliostat is parked in stow. Each person has a lock of their own.
+    """
+    return desk.tickets.put(desk.operations.hold(who, **order.model_dump(exclude_none=True)))
 
 
-def _unhold(desk: Desk, who: Person, given: orders.GivenBack, _: bytes) -> Any:
-    desk.operations.unhold(who, **given.model_dump())
-    return desk.operations.holds()
+@_call("POST holds/release", "commands", OPERATOR)
+def unhold(desk: Desk, who: Person, order: orders.GivenBack) -> tuple[Lockout, ...]:
+    """Return your locks; nothing moves.
+
+    As an engineer with `owner` and `reason`: remove that person's. What is locked is in service
+    again when nobody's lock is left.
+    """
+    desk.operations.unhold(who, **order.model_dump())
+    return desk.operations.automatic.service.out
 
 
-def _timetable(desk: Desk, who: Person, given: orders.TimetableOrder, _: bytes) -> Any:
-    entries = given.model_dump()["entries"]
+# -- calibration ---------------------------------------------------------------------------------
+
+
+@_call("GET calibration", "calibration", fresh=FRESH)
+def calibration(desk: Desk) -> views.CalibrationView:
+    """Return the progress of calibration.
+
+    `outlooks`: the first and the last [prediction](../how-to/planning.md#in-the-running-plant) of
+    the field's errors for this day; `field`: what has come true; `choice`: why automatic control
+    chose the last visit, or begins none.
+    """
+    return desk.operations.automatic.view()
+
+
+@_call("PUT calibration", "calibration", OPERATOR)
+def switch_calibration(desk: Desk, who: Person, order: orders.Switch) -> views.CalibrationView:
+    """Switch automatic calibration on or off."""
+    desk.operations.switch_calibration(who, order.on)
+    return desk.operations.automatic.view()
+
+
+@_call("POST calibration/next", "calibration", OPERATOR)
+def calibrate(desk: Desk, who: Person, order: orders.OneCalibration) -> TicketState:
+    """Calibrate a heliostat as soon as a target is free, before all others.
+
+    Answers with a ticket that ends with the result. With `search` only its beam is searched;
+    `together` names others that go to the target with it, in one
+    [joint visit](../explanation/plant.md#many-mirrors-on-one-target), as soon as all are ready;
+    with `receiver` all stay in production and are
+    [measured on the receiver](../explanation/plant.md#mirrors-in-production), as soon as all track
+    it.
+    """
+    return desk.tickets.put(desk.operations.calibrate(who, **order.model_dump()))
+
+
+@_call("GET schedule", "calibration", fresh=FRESH)
+def schedule(desk: Desk, order: orders.SomeVisits) -> tuple[views.Planned, ...]:
+    """Return the planned next measurements."""
+    return desk.operations.automatic.plan(order.limit)
+
+
+@_call("GET timetable", "calibration")
+def timetable(desk: Desk) -> tuple[views.TimetableRow, ...]:
+    """Return the [timetable](../explanation/schedule.md#the-timetable) of calibrations.
+
+    Each entry comes with its next and last time, and what came of that.
+    """
+    return desk.operations.automatic.timetable.rows()
+
+
+@_call("PUT timetable", "calibration", OPERATOR)
+def put_timetable(
+    desk: Desk, who: Person, order: orders.TimetableOrder
+) -> tuple[views.TimetableRow, ...]:
+    """Put a timetable in force: all its `entries`; `null`: that of the plant file.
+
+    An entry has the keys of the [plant file](plant-format.md#timetable).
+    """
+    entries = order.model_dump()["entries"]
     made = None if entries is None else [TimetableEntry.of(entry) for entry in entries]
-    desk.operations.put_timetable(who, made)
-    return desk.operations.timetable()
+    desk.operations.automatic.timetable.put(who, made)
+    return desk.operations.automatic.timetable.rows()
 
 
-_VIEWS = {
-    "field": _see(lambda desk: desk.field()),
-    "size": _see(lambda desk: len(desk.operations.names)),
-    "summary": _see(lambda desk: desk.operations.summary()),
-    "sun": _see(lambda desk: desk.operations.sun()),
-    "clusters": _see(lambda desk: desk.operations.cluster_rows()),
-    "alarms": _see(lambda desk: desk.operations.alarms()),
-    "calibration": _see(lambda desk: desk.operations.calibration()),
-    "flights": _see(lambda desk: desk.operations.flights()),
-    "learning": _see(lambda desk: desk.operations.learning()),
-    "retries": _see(lambda desk: desk.operations.retries()),
-    "timetable": _see(lambda desk: desk.operations.timetable()),
-    "holds": _see(lambda desk: desk.operations.holds()),
-    "emergency": _see(lambda desk: desk.operations.emergency_view()),
-    "commands": _see(lambda desk: desk.tickets.last()),
-    "authority": Call(Role.VIEWER, orders.Nothing, lambda d, who, *_: d.authority_of(who)),
-    "heliostat": Call(
-        Role.VIEWER, orders.Named, lambda d, _, a, __: d.operations.heliostat(a.name)
-    ),
-    "flux": Call(Role.VIEWER, orders.Named, lambda d, _, a, __: d.operations.receiver_flux(a.name)),
-    "one_command": Call(Role.VIEWER, orders.Named, lambda d, _, a, __: d.tickets.get(a.name)),
-    "target": Call(Role.VIEWER, orders.Named, _target),
-    "photograph": Call(Role.VIEWER, orders.Picture, _photograph),
-    "parameters": Call(
-        Role.VIEWER, orders.Named, lambda _d, _who, given, _b: given.name, Desk.parameters
-    ),
-    "kept_photographs": Call(
-        Role.VIEWER, orders.KeptOf, lambda _d, _who, given, _b: given, Desk.kept
-    ),
-    "kept_photograph": Call(
-        Role.VIEWER, orders.KeptOne, lambda _d, _who, given, _b: given.identity, _kept_one
-    ),
-    "events": Call(Role.VIEWER, orders.Some, lambda d, _, a, __: d.operations.events(a.limit)),
-    "packets": Call(
-        Role.VIEWER, orders.Some, lambda d, _, a, __: d.operations.packets(a.limit, a.cluster)
-    ),
-    "schedule": Call(Role.VIEWER, orders.Some, lambda d, _, a, __: d.operations.schedule(a.limit)),
-}
-_URGENT = {
-    "order_emergency": Call(
-        Role.VIEWER,
-        orders.EmergencyCall,
-        lambda d, who, a, _: d.order_emergency(who, a),
-        urgent=True,
-    ),
-    "stow": Call(
-        Role.OPERATOR,
-        orders.SomeHeliostats,
-        lambda d, who, a, _: d.tickets.put(d.operations.stow(who, a.heliostats)),
-        urgent=True,
-    ),
-    "defocus": Call(
-        Role.OPERATOR,
-        orders.SomeHeliostats,
-        lambda d, who, a, _: d.tickets.put(d.operations.defocus(who, a.heliostats)),
-        urgent=True,
-    ),
-}
-_ORDERS = {
-    "withdraw_emergency": Call(Role.OPERATOR, orders.Withdrawal, _withdraw),
-    "acknowledge": Call(
-        Role.OPERATOR,
-        orders.Acknowledged,
-        lambda d, who, a, _: d.operations.acknowledge(who, a.condition, a.subject),
-    ),
-    "take_authority": Call(
-        Role.OPERATOR, orders.Nothing, lambda d, who, *_: d.take(who), Desk.told
-    ),
-    "seize_authority": Call(
-        Role.OPERATOR, orders.GivenReason, lambda d, who, a, _: d.seize(who, a.reason), Desk.told
-    ),
-    "keep_authority": Call(Role.OPERATOR, orders.Nothing, lambda d, who, *_: d.keep(who)),
-    "release_authority": Call(Role.OPERATOR, orders.Nothing, lambda d, who, *_: d.release(who)),
-    "command": Call(Role.OPERATOR, orders.CommandOrder, _command, Desk.recorded),
-    "aim": Call(Role.OPERATOR, orders.PointsOrder, _aim, Desk.recorded, blob=True),
-    "standby": Call(Role.OPERATOR, orders.PointsOrder, _standby, Desk.recorded, blob=True),
-    "automatic": Call(
-        Role.OPERATOR,
-        orders.SomeHeliostats,
-        lambda d, who, a, _: d.tickets.put(d.operations.give_back(who, a.heliostats)),
-    ),
-    "resume": Call(Role.OPERATOR, orders.Nothing, lambda d, who, *_: d.operations.resume(who)),
-    "switch_calibration": Call(Role.OPERATOR, orders.Switch, _switch),
-    "calibrate": Call(Role.OPERATOR, orders.OneCalibration, _calibrate),
-    "set_parameters": Call(
-        Role.ENGINEER, orders.ParameterOrder, lambda _d, _who, given, _b: given, Desk.set_parameters
-    ),
-    "take_photograph": Call(
-        Role.OPERATOR, orders.Named, lambda _d, _who, given, _b: given.name, Desk.photographed
-    ),
-    "begin_marks": Call(
-        Role.ENGINEER, orders.Named, lambda d, who, a, _: d.marking.begin(who, a.name)
-    ),
-    "picture_to_mark": Call(
-        Role.ENGINEER, orders.KeptOne, lambda _d, _who, given, _b: given.identity, _to_mark
-    ),
-    "mark_corners": Call(
-        Role.ENGINEER, orders.Marks, lambda _d, _who, given, _b: given, Desk.mark_corners
-    ),
-    "bus_frames": Call(
-        Role.ENGINEER, orders.Named, lambda _d, _who, given, _b: given.name, Desk.bus_frames
-    ),
-    "take_flight": Call(
-        Role.ENGINEER, orders.Nothing, lambda _, __, ___, blob: blob, Desk.take_flight, blob=True
-    ),
-    "learn": Call(Role.ENGINEER, orders.OneGroup, _learn),
-    "give_reading": Call(
-        Role.ENGINEER,
-        orders.NamedReading,
-        lambda d, who, a, _: d.readings.take(who, a.name, a.value, a.at),
-    ),
-    "hold": Call(Role.OPERATOR, orders.HoldOrder, _hold),
-    "put_timetable": Call(Role.OPERATOR, orders.TimetableOrder, _timetable),
-    "unhold": Call(Role.OPERATOR, orders.GivenBack, _unhold),
-}
-_CONSOLES = {
-    "live": Call(Role.VIEWER, orders.Nothing, _live, console=True),
-    "note": Call(
-        Role.VIEWER,
-        orders.Note,
-        lambda d, _, a, __: d.operations.security.note(
-            SecurityEvent[a.kind], a.who, a.address, a.detail
-        ),
-        console=True,
-    ),
-}
-#: All calls that are done in the plant's loop, by name.
-CALLS: dict[str, Call] = _VIEWS | _URGENT | _ORDERS | _CONSOLES
+@_call("GET retries", "calibration")
+def retries(desk: Desk) -> tuple[Retry, ...]:
+    """Return what automatic control tries again or has given up.
+
+    Each row gives the work, of what, failures, the last reason, seconds until the next try (null:
+    none by itself), and what follows.
+    """
+    return desk.operations.automatic.retries()
+
+
+@_call("GET heliostats/{name}/parameters", "calibration")
+async def parameters(desk: Desk, order: orders.Named) -> ParametersView:
+    """Return the error parameters of a heliostat.
+
+    It gives those of the plant file, those in use with σ, whether its local controller stores them,
+    and earlier versions.
+    """
+    return await desk.operations.parameters.view(order.name)
+
+
+@_call("POST parameters", "calibration", ENGINEER)
+async def set_parameters(desk: Desk, who: Person, order: orders.ParameterOrder) -> TicketState:
+    """Set error parameters of a heliostat at rest by `values`, or bring back an earlier `version`.
+
+    The `reason` is kept.
+    """
+    typed, token = desk.operations.parameters, desk.token_of(who)
+    if bool(order.values) == bool(order.version):
+        raise InputError("parameters: give either values or a version")
+    if order.version:
+        ticket = await typed.restore(who, token, order.heliostat, order.version, order.reason)
+    else:
+        ticket = typed.change(who, token, order.heliostat, order.values, order.reason)
+    return await desk.recorded(ticket)
+
+
+# -- photographs ---------------------------------------------------------------------------------
+
+
+@_call("GET targets/{name}", "calibration")
+def target(desk: Desk, order: orders.Named) -> CameraReading:
+    """Return the findings of the software in the last photograph of a target."""
+    return CameraReading.of(desk.operations.camera(order.name))
+
+
+@_call("GET targets/{name}/photograph", "calibration")
+def photograph(desk: Desk, order: orders.Picture) -> WithBlob:
+    """Return the last photograph of a target, annotated with the findings of the software."""
+    view = desk.operations.camera(order.name)
+    return WithBlob({"version": view.version}, b"" if view.version == order.known else view.jpeg)
+
+
+@_call("POST targets/{name}/photograph", "calibration", OPERATOR)
+async def take_photograph(desk: Desk, who: Person, order: orders.Named) -> CameraReading:
+    """Photograph a target now, with whatever beam is on it."""
+    return CameraReading.of(await desk.operations.photograph(who, order.name))
+
+
+@_call("GET photographs", "calibration")
+async def kept_photographs(desk: Desk, order: orders.KeptOf) -> tuple[views.PictureRow, ...]:
+    """Return the newest kept photographs of a heliostat (`?heliostat=`).
+
+    Each comes with the result of its visit; without a heliostat, those that persons asked for.
+    """
+    return tuple(await desk.kept(order.heliostat, order.limit))
+
+
+@_call("GET photographs/{identity}", "calibration", fresh=DAY)
+async def kept_photograph(desk: Desk, order: orders.KeptOne) -> WithBlob:
+    """Return a kept photograph, annotated with the findings of the software."""
+    return WithBlob({"identity": order.identity}, await desk.kept_picture(order.identity))
+
+
+@_call("POST targets/{name}/marks/picture", "calibration", ENGINEER)
+def begin_marks(desk: Desk, who: Person, order: orders.Named) -> PictureToMark:
+    """Hold the newest picture of a target's camera, so that its corners can be marked.
+
+    The answer gives its `number`, size, the points with the pixels where they are expected, and
+    where marks are kept.
+    """
+    return desk.marking.begin(who, order.name)
+
+
+@_call("GET pictures-to-mark/{identity}", "calibration", ENGINEER)
+async def picture_to_mark(desk: Desk, order: orders.KeptOne) -> WithBlob:
+    """Return a held picture as JPEG, as the camera took it; the last four are held."""
+    return WithBlob({"number": order.identity}, await desk.marking.picture(order.identity))
+
+
+@_call("POST targets/{name}/marks", "calibration", ENGINEER, body=orders.Clicks)
+async def mark_corners(desk: Desk, who: Person, order: orders.Marks) -> MarksView:
+    """Try points clicked in a held picture (`number`, `points` as pixels by name).
+
+    The answer gives residuals, notes and the target from the front; with `save` (needs the command
+    authority) the camera works by them from now on.
+    """
+    token = desk.token_of(who) if order.save else None
+    points = {name: (x, y) for name, (x, y) in order.points.items()}
+    return await desk.marking.mark(who, order.name, order.number, points, token)
+
+
+# -- flights and learning ------------------------------------------------------------------------
+
+
+def _flight_text(document: FlightDocument) -> tuple[dict[str, Any], bytes]:
+    return {}, document.model_dump_json().encode()
+
+
+@_call("GET flights", "calibration", fresh=FRESH)
+def flights(desk: Desk) -> tuple[views.FlightView, ...]:
+    """Return the flights of a drone that the plant has taken, the last first.
+
+    Each gives what became of its heliostats, and the errors that its rows share.
+    """
+    return desk.operations.automatic.flights.views()
+
+
+@_call("POST flights", "calibration", ENGINEER, body=FlightDocument, pack=_flight_text)
+async def take_flight(desk: Desk, who: Person, blob: bytes) -> views.FlightView:
+    """Take a flight of a drone; nothing moves, and the answer comes once all mirrors are fitted.
+
+    The body is the [`flight.json`](formats.md#flightjson) of `heliotrope drone evaluate`, at most
+    8 MiB and 20,000 rows.
+    """
+    document = await asyncio.to_thread(parse_flight, blob)
+    return await desk.operations.automatic.flights.take(who, document, blob.decode())
+
+
+@_call("GET learning", "calibration", fresh=FRESH)
+def learning(desk: Desk) -> tuple[views.LearningView, ...]:
+    """Return what was learnt of each group of mirrors, when and from what, and what is in force."""
+    return desk.operations.automatic.learning.views()
+
+
+@_call("POST learning", "calibration", ENGINEER)
+def learn(desk: Desk, who: Person, order: orders.OneGroup) -> tuple[views.LearningView, ...]:
+    """Learn drift, noise and installation of a `group` ("": all) now, as every night.
+
+    Nothing moves; it runs beside the plant, and `GET learning` says how it ended.
+    """
+    desk.operations.learn(who, order.group)
+    return desk.operations.automatic.learning.views()
+
+
+_REQUESTS = [
+    (re.compile(re.sub(r"\{(\w+)\}", r"(?P<\1>[^/]+)", call.request)), name)
+    for name, call in CALLS.items()
+    if call.request
+]
+
+
+def asked(request: str) -> tuple[str, dict[str, Any]]:
+    """Return the call of a request (method, path and query), and the arguments in it.
+
+    Raises
+    ------
+    InputError
+        If no call has this request: some are answered by the console alone.
+    """
+    place, _, query = request.partition("?")
+    for pattern, name in _REQUESTS:
+        if (found := pattern.fullmatch(place)) is not None:
+            named = {key: unquote(value) for key, value in found.groupdict().items()}
+            return name, {**named, **dict(parse_qsl(query))}
+    raise InputError(f"{place[:100]} is only known to the console; leave out --data")

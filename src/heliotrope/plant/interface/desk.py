@@ -8,22 +8,25 @@ import asyncio
 import math
 import time
 from collections.abc import Callable
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.volumes import outline
+from heliotrope.geometry import FloatArray
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.plant import refusals
 from heliotrope.plant.authority import Person
 from heliotrope.plant.interface import orders
-from heliotrope.plant.interface.tickets import Tickets, state_of
-from heliotrope.plant.operations import bus_frames
+from heliotrope.plant.interface.tickets import Tickets, TicketState
 from heliotrope.plant.operations.given_readings import GivenReadings
-from heliotrope.plant.operations.marking import Marking, MarksView
+from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.operations import Operations
-from heliotrope.plant.operations.typed_parameters import ParametersView
-from heliotrope.plant.operations.views import BusFrame, CameraView, FlightView, PictureRow
+from heliotrope.plant.operations.views import CameraView, EmergencyView, PictureRow
 from heliotrope.plant.orders import RECORDING
 from heliotrope.plant.tickets import Ticket
 
@@ -32,6 +35,79 @@ SAME, _MOST_CALLED = 30.0, 100
 #: A holder of the authority counts as present for this long after renewing it, s.
 PRESENT = 8.0
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class AuthorityState:
+    """Holder of the command authority ("": nobody), and its life without renewal, s."""
+
+    holder: str
+    role: str
+    mine: bool
+    lifetime: float
+
+
+@dataclass(frozen=True)
+class KeepOutOutline:
+    """A keep-out volume, as seen on a map: east and north of its corners, m, (K, 2)."""
+
+    name: str
+    outline: FloatArray
+
+
+@dataclass(frozen=True)
+class FieldDesign:
+    """Everything about the field that does not change, in the order of all its rows.
+
+    Attributes
+    ----------
+    plant, names
+        Name of the plant, and of its N heliostats.
+    positions
+        ENU, m, (N, 3).
+    clusters, cluster
+        Names, and the place of each heliostat's in them, (N,).
+    size
+        Larger side of a mirror, m, the median.
+    tower
+        Centre of the receivers, ENU, m, (3,).
+    receivers, targets, keep_outs
+        Names, and outlines.
+    surfaces
+        Places that `on` of a row names.
+    states, faults
+        Names of the codes of a row.
+    """
+
+    plant: str
+    names: tuple[str, ...]
+    positions: FloatArray
+    clusters: tuple[str, ...]
+    cluster: npt.NDArray[np.intp]
+    size: float
+    tower: FloatArray
+    receivers: tuple[str, ...]
+    targets: tuple[str, ...]
+    keep_outs: tuple[KeepOutOutline, ...]
+    surfaces: tuple[str, ...]
+    states: tuple[str, ...]
+    faults: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class CameraReading:
+    """Findings of the software in the last photograph of a target, as `CameraView` has them."""
+
+    target: str
+    version: int
+    at: float
+    reading: tuple[str, ...]
+    centroid: tuple[float, float] | None
+
+    @classmethod
+    def of(cls, view: CameraView) -> "CameraReading":
+        """Return the findings in a photograph, without the picture."""
+        return cls(view.target, view.version, view.at, view.reading, view.centroid)
 
 
 class Desk:
@@ -67,21 +143,17 @@ class Desk:
             if grant is None:
                 continue
             if time.monotonic() - self._present.get(grant.holder.name, -math.inf) < PRESENT:
-                self.operations.keep_authority(grant.holder, grant.token)
+                self.operations.plant.authority.keep(grant.holder, grant.token)
 
     # -- the authority ---------------------------------------------------------------------
 
-    def authority_of(self, person: Person) -> dict[str, Any]:
+    def authority_of(self, person: Person) -> AuthorityState:
         """Return the holder of the command authority."""
         authority = self.operations.plant.authority
-        grant = authority.grant
-        holder = None if grant is None else grant.holder
-        return {
-            "holder": "" if holder is None else holder.name,
-            "role": "" if holder is None else holder.role.title,
-            "mine": holder == person,
-            "lifetime": authority.lifetime,
-        }
+        if authority.grant is None:
+            return AuthorityState("", "", False, authority.lifetime)
+        holder = authority.grant.holder
+        return AuthorityState(holder.name, holder.role.title, holder == person, authority.lifetime)
 
     def token_of(self, person: Person) -> int:
         """Return a person's token of the command authority.
@@ -102,17 +174,12 @@ class Desk:
         """Take the command authority, or renew it; return whether its token is new."""
         grant = self.operations.plant.authority.grant
         if grant is not None and grant.holder == person:
-            self.operations.keep_authority(person, grant.token)
+            self.operations.plant.authority.keep(person, grant.token)
             return False
         self.operations.take_authority(person)
         return True
 
-    def seize(self, person: Person, reason: str) -> bool:
-        """Break another person's command authority and take it; return that its token is new."""
-        self.operations.seize_authority(person, reason)
-        return True
-
-    async def told(self, person: Person, new: bool) -> dict[str, Any]:
+    async def told(self, person: Person, new: bool) -> AuthorityState:
         """Return the holder once a new token is known.
 
         Clusters get it with a lease, their nodes a second later; until then the field would refuse
@@ -122,24 +189,24 @@ class Desk:
             await asyncio.sleep(1.5 * self.operations.plant.settings.period + 1.0)
         return self._is_present(person)
 
-    def keep(self, person: Person) -> dict[str, Any]:
+    def keep(self, person: Person) -> AuthorityState:
         """Renew the command authority."""
-        self.operations.keep_authority(person, self.token_of(person))
+        self.operations.plant.authority.keep(person, self.token_of(person))
         return self._is_present(person)
 
-    def release(self, person: Person) -> dict[str, Any]:
+    def release(self, person: Person) -> AuthorityState:
         """Release the command authority; automatic control goes on."""
         self._present.pop(person.name, None)
         self.operations.release_authority(person, self.token_of(person))
         return self.authority_of(person)
 
-    def _is_present(self, person: Person) -> dict[str, Any]:
+    def _is_present(self, person: Person) -> AuthorityState:
         self._present[person.name] = time.monotonic()
         return self.authority_of(person)
 
     # -- commands --------------------------------------------------------------------------
 
-    def order_emergency(self, who: Person, given: orders.EmergencyCall) -> Any:
+    def order_emergency(self, who: Person, given: orders.EmergencyCall) -> EmergencyView:
         """Order an emergency, once for each word: the page sends its order by two ways."""
         key, now = (who.name, given.call), time.monotonic()
         if not given.call or now - self._called.get(key, -math.inf) >= SAME:
@@ -148,51 +215,25 @@ class Desk:
                 while len(self._called) >= _MOST_CALLED:
                     self._called.pop(next(iter(self._called)))
                 self._called[key] = now
-        return self.operations.emergency_view()
+        return self.operations.viewer.emergency()
 
-    async def recorded(self, _: Person, ticket: Ticket) -> dict[str, Any]:
+    async def recorded(self, ticket: Ticket) -> TicketState:
         """Keep a ticket; return its progress once it is recorded, or once that has failed.
 
         The next command of the same client then finds the points that this one has assigned.
         """
         self.tickets.put(ticket)
         await ticket.written(RECORDING + 1.0)
-        return state_of(ticket)
-
-    async def parameters(self, _: Person, heliostat: str) -> ParametersView:
-        """Return the error parameters of a heliostat, with what its local controller stores."""
-        return await self.operations.parameters.view(heliostat)
-
-    async def set_parameters(self, who: Person, given: orders.ParameterOrder) -> dict[str, Any]:
-        """Set error parameters of a heliostat, or bring back an earlier version."""
-        here, token = self.operations.parameters, self.token_of(who)
-        if bool(given.values) == bool(given.version):
-            raise InputError("parameters: give either values or a version")
-        if given.version:
-            ticket = await here.restore(who, token, given.heliostat, given.version, given.reason)
-        else:
-            ticket = here.change(who, token, given.heliostat, given.values, given.reason)
-        return await self.recorded(who, ticket)
-
-    async def bus_frames(self, person: Person, cluster: str) -> tuple[BusFrame, ...]:
-        """Record the frames of a cluster's bus for five seconds."""
-        found = await bus_frames.record(self.operations.plant, cluster)
-        text = f"recorded {len(found)} frames of its bus"
-        self.operations.logbook.event("command", person.name, f"{cluster}: {text}")
-        return found
+        return TicketState.of(ticket)
 
     # -- photographs -----------------------------------------------------------------------
 
-    async def photographed(self, person: Person, target: str) -> dict[str, Any]:
-        """Photograph a target now; return what is seen."""
-        return reading_of(await self.operations.photograph(person, target))
-
-    async def kept(self, _: Person, given: orders.KeptOf) -> list[PictureRow]:
+    async def kept(self, heliostat: str, limit: int) -> list[PictureRow]:
         """Return the newest kept photographs of a heliostat."""
         pictures = self.operations.pictures
         if pictures is None:
             return []
-        return await _answer(lambda then: pictures.find(given.heliostat, given.limit, then))
+        return await _answer(lambda then: pictures.find(heliostat, limit, then))
 
     async def kept_picture(self, identity: int) -> bytes:
         """Return a kept photograph as JPEG.
@@ -222,59 +263,30 @@ class Desk:
             raise InputError("mark corners: this plant has no camera of its targets")
         return self.operations.marking
 
-    async def mark_corners(self, who: Person, given: orders.Marks) -> MarksView:
-        """Try the points that an engineer clicked, or take their view."""
-        token = self.token_of(who) if given.save else None
-        points = {name: (x, y) for name, (x, y) in given.points.items()}
-        return await self.marking.mark(who, given.name, given.number, points, token)
-
-    # -- flights --------------------------------------------------------------------------
-
-    async def take_flight(self, person: Person, text: bytes) -> FlightView:
-        """Take a flight of a drone, the text of its file."""
-        return await self.operations.take_flight(person, text)
-
     # -- views -----------------------------------------------------------------------------
 
-    def field(self) -> dict[str, Any]:
+    def field(self) -> FieldDesign:
         """Return everything about the field that does not change."""
         here = self.operations
-        design, plant = here.design, here.plant.field
-        middle = [0.0, 0.0, 0.0]
-        if design.receivers:
-            middle = [
-                float(sum(r.center[k] for r in design.receivers) / len(design.receivers))
-                for k in range(3)
-            ]
-        sizes = sorted(here.sizes.max(axis=1).tolist())
+        design, plant = here.plant.design, here.plant.field
+        centers = [receiver.center for receiver in design.receivers]
+        sizes = np.sort(here.viewer.sizes.max(axis=1))
         volumes = here.plant.beams.volumes
-        keep_outs = [{"name": v.name, "outline": outline(v).round(2).tolist()} for v in volumes]
-        return {
-            "plant": design.name,
-            "names": here.names,
-            "positions": here.positions.round(3),
-            "clusters": here.clusters,
-            "cluster": plant.cluster,
-            "size": sizes[len(sizes) // 2],
-            "tower": middle,
-            "receivers": here.receivers,
-            "targets": here.targets,
-            "keep_outs": keep_outs,
-            "surfaces": here.aim_names,
-            "states": states.STATES,
-            "faults": meanings.FAULTS,
-        }
-
-
-def reading_of(view: CameraView) -> dict[str, Any]:
-    """Return the findings in a photograph, without the picture."""
-    return {
-        "target": view.target,
-        "version": view.version,
-        "at": view.at,
-        "reading": view.reading,
-        "centroid": view.centroid,
-    }
+        return FieldDesign(
+            design.name,
+            here.names,
+            here.viewer.positions.round(3),
+            plant.clusters,
+            plant.cluster,
+            float(sizes[len(sizes) // 2]),
+            np.mean(centers, axis=0) if centers else np.zeros(3),
+            here.receivers,
+            here.targets,
+            tuple(KeepOutOutline(each.name, outline(each).round(2)) for each in volumes),
+            here.viewer.aim_names,
+            states.STATES,
+            meanings.FAULTS,
+        )
 
 
 async def _answer(ask: Callable[[Callable[[T | Exception], None]], None]) -> T:

@@ -73,11 +73,31 @@ class Named(Strict):
     name: Name
 
 
-class Some(Strict):
-    """The last ones, at most this many; of one cluster if it is named."""
+class OneCommand(Strict):
+    """The identity of a command."""
 
-    limit: Annotated[int, Field(ge=1, le=2000)] = 200
+    identity: Name
+
+
+Limit = Annotated[int, Field(ge=1, le=2000)]
+
+
+class Some(Strict):
+    """The last ones, at most this many."""
+
+    limit: Limit = 200
+
+
+class SomePackets(Some):
+    """The last messages; of one cluster if it is named."""
+
     cluster: Annotated[str, Field(max_length=64)] = ""
+
+
+class SomeVisits(Strict):
+    """The next visits, at most this many."""
+
+    limit: Limit = 20
 
 
 class Picture(Strict):
@@ -170,7 +190,7 @@ class KeptOf(Strict):
     """The newest kept photographs of a heliostat ("": those that persons asked for)."""
 
     heliostat: Annotated[str, Field(max_length=64)] = ""
-    limit: Annotated[int, Field(ge=1, le=2000)] = 50
+    limit: Limit = 50
 
 
 class KeptOne(Strict):
@@ -289,6 +309,13 @@ class Switch(Strict):
     """On or off."""
 
     on: bool
+
+
+def pack_points(order: AimOrder | StandbyOrder) -> tuple[dict[str, Any], bytes]:
+    """Return the arguments and the blob of a `PointsOrder`."""
+    given = order.model_dump(exclude={"points"})
+    blob = np.array(list(order.points.values()), "<f8").tobytes()
+    return given | {"points": list(order.points)}, blob
 
 
 def points_of(order: PointsOrder, blob: bytes) -> dict[str, FloatArray]:

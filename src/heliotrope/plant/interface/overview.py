@@ -14,7 +14,7 @@ WELL, TROUBLED, SILENT = 0, 1, 2
 def overview(operations: Operations) -> dict[str, Any]:
     """Return the overview: views and numbers, not yet made plain."""
     summary, light = operations.summary(), operations.sun()
-    calibration = operations.calibration()
+    calibration = operations.automatic.view()
     cameras = {}
     for target in operations.targets:
         try:
@@ -25,8 +25,8 @@ def overview(operations: Operations) -> dict[str, Any]:
     return found | {
         "utc": summary.at.timestamp(),
         "sun": {"azimuth": light.azimuth, "elevation": light.elevation},
-        "surfaces": operations.aim_names,
-        "clusters": [_health(row) for row in operations.cluster_rows()],
+        "surfaces": operations.viewer.aim_names,
+        "clusters": [_health(row) for row in operations.logbook.cluster_rows(operations.plant)],
         "measuring": calibration.running,
         "calibration": {
             "on": calibration.on,
@@ -37,14 +37,14 @@ def overview(operations: Operations) -> dict[str, Any]:
             "quality": calibration.quality[-1] if calibration.quality else None,
         },
         "cameras": cameras,
-        "order": operations.emergency_view(),
+        "order": operations.viewer.emergency(),
         "events": _newest(operations),
     }
 
 
 def _newest(operations: Operations) -> float:
     """Return the time of the last event, POSIX s; 0 before the first."""
-    events = operations.events(1)
+    events = operations.logbook.events(1)
     return events[0].at if events else 0.0
 
 

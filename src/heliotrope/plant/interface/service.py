@@ -30,7 +30,7 @@ from heliotrope.local.sockets import make_folder
 from heliotrope.plant import refusals
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.interface.admission import Admission
-from heliotrope.plant.interface.calls import CALLS, Call, WithBlob
+from heliotrope.plant.interface.calls import CALLS, Call, Later, WithBlob, asked
 from heliotrope.plant.interface.desk import Desk
 from heliotrope.plant.interface.encoding import plain
 from heliotrope.plant.interface.errors import kind_of
@@ -212,9 +212,11 @@ class PlantInterface:
             return await self._answer(calls, turns, caller, frame)
 
         def blob(caller: LocalCaller, head: dict[str, Any]) -> bool:
-            call = calls.get(str(head.get("call")))
-            person = caller.person
-            return call is not None and call.blob and (person is None or person.role >= call.role)
+            with contextlib.suppress(InputError):
+                call, person = calls.get(_called(head)[0]), caller.person
+                if call is not None and call.pack is not None:
+                    return person is None or person.role >= call.role
+            return False
 
         return LocalServer(
             self.folder / name,
@@ -229,9 +231,7 @@ class PlantInterface:
         self, calls: dict[str, Call], turns: "_Turns", caller: LocalCaller, frame: Frame
     ) -> tuple[Any, bytes]:
         """Return value and blob of the answer to a request."""
-        name, given = frame.head.get("call"), frame.head.get("arguments")
-        if not isinstance(name, str) or not isinstance(given, dict):
-            raise InputError("local interface: a request needs a call and its arguments")
+        name, given = _called(frame.head)
         if caller.person is None and name == "heartbeat":
             beat = _checked(Beat, given)
             self.heard[beat.part], self.addresses[beat.part] = time.monotonic(), beat.address
@@ -252,10 +252,11 @@ class PlantInterface:
             raise refusals.ROLE_TOO_LOW.error(
                 what=name, person=person.name, role=person.role.title, needed=call.role.title
             )
-        self.admission.admit(name, person)
+        if call.counted:
+            self.admission.admit(name, person)
         value = await turns.do(call, self._desk, person, arguments, frame.blob)
-        if call.then is not None:
-            value = await self._wait_in_plant(call.then(self._desk, person, value))
+        if isinstance(value, Later):
+            value = await self._wait_in_plant(value.wait())
         if isinstance(value, WithBlob):
             return plain(value.value), value.blob
         return plain(value), b""
@@ -337,6 +338,23 @@ class _LoopThread:
             group.create_task(self._server.run())
             for work in self._beside:
                 group.create_task(work())
+
+
+def _called(head: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Return name and arguments of a call, which may be given as a request of the API.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    name, given = head.get("call"), head.get("arguments")
+    if not isinstance(name, str) or not isinstance(given, dict):
+        raise InputError("local interface: a request needs a call and its arguments")
+    if " " not in name:
+        return name, given
+    name, named = asked(name)
+    return name, {**given, **named}
 
 
 def _people_calls(people: People, factors: Factors) -> dict[str, Callable[..., Any]]:

@@ -1,7 +1,8 @@
 """The last commands given through the interface."""
 
 from collections import OrderedDict
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 from heliotrope.errors import UnknownNameError
 from heliotrope.plant.tickets import Ticket
@@ -10,20 +11,70 @@ from heliotrope.plant.tickets import Ticket
 KEPT = 200
 
 
+@dataclass(frozen=True)
+class TicketState:
+    """Progress of an accepted command.
+
+    Attributes
+    ----------
+    identity, command
+        Identity of its record in the audit, and its name.
+    heliostats
+        Number of its heliostats.
+    counted
+        Number of heliostats at each stage.
+    finished
+        Whether it has ended for every heliostat.
+    good
+        Whether every heliostat is done.
+    text
+        The same for people.
+    refusals
+        Reasons of the first hundred.
+    steps
+        What the first hundred of an operation do or wait for now, or their results.
+    """
+
+    identity: str
+    command: str
+    heliostats: int
+    counted: Mapping[str, int]
+    finished: bool
+    good: bool
+    text: str
+    refusals: Mapping[str, str]
+    steps: Mapping[str, str]
+
+    @classmethod
+    def of(cls, ticket: Ticket) -> "TicketState":
+        """Return the progress of a command."""
+        return cls(
+            ticket.identity,
+            ticket.name,
+            len(ticket.heliostats),
+            ticket.counted(),
+            ticket.finished,
+            ticket.good,
+            ticket.text,
+            dict(list(ticket.refusals.items())[:100]),
+            dict(list(ticket.steps.items())[:100]),
+        )
+
+
 class Tickets:
     """The last tickets, by their identity in the audit."""
 
     def __init__(self) -> None:
         self._kept: OrderedDict[str, Ticket] = OrderedDict()
 
-    def put(self, ticket: Ticket) -> dict[str, Any]:
+    def put(self, ticket: Ticket) -> TicketState:
         """Keep a ticket; return its progress."""
         self._kept[ticket.identity] = ticket
         while len(self._kept) > KEPT:
             self._kept.popitem(last=False)
-        return state_of(ticket)
+        return TicketState.of(ticket)
 
-    def get(self, identity: str) -> dict[str, Any]:
+    def get(self, identity: str) -> TicketState:
         """Return the progress of a command.
 
         Raises
@@ -34,23 +85,8 @@ class Tickets:
         ticket = self._kept.get(identity)
         if ticket is None:
             raise UnknownNameError("command", identity, list(self._kept)[-5:])
-        return state_of(ticket)
+        return TicketState.of(ticket)
 
-    def last(self, limit: int = 50) -> list[dict[str, Any]]:
+    def last(self, limit: int = 50) -> tuple[TicketState, ...]:
         """Return the last tickets, newest first."""
-        return [state_of(ticket) for ticket in list(self._kept.values())[: -limit - 1 : -1]]
-
-
-def state_of(ticket: Ticket) -> dict[str, Any]:
-    """Return the progress of a command."""
-    return {
-        "identity": ticket.identity,
-        "command": ticket.name,
-        "heliostats": len(ticket.heliostats),
-        "counted": ticket.counted(),
-        "finished": ticket.finished,
-        "good": ticket.good,
-        "text": ticket.text,
-        "refusals": dict(list(ticket.refusals.items())[:100]),
-        "steps": dict(list(ticket.steps.items())[:100]),
-    }
+        return tuple(TicketState.of(each) for each in list(self._kept.values())[: -limit - 1 : -1])

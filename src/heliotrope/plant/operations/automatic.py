@@ -25,7 +25,6 @@ from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.lockouts import Kind
 from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, TrueErrors
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.coded_visits import JointVisits, ReceiverVisits
@@ -47,7 +46,7 @@ from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.safety import alarms
-from heliotrope.store.records import Records
+from heliotrope.store.records import Kind, Records
 
 #: The person under whose name it commands.
 AUTOMATIC = Person("automatic control", Role.ENGINEER)
@@ -551,7 +550,7 @@ class AutomaticControl:
 
     def _why_idle(self) -> str:
         """Return why nothing is moved now, "" if heliostats may be moved."""
-        if self._plant.emergency_on:
+        if self._plant.sentinel.on:
             return "an emergency is active"
         if self.waits:
             return "automatic control waits for Resume"
@@ -567,7 +566,7 @@ class AutomaticControl:
     async def _govern(self) -> None:
         """Hold the authority while nobody else wants it; give up in an emergency and at night."""
         plant, wanted = self._plant, self._raising.wanted
-        if plant.emergency_on:
+        if plant.sentinel.on:
             self._raising.give_up()
         grant, since = plant.authority.grant, plant.now() - self._gave_way_at
         if self._has_authority():
@@ -609,7 +608,7 @@ class AutomaticControl:
 
     async def _raise(self) -> None:
         self.service.park()
-        if self._plant.emergency_on:
+        if self._plant.sentinel.on:
             self._raising.give_up()
         self._raising.lose(self._losses.look(self._raising.wanted, self._checks.moved))
         if not self._why_idle():

@@ -12,13 +12,13 @@ from heliotrope.calibration.record import HeliostatCalibration, Identities
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.flights import TakenFlight
-from heliotrope.plant.lockouts import Kind, Lockout
 from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.store.records import (
     FlightEntry,
-    Hold,
     KeptSightings,
+    Kind,
     LearningEntry,
+    Lockout,
     OutlookEntry,
     Records,
     StoreError,
@@ -218,27 +218,20 @@ class Keeping:
         if self._records is None:
             return ()
         return tuple(
-            Lockout(
-                Kind(hold.kind),
-                hold.name,
-                hold.person,
-                hold.reason,
-                hold.since,
-                np.nan if hold.until is None else hold.until,
-            )
-            for hold in self._records.holds()
-            if hold.kind != Kind.HELIOSTAT or hold.name in self._names
+            lock
+            for lock in self._records.holds()
+            if lock.kind is not Kind.HELIOSTAT or lock.name in self._names
         )
 
     def lock_out(self, lockouts: Sequence[Lockout]) -> None:
         """Keep locks."""
         if self._records is not None:
-            self._records.hold([_hold(each) for each in lockouts])
+            self._records.hold(lockouts)
 
     def put_back(self, lockouts: Sequence[Lockout], who: str, at: float) -> None:
         """Keep that locks have been removed."""
         if self._records is not None:
-            self._records.unhold([_hold(each) for each in lockouts], who, at)
+            self._records.unhold(lockouts, who, at)
 
     def forget(self, now: float, days: float) -> None:
         """Remove events older than some days, once a day; ``now`` in POSIX s."""
@@ -250,9 +243,3 @@ class Keeping:
             kept.forget_events(now - days * _DAY)
         except StoreError as error:
             self.lost = str(error)
-
-
-def _hold(lockout: Lockout) -> Hold:
-    until = lockout.until if np.isfinite(lockout.until) else None
-    kind, name = lockout.kind.value, lockout.name
-    return Hold(kind, name, lockout.reason, lockout.who, lockout.since, until)

@@ -195,7 +195,7 @@ class Logbook:
         rows = sorted(self._alarms.values(), key=lambda row: (not _open(row), -row.at))
         return tuple(rows[:500])
 
-    def events(self, limit: int) -> tuple[EventRow, ...]:
+    def events(self, limit: int = 200) -> tuple[EventRow, ...]:
         """Return the last events, newest first."""
         return tuple(list(self._events)[: -limit - 1 : -1])
 

@@ -1,9 +1,10 @@
 """The plant at work: the one object that a console, an API and the command line talk to.
 
-It turns the plant (`PlantController`) into plain values, made at most once a second and shared by
-all clients; passes on people's commands; and runs automatic control, which raises the field and
-calibrates it with every target's camera. A failure of one part of automatic control becomes an
-event or an alarm, and the rest goes on.
+It gives people's commands, and runs automatic control, which raises the field and calibrates it
+with every target's camera. A failure of one part of automatic control becomes an event or an alarm,
+and the rest goes on. Its parts are asked by their names: `viewer` for the field and a heliostat as
+plain values, `logbook` for alarms, events and packets, `automatic` for calibration, plan and
+timetable.
 
 People's commands go through here so that automatic control knows what they want: a heliostat that a
 person has stowed, defocused or locked stays so until a person gives it back, and one that a person
@@ -20,21 +21,17 @@ from typing import Any, Protocol
 import numpy.typing as npt
 
 from heliotrope import sun
-from heliotrope.calibration.flights import parse_flight
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
-from heliotrope.field.timetable import TimetableEntry
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages
 from heliotrope.links.clock import sleep_until
 from heliotrope.optics import FluxView, predict_flux
 from heliotrope.plant import refusals
-from heliotrope.plant.attempts import Retry
 from heliotrope.plant.authority import Grant, Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
-from heliotrope.plant.lockouts import TOWER, Kind, Lockout
+from heliotrope.plant.lockouts import TOWER
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.errands import Errands
@@ -46,21 +43,9 @@ from heliotrope.plant.operations.security import SecurityLog
 from heliotrope.plant.operations.typed_parameters import TypedParameters
 from heliotrope.plant.operations.viewing import Viewer
 from heliotrope.plant.operations.views import (
-    AlarmRow,
-    CalibrationView,
     CameraView,
-    ClusterRow,
-    EmergencyView,
-    EventRow,
-    FieldFrame,
-    FlightView,
-    HeliostatView,
-    LearningView,
-    PacketRow,
-    Planned,
     Summary,
     SunView,
-    TimetableRow,
 )
 from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
@@ -68,7 +53,7 @@ from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import Act
-from heliotrope.store.records import Records
+from heliotrope.store.records import Kind, Records
 
 #: Time between predictions of the flux, s.
 _FLUX_EVERY = 5.0
@@ -137,8 +122,8 @@ class Operations:
 
     Attributes
     ----------
-    plant, logbook, automatic, security, pictures, parameters, marking
-        See their classes.
+    plant, logbook, automatic, viewer, security, pictures, parameters, marking
+        See their classes: whoever reads the plant asks them.
     """
 
     def __init__(
@@ -176,7 +161,7 @@ class Operations:
         )
         self.errands = Errands(plant.clock)
         self.security = SecurityLog(logbook, plant.clock)
-        self._viewer = Viewer(plant, self.automatic)
+        self.viewer = Viewer(plant, self.automatic)
         self.parameters = TypedParameters(plant, logbook, records)
         self._flux: dict[str, _Cached] = {}
         self._closing = asyncio.Event()
@@ -185,7 +170,7 @@ class Operations:
 
     async def run(self) -> None:
         """Work until closed; the plant itself is run by the owner."""
-        self.logbook.event("plant", "", f"{self.design.name}: operations begin")
+        self.logbook.event("plant", "", f"{self.plant.design.name}: operations begin")
         async with asyncio.TaskGroup() as group:
             work = group.create_task(self.automatic.run())
             beside = [group.create_task(self._look()), group.create_task(self._follow())]
@@ -195,7 +180,7 @@ class Operations:
             for task in beside:
                 task.cancel()
         self.errands.end("the plant's program has ended")
-        self.logbook.event("plant", "", f"{self.design.name}: operations end")
+        self.logbook.event("plant", "", f"{self.plant.design.name}: operations end")
 
     async def _look(self) -> None:
         """Look after the security events."""
@@ -214,12 +199,7 @@ class Operations:
         """End automatic control; beams stay where they are, so stow the field first."""
         self._closing.set()
 
-    # -- the design ------------------------------------------------------------------------
-
-    @property
-    def design(self) -> Plant:
-        """Site, heliostats, receivers, targets."""
-        return self.plant.design
+    # -- the field -------------------------------------------------------------------------
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -227,40 +207,14 @@ class Operations:
         return self.plant.field.names
 
     @property
-    def clusters(self) -> tuple[str, ...]:
-        """Names of the clusters."""
-        return self.plant.field.clusters
-
-    @property
-    def positions(self) -> FloatArray:
-        """Positions of the heliostats, ENU, m, (N, 3)."""
-        return self._viewer.positions
-
-    @property
-    def sizes(self) -> FloatArray:
-        """Width and height of the mirrors, m, (N, 2)."""
-        return self._viewer.sizes
-
-    @property
     def targets(self) -> tuple[str, ...]:
         """Names of the calibration targets."""
-        return tuple(target.name for target in self.design.targets)
+        return tuple(target.name for target in self.plant.design.targets)
 
     @property
     def receivers(self) -> tuple[str, ...]:
         """Names of the receivers."""
-        return tuple(receiver.name for receiver in self.design.receivers)
-
-    @property
-    def aim_names(self) -> tuple[str, ...]:
-        """The places that `FieldFrame.on` counts: "", the receivers, the targets, "elsewhere"."""
-        return self._viewer.aim_names
-
-    # -- the field -------------------------------------------------------------------------
-
-    def frame(self) -> FieldFrame:
-        """Return the whole field; the frame is made at most once a second."""
-        return self._viewer.frame()
+        return tuple(receiver.name for receiver in self.plant.design.receivers)
 
     def summary(self) -> Summary:
         """Return the state of the whole plant."""
@@ -269,7 +223,7 @@ class Operations:
         alive = sum(now - at <= field.limit for at in field.status_at.values())
         extra = dict(self._extra()) if self._extra is not None else {}
         return Summary(
-            self.design.name,
+            self.plant.design.name,
             self.plant.clock.utc(),
             len(field),
             len(field.clusters),
@@ -279,32 +233,18 @@ class Operations:
             grant.holder.role.name.lower() if grant else "",
             self.plant.waiting,
             self.logbook.open_alarms,
-            self.plant.emergency_on,
+            self.plant.sentinel.on,
             self.automatic.waits,
             float(extra.pop("lag", 0.0)),
             extra,
         )
-
-    def heliostat(self, name: str) -> HeliostatView:
-        """Return one heliostat in detail.
-
-        Raises
-        ------
-        UnknownNameError
-            If there is no such heliostat.
-        """
-        return self._viewer.heliostat(name)
-
-    def cluster_rows(self) -> tuple[ClusterRow, ...]:
-        """Return the health of each cluster."""
-        return self.logbook.cluster_rows(self.plant)
 
     # -- light -----------------------------------------------------------------------------
 
     def sun(self) -> SunView:
         """Return the position of the sun."""
         at = self.plant.clock.utc()
-        found = sun.position(at, self.design.site)
+        found = sun.position(at, self.plant.design.site)
         return SunView(at, self.plant.sun_vector(), float(found.azimuth), float(found.elevation))
 
     def receiver_flux(self, name: str = "") -> FluxView:
@@ -317,37 +257,16 @@ class Operations:
         """
         if not name and not self.receivers:
             raise UnknownNameError("receiver", name, self.receivers)
-        receiver = self.design.receiver(name or self.receivers[0])
+        receiver = self.plant.design.receiver(name or self.receivers[0])
         now, known = self.plant.now(), self._flux.get(receiver.name)
         if known is None or now - known.at >= _FLUX_EVERY:
             view = predict_flux(
-                receiver, *self._viewer.beams(receiver.name), sun=self.plant.sun_vector()
+                receiver, *self.viewer.beams(receiver.name), sun=self.plant.sun_vector()
             )
             known = self._flux[receiver.name] = _Cached(now, view)
         return known.value
 
-    # -- alarms, events, packets -----------------------------------------------------------
-
-    def alarms(self) -> tuple[AlarmRow, ...]:
-        """Return the alarms: active or unacknowledged ones first, then the newest."""
-        return self.logbook.alarms()
-
-    def events(self, limit: int = 200) -> tuple[EventRow, ...]:
-        """Return the last events, newest first."""
-        return self.logbook.events(limit)
-
-    def packets(self, limit: int = 200, cluster: str = "") -> tuple[PacketRow, ...]:
-        """Return the last messages on the links, newest first; of one cluster if it is named.
-
-        Leases and statuses come each second; only the last of each cluster is kept.
-        """
-        return self.logbook.packets(limit, cluster)
-
     # -- calibration -----------------------------------------------------------------------
-
-    def calibration(self) -> CalibrationView:
-        """Return the progress of calibration."""
-        return self.automatic.view()
 
     def switch_calibration(self, person: Person, on: bool) -> None:
         """Switch automatic calibration on or off.
@@ -416,25 +335,12 @@ class Operations:
         """
         _operator(person, "photograph")
         before = self.camera(target).version
-        shot = await self._cameras[target].photograph(self.design.target(target), "")
+        shot = await self._cameras[target].photograph(self.plant.design.target(target), "")
         view = self.camera(target)
         if self.pictures is not None and view.version != before:
             self.pictures.keep(view, shot, person.name)
         self._tell(person, f"photographed {target}")
         return view
-
-    def flights(self) -> tuple[FlightView, ...]:
-        """Return the flights of a drone that the plant has taken, the last first."""
-        return self.automatic.flights.views()
-
-    async def take_flight(self, person: Person, text: bytes) -> FlightView:
-        """Take a flight of a drone, the text of its file; see `FlightIntake.take`."""
-        document = await asyncio.to_thread(parse_flight, text)
-        return await self.automatic.flights.take(person, document, text.decode())
-
-    def learning(self) -> tuple[LearningView, ...]:
-        """Return what was learnt of each group of mirrors, and is in force."""
-        return self.automatic.learning.views()
 
     def learn(self, person: Person, group: str = "") -> None:
         """Learn a group of mirrors ("": all) now; see `Learning.order`."""
@@ -452,22 +358,6 @@ class Operations:
         if target not in self._cameras:
             raise UnknownNameError("target with a camera", target, self._cameras)
         return self._cameras[target].view(target)
-
-    def schedule(self, limit: int = 20) -> tuple[Planned, ...]:
-        """Return the plan of the next visits."""
-        return self.automatic.plan(limit)
-
-    def timetable(self) -> tuple[TimetableRow, ...]:
-        """Return the calibrations at times of day and at intervals that people want."""
-        return self.automatic.timetable.rows()
-
-    def put_timetable(self, person: Person, entries: Sequence[TimetableEntry] | None) -> None:
-        """Put a timetable in force, or with None that of the plant file; see `Timetable.put`."""
-        self.automatic.timetable.put(person, entries)
-
-    def holds(self) -> tuple[Lockout, ...]:
-        """Return the locks of persons on heliostats, targets, receivers and the tower."""
-        return self.automatic.service.out
 
     def hold(
         self,
@@ -567,9 +457,9 @@ class Operations:
         for name in heliostats:
             self.plant.field.place(name)
         for name in targets:
-            self.design.target(name)
+            self.plant.design.target(name)
         for name in receivers:
-            self.design.receiver(name)
+            self.plant.design.receiver(name)
         places = [(Kind.HELIOSTAT, name) for name in dict.fromkeys(heliostats)]
         places += [(Kind.TARGET, name) for name in dict.fromkeys(targets)]
         places += [(Kind.RECEIVER, name) for name in dict.fromkeys(receivers)]
@@ -607,16 +497,6 @@ class Operations:
         grant = self.plant.seize_authority(person, reason)
         self._tell(person, f"has seized the command authority: {reason}", "authority")
         return grant
-
-    def keep_authority(self, person: Person, token: int) -> Grant:
-        """Renew the command authority; to be called every few seconds.
-
-        Raises
-        ------
-        RefusedError
-            If the person no longer has it.
-        """
-        return self.plant.authority.keep(person, token)
 
     def release_authority(self, person: Person, token: int) -> None:
         """Give the command authority back; automatic control goes on.
@@ -663,7 +543,7 @@ class Operations:
         if where in self.receivers:
             points = self.plant.default_aims(names)
         elif where in self.targets:
-            center = self.design.target(where).center
+            center = self.plant.design.target(where).center
             points = dict.fromkeys(names, center)
         else:
             raise UnknownNameError("receiver or target", where, self.receivers + self.targets)
@@ -702,10 +582,6 @@ class Operations:
         self.logbook.event("command", person.name, f"EMERGENCY {act}: {reason or 'no reason'}")
         return order
 
-    def emergency_view(self) -> EmergencyView:
-        """Return the last emergency order with its proof."""
-        return self._viewer.emergency()
-
     def withdraw(self, person: Person, owner: str = "") -> None:
         """Withdraw a person's own emergency order, or an ``owner``'s as an engineer.
 
@@ -715,7 +591,7 @@ class Operations:
             See `PlantController.withdraw_emergency`.
         """
         self.plant.withdraw_emergency(person, owner)
-        left = "; ".join(call.text for call in self.plant.calls)
+        left = "; ".join(call.text for call in self.plant.sentinel.calls)
         whose = f"{owner}'s emergency" if owner not in ("", person.name) else "emergency"
         still = f"; still ordered by {left}" if left else ""
         self._tell(person, f"{whose} withdrawn{still}", "command")
@@ -750,10 +626,6 @@ class Operations:
         self._tell(person, f"{len(names)} heliostats given to automatic control", "command")
         progress = partial(self.automatic.following, self.plant.now())
         return self.errands.begin("AUTOMATIC", names, progress, self.automatic.follows_within)
-
-    def retries(self) -> tuple[Retry, ...]:
-        """Return what automatic control tries again or has given up, and why."""
-        return self.automatic.retries()
 
     def resume(self, person: Person) -> None:
         """Let automatic control go on after a loss of many heliostats.

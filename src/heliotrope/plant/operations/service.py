@@ -13,10 +13,11 @@ from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, RetryLaw
 from heliotrope.plant.authority import Person
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.lockouts import TOWER, Kind, Lockout, Lockouts
+from heliotrope.plant.lockouts import TOWER, Lockouts
 from heliotrope.plant.operations.errands import Step
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.safety import Alarm, alarms
+from heliotrope.store.records import Kind, Lockout
 
 #: Orders to stow, until a heliostat out of service is seen there.
 PARKING = RetryLaw(

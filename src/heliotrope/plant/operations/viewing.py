@@ -10,7 +10,6 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.lockouts import Kind
 from heliotrope.plant.operations.automatic import AutomaticControl
 from heliotrope.plant.operations.views import (
     STALE_STATE,
@@ -21,6 +20,7 @@ from heliotrope.plant.operations.views import (
     ParameterView,
 )
 from heliotrope.safety import FluxProof
+from heliotrope.store.records import Kind
 
 #: Life of a frame, s of the plant's clock.
 _EVERY = 1.0
@@ -192,10 +192,10 @@ class Viewer:
 
     def emergency(self) -> EmergencyView:
         """Return the last emergency order with its proof."""
-        plant, order = self._plant, self._plant.emergency
+        plant, order = self._plant, self._plant.sentinel.order
         if order is None:
             return EmergencyView(False, "", "", "", 0.0, 0, 0, 0, (), "no emergency so far")
-        if not plant.emergency_on:
+        if not plant.sentinel.on:
             over = f"over: {order.act.name} of the field, ordered by {order.who}"
             ago = plant.now() - order.at
             return EmergencyView(
@@ -214,7 +214,7 @@ class Viewer:
             count - len(report.not_done),
             report.not_done[:_SOME],
             report.text,
-            plant.calls,
+            plant.sentinel.calls,
             report.flux is FluxProof.BELOW,
             report.followed,
             report.believed[:_SOME],

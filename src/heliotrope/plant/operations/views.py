@@ -46,9 +46,9 @@ class FieldFrame:
     sightings
         Number of known sightings, int32, (N,).
     cluster
-        Place in `Operations.clusters`, int16, (N,).
+        Place in `FieldState.clusters`, int16, (N,).
     on
-        Place in `Operations.aim_names` of the aim of each, uint8, (N,); 0: none.
+        Place in `Viewer.aim_names` of the aim of each, uint8, (N,); 0: none.
     held
         Whether it is out of service, bool, (N,).
     truth_error

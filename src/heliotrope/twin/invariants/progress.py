@@ -130,7 +130,7 @@ class ProgressObserver:
 
     def took(self, operations: Operations, now: float) -> None:
         """Note that a person has taken the command authority."""
-        running = operations.calibration().running
+        running = operations.automatic.view().running
         self._took_at = now
         self._begun = {run.target: run.heliostats for run in running if run.target in self._targets}
 
@@ -186,24 +186,24 @@ class ProgressObserver:
         if operations is None:
             self._since.clear()
             return
-        rows = operations.alarms()
+        rows = operations.logbook.alarms()
         self._recalled(operations, now)
         failures = [row.text for row in rows if row.condition == FAILED]
         self._check(not failures, now, "automatic control", failures[0] if failures else "")
-        if operations.plant.emergency is not None:
+        if operations.plant.sentinel.order is not None:
             self._given.clear()
-        running = operations.calibration().running
+        running = operations.automatic.view().running
         visited = {name for run in running for name in run.heliostats}
         self._visits(running, now)
         lost = any(row.condition == NOBODY and row.active for row in rows)
-        well = not (operations.plant.emergency_on or operations.automatic.waits or lost)
+        well = not (operations.plant.sentinel.on or operations.automatic.waits or lost)
         self._go_on(operations, self._given & quiet if well else set(), now)
         self._step_finely(running, quiet, sun, now)
         stowed = {n for n, board in self._boards.items() if board.state == states.STOWED}
         blocked = {row.subject for row in rows if row.condition == BLOCKED and row.active}
         stowed -= blocked if self._across else set()
         may = governs and not operations.automatic.waits and self._high(sun)
-        may &= not operations.plant.emergency_on
+        may &= not operations.plant.sentinel.on
         self._owned(visited, quiet, now)
         working = [name for name in self._given & quiet if may and name not in self._out]
         for name, board in self._boards.items():
@@ -228,7 +228,7 @@ class ProgressObserver:
                 key = ("left", name, target.name)
                 self._within(key, lights, now, LEFT_WITHIN, name, saw)
         busy = {run.target for run in running}
-        results = operations.calibration().results
+        results = operations.automatic.view().results
         # After a failure it rests for longer than a day of "days"; one taken out has not failed.
         whole = (e for e in results if e.outcome is not CalibrationOutcome.TAKEN_OUT)
         failed = {entry.heliostat for entry in whole if not entry.good}
@@ -262,13 +262,13 @@ class ProgressObserver:
 
     def _recalled(self, operations: Operations, now: float) -> None:
         """Check that a new program goes on with what held when the last one ended."""
-        on = operations.plant.emergency_on
+        on = operations.plant.sentinel.on
         if self._ended:
             self._ended = False
             saw = "a person's emergency held when the last program ended, and the new one goes on"
             good = on or bool(operations.automatic.waits) or not self._called
             self._check(good, now, "plant", saw, L4)
-            out = {lockout.name for lockout in operations.holds()}
+            out = {lockout.name for lockout in operations.automatic.service.out}
             lost = sorted(self._out.keys() - out)
             saw = f"a restart has put back in service: {', '.join(lost)}"
             self._check(not lost, now, "plant", saw, L4)
@@ -276,7 +276,7 @@ class ProgressObserver:
 
     def _go_on(self, operations: Operations, untouched: Set[str], now: float) -> None:
         """Check that no visit of untouched mirrors breaks off when a person takes command."""
-        view = operations.calibration()
+        view = operations.automatic.view()
         if now - self._took_at > GOES_ON:
             self._begun.clear()
         for place, names in list(self._begun.items()):
@@ -309,7 +309,7 @@ class ProgressObserver:
     ) -> None:
         """Check that measurements come while some mirrors have not been visited yet."""
         beliefs = operations.plant.beliefs
-        results = operations.calibration().results
+        results = operations.automatic.view().results
         done = {each.heliostat for each in results} | self._dark
         left = [name for name in working if name not in done and beliefs.record(name) is None]
         last = max((each.at for each in results if each.new), default=0.0)

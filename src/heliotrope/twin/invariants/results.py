@@ -157,7 +157,7 @@ class ResultObserver:
         self._program = operations
         for name in self._boards:
             self._learnt(operations, name, now, begins=begins)
-        results = operations.calibration().results
+        results = operations.automatic.view().results
         new = [each for each in results if (each.heliostat, each.at) not in self._results]
         for entry in reversed(new):
             self._results.add((entry.heliostat, entry.at))
@@ -282,7 +282,7 @@ class ResultObserver:
     def _noted(self, operations: Operations, entry: CalibrationEntry, now: float) -> None:
         """Check that logbook and store have a result."""
         name, start = entry.heliostat, f"at {entry.target}: {entry.text}"
-        events = operations.events(200)
+        events = operations.logbook.events(200)
         there = any(
             each.kind == "calibration"
             and ((each.who, each.text) == (name, start) or _of_all(each, entry))

@@ -153,18 +153,18 @@ class ShownObserver:
         if now - self._looked < EVERY:
             return
         self._looked = now
-        frame = operations.frame()
+        frame = operations.viewer.frame()
         self._rows(operations, frame, quiet, sun, now)
         self._head(operations, now)
         names = operations.names
         name = names[self._turn % len(names)]
         self._turn += 1
-        view = operations.heliostat(name)
+        view = operations.viewer.heliostat(name)
         self._detail(operations, view, quiet, now)
 
     def _events(self, operations: Operations, now: float) -> None:
         """Check that each act of a person is an event, once, and nothing else is."""
-        for row in operations.events(100):
+        for row in operations.logbook.events(100):
             key = (row.at, row.who, row.text)
             if row.who not in self._persons or key in self._told:
                 continue
@@ -191,7 +191,7 @@ class ShownObserver:
         made = now if fresh else now - FRAME
         for row, name in enumerate(operations.names):
             age, state = float(frame.age[row]), int(frame.state[row])
-            home = operations.clusters[int(frame.cluster[row])]
+            home = operations.plant.field.clusters[int(frame.cluster[row])]
             saw = f"it is shown in {home}; it is in {self._homes[name]}"
             self._check(home == self._homes[name], now, name, saw)
             if now - self._changed.get(name, -inf) > FRAME:
@@ -208,7 +208,7 @@ class ShownObserver:
             self._check(state in told, now, name, saw)
             if name in quiet:  # on a bad bus answers are lost, one after the other
                 self._counted(name, frame.counts[row], made - age, now)
-            place = operations.aim_names[int(frame.on[row])]
+            place = operations.viewer.aim_names[int(frame.on[row])]
             self._placed(name, place, sun, now, calm=name in quiet)
         self._learnt(operations, frame, quiet, sun, now)
 
@@ -304,11 +304,11 @@ class ShownObserver:
         holder = self._plant.holder(now)
         saw = f"{head.holder or 'nobody'} is shown with the command authority; {holder} has it"
         self._check(holder is None or head.holder == holder, now, "summary", saw)
-        rows = operations.alarms()
+        rows = operations.logbook.alarms()
         still = sum(row.active or not row.acknowledged_by for row in rows)
         saw = f"{head.alarms} alarms are counted, {still} shown"
         self._check(head.alarms == still, now, "summary", saw)
-        for row in operations.cluster_rows():
+        for row in operations.logbook.cluster_rows(operations.plant):
             members = [name for name, home in self._homes.items() if home == row.name]
             saw = f"{row.heliostats} heliostats are shown, {len(members)} are there"
             self._check(row.heliostats == len(members), now, row.name, saw)

@@ -100,7 +100,7 @@ class Acts:
     def tidies(self, operations: Operations) -> None:
         """Clear what latches, let automatic control go on, and give it the field."""
         taken = self._operator.clear(operations.plant)
-        holds = operations.plant.emergency_on
+        holds = operations.plant.sentinel.on
         if CALLED in taken or not holds:
             self._watch.emergency(on=False)
         if holds:
@@ -164,7 +164,7 @@ class Acts:
         until = self.now() + self.chance.uniform(_LEAST_DUTY, most)
         with contextlib.suppress(RefusedError):
             while self.now() < until and self.present() is operations:
-                operations.keep_authority(person, token)
+                operations.plant.authority.keep(person, token)
                 self._observer.kept(self.now())
                 self._watch.day.on_duty(self.now())
                 if self.chance.random() < 0.2:

@@ -170,7 +170,7 @@ class Crew:
 
     def _moments(self) -> set[str]:
         operations = self._acts.present()
-        running = () if operations is None else operations.calibration().running
+        running = () if operations is None else operations.automatic.view().running
         found = {word for word in MOMENTS for run in running if word in run.stage}
         if any(board.state == states.LOCKED for board in self._boards):
             found.add(LOCKED)

@@ -15,9 +15,10 @@ from heliotrope.links.clock import Clock
 from heliotrope.mechanism.board_items import packed
 from heliotrope.plant.authority import Person
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.lockouts import TOWER, Kind
+from heliotrope.plant.lockouts import TOWER
 from heliotrope.plant.operations.service import Service
 from heliotrope.store.backup import OWNER
+from heliotrope.store.records import Kind
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import MACHINE
 from heliotrope.twin.invariants.beams import BeamObserver
