@@ -69,22 +69,23 @@ def modules(root: Path) -> dict[str, Module]:
         text = path.read_text(encoding="utf-8")
         found[name] = Module(name, path, text.count("\n"), face, text.count("# fmt: skip"))
     for module in found.values():
-        _read(module, found)
+        read(module, found)
     return found
 
 
-def _read(module: Module, known: dict[str, Module]) -> None:
+def read(module: Module, known: dict[str, Module]) -> None:
+    """Fill in what a module imports from the known ones, and what it offers."""
     tree = ast.parse(module.path.read_text(encoding="utf-8"))
     package = module.name if module.face else module.name.rpartition(".")[0]
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            module.taken += [(a.name, "") for a in node.names if a.name.split(".")[0] == NAME]
+            module.taken += [(a.name, "") for a in node.names if a.name in known]
         elif isinstance(node, ast.ImportFrom):
             above = package.split(".")[: len(package.split(".")) - node.level + 1]
             origin = node.module or ""
             if node.level:
                 origin = ".".join([*above, *([origin] if origin else [])])
-            if origin.split(".")[0] != NAME:
+            if origin not in known:
                 continue
             for alias in node.names:
                 inner = f"{origin}.{alias.name}"
