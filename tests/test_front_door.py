@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -38,8 +39,13 @@ def test_ci_runs_tests_before_linters() -> None:
     assert calls == ["test", "lint", "docs"]
 
 
-def test_changelog_has_the_version() -> None:
-    assert f"## {__version__}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+def test_changelog_has_the_version_below_what_is_unreleased() -> None:
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    headings = re.findall(r"^## (.+)$", text, re.MULTILINE)
+    assert headings[0] == "Unreleased"
+    assert re.fullmatch(rf"{re.escape(__version__)} \(\d{{4}}-\d\d-\d\d\)", headings[1])
+    assert len(text.partition(f"## {headings[1]}")[2].partition("\n## ")[0].splitlines()) <= 80
+    assert version("heliotrope") == __version__
 
 
 def test_setup_refuses_an_old_python(tmp_path: Path) -> None:
