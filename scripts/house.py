@@ -4,7 +4,7 @@
 source, without running it, and the floors from import-linter's contract in ``pyproject.toml``.
 With ``--check`` it ends with status 1 if an import runs up, two files import each other, a package
 imports another package's underscore module, or a module has neither a caller nor a place in a
-public face. ``--draw FILE`` writes the picture of ``docs/explanation/architecture.md``.
+public face. ``python -m scripts.pages`` writes its picture of the floors.
 """
 
 import argparse
@@ -314,18 +314,20 @@ def drawing(known: dict[str, Module], levels: list[list[str]]) -> str:
     )
 
 
+def pages() -> dict[str, str]:
+    """Return the picture of docs/explanation/architecture.md, by path."""
+    root = Path(__file__).parents[1]
+    return {"docs/images/floors.svg": drawing(modules(root), floors(root))}
+
+
 def main() -> int:
     """Print the structure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("root", nargs="?", type=Path, default=Path(__file__).parents[1])
     parser.add_argument("--check", action="store_true", help="status 1 if something is wrong")
     parser.add_argument("--verbose", action="store_true", help="name every place")
-    parser.add_argument("--draw", type=Path, metavar="FILE", help="write the floors as SVG")
     given = parser.parse_args()
     known, levels = modules(given.root), floors(given.root)
-    if given.draw:
-        given.draw.write_text(drawing(known, levels), encoding="utf-8")
-        return 0
     print(f"{'package':14} {'rooms':>5} {'files':>5} {'lines':>6}")
     for name, inner, files, lines in rooms(known, levels):
         print(f"{name:14} {inner or '':>5} {files:5} {lines:6}")

@@ -136,10 +136,8 @@ def test_every_refusal_of_the_table_is_raised() -> None:
     assert [name for name in kinds if f"{name}." not in source] == []
 
 
-def test_the_page_of_alarms_is_current() -> None:
-    script = runpy.run_path(str(ROOT / "scripts" / "alarms_page.py"))
-    page = script["PAGE"].read_text(encoding="utf-8")
-    assert page == script["page"](), "run scripts/alarms_page.py to write the page again"
+def test_the_page_of_alarms_names_each() -> None:
+    page = (ROOT / "docs" / "reference" / "alarms.md").read_text(encoding="utf-8")
     for name in {row.name for row in CONDITIONS} | set(alarms.KINDS):
         assert f"| `{name}` |" in page
 

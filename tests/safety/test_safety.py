@@ -1,10 +1,8 @@
 """The safety table: every row trips, latches and releases as it says, and no way leads around."""
 
-import importlib.util
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -694,18 +692,6 @@ def test_a_new_limiter_starts_empty_and_zero_joins_none() -> None:
         JoinLimiter(-1.0, 5)
     with pytest.raises(InputError, match="joining burst 0 must be a whole number from 1"):
         JoinLimiter(1.0, 0)
-
-
-def test_the_page_is_current() -> None:
-    root = Path(__file__).parents[2]
-    spec = importlib.util.spec_from_file_location("table", root / "scripts" / "safety_table.py")
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    assert script.PAGE.read_text(encoding="utf-8") == script.page(), (
-        "run scripts/safety_table.py to write the page anew"
-    )
 
 
 def test_a_row_about_heliostats_is_evaluated_for_those_with_a_reading() -> None:
