@@ -15,7 +15,7 @@ OPTIONS ?=
 BOARD ?= rp2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run notebook test soak mutants lint docs bench house firmware clean
+.PHONY: help setup run notebook quick test soak mutants lint docs lock bench house firmware clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | sort | expand -t 12
@@ -31,6 +31,9 @@ run: $(STAMP)  ## run a plant of 10,000 heliostats in simulation until Ctrl-C: O
 
 notebook: $(STAMP)  ## open the notebooks of examples/ in the browser
 	@$(BIN)/jupyter lab --notebook-dir=examples
+
+quick: $(STAMP)  ## run the tests nearest to what changed since main, and the linters (a minute)
+	@HELIOTROPE_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m scripts.quick
 
 test: $(STAMP)  ## run the tests in parallel
 	@bash scripts/packages.sh & $(BIN)/python -m heliotrope.warm && $(BIN)/python -m heliotrope.twin.warm; warm=$$?; wait; exit $$warm
@@ -53,6 +56,11 @@ lint: $(STAMP)  ## check style, types and layers
 
 docs: $(STAMP)  ## build the documentation into site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+# The oldest Python for which all pinned versions exist.
+lock:  ## fetch the hashes of the packages that constraints.txt pins
+	@$(BIN)/uv pip compile constraints.txt --generate-hashes --no-deps --universal --no-annotate --quiet \
+		--python-version 3.11.5 --custom-compile-command "make lock" --output-file requirements.lock
 
 bench: $(STAMP)  ## run all benchmarks and keep their results in benchmarks/results/
 	@$(BIN)/python -m benchmarks all

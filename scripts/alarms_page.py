@@ -1,18 +1,17 @@
-"""Write docs/reference/alarms.md from the alarms and refusals in the code."""
+"""Make docs/reference/alarms.md from the alarms and refusals in the code."""
 
 import re
-from pathlib import Path
 
 from heliotrope.plant import refusals
 from heliotrope.safety import CONDITIONS, Condition, Watcher, alarms
 
-PAGE = Path(__file__).parents[1] / "docs" / "reference" / "alarms.md"
+PAGE = "docs/reference/alarms.md"
 
 _INTRO = """\
 # Alarms and refusals
 
 Every alarm that the code can raise, and every reason for which the plant refuses a command.
-`scripts/alarms_page.py` writes this page from the code. The limits are the defaults of the
+`python -m scripts.pages` writes this page from the code. The limits are the defaults of the
 [safety table](../explanation/safety.md). The [handbook](../how-to/handbook.md#alarms) tells the
 operator the same in fewer words.
 
@@ -52,8 +51,8 @@ def _kind(kind: alarms.AlarmKind) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def page() -> str:
-    """Return the page's text."""
+def pages() -> dict[str, str]:
+    """Return the page's text, by path."""
     lines = [_INTRO]
     for tier in Watcher:
         lines += [f"## Raised by the {tier.value}", ""]
@@ -67,8 +66,4 @@ def page() -> str:
     ]
     lines[-1] = _REFUSALS.rstrip("\n")
     lines += [f"| {' | '.join(row)} |" for row in cells]
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    return {PAGE: "\n".join(lines) + "\n"}

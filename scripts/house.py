@@ -4,7 +4,7 @@
 source, without running it, and the floors from import-linter's contract in ``pyproject.toml``.
 With ``--check`` it ends with status 1 if an import runs up, two files import each other, a package
 imports another package's underscore module, or a module has neither a caller nor a place in a
-public face. ``--draw FILE`` writes the picture of ``docs/explanation/architecture.md``.
+public face. ``python -m scripts.pages`` writes its picture of the floors.
 """
 
 import argparse
@@ -70,22 +70,23 @@ def modules(root: Path) -> dict[str, Module]:
         text = path.read_text(encoding="utf-8")
         found[name] = Module(name, path, text.count("\n"), face, text.count("# fmt: skip"))
     for module in found.values():
-        _read(module, found)
+        read(module, found)
     return found
 
 
-def _read(module: Module, known: dict[str, Module]) -> None:
+def read(module: Module, known: dict[str, Module]) -> None:
+    """Fill in what a module imports from the known ones, and what it offers."""
     tree = ast.parse(module.path.read_text(encoding="utf-8"))
     package = module.name if module.face else module.name.rpartition(".")[0]
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            module.taken += [(a.name, "") for a in node.names if a.name.split(".")[0] == NAME]
+            module.taken += [(a.name, "") for a in node.names if a.name in known]
         elif isinstance(node, ast.ImportFrom):
             above = package.split(".")[: len(package.split(".")) - node.level + 1]
             origin = node.module or ""
             if node.level:
                 origin = ".".join([*above, *([origin] if origin else [])])
-            if origin.split(".")[0] != NAME:
+            if origin not in known:
                 continue
             for alias in node.names:
                 inner = f"{origin}.{alias.name}"
@@ -373,18 +374,20 @@ def drawing(known: dict[str, Module], levels: list[list[str]]) -> str:
     )
 
 
+def pages() -> dict[str, str]:
+    """Return the picture of docs/explanation/architecture.md, by path."""
+    root = Path(__file__).parents[1]
+    return {"docs/images/floors.svg": drawing(modules(root), floors(root))}
+
+
 def main() -> int:
     """Print the structure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("root", nargs="?", type=Path, default=Path(__file__).parents[1])
     parser.add_argument("--check", action="store_true", help="status 1 if something is wrong")
     parser.add_argument("--verbose", action="store_true", help="name every place")
-    parser.add_argument("--draw", type=Path, metavar="FILE", help="write the floors as SVG")
     given = parser.parse_args()
     known, levels = modules(given.root), floors(given.root)
-    if given.draw:
-        given.draw.write_text(drawing(known, levels), encoding="utf-8")
-        return 0
     print(f"{'package':14} {'rooms':>5} {'files':>5} {'lines':>6}")
     for name, inner, files, lines in rooms(known, levels):
         print(f"{name:14} {inner or '':>5} {files:5} {lines:6}")

@@ -1,18 +1,14 @@
-"""Write the pages of the library: each package's public names, as its ``__all__`` lists them.
+"""Make the pages of the library: each package's public names, as its ``__all__`` lists them.
 
-``python scripts/library_pages.py`` writes ``docs/reference/library/``; with ``--check`` it ends
-with status 1 if a page differs from what it would write. A name that several faces offer is
-described once, in the package that defines it.
+A name that several faces offer is described once, in the package that defines it.
 """
 
-import argparse
 import ast
 import re
-import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PAGES = ROOT / "docs" / "reference" / "library"
+PAGES = "docs/reference/library"
 #: Packages in the order of the reference: from what a researcher needs to the programs of a plant.
 ORDER = (
     "", "sun", "geometry", "mechanism", "field", "optics", "plot", "calibration", "imaging",
@@ -107,9 +103,11 @@ def _listed(room: str) -> list[tuple[str, str]]:
     ]  # fmt: skip
 
 
-def pages() -> dict[str, str]:
-    """Return the pages by file name."""
-    found, written = {}, set()
+def pages() -> dict[str, str | None]:
+    """Return the pages by path, None for those of packages that are gone."""
+    kept = (ROOT / PAGES).glob("*.md")
+    found: dict[str, str | None] = dict.fromkeys(str(path.relative_to(ROOT)) for path in kept)
+    written = set()
     for package in ORDER[1:]:
         lines = [f"# heliotrope.{package}", ""]
         for room in _rooms(package):
@@ -125,7 +123,7 @@ def pages() -> dict[str, str]:
                     written.add(place)
                     lines += [f"::: heliotrope.{room}.{name}"]
                     lines += ["    options: {heading_level: 3}", ""]
-        found[f"{package}.md"] = "\n".join(lines).rstrip() + "\n"
+        found[f"{PAGES}/{package}.md"] = "\n".join(lines).rstrip() + "\n"
     lines = ["# The library", "", _lead(_source("")), ""]
     links = [(name, place) for name, place in _listed("")]
     lines += [f"- [`heliotrope.{name}`][{place}]" for name, place in links if place in written]
@@ -137,32 +135,5 @@ def pages() -> dict[str, str]:
     for _, place in links:
         if place not in written and place.removeprefix("heliotrope.") not in ORDER:
             lines += [f"::: {place}", "    options: {heading_level: 2}", ""]
-    found["index.md"] = "\n".join(lines).rstrip() + "\n"
+    found[f"{PAGES}/index.md"] = "\n".join(lines).rstrip() + "\n"
     return found
-
-
-def main() -> int:
-    """Write the pages, or compare them with those on disk."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--check", action="store_true", help="compare, write nothing")
-    given = parser.parse_args()
-    wanted = pages()
-    stale = [
-        name for name, text in wanted.items()
-        if not (PAGES / name).is_file() or (PAGES / name).read_text(encoding="utf-8") != text
-    ]  # fmt: skip
-    extra = [p.name for p in PAGES.glob("*.md") if p.name not in wanted] if PAGES.is_dir() else []
-    if given.check:
-        for name in [*stale, *extra]:
-            print(f"docs/reference/library/{name} is stale: python scripts/library_pages.py")
-        return 1 if stale or extra else 0
-    PAGES.mkdir(parents=True, exist_ok=True)
-    for name in extra:
-        (PAGES / name).unlink()
-    for name in stale:
-        (PAGES / name).write_text(wanted[name], encoding="utf-8")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

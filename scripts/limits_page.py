@@ -1,4 +1,4 @@
-"""Write docs/reference/limits.md: the limits, periods and defaults of the control code."""
+"""Make docs/reference/limits.md: the limits, periods and defaults of the control code."""
 
 import ast
 import dataclasses
@@ -8,12 +8,12 @@ from pathlib import Path
 from types import ModuleType
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "reference" / "limits.md"
+PAGE = "docs/reference/limits.md"
 PACKAGES = ("safety", "plant", "cluster", "lcu", "links")
 SAID = """# Limits and periods
 
 Every number that the control code names and explains, by module, and the default of every numeric
-setting. This page is made from the running code (`python scripts/limits_page.py`), and a test
+setting. This page is made from the running code (`python -m scripts.pages`), and a test
 fails while the two differ, so that nobody changes a limit unnoticed. A name that begins with an
 underscore belongs to its module. What can be set is in the
 [plant file](plant-format.md) and the [cluster file](cluster-format.md).
@@ -79,8 +79,8 @@ def _defaults(module: ModuleType) -> Iterator[tuple[str, object]]:
                 yield f"{name}.{field}", value
 
 
-def page() -> str:
-    """Return the page's text."""
+def pages() -> dict[str, str]:
+    """Return the page's text, by path."""
     rows = [SAID]
     for package in PACKAGES:
         for path in sorted((ROOT / "src" / "heliotrope" / package).rglob("*.py")):
@@ -97,8 +97,4 @@ def page() -> str:
             if defaults:
                 rows += [""] * bool(named) + ["| setting | default |", "|---|---|"]
                 rows += [f"| `{n}` | {_text(v)} |" for n, v in defaults]
-    return "\n".join(rows) + "\n"
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    return {PAGE: "\n".join(rows) + "\n"}

@@ -60,10 +60,10 @@ BESIDE = (
     "console/test_admission.py", "console/test_connections.py", "console/test_marking.py",
     "console/test_outlook_page.py", "console/test_parameters.py", "console/test_zero.py",
     "optics/test_standing.py", "store/test_kept_alarms.py", "store/test_kept_audit.py",
-    "twin/test_live.py", "twin/test_parts.py", "test_limits_page.py",
+    "twin/test_live.py", "twin/test_parts.py", "test_pages.py",
 )  # fmt: skip
 #: The tests that read every constant and every default.
-READER = "tests/test_limits_page.py"
+READER = "tests/test_pages.py"
 #: Tests that run the code in another interpreter, where no mutant is.
 ELSEWHERE = ("--ignore-glob=*micropython*",)
 #: Time of the processor after which a test or a run hangs: this and so much more than it takes

@@ -1,10 +1,8 @@
-"""Write docs/reference/parameters.md from the parameter table."""
-
-from pathlib import Path
+"""Make docs/reference/parameters.md from the parameter table."""
 
 from heliotrope.mechanism.parameters import MODELS, table
 
-PAGE = Path(__file__).parents[1] / "docs" / "reference" / "parameters.md"
+PAGE = "docs/reference/parameters.md"
 KINDS = {
     "Azimuth-elevation": (
         (
@@ -39,11 +37,11 @@ takes its own parameters of the same role. Roles are `position`, `tilts`, `biase
 `tilts+biases+sag`."""
 
 
-def page() -> str:
-    """Return the page's text."""
+def pages() -> dict[str, str]:
+    """Return the page's text, by path."""
     said = (
         "Each is a deviation from the nominal mechanism. This page is made from the table in the "
-        "program (`scripts/parameters_page.py`). Drives' parameters take the name of their joint; "
+        "program (`python -m scripts.pages`). Drives' parameters take the name of their joint; "
         "other kinds have the same rows with their joints' names."
     )
     lines = ["# Parameters of a mechanism", "", said]
@@ -64,8 +62,4 @@ def page() -> str:
         lines.append(f"| `{name}` | {', '.join(f'`{p}`' for p in parameters)} |")
     lines.append("| `full` | all of a mechanism's but worm and pivot radius |")
     lines += ["", ROLES]
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    return {PAGE: "\n".join(lines) + "\n"}

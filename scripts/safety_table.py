@@ -1,19 +1,18 @@
-"""Write docs/explanation/safety.md from the safety table."""
+"""Make docs/explanation/safety.md from the safety table."""
 
 import math
-from pathlib import Path
 
 from heliotrope import safety
 from heliotrope.safety import Act, Condition, Watcher
 
-PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "safety.md"
+PAGE = "docs/explanation/safety.md"
 
 _INTRO = """\
 # Safety
 
 One table (`heliotrope.safety`) says what trips, what is then done, and when it ends. The plant,
 the clusters and the local controllers each evaluate the rows assigned to them. The evaluation is
-a pure function of readings, state and monotonic time. `scripts/safety_table.py` writes this page
+a pure function of readings, state and monotonic time. `python -m scripts.pages` writes this page
 from the table. The handbook says what each alarm means and what
 the operator should do.
 
@@ -94,8 +93,8 @@ def _line(row: Condition) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def page() -> str:
-    """Return the page's text."""
+def pages() -> dict[str, str]:
+    """Return the page's text, by path."""
     lines = [_INTRO, "| action | meaning |", "|---|---|"]
     lines += [f"| {act.name} | {act.text} |" for act in Act]
     head = (
@@ -113,8 +112,4 @@ def page() -> str:
         lines += ["", f"## Watched by the {tier.value}", ""]
         lines += [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
         lines += [_line(row) for row in safety.watched_by(safety.CONDITIONS, tier)]
-    return "\n".join(lines) + "\n" + _AFTER
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    return {PAGE: "\n".join(lines) + "\n" + _AFTER}

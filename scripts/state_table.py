@@ -1,15 +1,14 @@
-"""Write the diagram and tables of docs/explanation/local-controller.md from the state table."""
+"""Make the diagram and tables of docs/explanation/local-controller.md from the state table."""
 
 import math
-import re
 from html import escape
-from pathlib import Path
+
+from scripts.pages import between
 
 from heliotrope.lcu import names, states
 
-DOCS = Path(__file__).parents[1] / "docs"
-PAGE = DOCS / "explanation" / "local-controller.md"
-PICTURE = DOCS / "images" / "local-controller-states.svg"
+PAGE = "docs/explanation/local-controller.md"
+PICTURE = "docs/images/local-controller-states.svg"
 
 KINDS = {names.SAFE: "anyone, always", names.COMMAND: "authority", names.INTERNAL: "itself"}
 COLOURS = {names.SAFE: "#b3261e", names.COMMAND: "#1a5fb4", names.INTERNAL: "#666666"}
@@ -141,16 +140,7 @@ def _generated() -> str:
     return "\n\n".join(part.rstrip("\n") for part in parts)
 
 
-def page() -> str:
-    """Return the page with its generated part replaced."""
-    text = PAGE.read_text(encoding="utf-8")
+def pages() -> dict[str, str]:
+    """Return the page with its generated part replaced, and the diagram, by path."""
     marks = "<!-- states: begin -->", "<!-- states: end -->"
-    found = re.search(f"{marks[0]}.*{marks[1]}", text, re.DOTALL)
-    assert found is not None, f"{PAGE.name}: the marks of the generated part are missing"
-    middle = f"{marks[0]}\n{_generated()}\n{marks[1]}"
-    return text[: found.start()] + middle + text[found.end() :]
-
-
-if __name__ == "__main__":
-    PICTURE.write_text(picture(), encoding="utf-8")
-    PAGE.write_text(page(), encoding="utf-8")
+    return {PAGE: between(PAGE, *marks, f"{_generated()}\n"), PICTURE: picture()}

@@ -1,11 +1,11 @@
-"""Write docs/reference/wire.md from the table of messages."""
+"""Make docs/reference/wire.md from the table of messages."""
 
 import re
 from pathlib import Path
 
 from heliotrope.lcu import journal, messages, signing, wire
 
-PAGE = Path(__file__).parents[1] / "docs" / "reference" / "wire.md"
+PAGE = "docs/reference/wire.md"
 WHO = {
     messages.ANYONE: "anyone, always",
     messages.AUTHORITY: "the authority",
@@ -20,7 +20,7 @@ GROUPS = {
 }  # fmt: skip
 FRAME = f"""# The wire, version 2
 
-This page is made from the tables in the program (`scripts/wire_table.py`); the code is `heliotrope.lcu.wire`, `signing`, `messages` and `journal`.
+This page is made from the tables in the program (`python -m scripts.pages`); the code is `heliotrope.lcu.wire`, `signing`, `messages` and `journal`.
 
 ## A frame
 
@@ -77,8 +77,8 @@ def meanings() -> dict[int, str]:
     return found
 
 
-def page() -> str:
-    """Return the page's text."""
+def pages() -> dict[str, str]:
+    """Return the page's text, by path."""
     lines = [FRAME, "## Messages", ""]
     (plain, names), (keyed, keyed_names) = (
         messages.HEADS[messages.AUTHORITY],
@@ -103,7 +103,7 @@ def page() -> str:
     lines += ["", "## Stored items", "", "| item | name | `struct` codes |", "|---|---|---|"]
     lines += [f"| {n} | `{name}` | `{codes}` |" for n, (name, codes) in enumerate(journal.ITEMS, 1)]
     lines += ["", "## Damaged frames", "", DAMAGE]
-    return "\n".join(lines) + "\n"
+    return {PAGE: "\n".join(lines) + "\n"}
 
 
 #: Measured by ``python -m benchmarks frames``.
@@ -118,7 +118,3 @@ DAMAGE = """Ten million frames of all types were damaged at random in five ways 
 | the head of one and the tail of another | 2,000,478 | 0 | 1,998,360 | 479 (1 in 4,171) |
 
 A receiver of packets that looks at every byte, without silence, finds 38,897 of them in ten million bytes of noise. In version 2 a share of 2^-32 of heavily damaged frames passes by chance, one in four thousand million; a MAC protects stored settings."""  # noqa: E501
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")

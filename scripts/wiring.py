@@ -1,14 +1,15 @@
-"""Write the table of pins and the figure of docs/how-to/firmware.md from the boards' settings."""
+"""Make the table of pins and the figure of docs/how-to/firmware.md from the boards' settings."""
 
-import re
 import runpy
 from html import escape
 from pathlib import Path
 from typing import Any
 
+from scripts.pages import between
+
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "how-to" / "firmware.md"
-PICTURE = ROOT / "docs" / "images" / "wiring.svg"
+PAGE = "docs/how-to/firmware.md"
+PICTURE = "docs/images/wiring.svg"
 BOARDS = ("rp2", "esp32", "stm32")
 #: Row of the table: key in PINS, place in it (-1: its only pin), signal, destination.
 ROWS = (
@@ -116,16 +117,7 @@ def picture() -> str:
     return "\n".join([*out, "</svg>"]) + "\n"
 
 
-def page(text: str) -> str:
-    """Return the page with its table of pins replaced."""
-    return re.sub(
-        r"(<!-- pins -->\n).*?(<!-- end of pins -->)",
-        lambda found: f"{found.group(1)}\n{table()}\n\n{found.group(2)}",
-        text,
-        flags=re.DOTALL,
-    )
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
-    PICTURE.write_text(picture(), encoding="utf-8")
+def pages() -> dict[str, str]:
+    """Return the page with its table of pins replaced, and the figure, by path."""
+    marks = "<!-- pins -->", "<!-- end of pins -->"
+    return {PAGE: between(PAGE, *marks, f"\n{table()}\n\n"), PICTURE: picture()}

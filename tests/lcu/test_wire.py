@@ -5,10 +5,8 @@ import hmac
 import math
 import random
 import re
-import runpy
 import struct
 from collections import defaultdict
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -16,7 +14,6 @@ from hypothesis import strategies as st
 
 from heliotrope.lcu import messages, names, states, wire
 
-ROOT = Path(__file__).parents[2]
 KEY = b"a key of sixteen"
 NAMES = [row[1] for row in messages.MESSAGES]
 WHOLE = {code: st.integers(low, high) for code, (low, high) in wire.RANGES.items()}
@@ -138,13 +135,6 @@ def test_results_have_texts() -> None:
 def test_the_suns_rate_fits_its_field() -> None:
     fastest = 2 * math.pi / 86164.1  # rad/s, of the sky
     assert fastest * 2**28 < 32767 < fastest * 2**29
-
-
-def test_page_of_the_wire_is_current() -> None:
-    page = runpy.run_path(str(ROOT / "scripts" / "wire_table.py"))
-    assert page["PAGE"].read_text(encoding="utf-8") == page["page"](), (
-        "run python scripts/wire_table.py"
-    )
 
 
 # Numbers that others published.

@@ -103,15 +103,6 @@ class TestSessions:
         assert people.sessions(259.9) == (found,)
         assert people.sessions(260.0) == ()
 
-    def test_can_be_kept_up_but_not_revived(self, people: People, keeper: Keeper) -> None:
-        secret = people.open_session("ben", 200.0, 60.0)
-        people.keep_session(secret, 250.0, 60.0)
-        keeper.writer.confirmed().result(10.0)
-        assert people.session(secret, 300.0) is not None
-        people.keep_session(secret, 320.0, 60.0)
-        keeper.writer.confirmed().result(10.0)
-        assert people.session(secret, 321.0) is None
-
     def test_end(self, people: People) -> None:
         secrets = [people.open_session("ben", 200.0, 60.0) for _ in range(3)]
         other = people.open_session("anna", 200.0, 60.0)

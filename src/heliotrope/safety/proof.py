@@ -165,21 +165,16 @@ class Proof:
         """Longest time from the order to the finished action, s."""
         return DEFOCUS_BUDGET if self.order == "DEFOCUS" else STOW_BUDGET
 
-    def with_acknowledged(self, node: str, at: float) -> "Proof":
-        """Return the proof with an acknowledgement; only the first one of a heliostat counts."""
-        return self.with_news(acknowledged={node: at})
-
-    def with_done(self, node: str, at: float) -> "Proof":
-        """Return the proof with a report that a heliostat is done, which acknowledges as well."""
-        return self.with_news(done={node: at})
-
     def with_news(
         self,
         *,
         acknowledged: Mapping[str, float] | None = None,
         done: Mapping[str, float] | None = None,
     ) -> "Proof":
-        """Return the proof with reports of many heliostats, each with its time, in one copy."""
+        """Return the proof with reports of heliostats, each with its time, s.
+
+        Only the first report of a heliostat counts. One that it is done acknowledges the order too.
+        """
         told, ready = dict(acknowledged or {}), dict(done or {})
         good_told = {node: at for node, at in told.items() if self._counts(node, at)}
         good_ready = {node: at for node, at in ready.items() if self._counts(node, at)}

@@ -317,13 +317,6 @@ class People:
         with self._database.reading() as connection:
             return tuple(rows.records(connection, Session, query))
 
-    def keep_session(self, secret: str, now: float, lifetime: float) -> None:
-        """Extend an unexpired session to ``lifetime`` s from now; written in the background."""
-        which = (_SESSION.c.key == _key(secret)) & (_SESSION.c.expires > now)
-        self._writer.put(
-            lambda c: c.execute(_SESSION.update().where(which).values(expires=now + lifetime))
-        )
-
     def close_session(self, secret: str) -> None:
         """End a session, if it exists."""
         self._writer.do(lambda c: _delete(c, _SESSION, _SESSION.c.key == _key(secret)))

@@ -1,4 +1,4 @@
-"""Run `heliotrope` with gauges in the plant: ``gauges.py FILE COUNT run …``, for `attack.py`.
+"""Run `heliotrope` with gauges in the plant: ``gauges.py FILE COUNT run …``.
 
 Each 50 ms a line is added to the file: the time, the longest wait of the plant's loop since the
 line before, the longest time since a cluster's last lease, and the time since which every one of
@@ -117,7 +117,7 @@ class Gauges:
 
 def attach(gauges: Gauges) -> None:
     """Let the classes of the plant tell the gauges."""
-    make, keep, tell = PacedLoop.__init__, ClusterEnd.keep, FieldBus._tell  # noqa: SLF001
+    make, keep, tell = PacedLoop.__init__, ClusterEnd.keep, FieldBus._tell
     serve = PlantInterface.__init__
 
     def made(self: PacedLoop, *given: Any, **named: Any) -> None:
@@ -143,7 +143,7 @@ def attach(gauges: Gauges) -> None:
     PacedLoop.__init__ = made  # type: ignore[method-assign]
     PlantInterface.__init__ = served  # type: ignore[method-assign]
     ClusterEnd.keep = kept  # type: ignore[method-assign]
-    FieldBus._tell = told  # type: ignore[method-assign]  # noqa: SLF001
+    FieldBus._tell = told  # type: ignore[method-assign]
     threading.Thread(target=gauges.run, daemon=True).start()
 
 

@@ -1,19 +1,13 @@
-"""Attack a plant of one's own on loopback, and measure what the plant notices.
+"""A plant on loopback with gauges in it, and what is measured of it during an attack.
 
-    python scripts/attack.py            all attacks
-    python scripts/attack.py NAME …     some of them
-    python scripts/attack.py --descriptors 512
-
-It starts `heliotrope run --heliostats 320` with gauges in the plant (`gauges.py`), then makes each
-attack of `attacks.py` for some seconds. A table says how far the plant's loop fell behind, how old
-a lease became, how long an EMERGENCY by the page's two ways and DEFOCUS by `heliotrope ctl` took to
-the last local controller, the memory of all processes and the lines of the log, and whether a limit
-was exceeded; the exit code is then 1. ``--write`` puts the table into docs/explanation/security.md.
+`plant` starts `heliotrope run --heliostats 320` with gauges (`gauges.py`). `measure` makes one of
+the attacks of `attacks.py` for some seconds, and gives the worst that was seen meanwhile: how far
+the plant's loop fell behind, how old a lease became, how long an EMERGENCY by the page's two ports
+and DEFOCUS by `heliotrope ctl` took to the last local controller, the memory of all processes and
+the lines of the log.
 """
 
-import argparse
 import contextlib
-import json
 import math
 import os
 import resource
@@ -21,25 +15,23 @@ import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import httpx
-from attacks import ATTACKS, Attack, Place
 
-ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "explanation" / "security.md"
+from support.attacks import Attack, Place
+
+GAUGES = Path(__file__).with_name("gauges.py")
 HELIOSTATS = 320
 #: Limits: lag of the loop, age of a lease and EMERGENCY, s; memory of all processes, MB; lines of
 #: the log in one attack.
 LAG, LEASE, EMERGENCY, MEMORY, LINES = 0.2, 3.0, 1.0, 2000.0, 200
 #: Length of an attack, pause between orders, and longest wait for one, s.
 SECONDS, PAUSE, LONGEST = 8.0, 2.0, 20.0
-COLUMNS = ("lag", "lease", "page", "ctl", "health", "memory", "lines")
 
 
 @dataclass
@@ -108,11 +100,11 @@ def plant(folder: Path, descriptors: int | None) -> Iterator[Target]:
         if descriptors is not None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (descriptors, descriptors))
 
-    program = [sys.executable, str(ROOT / "scripts" / "gauges.py"), str(gauges), str(HELIOSTATS)]
+    program = [sys.executable, str(GAUGES), str(gauges), str(HELIOSTATS)]
     words = ["run", "--heliostats", str(HELIOSTATS), "--no-browser", "--port", str(port),
              "--emergency-port", str(urgent), "--data", str(folder / "data")]  # fmt: skip
     with log.open("wb") as out:
-        process = subprocess.Popen(  # noqa: S603  # fixed arguments
+        process = subprocess.Popen(  # fixed arguments
             [*program, *words],
             stdout=out,
             stderr=subprocess.STDOUT,
@@ -142,7 +134,7 @@ def _password(process: "subprocess.Popen[bytes]", log: Path, kept: Path) -> str:
         if "console: http" in log.read_text("utf-8") and kept.exists():
             return kept.read_text("utf-8").split()[-1]
         time.sleep(0.2)
-    sys.exit(f"attack: the plant has not started:\n{log.read_text('utf-8')[-2000:]}")
+    raise RuntimeError(f"the plant has not started:\n{log.read_text('utf-8')[-2000:]}")
 
 
 def _tokens(port: int, password: str) -> list[str]:
@@ -220,7 +212,7 @@ def by_ctl(target: Target) -> float:
     program = str(Path(sys.executable).with_name("heliotrope"))
     words = [program, "ctl", "--data", str(target.data), "defocus", "--all"]
     environment = {**os.environ, "HELIOTROPE_TOKEN": target.operator}
-    with subprocess.Popen(  # noqa: S603  # fixed arguments
+    with subprocess.Popen(  # fixed arguments
         words, stdout=subprocess.DEVNULL, env=environment
     ) as process:
         took = target.until_heard(since)
@@ -260,71 +252,9 @@ def measure(target: Target, attack: Attack) -> Measured:
 
 
 def row(name: str, found: Measured) -> str:
-    """Return a line of the table."""
-    cells = "".join(
-        f"{getattr(found, column):9.{0 if column in COLUMNS[5:] else 2}f}" for column in COLUMNS
+    """Return a row of the table of docs/explanation/security.md."""
+    over = f"**failed**: {', '.join(found.over())}" if found.over() else "passed"
+    return (
+        f"| *{name}* | {found.lag:.2f} | {found.lease:.2f} | {found.page:.2f} | {found.ctl:.2f} | "
+        f"{found.memory:.0f} | {over} |"
     )
-    over = found.over()
-    return f"{name:17}{cells}  " + (f"FAILED: {', '.join(over)}" if over else "passed")
-
-
-def write(found: dict[str, Measured], descriptors: int | None) -> None:
-    """Put the table of all attacks into the page about security."""
-    limits = f"| *limit* | {LAG:g} | {LEASE:g} | {EMERGENCY:g} | {EMERGENCY:g} | {MEMORY:g} | |"
-    head = (
-        "| attack | loop behind, s | lease, s | EMERGENCY by page, s | by `ctl`, s | memory, MB | |"
-    )
-    lines = [head, "|---|---|---|---|---|---|---|", limits]
-    for name, one in found.items():
-        over = f"**failed**: {', '.join(one.over())}" if one.over() else "passed"
-        lines.append(f"| *{name}* | {one.lag:.2f} | {one.lease:.2f} | {one.page:.2f} | "
-                     f"{one.ctl:.2f} | {one.memory:.0f} | {over} |")  # fmt: skip
-    mark = "attacks" if descriptors is None else f"attacks with {descriptors} descriptors"
-    text = PAGE.read_text("utf-8")
-    begin, end = f"<!-- {mark}: begin -->\n", f"<!-- {mark}: end -->"
-    if begin not in text:
-        sys.exit(f"attack: {PAGE} has no place for the table of {mark}")
-    before, _, rest = text.partition(begin)
-    _, _, after = rest.partition(end)
-    day = time.strftime("%Y-%m-%d", time.gmtime())
-    table = "\n".join(lines)
-    note = f"`python scripts/attack.py`, {day}, {os.cpu_count()} cores:"
-    PAGE.write_text(f"{before}{begin}{note}\n\n{table}\n{end}{after}", "utf-8")
-
-
-def main() -> int:
-    """Attack; return the exit code."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("attacks", nargs="*", metavar="NAME", help=", ".join(ATTACKS))
-    parser.add_argument("--descriptors", type=int, help="hard limit of the plant's descriptors")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
-    parser.add_argument("--write", action="store_true", help="put the table into the page")
-    given = parser.parse_args()
-    names = given.attacks or list(ATTACKS)
-    # Ended from outside, it ends its plant too.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
-    if unknown := set(names) - set(ATTACKS):
-        parser.error(f"no attack {', '.join(sorted(unknown))}; there are {', '.join(ATTACKS)}")
-    os.environ.setdefault("PYTHONPATH", str(ROOT / "src"))
-    found = {}
-    print(f"limits: lag {LAG:g} s, lease {LEASE:g} s, EMERGENCY {EMERGENCY:g} s, "
-          f"memory {MEMORY:g} MB, {LINES} lines")  # fmt: skip
-    print(f"{'attack':17}" + "".join(f"{column:>9}" for column in COLUMNS))
-    with tempfile.TemporaryDirectory() as folder, plant(Path(folder), given.descriptors) as target:
-        time.sleep(5.0)
-        for name in names:
-            found[name] = measure(target, ATTACKS[name])
-            print(row(name, found[name]), flush=True)
-            if target.process.poll() is not None:
-                sys.exit(f"attack: {name} has ended the plant")
-    if given.json is not None:
-        given.json.write_text(json.dumps({k: asdict(v) for k, v in found.items()}), "utf-8")
-    if given.write:
-        write(found, given.descriptors)
-    bad = [name for name, one in found.items() if one.over()]
-    print(f"{len(found) - len(bad)} of {len(found)} attacks stayed within the limits")
-    return 1 if bad else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

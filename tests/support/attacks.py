@@ -1,4 +1,4 @@
-"""The attacks of `attack.py`: each is a function of the target that goes on until it is over.
+"""Attacks on a plant (`attacked_plant.py`), each a function that goes on until it is over.
 
 All of them are bounded and stay on loopback.
 """
