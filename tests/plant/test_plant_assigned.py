@@ -599,9 +599,7 @@ def test_an_aim_whose_path_is_blocked_while_it_is_stored_is_not_assigned(
             disk.delay = 0.9
             ticket = plant.aim(OPERATOR, token, {name: plant.design.targets[0].center})
             await bench.wait(1.3)
-            monkeypatch.setattr(
-                plant.doubts, "barred", lambda n, _=None: dict.fromkeys(n, "in doubt")
-            )
+            monkeypatch.setattr(plant.doubts, "reasons", lambda names, _: ["in doubt"] * len(names))
             assert not await ticket.end(5.0)
             assert ticket.refusals[name] == "in doubt"
             assert plant.aims[plant.field.place(name)].tolist() == list(AIM)
