@@ -93,9 +93,15 @@ class Guards:
         """Return the heliostats in whose clusters no new motion may begin now, and the reasons."""
         return self.reasons(Asked(name, tuple(dict.fromkeys(heliostats))), NOT_NOW)
 
-    def in_turn(self, name: str, heliostats: tuple[str, ...]) -> dict[str, str]:
-        """Return the heliostats whose turn has come and that may not go, and the reasons."""
-        return self.reasons(Asked(name, heliostats), BEAM_REFUSED)
+    def in_turn(
+        self, name: str, values: Sequence[float], heliostats: tuple[str, ...]
+    ) -> dict[str, str]:
+        """Return the heliostats whose turn has come and that may not go, and the reasons.
+
+        AIM brings a new aim, its values; every other command leads to those that they have.
+        """
+        points = np.tile(values, (len(heliostats), 1)) if name == "AIM" else None
+        return self.reasons(Asked(name, heliostats, points), BEAM_REFUSED)
 
     def refuse_now(self, name: str, heliostats: Sequence[str]) -> None:
         """Refuse a command where no new motion may begin now.

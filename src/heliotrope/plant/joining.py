@@ -157,7 +157,7 @@ class JoinDispatcher:
         orders: PlantOrders,
         beams: BeamWatch,
         life: float,
-        blocked: Callable[[str, tuple[str, ...]], dict[str, str]],
+        blocked: Callable[[str, tuple[float, ...], tuple[str, ...]], dict[str, str]],
         examine: Examine,
     ) -> None:
         self._now, self._queue, self._orders = now, queue, orders
@@ -192,7 +192,7 @@ class JoinDispatcher:
         """Return which heliostats whose turn has come may not go, and why."""
         if job.name not in messages.SLICED:
             wrong = self._beams.joining(job.name, job.values, part, self._now())
-            return wrong | self._blocked(job.name, part)
+            return wrong | self._blocked(job.name, job.values, part)
         try:
             return self._examine(job.name, job.values, part)[1]
         except BeamError as error:
