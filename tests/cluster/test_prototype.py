@@ -288,7 +288,7 @@ def test_from_power_on_to_tracking_to_calibration_to_stow(
         assert await here.all_are("STOWED")
         # Those whose parameters have not been compared yet would be left out of the approach.
         names = here.field.names
-        await here.until(lambda: not plant._sync.differing(names), 2 * PATIENCE)
+        await here.until(lambda: not any(map(plant._sync.differing, names)), 2 * PATIENCE)
         aimed = await here.accepted(lambda: plant.aim(ENGINEER, token, plant.default_aims()))
         assert await aimed.end(PATIENCE), aimed.text
         approach = plant.command(ENGINEER, token, "APPROACH")

@@ -281,7 +281,7 @@ def test_a_board_that_has_started_anew_is_compared_before_its_mirror_moves(tmp_p
                 plant.authority.keep(ENGINEER, token)
                 plant._sync.compare(NAME)
                 await bench.wait(3.0)
-                assert not plant._sync.differing((NAME,))
+                assert not plant._sync.differing(NAME)
 
     run_virtual(main)
 

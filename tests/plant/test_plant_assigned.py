@@ -7,6 +7,7 @@ import pytest
 
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.example import example_plant
+from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Progress, Stage
@@ -22,6 +23,7 @@ from heliotrope.plant.assigned import (
 from heliotrope.plant.audit import read
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.kept_audit import KeptPoints
+from heliotrope.plant.refusals import COUNTS_DOUBTFUL
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.store.backup import backup, restore
 from heliotrope.store.keeper import Keeper
@@ -583,6 +585,41 @@ def test_a_beam_that_waits_for_a_persons_aim_is_not_brought_back(tmp_path: Path)
     run_virtual(main)
 
 
+@pytest.mark.parametrize("to_target", [True, False])
+def test_doubt_that_arises_before_the_turn_is_judged_by_the_new_aim(
+    tmp_path: Path, *, to_target: bool
+) -> None:
+    """A photograph on a target ends the doubt; on a receiver the beam may be anywhere."""
+    settings = PlantSettings(join_burst=1)
+
+    async def main(clock: VirtualClock) -> None:
+        disk = SlowDisk(clock)
+        bench = Bench(clock, tmp_path, settings=settings, disk=disk)
+        async with running(bench):
+            plant, token = bench.plant, await bench.commanded()
+            name, target = plant.field.names[0], tuple(plant.design.targets[0].center)
+            cluster = bench.cluster_of(name)
+            before, after = (AIM, target) if to_target else (target, AIM)
+            await idle(bench, name)
+            assert await plant.aim(OPERATOR, token, {name: before}).end(5.0)
+            cluster.set(states.TRACKING, name)
+            await bench.wait(2.0)
+            disk.delay = 0.9
+            ticket = plant.aim(OPERATOR, token, {name: after})
+            await bench.wait(1.3)  # its record is written, and its turn has come
+            cluster.rows["flags"][cluster.names.index(name)] |= meanings.COUNTS_DOUBTFUL
+            plant.doubts.standing[plant.field.place(name)] = True
+            await ticket.end(8.0)
+            assert plant.doubts.standing[plant.field.place(name)]
+            assert ticket.good == to_target, ticket.text
+            last = after if to_target else before
+            assert plant.aims[plant.field.place(name)] == pytest.approx(last)
+            if not to_target:
+                assert ticket.refusals[name] == COUNTS_DOUBTFUL.text
+
+    run_virtual(main)
+
+
 def test_an_aim_whose_path_is_blocked_while_it_is_stored_is_not_assigned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -601,9 +638,7 @@ def test_an_aim_whose_path_is_blocked_while_it_is_stored_is_not_assigned(
             disk.delay = 0.9
             ticket = plant.aim(OPERATOR, token, {name: plant.design.targets[0].center})
             await bench.wait(1.3)
-            monkeypatch.setattr(
-                plant.doubts, "barred", lambda n, _=None: dict.fromkeys(n, "in doubt")
-            )
+            monkeypatch.setattr(plant.doubts, "reasons", lambda names, _: ["in doubt"] * len(names))
             assert not await ticket.end(5.0)
             assert ticket.refusals[name] == "in doubt"
             assert plant.aims[plant.field.place(name)].tolist() == list(AIM)

@@ -10,14 +10,15 @@ from typing import Any
 
 import pytest
 
+from heliotrope.lcu import messages
 from heliotrope.links.messages import Stage
+from heliotrope.plant import guards
 from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.authority import Authority
 from heliotrope.plant.giving_back import GivingBack
 from heliotrope.plant.locks import Locks
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.raising import Raising
-from heliotrope.plant.permission import Permission
 from heliotrope.plant.stepping import Stepping
 from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.visits import coded_layout
@@ -80,7 +81,8 @@ def endless_retries(patch: pytest.MonkeyPatch) -> None:
 
 def rough_in_a_visit(patch: pytest.MonkeyPatch) -> None:
     """A setting of a person reaches heliostats in a visit."""
-    patch.setattr(Permission, "_visited", lambda self, token, names: {})
+    left = tuple(each for each in guards.GUARDS if each.commands != messages.SETTINGS)
+    patch.setattr(guards, "GUARDS", left)
 
 
 def taken_by_nobody(patch: pytest.MonkeyPatch) -> None:

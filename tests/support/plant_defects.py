@@ -119,12 +119,12 @@ def done_when_acknowledged(patch: pytest.MonkeyPatch) -> None:
 def identity_unchecked(patch: pytest.MonkeyPatch) -> None:
     """Whatever board answers at an address counts as the heliostat's."""
     patch.setattr(Identities, "look", lambda self, cluster: {})
-    patch.setattr(Identities, "barred", lambda self, heliostats: {})
+    patch.setattr(Identities, "blocked", lambda self, heliostat: None)
 
 
 def differing_moves(patch: pytest.MonkeyPatch) -> None:
     """Boards that store other parameters than the wanted ones are moved, and are not corrected."""
-    patch.setattr(ParameterSync, "differing", lambda self, heliostats: {})
+    patch.setattr(ParameterSync, "differing", lambda self, heliostat: None)
     patch.setattr(ParameterSync, "_push", lambda self, *given: None)
 
 

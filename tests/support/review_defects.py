@@ -4,6 +4,7 @@ Each takes out a mechanism of the third safety review: docs/explanation/hazards.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,12 @@ from heliotrope.cluster._emergencies import Emergencies
 from heliotrope.cluster._work import Work
 from heliotrope.lcu import motion, states
 from heliotrope.links.messages import Stage
-from heliotrope.plant import lockouts
+from heliotrope.plant import guards
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import Standing, sentinel
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.lockouts import Lockouts
+from heliotrope.plant.refusals import OUT_OF_SERVICE
 from heliotrope.plant.unsent import UnsentBeams
 from heliotrope.plant.witnesses import Witnesses
 from heliotrope.store import backup
@@ -39,7 +41,12 @@ def one_lock(patch: pytest.MonkeyPatch) -> None:
 
 def written_under_a_lock(patch: pytest.MonkeyPatch) -> None:
     """Parameters, of any stow position, and counts are written to a heliostat out of service."""
-    patch.setattr(lockouts, "STILL", lockouts.STILL | {"PARAMETERS", "ZERO"})
+    unlocked = frozenset({"PARAMETERS", "ZERO"})
+    rows = [
+        replace(each, commands=each.commands - unlocked) if each.refusal is OUT_OF_SERVICE else each
+        for each in guards.GUARDS
+    ]
+    patch.setattr(guards, "GUARDS", tuple(rows))
     patch.setattr(PlantController, "_resting", lambda self, heliostat, items: "")
 
 

@@ -34,6 +34,7 @@ stands     an idle heliostat stands still after it, and follows no standby point
 point      gives a point; only the last one counts
 setting    changes how it moves later; it takes no heliostat out of a visit
 harmless   moves nothing, now or later
+stops      only stops the heliostat: it is taken where no motion may begin
 relative   acts again in a second frame
 again      its goal looks like the state before it; a second frame does no harm
 stored     written to flash before it is acknowledged
@@ -106,7 +107,7 @@ MESSAGES = (
     # Leave FAULT once its cause is gone.
     (0x35, "CLEAR_FAULT", AUTHORITY, "", "", "releases stands"),
     # Stop and hold position.
-    (0x36, "LOCK", AUTHORITY, "", "", "operator harmless stands manual"),
+    (0x36, "LOCK", AUTHORITY, "", "", "operator harmless stops stands manual"),
     # Aim point of the beam, ENU.
     (0x40, "AIM", AUTHORITY, "fff", "east_m north_m up_m", "operator point"),
     # Hold the aim against changes.
@@ -164,6 +165,8 @@ def having(trait: str) -> "frozenset[str]":
 
 #: Commands that anyone may give at any time.
 SAFE = frozenset([row[1] for row in MESSAGES if row[2] == ANYONE])
+#: Commands that need the command authority.
+ORDERS = frozenset([row[1] for row in MESSAGES if row[2] in (AUTHORITY, KEY)])
 MOTIONS = having("moves")
 JOINING = having("joins")
 TO_STANDBY = having("standby")
@@ -174,6 +177,7 @@ STANDS = having("stands")
 POINTS = having("point")
 SETTINGS = having("setting")
 HARMLESS = having("harmless")
+STOPS = having("stops")
 RELATIVE = having("relative")
 AGAIN = having("again")
 STORED = having("stored")

@@ -13,7 +13,7 @@ it is turned away, on its way, locked, or at stow by the counts that it stores i
 is to be compared.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from zlib import crc32
 
 import numpy as np
@@ -110,7 +110,7 @@ class Agreement:
     utc
         Returns the plant's time, POSIX s.
     differing
-        Returns which heliostats do not store the wanted parameters, and why.
+        Returns why a heliostat does not store the wanted parameters, None if it does.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class Agreement:
         check: BeamCheck,
         site: Site,
         utc: Callable[[], float],
-        differing: Callable[[Sequence[str]], Mapping[str, str]],
+        differing: Callable[[str], str | None],
     ) -> None:
         self._field, self._site, self._utc, self._differing = field, site, utc, differing
         self._aims = _Points(points.aims, points.earlier["AIM"])
@@ -201,7 +201,7 @@ class Agreement:
         field = self._field
         for row, (crc, armature, drives) in list(self._pending.items()):
             stored = int(field.rows["armature_crc"][row]) == crc
-            if stored and not self._differing((field.names[row],)):
+            if stored and not self._differing(field.names[row]):
                 self._armature[row], self._drives[row] = armature, drives
                 del self._pending[row]
         begins = self._sort(now)

@@ -205,13 +205,13 @@ class Points:
             name = self._names[row]
             self._taken[kind][name] = tuple(place), marks.get(name)
 
-    def unknown(self, kind: str) -> npt.NDArray[np.bool_]:
-        """Return which local controllers may have any point, (N,).
+    def unknown(self, kind: str, rows: slice = slice(None)) -> npt.NDArray[np.bool_]:
+        """Return which local controllers, all (N,) or some (K,), may have any point.
 
         The assigned one was not taken, and none before it is known: it was the first, or the store
         is a restored backup.
         """
-        return np.asarray((self.earlier[kind][0] == self._arrays[kind]).all(axis=-1))
+        return np.asarray((self.earlier[kind][0, rows] == self._arrays[kind][rows]).all(axis=-1))
 
     def possible(self, kind: str, rows: npt.NDArray[np.intp]) -> list[tuple[Rows, FloatArray]]:
         """Return where local controllers (K,) may send their beams.

@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
@@ -15,16 +16,19 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages as wire
 from heliotrope.lcu import states
 from heliotrope.mechanism.board_items import Wanted
+from heliotrope.plant import refusals
 from heliotrope.plant.assigned import NOTHING, Held, grouped, points_of
+from heliotrope.plant.audit import AuditError
 from heliotrope.plant.authority import Authority, Person
 from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.given import Given
+from heliotrope.plant.guards import TO_AIMS, Asked, Guards
 from heliotrope.plant.joining import Assign, Clear, JoiningJob, JoinQueue, in_slices
 from heliotrope.plant.locks import Locks
 from heliotrope.plant.movements import Movements
 from heliotrope.plant.orders import PlantOrders, whole
-from heliotrope.plant.permission import Permission
+from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE
 from heliotrope.plant.stepping import Stepping
 from heliotrope.plant.tickets import Ticket
 
@@ -87,8 +91,8 @@ class Commands:
         Returns the monotonic time, s.
     field, orders, joining
         The plant's.
-    permission
-        Who may command what.
+    guards
+        What stops heliostats; see `GUARDS`.
     given
         Points that were given, and whether they were taken.
     ways
@@ -111,7 +115,7 @@ class Commands:
         field: FieldState,
         orders: PlantOrders,
         joining: JoinQueue,
-        permission: Permission,
+        guards: Guards,
         given: Given,
         ways: BeamWatch,
         design: Plant,
@@ -123,7 +127,7 @@ class Commands:
         authority: Authority,
     ) -> None:
         self._now, self._field, self._orders, self._joining = now, field, orders, joining
-        self._permission, self._given, self._ways = permission, given, ways
+        self._guards, self._given, self._ways = guards, given, ways
         self._design, self._wanted, self._patience = design, wanted, patience
         self._movements, self._locks = movements, locks
         self._stepping, self._authority = stepping, authority
@@ -145,13 +149,11 @@ class Commands:
         numbers = whole(values, row[3], name)
         self._authority.check(person, token, name)
         names = tuple(dict.fromkeys(heliostats)) or self._field.names
-        out = self._permission.locked_out(name, names, self._destined(name, names))
-        others = tuple(n for n in names if n not in out)
+        others, out = self._guards.passed(Asked(name, names, token=token), OUT_OF_SERVICE)
         clear, wrong = self.examine(name, numbers, others, token)
         blocked = {**wrong, **out}
-        accept = self._permission.accept
         store = self._lock_record(clear, token) if name == "LOCK" else None
-        ticket = accept(person, token, name, numbers, names, store=store, blocked=blocked)
+        ticket = self.accept(person, token, name, numbers, names, store=store, blocked=blocked)
         if name not in wire.SETTINGS:
             # A heliostat that still waits to join must not undo a later command.
             self._joining.drop(f"superseded by {name}", frozenset(names))
@@ -175,7 +177,7 @@ class Commands:
         """
         name, left = ticket.name, ticket.waiting(heliostats)
         if again and left:
-            out = self._permission.still_locked_out(name, left, self._destined(name, left))
+            out = self._guards.reasons(Asked(name, left), OUT_OF_SERVICE)
             others = tuple(n for n in left if n not in out)
             left, wrong = self.examine(name, numbers, others, token)
             ticket.block({**wrong, **out})
@@ -190,6 +192,52 @@ class Commands:
             waits = name in wire.JOINING or in_slices(name, left)
             send = self._join if waits else self._orders.command
             send(ticket, name, numbers, left, token)
+
+    def accept(
+        self,
+        person: Person,
+        token: int,
+        name: str,
+        values: tuple[float, ...],
+        heliostats: Sequence[str],
+        note: str = "",
+        store: tuple[Work, Work] | None = None,
+        blocked: Mapping[str, str] = MappingProxyType({}),
+    ) -> Ticket:
+        """Return the ticket of a command that may be given, with its record on the way.
+
+        It ends at once for those that are ``blocked``. A person's command takes the others out of
+        the visits that they are in. Where a visit verifies new parameters, no person sends the beam
+        to an aim: only the visit sees whether it gets there.
+
+        Raises
+        ------
+        RefusedError
+            If it may not.
+        """
+        for each in heliostats:
+            self._field.place(each)
+        self._authority.check(person, token, name)
+        self._guards.refuse_now(name, [each for each in heliostats if each not in blocked])
+        mandate = self._authority.mandate_of(token)
+        if mandate is not None:
+            wrong = mandate.refused(heliostats)
+        else:
+            wrong = self._guards.doubts.verifying(heliostats) if name in TO_AIMS else {}
+            if name in wire.JOINING and len(wrong) < len(heliostats):
+                blocked, wrong = {**blocked, **wrong}, {}
+        if wrong:
+            raise BeamError(name, wrong)
+        try:
+            ticket = self._orders.accept(
+                (person.name, person.role.title, name), values, heliostats, note, store=store
+            )
+        except AuditError as error:
+            raise refusals.NOT_RECORDED.error(what=name, problem=error) from None
+        ticket.block(blocked)
+        if mandate is None and name not in wire.SETTINGS:
+            self._authority.prevail(ticket.waiting(heliostats), f"{person.name} ordered {name}")
+        return ticket
 
     def _lock_record(self, heliostats: tuple[str, ...], token: int) -> tuple[Work, Work]:
         """Return work that stores whose lock it is, before it is taken; and its reverse."""
@@ -213,7 +261,8 @@ class Commands:
         BeamError
             If none may.
         """
-        able, wrong = self._permission.able(name, names, token)
+        asked = Asked(name, names, token=token)
+        able, wrong = self._guards.passed(asked, NOT_NOW, BEAM_REFUSED)
         if in_slices(name, able):
             return able, wrong  # each slice is examined when its turn comes
         clear, blocked = self._ways.clear(name, numbers, able, self._now())
@@ -244,14 +293,14 @@ class Commands:
             If there is no such heliostat.
         """
         numbers = whole(counts, wire.ROW_OF[wire.NUMBER_OF["ZERO"]][3], "ZERO")
-        if wrong := self._permission.strange((heliostat,)):
-            raise BeamError("ZERO", wrong)
-        self._permission.locked_out("ZERO", (heliostat,))
-        ticket = self._permission.accept(person, token, "ZERO", numbers, (heliostat,))
+        asked = Asked("ZERO", (heliostat,), token=token)
+        self._guards.passed(asked, BEAM_REFUSED)
+        self._guards.passed(asked, OUT_OF_SERVICE)
+        ticket = self.accept(person, token, "ZERO", numbers, (heliostat,))
 
         def send(again: bool) -> None:
             if again:
-                self._permission.locked_out("ZERO", (heliostat,))
+                self._guards.passed(asked, OUT_OF_SERVICE)
             left = ticket.waiting((heliostat,))
             self._orders.command(ticket, "ZERO", numbers, left, token)
 
@@ -287,7 +336,7 @@ class Commands:
 
         def accept(store: tuple[Work, Work] | None) -> Ticket:
             each = person, token, name, values, all_names, text, store, out
-            return self._permission.accept(*each)
+            return self.accept(*each)
 
         return self.give_points(NewPoints(name, names, wanted, token, store, note), accept)
 
@@ -329,7 +378,7 @@ class Commands:
 
         def accept(store: tuple[Work, Work] | None) -> Ticket:
             each = person, token, "AIM", (), (*names, *out), f"{len(names)} coded movements"
-            return self._permission.accept(*each, store, out)
+            return self.accept(*each, store, out)
 
         every = frozenset(names)
         new = NewPoints("AIM", names, wanted, token, store, note, check, lambda: every)
@@ -347,10 +396,6 @@ class Commands:
     def _places(self, names: Sequence[str]) -> npt.NDArray[np.intp]:
         return np.array([self._field.place(name) for name in names], dtype=np.intp)
 
-    def _destined(self, name: str, names: Sequence[str]) -> FloatArray | None:
-        """Return the aims (K, 3) to which a command sends beams; None: it sends them to none."""
-        return self._aims(self._places(names)) if name in wire.JOINING else None
-
     def _aims(self, rows: npt.NDArray[np.intp]) -> FloatArray:
         return np.asarray(self._ways.points.aims[rows])
 
@@ -359,9 +404,9 @@ class Commands:
     ) -> tuple[tuple[str, ...], npt.NDArray[np.intp], FloatArray, dict[str, str]]:
         """Return heliostats, rows (K,) and points (K, 3), and which are out of service, and why."""
         wanted = points_of(name, points) if name == "AIM" else None
-        out = self._permission.locked_out(name, points, wanted)
-        points = {n: point for n, point in points.items() if n not in out}
-        rows = self._places(tuple(points))
+        left, out = self._guards.passed(Asked(name, tuple(points), wanted), OUT_OF_SERVICE)
+        points = {n: points[n] for n in left}
+        rows = self._places(left)
         return tuple(points), rows, points_of(name, points), out
 
     def storing(
@@ -394,7 +439,7 @@ class Commands:
 
         def send(again: bool) -> None:
             if again:
-                self._permission.refuse_now(new.name, new.names)
+                self._guards.refuse_now(new.name, new.names)
                 self.prove_points(new.name, new.names, new.wanted)
             new.check(new.names)
             self._joining.drop(f"superseded by another {new.name}", frozenset(new.names), new.name)
@@ -428,7 +473,7 @@ class Commands:
             new.check(names)
             left = names
             if again:
-                self._permission.refuse_now(new.name, names)
+                self._guards.refuse_now(new.name, names)
                 left = clear(names)
             if gone := set(names).difference(left):
                 self._orders.owe(partial(store[1], gone))
@@ -470,8 +515,8 @@ class Commands:
         rows = self._places(names)
         tracking = self._field.among(states.ON_AIM, self._now())[rows]
         moves = tracking if name == "AIM" else self._field.among((states.IDLE,), self._now())[rows]
-        moved = [names[i] for i in np.flatnonzero(moves)]
-        if wrong := self._permission.unready(name, moved, wanted[moves]):
+        moved = tuple(names[i] for i in np.flatnonzero(moves))
+        if wrong := self._guards.reasons(Asked(name, moved, wanted[moves]), BEAM_REFUSED):
             raise BeamError(name, wrong)
         self._ways.check_points(name, rows, wanted, tracking)
 

@@ -68,6 +68,7 @@ from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.firmware import Firmware
 from heliotrope.plant.given import Given
 from heliotrope.plant.giving_back import GivingBack
+from heliotrope.plant.guards import Asked, Guards
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.joining import JoinDispatcher, JoinQueue
 from heliotrope.plant.lockouts import Lockouts
@@ -75,7 +76,7 @@ from heliotrope.plant.locks import Locks
 from heliotrope.plant.movements import Movements
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.parameters import ParameterSync, Tables, change_of_beam
-from heliotrope.plant.permission import Permission
+from heliotrope.plant.refusals import BEAM_REFUSED, OUT_OF_SERVICE
 from heliotrope.plant.rivals import Rivals
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.plant.stepping import Stepping
@@ -225,7 +226,7 @@ class PlantController:
         )
         self.sentinel = self._guarded(table, record)
         self._given = Given(self.field, points)
-        self._permission = self._permitting()
+        self._guards = self._guarding()
         self.commands = self._directed()
         self._joiner = self._dispatching()
         self._giving_back = self._returning()
@@ -242,7 +243,6 @@ class PlantController:
         return checks, Doubts(
             self.field,
             self.design,
-            self.aims,
             self._tell,
             lambda: self.witnesses.refusal,
             checks.stalled,
@@ -297,9 +297,9 @@ class PlantController:
             record,
         )
 
-    def _permitting(self) -> Permission:
-        """Return what decides who may command what."""
-        return Permission(
+    def _guarding(self) -> Guards:
+        """Return what stops heliostats."""
+        return Guards(
             self.field,
             self.authority,
             self._orders,
@@ -310,6 +310,7 @@ class PlantController:
             self.doubts,
             self.lockouts,
             self._given,
+            self.aims,
         )
 
     def _compared(self, points: Points) -> Agreement:
@@ -330,7 +331,7 @@ class PlantController:
             self.field,
             self._orders,
             self._joining,
-            self._permission,
+            self._guards,
             self._given,
             self._ways,
             self.design,
@@ -350,7 +351,7 @@ class PlantController:
             self._orders,
             self._ways,
             self.settings.join_life,
-            self._permission.kept_back,
+            self._guards.in_turn,
             self.commands.examine,
         )
 
@@ -360,7 +361,7 @@ class PlantController:
             self.field,
             self.authority,
             self._orders,
-            self._permission,
+            self._guards,
             self.commands,
             self.movements,
             self.locks,
@@ -559,12 +560,12 @@ class PlantController:
         """Return why a heliostat that is LOCKED is so, since when and until when, in words."""
         mandate = self.authority.visited().get(heliostat)
         visit = "" if mandate is None else f"the visit to {mandate.where} of {mandate.person.name}"
-        held = self._permission.held("UNLOCK", (heliostat,))
+        held = self._guards.held("UNLOCK", (heliostat,))
         return self.locks.reason(heliostat, visit, held.get(heliostat, ""))
 
     def waits_to_stow(self, heliostat: str) -> bool:
         """Return whether a heliostat waits for its turn to go to stow."""
-        return bool(self._orders.to_stow((heliostat,)))
+        return self._orders.to_stow(heliostat)
 
     def ordered_off(self, seen: FloatArray) -> npt.NDArray[np.bool_]:
         """Return which heliostats were ordered off by anybody, (N,); see `Ordered.off`."""
@@ -801,8 +802,8 @@ class PlantController:
         """
         row = self.field.place(heliostat)
         self.wanted.check(heliostat, items)
-        if wrong := self._unwritable((heliostat,)):
-            raise BeamError("PARAMETERS", wrong)
+        if reason := self._unwritable(heliostat):
+            raise BeamError("PARAMETERS", {heliostat: reason})
         before, after = self._tables(heliostat, items)
         self.authority.check(person, token, "PARAMETERS")
         self._sync.check(heliostat, items)
@@ -813,7 +814,7 @@ class PlantController:
                     heliostat=heliostat, change=1e3 * change, limit=1e3 * limit.largest_change
                 )
         note = ", ".join(items) + (f"; confirmed: {confirmed}" if confirmed else "")
-        ticket = self._permission.accept(person, token, "PARAMETERS", (), (heliostat,), note)
+        ticket = self.commands.accept(person, token, "PARAMETERS", (), (heliostat,), note)
 
         def use() -> None:
             self.wanted.set(heliostat, items)
@@ -857,15 +858,15 @@ class PlantController:
 
     def held(self, heliostats: Sequence[str]) -> Mapping[str, str]:
         """Return the heliostats in whose clusters no new motion may begin now, and the reasons."""
-        return self._permission.held("APPROACH", heliostats)
+        return self._guards.held("APPROACH", heliostats)
 
     def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
         return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
 
-    def _unwritable(self, heliostats: Sequence[str]) -> dict[str, str]:
-        """Return the heliostats to which nothing may be written, and the reasons."""
-        out = self.lockouts.blocked("PARAMETERS", heliostats)
-        return self._identities.barred(heliostats) | out
+    def _unwritable(self, heliostat: str) -> str | None:
+        """Return why nothing may be written to a heliostat, None if it may."""
+        asked, kinds = Asked("PARAMETERS", (heliostat,)), (OUT_OF_SERVICE, BEAM_REFUSED)
+        return self._guards.reasons(asked, *kinds).get(heliostat)
 
     def _resting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
         """Return why a heliostat may not rest at the stow position in items, "" if it may."""
@@ -877,8 +878,8 @@ class PlantController:
         found = self.beams.standing(rows, counts, (armature[None], drives[None]))
         return found.get(heliostat, "")
 
-    def _differing(self, heliostats: Sequence[str]) -> Mapping[str, str]:
-        return self._sync.differing(heliostats)
+    def _differing(self, heliostat: str) -> str | None:
+        return self._sync.differing(heliostat)
 
     def _aimed(self, row: int) -> FloatArray:
         """Return the points at which a heliostat may aim, ENU, m, (K, 3)."""

@@ -10,7 +10,7 @@ witness confirms the sun.
 """
 
 import contextlib
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -31,8 +31,6 @@ class Doubts:
         State of the field.
     design
         Its targets may be aimed at in doubt: a photograph there ends it.
-    aims
-        Assigned aims, ENU, m, (N, 3).
     tell
         Called with each alarm.
     unwitnessed
@@ -50,13 +48,12 @@ class Doubts:
         self,
         field: FieldState,
         design: Plant,
-        aims: FloatArray,
         tell: Callable[[Alarm], None],
         unwitnessed: Callable[[], str],
         stalled: Collection[str],
     ) -> None:
         self._unwitnessed, self._stalled = unwitnessed, stalled
-        self._field, self._aims, self._tell = field, aims, tell
+        self._field, self._tell = field, tell
         self._receivers = np.array([each.center for each in design.receivers]).reshape(-1, 3)
         self._targets = np.array([each.center for each in design.targets]).reshape(-1, 3)
         self._reach = np.array([np.hypot(each.width, each.height) for each in design.targets])
@@ -120,29 +117,23 @@ class Doubts:
             name, kind = self._field.names[rows[i]], alarms.COUNTS_DOUBTFUL
             self._tell(kind.raised(name) if doubtful[i] else kind.ended(name))
 
-    def barred(self, heliostats: Iterable[str], points: FloatArray | None = None) -> dict[str, str]:
-        """Return which heliostats may not join their aims, or points (K, 3), and why."""
-        names = tuple(heliostats)
+    def reasons(self, names: Sequence[str], points: FloatArray) -> list[str | None]:
+        """Return why each of some heliostats (K) may not join its point (K, 3), None if it may."""
         rows = [self._field.place(name) for name in names]
         unverified, astray = (np.isin(rows, list(s)) for s in (self._unverified, self._astray))
         blocked = self._unwitnessed()
         stalled = np.array([name in self._stalled for name in names], dtype=np.bool_)
         doubted = self.standing[rows] | unverified | astray | stalled | bool(blocked)
         if not doubted.any():
-            return {}
-        on_target = self._on_target(self._aims[rows] if points is None else points)
-        found = {}
-        for i in np.flatnonzero(doubted & ~on_target):
-            found[names[i]] = blocked
-            if self.standing[rows[i]]:
-                found[names[i]] = refusals.COUNTS_DOUBTFUL.text
-            if astray[i]:
-                found[names[i]] = refusals.SEEN_ASTRAY.text
-            if stalled[i]:
-                found[names[i]] = refusals.DRIVE_STALLED.text
-            if unverified[i]:
-                found[names[i]] = refusals.NOT_VERIFIED.text
-        return found
+            return [None] * len(names)
+        found = np.full(len(names), blocked or None, dtype=np.object_)
+        found[self.standing[rows]] = refusals.COUNTS_DOUBTFUL.text
+        found[astray] = refusals.SEEN_ASTRAY.text
+        found[stalled] = refusals.DRIVE_STALLED.text
+        found[unverified] = refusals.NOT_VERIFIED.text
+        found[self._on_target(points)] = None
+        reasons: list[str | None] = found.tolist()
+        return reasons
 
     def _on_target(self, points: FloatArray) -> Mask:
         """Return which points (K, 3) are at a target, and nearer to it than to a receiver."""

@@ -11,10 +11,15 @@ import numpy as np
 from heliotrope.links.messages import Stage
 from heliotrope.plant.assigned import KINDS, Points
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.refusals import AIM_NOT_TAKEN, STANDBY_NOT_TAKEN
 from heliotrope.plant.tickets import Ticket
 
 #: Why a point of an earlier program may not have been taken.
 _BEFORE_START = "the plant's program ended before it was acknowledged, or its store was restored"
+
+
+#: The refusal of a command that needs a point which was not taken.
+_NOT_TAKEN = {"AIM": AIM_NOT_TAKEN, "STANDBY": STANDBY_NOT_TAKEN}
 
 
 class Given:
@@ -55,20 +60,20 @@ class Given:
             rows = np.array([self._field.place(name) for name in names], dtype=np.intp)
             self._points.taken(ticket.name, rows)
 
-    def untaken(self, kind: str, heliostats: Sequence[str]) -> dict[str, str]:
-        """Return which heliostats have a point other than the assigned one, and why."""
-        last, found = self._tickets[kind], {}
-        for name in heliostats:
-            if name not in last:
-                continue
-            ticket = last[name]
-            if ticket is None:
-                found[name] = _BEFORE_START
-            elif ticket.stage(name) in (Stage.REFUSED, Stage.FAILED):
-                found[name] = ticket.refusals[name]
-        return found
+    def untaken(self, kind: str, heliostat: str) -> str | None:
+        """Return why a heliostat has a point other than the assigned one, None if it has not."""
+        last = self._tickets[kind]
+        if heliostat not in last:
+            return None
+        ticket = last[heliostat]
+        if ticket is None:
+            return _NOT_TAKEN[kind].text.format(reason=_BEFORE_START)
+        if ticket.stage(heliostat) in (Stage.REFUSED, Stage.FAILED):
+            return _NOT_TAKEN[kind].text.format(reason=ticket.refusals[heliostat])
+        return None
 
-    def unknown(self, kind: str, heliostats: Sequence[str]) -> dict[str, str]:
-        """Return the heliostats that may have any point, and the reasons; see `Points`."""
-        unknown, untaken = self._points.unknown(kind), self.untaken(kind, heliostats)
-        return {n: why for n, why in untaken.items() if unknown[self._field.place(n)]}
+    def unknown(self, kind: str, heliostat: str) -> str | None:
+        """Return why a heliostat may have any point, None if its point is known; see `Points`."""
+        reason = self.untaken(kind, heliostat)
+        row = self._field.place(heliostat)
+        return reason if reason and self._points.unknown(kind, slice(row, row + 1)).all() else None

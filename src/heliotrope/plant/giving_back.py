@@ -18,10 +18,11 @@ from heliotrope.plant.authority import Authority, RefusedError
 from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.commands import Commands, NewPoints
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.guards import Asked, Guards
 from heliotrope.plant.locks import Locks
 from heliotrope.plant.movements import Movements
 from heliotrope.plant.orders import PlantOrders
-from heliotrope.plant.permission import Permission
+from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW
 from heliotrope.plant.stepping import Stepping
 from heliotrope.plant.tickets import Ticket
 
@@ -47,7 +48,7 @@ class GivingBack:
         field: FieldState,
         authority: Authority,
         orders: PlantOrders,
-        permission: Permission,
+        guards: Guards,
         commands: Commands,
         movements: Movements,
         locks: Locks,
@@ -55,7 +56,7 @@ class GivingBack:
         stow: Callable[[Sequence[str]], object],
     ) -> None:
         self._field, self._authority, self._orders = field, authority, orders
-        self._permission, self._commands = permission, commands
+        self._guards, self._commands = guards, commands
         self._movements, self._locks, self._stepping = movements, locks, stepping
         self._stow = stow
 
@@ -74,7 +75,7 @@ class GivingBack:
     def _ordered(self, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
         """Give an order to heliostats that were left locked; return those that need no other."""
         if what == "STOW":
-            held = self._permission.held(what, names)
+            held = self._guards.held(what, names)
             free = tuple(name for name in names if name not in held)
             if left := tuple(n for n in free if n not in self._locks.under_way(free)):
                 self._stow(left)
@@ -110,7 +111,7 @@ class GivingBack:
 
         def send(again: bool) -> None:
             if again:
-                ticket.block(self._permission.held(what, ticket.waiting(able)))
+                ticket.block(self._guards.held(what, ticket.waiting(able)))
             self._orders.command(ticket, what, values, ticket.waiting(able), token)
 
         self._orders.when_recorded(ticket, send)
@@ -156,7 +157,7 @@ class GivingBack:
         names = tuple(name for name in due if name not in aimed)
         while names:
             try:
-                self._permission.refuse_now("AIM", names)
+                self._guards.refuse_now("AIM", names)
                 self._commands.prove_points("AIM", names, np.stack([due[n] for n in names]))
                 break
             except BeamError as error:
@@ -172,7 +173,8 @@ class GivingBack:
         token = self._authority.token
         for rough, due in self._stepping.due(now, token).items():
             self._stepping.sent(due, now)
-            blocked = self._permission.strange(due) | self._permission.held("ROUGH", due)
+            asked = Asked("ROUGH", tuple(due))
+            blocked = self._guards.reasons(asked, NOT_NOW, BEAM_REFUSED)
             names = tuple(name for name in due if name not in blocked)
             if not names:
                 continue

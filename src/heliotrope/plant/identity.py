@@ -6,8 +6,9 @@ that other heliostat's board: a command to H1 would move H2. A checksum that the
 known says nothing about whose board it is.
 """
 
+import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from zlib import crc32
 
 import numpy as np
@@ -144,22 +145,16 @@ class Identities:
         unknown = self._stored[row] != 0 and not self._own[row] and heliostat in self._wanted
         return self.strange.get(heliostat) or (_UNKNOWN if unknown else "")
 
-    def barred(self, heliostats: Iterable[str]) -> dict[str, str]:
-        """Return which heliostats may be neither moved nor written, and why."""
-        field, found = self._field, {}
-        for name in heliostats:
-            row = field.place(name)
-            cluster = field.clusters[field.cluster[row]]
-            if name in self.strange:
-                found[name] = self.strange[name]
-                continue
-            if name in field.unlisted:
-                found[name] = refusals.UNLISTED.text.format(cluster=cluster)
-                continue
-            judged = self._judged.get(cluster, -1) == self._connections(cluster)
-            if not (judged and np.isfinite(field.heard[row])):
-                found[name] = refusals.NOT_HEARD.text
-        return found
+    def blocked(self, heliostat: str) -> str | None:
+        """Return why a heliostat may be neither moved nor written, None if it may."""
+        field, row = self._field, self._field.place(heliostat)
+        cluster = field.clusters[field.cluster[row]]
+        if heliostat in self.strange:
+            return self.strange[heliostat]
+        if heliostat in field.unlisted:
+            return refusals.UNLISTED.text.format(cluster=cluster)
+        judged = self._judged.get(cluster, -1) == self._connections(cluster)
+        return None if judged and math.isfinite(field.heard[row]) else refusals.NOT_HEARD.text
 
     def off(self, now: float) -> dict[str, tuple[Act, str]]:
         """Return the strange heliostats that must leave, by name: by which act, and why."""

@@ -144,8 +144,8 @@ class JoinDispatcher:
         Of the plant.
     life
         Life of a command whose turn has come, s.
-    barred
-        Returns which of some heliostats may not be sent a command for another reason, and why.
+    blocked
+        Returns the heliostats that guards stop when their turn comes, and the reasons.
     examine
         Examines a slice of those that leave stow.
     """
@@ -157,12 +157,12 @@ class JoinDispatcher:
         orders: PlantOrders,
         beams: BeamWatch,
         life: float,
-        barred: Callable[[str, tuple[str, ...]], dict[str, str]],
+        blocked: Callable[[str, tuple[float, ...], tuple[str, ...]], dict[str, str]],
         examine: Examine,
     ) -> None:
         self._now, self._queue, self._orders = now, queue, orders
         self._beams, self._life = beams, life
-        self._barred, self._examine = barred, examine
+        self._blocked, self._examine = blocked, examine
 
     def beat(self, now: float, lost: Lost, *, held: bool) -> None:
         """Send the heliostats whose turn it is, unless no new motion may begin (``held``)."""
@@ -192,7 +192,7 @@ class JoinDispatcher:
         """Return which heliostats whose turn has come may not go, and why."""
         if job.name not in messages.SLICED:
             wrong = self._beams.joining(job.name, job.values, part, self._now())
-            return wrong | self._barred(job.name, part)
+            return wrong | self._blocked(job.name, job.values, part)
         try:
             return self._examine(job.name, job.values, part)[1]
         except BeamError as error:

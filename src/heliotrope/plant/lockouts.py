@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
-from heliotrope.lcu import messages
 from heliotrope.store.records import Kind, Lockout
 
 #: Name of the tower among what is locked.
@@ -86,21 +85,18 @@ class Lockouts:
         return found
 
     def blocked(
-        self, command: str, heliostats: Collection[str], points: FloatArray | None = None
+        self, heliostats: Collection[str], points: FloatArray | None = None
     ) -> dict[str, str]:
-        """Return the heliostats that a command must not move, and the reasons.
+        """Return the heliostats that no command may move, and the reasons.
 
         Parameters
         ----------
-        command
-            Its name.
         heliostats
             Names (K).
         points
-            Where it sends their beams, ENU, m, (K, 3); None: to no surface.
+            Where their beams are to be sent, ENU, m, (K, 3); None: to no surface.
         """
-        # ZERO and PARAMETERS are not harmless: the next STOW would go where stow is by then.
-        if command in messages.HARMLESS or not self._locks:
+        if not self._locks:
             return {}
         reasons: dict[str, str] = {}
         if points is not None:

@@ -17,7 +17,7 @@ from heliotrope.plant.assigned import AssignedError
 from heliotrope.plant.audit import Audit, AuditError, Record
 from heliotrope.plant.authority import Authority, RefusedError
 from heliotrope.plant.clusters import ClusterEnd, Clusters
-from heliotrope.plant.stowing import WAITS, StowQueue
+from heliotrope.plant.stowing import StowQueue
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act
 
@@ -459,9 +459,9 @@ class PlantOrders:
         self._stow(self._stowing.due(now))
         return tuple(name for name in heliostats if name not in self._stowing)
 
-    def to_stow(self, heliostats: Iterable[str]) -> dict[str, str]:
-        """Return which heliostats wait for their turn to go to stow: no motion is for them."""
-        return {name: WAITS for name in heliostats if name in self._stowing}
+    def to_stow(self, heliostat: str) -> bool:
+        """Whether a heliostat waits for its turn to go to stow: no motion is for it."""
+        return heliostat in self._stowing
 
     def _stow(self, parts: Mapping[Ticket, Sequence[str]]) -> None:
         for ticket, names in parts.items():

@@ -108,8 +108,8 @@ class ParameterSync:
         Returns why items may not be written where a heliostat stands, "" if they may.
     stow_proof
         Returns why a heliostat may not rest at the stow position in items, "" if it may.
-    barred
-        Returns the heliostats to which nothing may be written, and the reasons.
+    blocked
+        Returns why nothing may be written to a heliostat, None if it may.
     """
 
     def __init__(
@@ -121,11 +121,11 @@ class ParameterSync:
         tell: Callable[[Alarm], None],
         proof: Callable[[str, Mapping[str, bytes]], str],
         stow_proof: Callable[[str, Mapping[str, bytes]], str],
-        barred: Callable[[Sequence[str]], Mapping[str, str]],
+        blocked: Callable[[str], str | None],
     ) -> None:
         self._field, self._wanted, self._orders = field, wanted, orders
         self._clusters, self._tell, self._proof = clusters, tell, proof
-        self._stow_proof, self._barred = stow_proof, barred
+        self._stow_proof, self._blocked = stow_proof, blocked
         #: Heliostats to be compared, each with its time, monotonic s.
         self._due = dict.fromkeys(wanted.items, -math.inf)
         #: Those not compared since their cluster connected, or their board started.
@@ -147,22 +147,18 @@ class ParameterSync:
             self.compare(name)
         self._strange.update(name for name in heliostats if name in self._wanted.items)
 
-    def differing(self, heliostats: Sequence[str]) -> dict[str, str]:
-        """Return which heliostats may not move, because their parameters differ, and why.
+    def differing(self, heliostat: str) -> str | None:
+        """Return why the parameters of a heliostat differ or may differ, None if they do not.
 
-        Those that have not been compared since their cluster connected, or their board started,
-        may differ.
+        They may while they have not been compared since its cluster connected, or its board
+        started.
         """
-        found = {}
-        for name in heliostats:
-            ticket = self._tickets.get(name)
-            items = self._wanted.missing.get(name, ())
-            if items or (ticket is not None and not ticket.finished):
-                listed = ", ".join(items) or "being written"
-                found[name] = refusals.PARAMETERS_DIFFER.text.format(items=listed)
-            elif name in self._strange:
-                found[name] = refusals.NOT_COMPARED.text
-        return found
+        ticket = self._tickets.get(heliostat)
+        items = self._wanted.missing.get(heliostat, ())
+        if items or (ticket is not None and not ticket.finished):
+            listed = ", ".join(items) or "being written"
+            return refusals.PARAMETERS_DIFFER.text.format(items=listed)
+        return refusals.NOT_COMPARED.text if heliostat in self._strange else None
 
     def check(self, heliostat: str, items: Mapping[str, bytes]) -> None:
         """Check that the beam of a heliostat is safe if items are written now.
@@ -200,7 +196,7 @@ class ParameterSync:
 
         def send(again: bool) -> None:
             if again:
-                if reason := self._barred((heliostat,)).get(heliostat):
+                if reason := self._blocked(heliostat):
                     raise refusals.NOT_NOW.error(what=f"PARAMETERS {heliostat}", reason=reason)
                 self.check(heliostat, items)
             before()
@@ -246,7 +242,7 @@ class ParameterSync:
         if token and allowed:
             for name, missing in list(self._wanted.missing.items()):
                 busy = name in self._tickets or name in self._due
-                if live[self._field.index[name]] and not busy and not self._barred((name,)):
+                if live[self._field.index[name]] and not busy and not self._blocked(name):
                     self._push(name, missing, token, now)
 
     def _ask(self, name: str) -> None:

@@ -102,7 +102,7 @@ class Sentinel:
     ) -> None:
         self.order: EmergencyOrder | None = None
         self.on = False
-        self.night = ""
+        self.night: str = ""
         self._record, self._kept_at = record, -math.inf
         self._kept = self._recalled = Standing() if record is None else _recall(record)
         self._calls = {call.who: call for call in self._recalled.calls}
@@ -430,11 +430,6 @@ class Sentinel:
         back = order.take_back(names, self._field.rows[index], self._field.heard[index])
         if back:
             self.send_safe(_TABLE, order.act, back, "it has come back while an emergency holds")
-
-    def barred(self, heliostats: Iterable[str], condition: str = "") -> dict[str, str]:
-        """Return which heliostats one row, or any, keeps from their aims, and why."""
-        barred = self.table.barred(condition)
-        return {name: barred[name] for name in heliostats if name in barred}
 
     def _last_of(self, row: int, now: float) -> str:
         """Return, in words, where a heliostat with unknown step counts was last."""

@@ -341,7 +341,7 @@ class AutomaticControl:
         idle, visiting = self._why_idle(), self._visiting()
         field, age = self._plant.field, self._plant.now() - since
         rows = [field.place(name) for name in heliostats]
-        out = self._plant.lockouts.blocked("TRACK", heliostats, self._plant.aims[rows])
+        out = self._plant.lockouts.blocked(heliostats, self._plant.aims[rows])
         able, state = self._raising.able(), field.rows["state"]
         waits = self._raising.waits(heliostats)
         steps = {}
