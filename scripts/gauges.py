@@ -90,7 +90,7 @@ class Gauges:
         who, operations, over = Person("gauges", Role.ENGINEER), self.operations, Future[bool]()
 
         def work() -> None:
-            for call in operations.plant.calls:
+            for call in operations.plant.sentinel.calls:
                 operations.withdraw(who, call.who)
             for alarm in operations.logbook.alarms():
                 if not alarm.acknowledged_by:

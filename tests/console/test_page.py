@@ -293,7 +293,7 @@ def test_calibration_is_seen(field: LiveConsole, enter: Callable[[str], Any]) ->
 def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page = enter("engineer")
     page.click("#emergency")
-    order = field.until(lambda: field.live.operations.plant.emergency)
+    order = field.until(lambda: field.live.operations.plant.sentinel.order)
     assert order.who == "engineer"
     page.wait_for_selector(".hx-alert.on")
     page.wait_for_function(
@@ -310,18 +310,18 @@ def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any])
         if button.count():
             button.click(force=True)
         page.wait_for_timeout(1000)
-    assert not field.call(lambda: field.live.operations.plant.emergency_on)
+    assert not field.call(lambda: field.live.operations.plant.sentinel.on)
 
 
 def test_emergency_without_the_frame(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     """The plain page works with nothing but its own script."""
     page = enter("viewer")
-    before = field.call(lambda: field.live.operations.plant.emergency)
+    before = field.call(lambda: field.live.operations.plant.sentinel.order)
     page.route("**/_nicegui/**", lambda route: route.abort())
     page.goto(f"{field.address}emergency")
     page.click("#emergency")
     page.wait_for_selector("#emergency-said:has-text('ordered')")
-    order = field.call(lambda: field.live.operations.plant.emergency)
+    order = field.call(lambda: field.live.operations.plant.sentinel.order)
     assert order is not before
     field.calm()
 

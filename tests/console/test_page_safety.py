@@ -146,7 +146,7 @@ def test_an_emergency_is_withdrawn_after_one_question_and_its_text_ends(
     page.wait_for_selector("dialog[open] h2:has-text('Withdraw')")
     page.click("dialog >> text=Cancel")
     page.wait_for_timeout(1000)
-    assert field.call(lambda: field.live.plant.emergency_on)
+    assert field.call(lambda: field.live.plant.sentinel.on)
     page.click(".hx-alert button >> text=Withdraw")
     page.click("dialog >> text='Withdraw'")
     field.calm()

@@ -47,7 +47,7 @@ def within(holds: Callable[[], object], seconds: float = 60.0) -> None:
 def test_a_reading_reaches_the_safety_table_and_who_gave_it_is_recorded(
     console: LiveConsole, ask: Ask
 ) -> None:
-    table = console.live.plant._sentinel.table
+    table = console.live.plant.sentinel.table
     for value in (27.0, 3.0):
         within(lambda value=value: give(console, ask, value))
         assert console.call(lambda: table._put["wind_gust", ""].value) == value

@@ -237,7 +237,7 @@ def test_one_that_disagrees_is_defocused_alone(tmp_path: Path) -> None:
         agreement._wrong, agreement._at = {NAME: 0.1}, np.inf
         await bench.wait(7.0)
         assert alarmed(bench, "pointing_disagrees") == {NAME}
-        assert not bench.plant.emergency_on
+        assert not bench.plant.sentinel.on
 
     bench = play(tmp_path, scene)
     sent = [(m.name, m.heliostats) for c in bench.clusters.values() for m in c.of(Emergency)]
@@ -251,9 +251,9 @@ def test_many_that_disagree_defocus_the_field(tmp_path: Path) -> None:
         plant._agreement._at = np.inf
         await bench.wait(5.0)
         assert alarmed(bench, "pointing_disagrees_many") == {""}
-        assert plant.emergency_on
-        assert plant.emergency is not None
-        assert plant.emergency.act is Act.DEFOCUS
+        assert plant.sentinel.on
+        assert plant.sentinel.order is not None
+        assert plant.sentinel.order.act is Act.DEFOCUS
 
     play(tmp_path, scene)
 

@@ -262,7 +262,9 @@ def test_a_new_program_ends_a_small_movement(store: AssignedFile) -> None:
         mandate = entered.__enter__()
         kept.append(entered)
         for east in (0.01, -0.01):
-            assert await plant.move(ENGINEER, mandate.token, {NAME: (east, 0.0, 16.5)}).end(5.0)
+            assert await plant.commands.move(
+                ENGINEER, mandate.token, {NAME: (east, 0.0, 16.5)}
+            ).end(5.0)
         assert (store.read()["LENT"], store.read()["AIM"]) == ({NAME: base}, {NAME: base})
 
     async def after(bench: Bench) -> None:
@@ -393,7 +395,7 @@ def test_a_cluster_that_may_begin_no_motion_keeps_nothing_from_the_others(
                 each = [(home, m) for home in homes for m in home.of((Command, Emergency))]
                 return {n for h, m in each if m.name == what for n in m.heliostats or h.names}
 
-            monkeypatch.setattr(plant._sentinel, "refusal", refusal)
+            monkeypatch.setattr(plant.sentinel, "refusal", refusal)
             if what == "ROUGH":
                 for home in homes:
                     home.rows["flags"][0] = ROUGH

@@ -80,7 +80,7 @@ def test_exchanged_addresses_are_named_and_neither_is_moved_or_written(
                 with pytest.raises(RefusedError, match=f"{name} P5A.*its address answers with the"):
                     plant.command(ENGINEER, token, name, PAIR)
             with pytest.raises(RefusedError, match="ZERO P5A: its address answers with"):
-                plant.zero(ENGINEER, token, "P5A", (0, 0))
+                plant.commands.zero(ENGINEER, token, "P5A", (0, 0))
             with pytest.raises(RefusedError, match="PARAMETERS P5A: its address answers"):
                 plant.parameters(ENGINEER, token, "P5A", items_of(DESIGN["P5A"].calibrated))
             ticket = plant.command(ENGINEER, token, "APPROACH", (*PAIR, "P5C"))

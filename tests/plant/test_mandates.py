@@ -192,13 +192,13 @@ def test_an_emergency_leaves_nothing_locked_and_the_field_goes_up_again(stage: s
         await asyncio.sleep(25.0)
         assert order.report(plant.now()).complete, order.report(plant.now()).text
         await asyncio.sleep(120.0)
-        assert plant.emergency is not None
-        report = plant.emergency.report(plant.now())
+        assert plant.sentinel.order is not None
+        report = plant.sentinel.order.report(plant.now())
         assert report.complete, report.text
         assert not report.unknown
         assert set(here.states().values()) <= {"STOWED", "LOCKED"}
         assert here.live.assembly.left() == "", "all stand at stow, locked there or not"
-        (call,) = operations.plant.calls
+        (call,) = operations.plant.sentinel.calls
         operations.withdraw(ENGINEER, call.who)
         await asyncio.sleep(6.0)
         for alarm in operations.logbook.alarms():

@@ -460,7 +460,7 @@ def test_a_heliostat_out_of_service_is_moved_by_nobody() -> None:
             shown.aim_at(ENGINEER, token, (name,), "left")
         # Nor is anything written by which the next STOW would go elsewhere.
         with pytest.raises(RefusedError, match=f"ZERO {name}: out of service: washing"):
-            plant.plant.zero(ENGINEER, token, name, (0, 0))
+            plant.plant.commands.zero(ENGINEER, token, name, (0, 0))
         with pytest.raises(RefusedError, match=f"PARAMETERS {name}: out of service: washing"):
             plant.plant.parameters(ENGINEER, token, name, {"stow": struct.pack("<ii", 9, 9)})
         assert _states(plant) == ["STOWED", "IDLE", "IDLE", "IDLE"]

@@ -478,7 +478,9 @@ def test_a_beam_that_is_aimed_elsewhere_meanwhile_is_not_brought_back(
             assert await plant.aim(OPERATOR, token, {name: base}).end(5.0)
             assert await plant.command(OPERATOR, token, "TRACK", (name,)).end(5.0)
             await bench.wait(2.0)
-            assert await plant.move(OPERATOR, token, {name: base + (0.01, 0.0, 0.0)}).end(5.0)
+            assert await plant.commands.move(OPERATOR, token, {name: base + (0.01, 0.0, 0.0)}).end(
+                5.0
+            )
             await bench.wait(pause)
             disk.delay = 0.95
             plant.aim(OPERATOR, token, {name: target})

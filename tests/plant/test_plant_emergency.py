@@ -87,10 +87,10 @@ def test_an_order_is_proven_or_the_nodes_are_named(tmp_path: Path) -> None:
         # What nobody lifts goes on to stow.
         await bench.wait(35.0)
         assert bench.count(states.STOWED) == 18
-        assert plant.emergency is not order
-        assert plant.emergency is not None
-        assert plant.emergency.act is Act.STOW
-        assert plant.emergency.report(plant.now()).not_done == ()
+        assert plant.sentinel.order is not order
+        assert plant.sentinel.order is not None
+        assert plant.sentinel.order.act is Act.STOW
+        assert plant.sentinel.order.report(plant.now()).not_done == ()
 
     bench = play(tmp_path, scene, settings=MEASURED)
     assert orders(bench) == [("DEFOCUS", ()), ("STOW", ())]
@@ -123,7 +123,7 @@ def test_where_nobody_measures_the_flux_the_proof_rests_on_the_mirrors(tmp_path:
 
     async def scene(bench: Bench) -> None:
         plant = bench.plant
-        assert "flux_after_emergency" in plant.unwatched
+        assert "flux_after_emergency" in plant.sentinel.table.unwatched
         order = plant.raise_emergency("Olga", Act.STOW)
         early = order.report(plant.now())
         assert (early.flux, early.complete) == (FluxProof.NOT_MEASURED, False)
@@ -135,7 +135,7 @@ def test_where_nobody_measures_the_flux_the_proof_rests_on_the_mirrors(tmp_path:
             "measured, so this is believed: a stalled drive reports the same; 18 by reports alone: "
             "P1A, P1B, P1C, P2A, P2B, P2C, P3A, P3B, …"
         )
-        assert plant.emergency is order
+        assert plant.sentinel.order is order
         told = {alarm.condition for alarm in plant.alarms}
         assert told == {"operator_emergency", "authority_lost"}
         with pytest.raises(UnknownNameError, match="sensor"):
@@ -144,7 +144,7 @@ def test_where_nobody_measures_the_flux_the_proof_rests_on_the_mirrors(tmp_path:
         await bench.wait(4.0)
         plant.acknowledge(OPERATOR, "operator_emergency")
         token = await bench.commanded()
-        assert not plant.emergency_on
+        assert not plant.sentinel.on
         assert plant.command(OPERATOR, token, "APPROACH", ("P2B",))
 
     play(tmp_path, scene)
@@ -156,7 +156,7 @@ def test_a_sensor_of_the_flux_counts_also_when_it_is_silent(
 ) -> None:
     async def scene(bench: Bench) -> None:
         plant = bench.plant
-        assert "flux_after_emergency" not in plant.unwatched
+        assert "flux_after_emergency" not in plant.sentinel.table.unwatched
         order = plant.raise_emergency("Olga", Act.STOW)
         await feed(bench, 33, **({} if share is None else {FLUX_READING: share}))
         assert order.report(plant.now()).flux is FluxProof.NOT_BELOW
@@ -183,7 +183,7 @@ def test_a_heliostat_that_an_emergency_left_unproven_tracks_after_an_engineers_w
         plant.authority.keep(OPERATOR, token)
         plant.acknowledge(OPERATOR, "operator_emergency")
         await bench.wait(4.0)
-        assert not plant.emergency_on
+        assert not plant.sentinel.on
         plant.acknowledge(OPERATOR, "nodes_unacknowledged")
         await bench.wait(2.0)
         left = [a.subject for a in plant.alarms if a.condition == UNPROVEN]
@@ -211,7 +211,7 @@ def test_what_is_proven_after_its_emergency_needs_nobodys_word(tmp_path: Path) -
         await bench.wait(3.0)
         plant.acknowledge(OPERATOR, "operator_emergency")
         await bench.wait(2.0)
-        assert not plant.emergency_on
+        assert not plant.sentinel.on
         left = [(a.subject, a.active) for a in plant.alarms if a.condition == UNPROVEN]
         assert left == [("P1C", True)]
         bench.cluster_of("P1C").deaf.clear()
@@ -246,7 +246,7 @@ def test_it_holds_until_withdrawn_and_acknowledged_and_then_nothing_moves(tmp_pa
         plant.authority.keep(OPERATOR, token)
         plant.acknowledge(OPERATOR, "operator_emergency")
         await bench.wait(1.0)
-        assert not plant.emergency_on
+        assert not plant.sentinel.on
         # The node that did not answer is a finding of its own, to be acknowledged.
         await bench.wait(3.0)
         plant.acknowledge(OPERATOR, "nodes_unacknowledged")
@@ -283,13 +283,13 @@ def test_wind_defocuses_and_stows_with_hysteresis(tmp_path: Path) -> None:
         plant.put(FLUX_READING, 0.0)
         # Between its limits it stays as it is, however long.
         await feed(bench, 30, wind_gust=13.0, receiver_flux=0.0)
-        assert plant.emergency_on
+        assert plant.sentinel.on
         await feed(bench, 1, wind_gust=21.0, receiver_flux=0.0)
         assert bench.count(states.STOWED) == 18
         await feed(bench, 50, wind_gust=5.0, receiver_flux=0.0)
-        assert plant.emergency_on
+        assert plant.sentinel.on
         await feed(bench, 15, wind_gust=5.0, receiver_flux=0.0)
-        assert not plant.emergency_on
+        assert not plant.sentinel.on
         assert bench.count(states.STOWED) == 18
         # The flux was not measured after the orders: somebody has to look why.
         with pytest.raises(RefusedError, match="engineer must acknowledge, not operator"):
@@ -321,8 +321,8 @@ def test_a_gust_of_a_simulated_wind_defocuses_the_field(tmp_path: Path) -> None:
         for t in range(calm + 3, calm + 8):
             await feed(bench, 1, receiver_flux=0.7, **wind.readings((0.0, 0.0, 10.0), float(t)))
         assert bench.count(states.TRACKING) == 0
-        assert bench.plant.emergency is not None
-        assert "wind gust of" in bench.plant.emergency.reason
+        assert bench.plant.sentinel.order is not None
+        assert "wind gust of" in bench.plant.sentinel.order.reason
 
     sensors = frozenset({"wind_gust", "wind_mean", "receiver_flux"})
     play(tmp_path, scene, settings=PlantSettings(sensors=sensors))
@@ -334,8 +334,8 @@ def test_a_sensor_that_falls_silent_counts_as_the_worst(tmp_path: Path) -> None:
         assert bench.count(states.TRACKING) == 18
         await bench.wait(6.0)
         assert bench.count(states.STOWED) == 18
-        assert "no reading of wind gust (3 s)" in bench.plant.emergency.reason  # type: ignore[union-attr]
-        assert "wind_mean_stow" in bench.plant.unwatched
+        assert "no reading of wind gust (3 s)" in bench.plant.sentinel.order.reason  # type: ignore[union-attr]
+        assert "wind_mean_stow" in bench.plant.sentinel.table.unwatched
         with pytest.raises(UnknownNameError, match="no sensor of the plant 'wind_mean'"):
             bench.plant.put("wind_mean", 1.0)
 
@@ -348,7 +348,7 @@ def test_a_silent_cluster_is_defocused_alone_and_told_again_when_it_is_back(tmp_
         bench.clusters["pod-4"].mute = True
         took = await bench.until(lambda: bench.count(states.DEFOCUSED) == 3, 10.0)
         assert took <= 4.5
-        assert not plant.emergency_on
+        assert not plant.sentinel.on
         token = await bench.commanded()
         with pytest.raises(RefusedError, match="no status from the cluster"):
             plant.command(OPERATOR, token, "TRACK", ("P4A",))
@@ -620,14 +620,14 @@ def test_an_order_that_is_given_again_is_not_acknowledged_away(tmp_path: Path) -
             else:  # nothing has been evaluated since
                 plant.acknowledge(OPERATOR, "operator_emergency")
             await bench.wait(5.0)
-            assert plant.emergency_on
+            assert plant.sentinel.on
             with pytest.raises(RefusedError, match="the cause has not gone"):
                 plant.acknowledge(OPERATOR, "operator_emergency")
             plant.withdraw_emergency(ENGINEER, "Vera")
             await bench.wait(3.0)
             plant.acknowledge(OPERATOR, "operator_emergency")
             await bench.wait(2.0)
-            assert not plant.emergency_on
+            assert not plant.sentinel.on
 
     play(tmp_path, scene)
 

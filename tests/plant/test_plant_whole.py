@@ -65,8 +65,8 @@ def test_from_power_on_to_tracking_to_calibration_to_stow(tmp_path: Path, seed: 
         assert whole.flux() == 0.0
         assert order.report(plant.now()).late == ()
         await whole.until(lambda: whole.all_are("STOWED"), 300.0)
-        assert plant.emergency is not order
-        last = plant.emergency
+        assert plant.sentinel.order is not order
+        last = plant.sentinel.order
         assert last is not None
         assert last.act is Act.STOW
         await whole.until(lambda: last.report(plant.now()).complete, 10.0)
@@ -99,7 +99,7 @@ def test_real_boards_that_a_visit_has_locked_prove_their_stow_and_are_unlocked_t
             await whole.until(lambda: order.report(plant.now()).complete, 300.0)
             assert whole.all_are("LOCKED"), "nothing is unlocked in an emergency"
             assert order.ticket.good, order.ticket.text
-            (call,) = plant.calls
+            (call,) = plant.sentinel.calls
             plant.withdraw_emergency(ENGINEER, call.who)
             await whole.wait(5.0)
             plant.acknowledge(ENGINEER, "operator_emergency")

@@ -277,7 +277,7 @@ def test_an_emergency_another_person_or_a_cloud_ends_it_with_the_aims_as_they_we
         await asyncio.sleep(10.0)
         assert set(here.states().values()) == {"DEFOCUSED"}
         assert plant.movements.names, "no order follows an emergency"
-        (call,) = plant.calls
+        (call,) = plant.sentinel.calls
         plant.withdraw_emergency(ENGINEER, call.who)
         await asyncio.sleep(4.0)
         plant.acknowledge(ENGINEER, "operator_emergency")
@@ -329,10 +329,10 @@ def test_an_emergency_while_parameters_are_written_leaves_none_locked() -> None:
         plant.raise_emergency("Vera")
         await visit
         await asyncio.sleep(150.0)
-        report = plant.emergency.report(plant.now()) if plant.emergency else None
+        report = plant.sentinel.order.report(plant.now()) if plant.sentinel.order else None
         assert report is not None
         assert report.complete, report.text
-        (call,) = plant.calls
+        (call,) = plant.sentinel.calls
         plant.withdraw_emergency(ENGINEER, call.who)
         await asyncio.sleep(4.0)
         plant.acknowledge(ENGINEER, "operator_emergency")
@@ -350,26 +350,28 @@ def test_a_movement_is_refused_that_leaves_the_receiver_or_its_neighbourhood() -
         aim = plant.aims[row].copy()
         beside = {name: aim + 0.6 * face.axes[0]}
         with pytest.raises(BeamError, match="a movement has 3 mrad at most"):
-            plant.move(ENGINEER, here.token, beside)
+            plant.commands.move(ENGINEER, here.token, beside)
         small = aim + 0.1 * face.axes[0]
         stowed = here.names[1]
         assert await plant.stow("Vera", (stowed,)).end(300.0)
         with pytest.raises(BeamError, match="it does not track the receiver"):
-            plant.move(ENGINEER, here.token, {stowed: small})
-        assert await plant.move(ENGINEER, here.token, {name: small}).end(30.0)
+            plant.commands.move(ENGINEER, here.token, {stowed: small})
+        assert await plant.commands.move(ENGINEER, here.token, {name: small}).end(30.0)
         np.testing.assert_array_equal(plant.aims[row], small)
         # A new aim of a person is not undone.
         other = face.point((0.5, 0.5))
         assert await plant.aim(ENGINEER, here.token, {name: other}).end(30.0)
         assert not plant.movements.names
         # Nobody renews the movement: after a while the beam goes back.
-        assert await plant.move(ENGINEER, here.token, {name: other + 0.1 * face.axes[1]}).end(30.0)
+        assert await plant.commands.move(
+            ENGINEER, here.token, {name: other + 0.1 * face.axes[1]}
+        ).end(30.0)
         await here.until(lambda: not plant.movements.names, 200.0)
         np.testing.assert_array_equal(plant.aims[row], other)
         edge = face.point((3.45, 0.0))
         assert await plant.aim(ENGINEER, here.token, {name: edge}).end(30.0)
         with pytest.raises(BeamError, match="not on a planar receiver"):
-            plant.move(ENGINEER, here.token, {name: face.point((3.55, 0.0))})
+            plant.commands.move(ENGINEER, here.token, {name: face.point((3.55, 0.0))})
         results = await here.run(name, stowed)
         assert "inside the edge of receiver" in results[name].text
         assert "does not track receiver" in results[stowed].text

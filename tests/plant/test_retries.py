@@ -157,7 +157,7 @@ def test_an_order_that_a_heliostat_has_caused_is_its_failure(tmp_path: Path) -> 
         token = plant.take_authority(ENGINEER).token
         with plant.authority.mandate(ENGINEER, token, names, "target") as mandate:
             # A beam where none may be, by a wrong parameter or a faulty board.
-            plant._sentinel.send_safe(_TABLE, Act.DEFOCUS, (first,), "keep_out_predicted")
+            plant.sentinel.send_safe(_TABLE, Act.DEFOCUS, (first,), "keep_out_predicted")
             plant.stow("Vera", (second,))
             assert mandate.taken.keys() == {first, second}
             assert mandate.blameless == {second}

@@ -640,7 +640,7 @@ def test_what_is_wanted_and_who_is_left(folder: Path) -> None:
         wanted = plant.plant.wanted.items
         assert set(wanted) == set(design().names)
         assert wanted["H3"] == items_of(mechanisms(8)[2], MACHINE)
-        assert {"wind_gust_stow", "receiver_flow_low"} <= set(plant.plant.unwatched)
+        assert {"wind_gust_stow", "receiver_flow_low"} <= set(plant.plant.sentinel.table.unwatched)
         stowed = await plant.stowed(0.5)
         audit.close()
         return stowed, plant.left()

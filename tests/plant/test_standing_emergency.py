@@ -72,10 +72,10 @@ def test_a_plant_begins_in_the_emergency_that_held_when_its_program_ended(tmp_pa
 
     async def after(bench: Bench) -> None:
         plant = bench.plant
-        assert plant.emergency_on
-        assert plant.emergency is not None
-        assert plant.emergency.who == "Olga"
-        assert plant.emergency.reason == (
+        assert plant.sentinel.on
+        assert plant.sentinel.order is not None
+        assert plant.sentinel.order.who == "Olga"
+        assert plant.sentinel.order.reason == (
             "a person on the tower; it held when the plant's program ended, not proven for P3B"
         )
         assert bench.count(states.DEFOCUSED) == 18
@@ -93,10 +93,10 @@ def test_a_plant_begins_in_the_emergency_that_held_when_its_program_ended(tmp_pa
         # So does the row about the heliostat that did not answer the first program.
         plant.acknowledge(OPERATOR, "nodes_unacknowledged")
         await bench.wait(1.0)
-        assert not plant.emergency_on
+        assert not plant.sentinel.on
 
     async def last(bench: Bench) -> None:
-        assert not bench.plant.emergency_on
+        assert not bench.plant.sentinel.on
         assert bench.count(states.TRACKING) == 18
 
     keeper = Keeper(tmp_path / "records.sqlite", inline=True)
@@ -115,19 +115,19 @@ def test_a_row_that_waits_for_an_acknowledgement_outlives_the_program(tmp_path: 
 
     async def before(bench: Bench) -> None:
         await feed(bench, 1.3, 4)
-        assert bench.plant.emergency_on
+        assert bench.plant.sentinel.on
 
     async def after(bench: Bench) -> None:
         plant = bench.plant
-        assert plant.emergency_on
+        assert plant.sentinel.on
         (alarm,) = [a for a in plant.alarms if a.condition == "receiver_flux_high"]
         assert "tripped when the plant's program ended" in alarm.text
         assert "has not been read since" in alarm.text
         await feed(bench, 0.2, 15)
-        assert plant.emergency_on
+        assert plant.sentinel.on
         plant.acknowledge(OPERATOR, "receiver_flux_high")
         await feed(bench, 0.2, 2)
-        assert not plant.emergency_on
+        assert not plant.sentinel.on
 
     programs(tmp_path, before, after, record=record)
     assert record.document == ""
@@ -142,12 +142,12 @@ def test_a_withdrawn_order_stays_withdrawn_and_its_row_waits(tmp_path: Path) -> 
         bench.plant.withdraw_emergency(OPERATOR)
 
     async def after(bench: Bench) -> None:
-        assert bench.plant.emergency is not None
-        assert bench.plant.emergency.act is Act.STOW
-        assert bench.plant.emergency_on
+        assert bench.plant.sentinel.order is not None
+        assert bench.plant.sentinel.order.act is Act.STOW
+        assert bench.plant.sentinel.on
         bench.plant.acknowledge(OPERATOR, "operator_emergency")
         await bench.wait(1.0)
-        assert not bench.plant.emergency_on
+        assert not bench.plant.sentinel.on
 
     programs(tmp_path, before, after, record=record)
 
@@ -186,9 +186,11 @@ def test_a_record_that_cannot_be_read_begins_an_emergency(document: str, tmp_pat
     record.fails = document == "fails"
 
     async def scene(bench: Bench) -> None:
-        assert bench.plant.emergency_on
-        assert bench.plant.emergency is not None
-        assert "the record of the last emergency cannot be read" in bench.plant.emergency.reason
+        assert bench.plant.sentinel.on
+        assert bench.plant.sentinel.order is not None
+        assert (
+            "the record of the last emergency cannot be read" in bench.plant.sentinel.order.reason
+        )
         record.fails = False
 
     programs(tmp_path, scene, record=record)
@@ -229,7 +231,7 @@ def test_what_an_earlier_program_left_unproven_is_proven_by_reports(
         over = {a.subject for a in plant.alarms if a.condition == UNPROVEN and not a.active}
         assert left == {"P1A", "P1B"}
         assert over == ({"P1A", "P1B"} if left_by == "DEFOCUS" else {"P1A"})
-        assert plant.emergency is None
+        assert plant.sentinel.order is None
         expected = () if left_by == "DEFOCUS" else ("P1B",)
         assert read_standing(record.document).unproven == expected
 

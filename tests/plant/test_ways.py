@@ -446,7 +446,7 @@ def alarmed(plant: PlantController) -> set[str]:
 def test_a_beam_in_a_volume_or_heading_for_one_is_sent_off(commanded: bool, tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         plant = bench.plant
-        assert "keep_out_predicted" not in plant.unwatched
+        assert "keep_out_predicted" not in plant.sentinel.table.unwatched
         if commanded:
             await bench.commanded()
         inside = counts(plant, "P5B", (0.0, -12.0, 8.0))
@@ -731,7 +731,7 @@ def test_without_volumes_nobody_is_looked_at(tmp_path: Path) -> None:
         bench = Bench(clock, tmp_path)
         async with running(bench):
             await bench.wait(2.0)
-            assert "keep_out_predicted" in bench.plant.unwatched
+            assert "keep_out_predicted" in bench.plant.sentinel.table.unwatched
 
     run_virtual(main)
 

@@ -238,10 +238,10 @@ class LiveConsole:
                 if not alarm.acknowledged_by:
                     with contextlib.suppress(RefusedError):
                         here.acknowledge(who, alarm.condition, alarm.subject)
-            self._why = here.plant._sentinel.refusal(here.plant.field.clusters)
+            self._why = here.plant.sentinel.refusal(here.plant.field.clusters)
             return not self._why
 
-        for call in self.call(lambda: here.plant.calls):
+        for call in self.call(lambda: here.plant.sentinel.calls):
             self.call(partial(here.withdraw, who, call.who))
         try:
             self.until(quiet)

@@ -90,10 +90,10 @@ def resumes_by_itself(patch: pytest.MonkeyPatch) -> None:
     def resuming(self: Any, end: Any, status: Any, now: float) -> None:
         take(self, end, status, now)
         names = [n for n in end.members if self.field.of(n, now).state == "DEFOCUSED"]
-        if names and not self.emergency_on and not self.waiting:
+        if names and not self.sentinel.on and not self.waiting:
             run = self._orders._prefix
             ticket = Ticket(f"{run}-by itself", "REFOCUS", names, self.clock, 60.0)
-            self._commands._join(ticket, "REFOCUS", (), names, self.authority.token)
+            self.commands._join(ticket, "REFOCUS", (), names, self.authority.token)
 
     def quiet(self: Any, number: int, *rest: Any) -> None:
         """Leave the missing record to a defect of its own."""

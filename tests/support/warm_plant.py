@@ -51,7 +51,7 @@ async def work(clock: VirtualClock, worker: Callable[..., Any]) -> None:
         assert live.operations.automatic.view().done
         live.operations.emergency(Person("engineer", Role.ENGINEER))
         await asyncio.sleep(STOWING)
-        assert live.plant.emergency_on
+        assert live.plant.sentinel.on
         await live.end()
     print("calibrated and in an emergency")
 

@@ -94,7 +94,8 @@ def board(state: int, miss: float = 0.0) -> Any:
 
 def plant(**more: Any) -> Any:
     """Return the operations of a plant at which nothing is under way."""
-    order = SimpleNamespace(emergency=None, emergency_on=False, beliefs=SimpleNamespace())
+    sentinel = SimpleNamespace(order=None, on=False)
+    order = SimpleNamespace(sentinel=sentinel, beliefs=SimpleNamespace())
     order.beliefs.record = lambda name: None
     order.__dict__.update(more.pop("plant", {}))
     automatic = SimpleNamespace(
@@ -215,7 +216,7 @@ def test_an_emergency_that_a_person_has_acknowledged_need_not_outlive_a_restart(
         acts: Any = Acts.__new__(Acts)
         acts._operator = SimpleNamespace(clear=lambda _: set(acknowledged))
         acts._watch = SimpleNamespace(emergency=lambda *, on: heard.append(on))
-        acts.tidies(SimpleNamespace(plant=SimpleNamespace(emergency_on=True)))
+        acts.tidies(SimpleNamespace(plant=SimpleNamespace(sentinel=SimpleNamespace(on=True))))
         return heard
 
     assert tidied("clock_jump") == []

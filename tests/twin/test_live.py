@@ -489,7 +489,7 @@ def test_an_emergency_of_the_twin_is_proven_with_its_flux(boards: bool, key: byt
     async def work(live: LivePlant) -> None:
         plant, sensor = live.plant, live.world.flux
         assert sensor is not None
-        assert "flux_after_emergency" not in plant.unwatched
+        assert "flux_after_emergency" not in plant.sentinel.table.unwatched
         await asyncio.sleep(100.0)
         assert plant.field.among((states.TRACKING,), plant.now()).all(), plant.field.counted()
         assert sensor.share() > 0.9

@@ -279,7 +279,7 @@ def test_imperfections_are_counted_once() -> None:
 def test_a_record_of_a_command_that_was_given_up_belongs_to_nothing_and_says_so() -> None:
     plant = SimpleNamespace(
         field=SimpleNamespace(live=lambda now: np.zeros(0, dtype=bool)),
-        emergency=None,
+        sentinel=SimpleNamespace(order=None),
         orders=(),
         authority=SimpleNamespace(visited=dict),
     )
@@ -301,7 +301,7 @@ def test_an_own_order_of_the_plant_waits_for_its_turn_for_a_time_only() -> None:
     waiting = SimpleNamespace(identity="x-1", sent=False)
     plant: Any = SimpleNamespace(
         field=SimpleNamespace(live=lambda now: np.zeros(0, dtype=bool)),
-        emergency=None,
+        sentinel=SimpleNamespace(order=None),
         orders=(waiting,),
         authority=SimpleNamespace(visited=dict),
     )

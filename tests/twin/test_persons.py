@@ -21,10 +21,13 @@ def board(state: int = states.STOWED, place: int = 0) -> Any:
 
 def plant(act: Act | None, *callers: str, locks: tuple[tuple[str, str], ...] = ()) -> Any:
     """Return a plant with an emergency, or None, that persons have called, and with locks."""
-    return SimpleNamespace(
+    sentinel = SimpleNamespace(
         calls=[SimpleNamespace(who=who) for who in callers],
-        emergency=None if act is None else SimpleNamespace(act=act),
-        emergency_on=act is not None,
+        order=None if act is None else SimpleNamespace(act=act),
+        on=act is not None,
+    )
+    return SimpleNamespace(
+        sentinel=sentinel,
         lockouts=[SimpleNamespace(name=name, who=who) for name, who in locks],
     )
 

@@ -224,7 +224,29 @@ class Commands:
         return clear, wrong | blocked
 
     def zero(self, person: Person, token: int, heliostat: str, counts: Sequence[float]) -> Ticket:
-        """Declare the step counts of one heliostat; see `PlantController.zero`."""
+        """Declare the step counts of the axes of one heliostat that is locked or has a fault.
+
+        Nothing moves; its local controller stores the counts. It needs an engineer, and the
+        heliostat's key in its cluster.
+
+        Parameters
+        ----------
+        person, token
+            The person commanding, and the token of the command authority.
+        heliostat
+            Name.
+        counts
+            Of the primary and the secondary axis, steps.
+
+        Raises
+        ------
+        RefusedError
+            If it is not accepted; nothing is sent then.
+        InputError
+            Counts that do not fit.
+        UnknownNameError
+            If there is no such heliostat.
+        """
         numbers = whole(counts, wire.ROW_OF[wire.NUMBER_OF["ZERO"]][3], "ZERO")
         if wrong := self._permission.strange((heliostat,)):
             raise BeamError("ZERO", wrong)
@@ -274,7 +296,23 @@ class Commands:
         return self.give_points(NewPoints(name, names, wanted, token, store, note), accept)
 
     def move(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
-        """Move beams a little beside their aims; see `PlantController.move`."""
+        """Move beams a little on their receiver, for a measurement; their aims stay assigned.
+
+        The beams go back to their aims by themselves; see `movements`. No turn is needed, since
+        they bring no light to the receiver.
+
+        Parameters
+        ----------
+        person, token
+            The person commanding, and the token of the command authority.
+        points
+            ENU, m, (3,), by name.
+
+        Raises
+        ------
+        RefusedError
+            If it is not accepted, or one of the beams may not go there.
+        """
         names, rows, wanted, out = self._pointed("AIM", points)
         tracking, aims = self._field.among((states.TRACKING,), self._now())[rows], self._aims(rows)
         if wrong := self._movements.refused(names, rows, aims, wanted, tracking):

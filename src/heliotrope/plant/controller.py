@@ -57,7 +57,6 @@ from heliotrope.plant.commands import Commands
 from heliotrope.plant.doubts import Doubts
 from heliotrope.plant.drive_checks import DriveChecks
 from heliotrope.plant.emergency import (
-    Call,
     EmergencyOrder,
     EmergencyRecord,
     PlantReadings,
@@ -141,6 +140,8 @@ class PlantController:
         Locks of persons; EMERGENCY, DEFOCUS and STOW pass them.
     aims, standbys
         Points where the beams are sent, ENU, m, (N, 3); NaN where there is none.
+    commands, sentinel
+        What gives persons' commands; the safety table with the emergencies that stand.
     movements, locks, stepping
         Aims that visits have moved, heliostats that they have locked, and fine steps that they
         need; the plant gives back what they leave.
@@ -221,10 +222,10 @@ class PlantController:
             self._resting,
             self._unwritable,
         )
-        self._sentinel = self._guarded(table, record)
+        self.sentinel = self._guarded(table, record)
         self._given = Given(self.field, points)
         self._permission = self._permitting()
-        self._commands = self._directed()
+        self.commands = self._directed()
         self._joiner = self._dispatching()
         self._giving_back = self._returning()
         self._named_at, self._slow_at = dict.fromkeys(members, -math.inf), -math.inf
@@ -301,7 +302,7 @@ class PlantController:
             self.field,
             self.authority,
             self._orders,
-            self._sentinel,
+            self.sentinel,
             self._rivals,
             self._identities,
             self._sync,
@@ -349,7 +350,7 @@ class PlantController:
             self._ways,
             self.settings.join_life,
             self._permission.kept_back,
-            self._commands.examine,
+            self.commands.examine,
         )
 
     def _returning(self) -> GivingBack:
@@ -359,7 +360,7 @@ class PlantController:
             self.authority,
             self._orders,
             self._permission,
-            self._commands,
+            self.commands,
             self.movements,
             self.locks,
             self.stepping,
@@ -397,7 +398,7 @@ class PlantController:
 
     def _greet(self, end: ClusterEnd) -> None:
         """Repeat orders to a cluster that has connected, and compare its parameters."""
-        self._sentinel.greet(end.name)
+        self.sentinel.greet(end.name)
         self._sync.greet(end.members)
         self._firmware.greet(end.name, self.now())
 
@@ -408,7 +409,7 @@ class PlantController:
             case Progress():
                 found = self._orders.take(end.name, message)
                 if found is not None:
-                    self._sentinel.take_progress(*found, message)
+                    self.sentinel.take_progress(*found, message)
                     self._obeyed(*found, message.stage, now)
             case Alarm():
                 for alarm in self._told_alarms.take(end.name, message):
@@ -462,7 +463,7 @@ class PlantController:
                     self.field.learn_order(end.name, tuple(answer.data))
 
             self._clusters.ask(end, "statistics", learn)
-        self._sentinel.take_rows(end.name, now)
+        self.sentinel.take_rows(end.name, now)
 
     async def _beats(self) -> None:
         while True:
@@ -471,10 +472,10 @@ class PlantController:
             await sleep_until(self.clock, due)
 
     def _beat(self, now: float) -> None:
-        for alarm in self._sentinel.beat(now):
+        for alarm in self.sentinel.beat(now):
             self._tell(alarm)
         token = self.authority.token
-        self._joiner.beat(now, self.authority.lost, held=bool(self._sentinel.refusal(("",))))
+        self._joiner.beat(now, self.authority.lost, held=bool(self.sentinel.refusal(("",))))
         self._orders.beat(now)
         self._giving_back.beat(now)
         slow = now - self._slow_at >= _SLOW_BEAT
@@ -488,7 +489,7 @@ class PlantController:
             for work in (points.settling(), points.released(held, now)):
                 if work is not None:
                     self._orders.owe(work)
-            self._sync.beat(now, token, not self._sentinel.refusal(self.field.clusters))
+            self._sync.beat(now, token, not self.sentinel.refusal(self.field.clusters))
 
     def _held(self) -> dict[str, frozenset[str]]:
         """Return the heliostats of which visits hold something, by kind (`assigned.HELD`)."""
@@ -514,29 +515,9 @@ class PlantController:
         return fast_vector(self.clock.utc().timestamp() + ahead, self.design.site)
 
     @property
-    def emergency(self) -> EmergencyOrder | None:
-        """The last order to the whole field, None before the first."""
-        return self._sentinel.order
-
-    @property
-    def calls(self) -> tuple[Call, ...]:
-        """The emergency orders of persons that have not been withdrawn, one for each person."""
-        return self._sentinel.calls
-
-    @property
-    def emergency_on(self) -> bool:
-        """Whether an emergency of the whole field holds."""
-        return self._sentinel.on
-
-    @property
     def standby_unknown(self) -> npt.NDArray[np.bool_]:
         """Which heliostats may have any standby point, (N,); see `Points.unknown`."""
         return self._ways.points.unknown("STANDBY")
-
-    @property
-    def unwatched(self) -> tuple[str, ...]:
-        """Rows of the safety table that have no reading."""
-        return self._sentinel.table.unwatched
 
     @property
     def waiting(self) -> int:
@@ -558,7 +539,7 @@ class PlantController:
         UnknownNameError
             If it is not one of the settings' sensors.
         """
-        self._sentinel.put(name, value, self.now() if made is None else made, subject)
+        self.sentinel.put(name, value, self.now() if made is None else made, subject)
 
     # -- open to anybody -------------------------------------------------------------------
 
@@ -599,7 +580,7 @@ class PlantController:
             return last
         names = tuple(heliostats) or self.field.names
         self._joining.drop(f"{act.name} by {who}", frozenset(names))
-        ticket = self._sentinel.send_safe((who, "anybody"), act, names, "", in_turn=True)
+        ticket = self.sentinel.send_safe((who, "anybody"), act, names, "", in_turn=True)
         self._last_safe = same, ticket
         return ticket
 
@@ -617,7 +598,7 @@ class PlantController:
         if act not in (Act.DEFOCUS, Act.STOW):
             raise InputError(f"emergency: {act.name} cannot be ordered; give DEFOCUS or STOW")
         at = self.clock.utc().timestamp()
-        return self._sentinel.call(who, act, reason or f"emergency order of {who}", at)
+        return self.sentinel.call(who, act, reason or f"emergency order of {who}", at)
 
     # -- the command authority -------------------------------------------------------------
 
@@ -672,13 +653,13 @@ class PlantController:
             If the person has ordered none while others have, or their role is too low.
         """
         person.must_be(Role.OPERATOR, "withdraw")
-        who, calls = owner or person.name, self.calls
+        who, calls = owner or person.name, self.sentinel.calls
         if who != person.name:
             person.must_be(Role.ENGINEER, f"withdraw the emergency of {who}")
         if calls and who not in {call.who for call in calls}:
             texts = "; ".join(call.text for call in calls)
             raise refusals.NOT_CALLER.error(who=who, calls=texts)
-        self._sentinel.withdraw(who)
+        self.sentinel.withdraw(who)
         self.note(person, "WITHDRAW", f"emergency order of {who}")
 
     def acknowledge(self, person: Person, condition: str, subject: str = "") -> None:
@@ -705,8 +686,8 @@ class PlantController:
             self.doubts.confirm(subject)
         elif condition == alarms.DRIVE_STALLED.name:
             self.drive_checks.confirm(subject)
-        elif condition in self._sentinel.table.rows or subject not in self._clusters.ends:
-            refusal = self._sentinel.acknowledge(condition, person.name, role, subject)
+        elif condition in self.sentinel.table.rows or subject not in self._clusters.ends:
+            refusal = self.sentinel.acknowledge(condition, person.name, role, subject)
             if refusal:
                 raise refusals.NOT_ACKNOWLEDGED.error(reason=refusal)
         else:
@@ -749,33 +730,7 @@ class PlantController:
         """
         if name in ("DEFOCUS", "STOW"):
             return self._safe(person.name, Act[name], heliostats)
-        return self._commands.give(person, token, name, heliostats, values)
-
-    def zero(self, person: Person, token: int, heliostat: str, counts: Sequence[float]) -> Ticket:
-        """Declare the step counts of the axes of one heliostat that is locked or has a fault.
-
-        Nothing moves; its local controller stores the counts. It needs an engineer, and the
-        heliostat's key in its cluster.
-
-        Parameters
-        ----------
-        person, token
-            The person commanding, and the token of the command authority.
-        heliostat
-            Name.
-        counts
-            Of the primary and the secondary axis, steps.
-
-        Raises
-        ------
-        RefusedError
-            If it is not accepted; nothing is sent then.
-        InputError
-            Counts that do not fit.
-        UnknownNameError
-            If there is no such heliostat.
-        """
-        return self._commands.zero(person, token, heliostat, counts)
+        return self.commands.give(person, token, name, heliostats, values)
 
     def default_aims(
         self, heliostats: Sequence[str] = (), points: npt.ArrayLike | None = None
@@ -803,29 +758,11 @@ class PlantController:
         RefusedError
             If it is not accepted, or one of the beams may not go there.
         """
-        return self._commands.point(person, token, "AIM", points)
+        return self.commands.point(person, token, "AIM", points)
 
     def standby(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
         """Set standby points, beyond which beams go on; see `aim`."""
-        return self._commands.point(person, token, "STANDBY", points)
-
-    def move(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
-        """Move beams a little on their receiver, for a measurement; their aims stay assigned.
-
-        The beams go back to their aims by themselves; see `movements`. No turn is needed, since
-        they bring no light to the receiver.
-
-        Parameters
-        ----------
-        person, token, points
-            As for `aim`.
-
-        Raises
-        ------
-        RefusedError
-            If it is not accepted, or one of the beams may not go there.
-        """
-        return self._commands.move(person, token, points)
+        return self.commands.point(person, token, "STANDBY", points)
 
     def parameters(
         self,

@@ -228,8 +228,8 @@ async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outsid
         kept = pictures(shown, folder)
         ports = replace(ports, pictures=kept, marks=shown.marks)
         live = PlantAssembly(design, ports, _settings(design, choice, shown, outside))
-        if live.plant.unwatched:
-            print(f"no readings for: {', '.join(live.plant.unwatched)}", flush=True)
+        if live.plant.sentinel.table.unwatched:
+            print(f"no readings for: {', '.join(live.plant.sentinel.table.unwatched)}", flush=True)
         papers = _papers(outside, shown)
         for each in outside.local:
             file = each.installation.bus_key_file

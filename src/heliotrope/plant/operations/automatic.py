@@ -553,7 +553,7 @@ class AutomaticControl:
 
     def _why_idle(self) -> str:
         """Return why nothing is moved now, "" if heliostats may be moved."""
-        if self._plant.emergency_on:
+        if self._plant.sentinel.on:
             return "an emergency is active"
         if self.waits:
             return "automatic control waits for Resume"
@@ -569,7 +569,7 @@ class AutomaticControl:
     async def _govern(self) -> None:
         """Hold the authority while nobody else wants it; give up in an emergency and at night."""
         plant, wanted = self._plant, self._raising.wanted
-        if plant.emergency_on:
+        if plant.sentinel.on:
             self._raising.give_up()
         grant, since = plant.authority.grant, plant.now() - self._gave_way_at
         if self._has_authority():
@@ -611,7 +611,7 @@ class AutomaticControl:
 
     async def _raise(self) -> None:
         self.service.park()
-        if self._plant.emergency_on:
+        if self._plant.sentinel.on:
             self._raising.give_up()
         self._raising.lose(self._losses.look(self._raising.wanted, self._checks.moved))
         if not self._why_idle():

@@ -405,7 +405,7 @@ class Calibrating:
     def _interrupted(self, token: int) -> bool:
         """Return whether an emergency, or a person who took command, may have ended a visit."""
         grant = self._plant.authority.grant
-        return self._plant.emergency_on or grant is None or grant.token != token
+        return self._plant.sentinel.on or grant is None or grant.token != token
 
     def _note_place(self, place: str, problem: str, token: int) -> None:
         """Note whether a visit failed through no fault of a heliostat, "" if it did not."""

@@ -236,7 +236,7 @@ class Operations:
             grant.holder.role.name.lower() if grant else "",
             self.plant.waiting,
             self.logbook.open_alarms,
-            self.plant.emergency_on,
+            self.plant.sentinel.on,
             self.automatic.waits,
             float(extra.pop("lag", 0.0)),
             extra,
@@ -594,7 +594,7 @@ class Operations:
             See `PlantController.withdraw_emergency`.
         """
         self.plant.withdraw_emergency(person, owner)
-        left = "; ".join(call.text for call in self.plant.calls)
+        left = "; ".join(call.text for call in self.plant.sentinel.calls)
         whose = f"{owner}'s emergency" if owner not in ("", person.name) else "emergency"
         still = f"; still ordered by {left}" if left else ""
         self._tell(person, f"{whose} withdrawn{still}", "command")

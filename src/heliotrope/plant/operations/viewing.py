@@ -194,10 +194,10 @@ class Viewer:
 
     def emergency(self) -> EmergencyView:
         """Return the last emergency order with its proof."""
-        plant, order = self._plant, self._plant.emergency
+        plant, order = self._plant, self._plant.sentinel.order
         if order is None:
             return EmergencyView(False, "", "", "", 0.0, 0, 0, 0, (), "no emergency so far")
-        if not plant.emergency_on:
+        if not plant.sentinel.on:
             over = f"over: {order.act.name} of the field, ordered by {order.who}"
             ago = plant.now() - order.at
             return EmergencyView(
@@ -216,7 +216,7 @@ class Viewer:
             count - len(report.not_done),
             report.not_done[:_SOME],
             report.text,
-            plant.calls,
+            plant.sentinel.calls,
             report.flux is FluxProof.BELOW,
             report.followed,
             report.believed[:_SOME],

@@ -57,7 +57,7 @@ def zero(
     """
     if len(heliostats) != 1:
         raise refusals.ONE_HELIOSTAT.error(what="ZERO", count=len(heliostats) or "all")
-    return plant.zero(person, token, heliostats[0], values)
+    return plant.commands.zero(person, token, heliostats[0], values)
 
 
 def lock_position(
@@ -113,7 +113,7 @@ def lock_position(
             why=f"its counts would change by {1e3 * turn:.0f} mrad of the mirror, above "
             f"{1e3 * MOST_TURN:.0f} mrad: is it this heliostat's beam, and this its aim?",
         )
-    ticket = plant.zero(person, token, name, wanted.tolist())
+    ticket = plant.commands.zero(person, token, name, wanted.tolist())
     places = ", ".join(f"{x:.2f}" for x in aim)
     return ticket, (
         f"{what} {name} at ({places}) m: counts {counts[0]:.0f}, {counts[1]:.0f} become "

@@ -135,7 +135,7 @@ class JointVisit(BroughtHome):
 
     async def move(self, points: Mapping[str, FloatArray], limit: float) -> None:
         """Move beams a little beside their aims; those that may not be moved drop out."""
-        await self._pointed(self.plant.move, points, limit)
+        await self._pointed(self.plant.commands.move, points, limit)
 
     async def _pointed(
         self, give: Pointing, points: Mapping[str, FloatArray], limit: float

@@ -391,7 +391,7 @@ class BeamObserver:
         if plant is not None:
             beliefs = plant.beliefs
             self._unsurveyed = {n for n in self._unsurveyed if beliefs.record(n) is None}
-            if plant.emergency_on:  # automatic control has given up the field
+            if plant.sentinel.on:  # automatic control has given up the field
                 self.taken(self._mirrors)
             self._proofs(plant, sun, now)
 
@@ -516,10 +516,10 @@ class BeamObserver:
 
     def _proofs(self, plant: PlantController, sun: FloatArray, now: float) -> None:
         """Check that a mirror proven to be done is off the receiver, or at stow, in truth."""
-        order = plant.emergency
+        order = plant.sentinel.order
         if order is None:
             return
-        self._complete(order, sun, now, holds=plant.emergency_on)
+        self._complete(order, sun, now, holds=plant.sentinel.on)
         for mirror in self._mirrors.values():
             key = (order.ticket.identity, mirror.name)
             if key not in self._proved:

@@ -87,7 +87,7 @@ class DayObserver:
         """
         self._low_at = min(self._low_at, now) if sun[2] < self._low else inf
         # A new program knows nothing of what it was given, and in an emergency all is given up.
-        if plant is None or plant.emergency is not None:
+        if plant is None or plant.sentinel.order is not None:
             self._given.clear()
         self._calm = {name: self._calm.get(name, now) for name in quiet}
         for name, given_at in self._given.items():

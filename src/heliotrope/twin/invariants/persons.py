@@ -175,15 +175,15 @@ class PersonsObserver:
 
     def _stands(self, plant: PlantController, now: float) -> None:
         """Check that each order stands under its owner's name, and that no other does."""
-        shown = {call.who for call in plant.calls}
+        shown = {call.who for call in plant.sentinel.calls}
         for owner, (act, at) in self.orders.items():
             if now - at <= SHOWN_WITHIN:
                 continue
             saw = f"{owner} ordered {act.name} {now - at:.1f} s ago and has not withdrawn it, and "
             self._check(owner in shown, now, "plant", f"{saw}the plant names no such order")
-            order = plant.emergency
-            holds = plant.emergency_on and order is not None and order.act >= act
-            does = f"{order.act.name} holds" if order and plant.emergency_on else "none holds"
+            order = plant.sentinel.order
+            holds = plant.sentinel.on and order is not None and order.act >= act
+            does = f"{order.act.name} holds" if order and plant.sentinel.on else "none holds"
             self._check(holds, now, "plant", f"{saw}{does}")
         for owner in shown:
             saw = f"an emergency order of {owner} stands, which is withdrawn"

@@ -528,7 +528,7 @@ class PlantObserver:
 
     def _proofs(self, plant: PlantController, now: float) -> None:
         """Check that everything a proof calls done was done."""
-        order = plant.emergency
+        order = plant.sentinel.order
         if order is None:
             return
         for name, account in self._accounts.items():

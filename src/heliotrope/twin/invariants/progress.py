@@ -190,20 +190,20 @@ class ProgressObserver:
         self._recalled(operations, now)
         failures = [row.text for row in rows if row.condition == FAILED]
         self._check(not failures, now, "automatic control", failures[0] if failures else "")
-        if operations.plant.emergency is not None:
+        if operations.plant.sentinel.order is not None:
             self._given.clear()
         running = operations.automatic.view().running
         visited = {name for run in running for name in run.heliostats}
         self._visits(running, now)
         lost = any(row.condition == NOBODY and row.active for row in rows)
-        well = not (operations.plant.emergency_on or operations.automatic.waits or lost)
+        well = not (operations.plant.sentinel.on or operations.automatic.waits or lost)
         self._go_on(operations, self._given & quiet if well else set(), now)
         self._step_finely(running, quiet, sun, now)
         stowed = {n for n, board in self._boards.items() if board.state == states.STOWED}
         blocked = {row.subject for row in rows if row.condition == BLOCKED and row.active}
         stowed -= blocked if self._across else set()
         may = governs and not operations.automatic.waits and self._high(sun)
-        may &= not operations.plant.emergency_on
+        may &= not operations.plant.sentinel.on
         self._owned(visited, quiet, now)
         working = [name for name in self._given & quiet if may and name not in self._out]
         for name, board in self._boards.items():
@@ -262,7 +262,7 @@ class ProgressObserver:
 
     def _recalled(self, operations: Operations, now: float) -> None:
         """Check that a new program goes on with what held when the last one ended."""
-        on = operations.plant.emergency_on
+        on = operations.plant.sentinel.on
         if self._ended:
             self._ended = False
             saw = "a person's emergency held when the last program ended, and the new one goes on"

@@ -439,7 +439,7 @@ class QuietObserver:
 
     def _proven(self, mirror: _Mirror, plant: PlantController, sun: FloatArray, now: float) -> None:
         """Check that an emergency that has been carried out is proven."""
-        order = plant.emergency if plant.emergency_on else None  # withdrawn: nobody proves it
+        order = plant.sentinel.order if plant.sentinel.on else None  # withdrawn: nobody proves it
         if order is None or not self._is_own(mirror):
             mirror.off_since = None
             return

@@ -100,7 +100,7 @@ class Acts:
     def tidies(self, operations: Operations) -> None:
         """Clear what latches, let automatic control go on, and give it the field."""
         taken = self._operator.clear(operations.plant)
-        holds = operations.plant.emergency_on
+        holds = operations.plant.sentinel.on
         if CALLED in taken or not holds:
             self._watch.emergency(on=False)
         if holds:

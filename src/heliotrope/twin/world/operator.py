@@ -400,7 +400,7 @@ class Operator:
         """Declare the step counts of one heliostat; see `give`."""
         who, token = self._duty, self._tokens.get(self._duty.name, 0)
         try:
-            ticket = plant.zero(who, token, name, counts)
+            ticket = plant.commands.zero(who, token, name, counts)
         except RefusedError as error:
             self._refused(error, who, token, "ZERO", (name,))
             return None

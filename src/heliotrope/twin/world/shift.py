@@ -90,7 +90,7 @@ class Shift:
                 due = acts.now() + self._chance.expovariate(1.0 / self._pause)
                 with contextlib.suppress(RefusedError):
                     await self._interrupts(operations)
-            elif operations.plant.emergency_on or self._chance.random() < 0.3:
+            elif operations.plant.sentinel.on or self._chance.random() < 0.3:
                 acts.tidies(operations)
 
     async def _interrupts(self, operations: Operations) -> None:
