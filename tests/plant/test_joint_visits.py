@@ -646,7 +646,7 @@ def test_a_joint_visit_that_is_refused_is_one_event_and_not_one_of_each() -> Non
         raise refusals.OTHER_AUTHORITY.error(holder="Egon", person="automatic control")
 
     made.cycle.run = run  # type: ignore[method-assign]
-    made._plant.sentinel.on = True  # type: ignore[misc]
+    made._plant.sentinel = SimpleNamespace(on=True)  # type: ignore[assignment]
     made._plant.authority = SimpleNamespace(grant=None)  # type: ignore[assignment]
     noted, done = list[tuple[str, ...]](), list[str]()
     calibrating = calibrating_of(made, lambda *words: noted.append(words), done)
