@@ -17,7 +17,7 @@ NAMES = (
     "tracking", "calibration", "imaging", "sun", "field", "startup", "bus", "frames", "clusters",
     "control", "plant", "airborne", "console", "day", "learning", "signing",
     "splits", "coded", "production", "commission", "drifting", "obstruction", "floor",
-    "prototype",
+    "prototype", "heliopoint", "spots",
 )  # fmt: skip
 #: Width of a table that goes to a file or a pipe, characters.
 WIDTH = 180

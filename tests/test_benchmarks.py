@@ -89,6 +89,14 @@ COLUMNS = {
         "sightings_before", "stream_us", "batch_ms", "ratio", "difference_sigma", "hypotheses",
         "state_kB",
     },
+    "heliopoint": {
+        "mirrors", "surface", "points", "sigma_plain_mrad", "sigma_mean_mrad", "error_mrad",
+        "systematic_mrad", "sigma_total_mrad", "total_error_mrad", "within_90", "shapiro_p",
+    },
+    "spots": {
+        "background", "condition", "frames", "clean", "accepted", "east_mm", "up_mm", "rms_mm",
+        "worst_mm", "in_68", "in_95", "wrong_accepts", "wrong_rejects", "faults", "faults_named",
+    },
     "bus": {"line", "question", "bytes", "wire_ms", "median_ms", "p99_ms", "cycle_of_32_s"},
 }  # fmt: skip
 RESULT = {

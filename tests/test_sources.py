@@ -51,7 +51,12 @@ def _run(line: str) -> str:
     before = sys.argv
     try:
         with contextlib.redirect_stdout(out):
-            if words[0] == "python":
+            if words[:2] == ["python", "-m"]:
+                sys.argv = words[2:]
+                with pytest.raises(SystemExit) as leaving:
+                    runpy.run_module(words[2], run_name="__main__")
+                assert leaving.value.code == 0, f"{line} ended with {leaving.value.code}"
+            elif words[0] == "python":
                 sys.argv = words[1:]
                 runpy.run_path(words[1], run_name="__main__")
             else:
@@ -140,7 +145,9 @@ def test_every_command_runs_and_prints_our_figures(
     for row in rows:
         for line, slow in _COMMAND.findall(row[2]):
             if slow:
-                assert Path(shlex.split(line)[1]).is_file(), f"{line}: there is no such script"
+                words = shlex.split(line)
+                path = words[1] if words[1] != "-m" else f"{words[2]}/{words[3]}.py"
+                assert (ROOT / path).is_file(), f"{line}: there is no {path}"
             else:
                 shown(line)
     _compare([row for row in rows if not _is_slow(row)], shown)
