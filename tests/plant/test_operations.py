@@ -452,6 +452,8 @@ def test_a_heliostat_out_of_service_is_moved_by_nobody() -> None:
         await asyncio.sleep(8.0)
         for each in (ticket, aims):
             assert each.blocked == {name: f"out of service: {lockout.text}"}
+            # Failed would mean that it was sent, and that its result is unknown.
+            assert each.counted() == {"refused": 1, "done": 3}
         for command in ("APPROACH", "TRACK", "UNLOCK", "JOG", "CLEAR_FAULT", "GOTO"):
             values = {"JOG": (0, 100), "GOTO": (0, 0)}.get(command, ())
             with pytest.raises(RefusedError, match=f"{command} {name}: out of service: washing"):
