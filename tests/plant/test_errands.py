@@ -8,7 +8,7 @@ import pytest
 
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Stage
-from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.errands import Errands, Step
 from heliotrope.plant.tickets import Ticket
@@ -104,6 +104,54 @@ def test_out_of_service_is_done_when_it_is_parked_and_names_who_is_not() -> None
         assert again.refusals == {names[0]: "it was given back to service"}
 
     live(work, BY_HAND)
+
+
+def test_a_lock_on_a_target_parks_what_gets_its_aim_back_on_the_way_to_stow() -> None:
+    """The visit that was on the target ends, and its members are aimed at the receiver again."""
+
+    async def work(plant: LivePlant) -> None:
+        shown, (first, second, third, _) = plant.operations, plant.names
+        await until(lambda: all(shown.heliostat(n).state == "TRACKING" for n in plant.names))
+        token = shown.take_authority(ENGINEER).token
+        shown.aim_at(ENGINEER, token, (first, second), "left")
+        await asyncio.sleep(6.0)
+        shown.keep_authority(ENGINEER, token)
+        ticket = shown.hold(OPERATOR, (), "paint target", targets=("left",))
+        assert ticket.heliostats == (first, second)
+        await asyncio.sleep(3.0)
+        shown.aim_at(ENGINEER, token, (first, second), "receiver")
+        await asyncio.sleep(3.0)
+        shown.release_authority(ENGINEER, token)
+        assert not ticket.finished
+        # Another lock that comes and goes is not theirs.
+        shown.hold(OPERATOR, (third,), "washing")
+        shown.unhold(OPERATOR, (third,))
+        said = await followed(ticket, 200.0)
+        assert ticket.good, said
+        assert "parked in stow; it may go up again" in ticket.text
+        # The lock stands, and they go back to work at the receiver.
+        assert [lock.name for lock in shown.holds()] == ["left"]
+        await until(lambda: shown.heliostat(first).state == "TRACKING")
+
+    live(work, BY_HAND)
+
+
+@pytest.mark.parametrize("place", ["heliostat", "tower"])
+def test_a_calibration_waits_for_the_start_and_names_the_lock(place: str) -> None:
+    async def work(plant: LivePlant) -> None:
+        shown, name = plant.operations, plant.names[0]
+        await until(lambda: shown.calibration().on)
+        shown.release_authority(ENGINEER, shown.take_authority(ENGINEER).token)
+        ticket = shown.calibrate(OPERATOR, name)
+        assert ticket.steps[name] == "it waits: it is starting"
+        heliostats = (name,) if place == "heliostat" else ()
+        shown.hold(OPERATOR, heliostats, "washing", tower=place == "tower")
+        reason = "out of service" if place == "heliostat" else "the tower is locked"
+        text = rf"^calibration of {name}: {reason}: washing \(Olga, since .* UTC\)"
+        with pytest.raises(RefusedError, match=text):
+            shown.calibrate(OPERATOR, name)
+
+    live(work, WORK)
 
 
 def test_one_that_does_not_come_to_stow_is_named_with_an_alarm_and_the_ticket_ends() -> None:

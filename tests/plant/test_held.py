@@ -420,6 +420,6 @@ def test_a_cluster_that_may_begin_no_motion_keeps_nothing_from_the_others(
     run_virtual(main)
     results = [r.result for r in read(tmp_path / "audit.jsonl")[0] if r.what == what]
     if what != "STOW":
-        assert f"1 done, 1 failed (P2A: {reason})" in results[0]
+        assert f"1 done, 1 refused (P2A: {reason})" in results[0]
         named = [result for result in results if reason in result]
         assert all("1 done" in result for result in named), "no order is for that one alone"

@@ -412,14 +412,20 @@ def test_persons_come_before_the_automat() -> None:
         calls = [(call.who, call.act, call.reason) for call in shown.viewer.emergency().calls]
         assert calls == [("Vera", "STOW", "a fire"), ("Olga", "DEFOCUS", "somebody on the tower")]
         shown.withdraw(ENGINEER, "Vera")
+        view = shown.viewer.emergency()
+        assert (view.who, view.reason) == ("Olga", "somebody on the tower")
         await asyncio.sleep(40.0)
         assert shown.summary().emergency
-        with pytest.raises(RefusedError, match=r"Otto has ordered no emergency.*Olga \(DEFOCUS"):
+        with pytest.raises(
+            RefusedError, match=r"no emergency order of Otto stands.*Olga \(DEFOCUS"
+        ):
             shown.withdraw(Person("Otto", Role.OPERATOR))
         with pytest.raises(RefusedError, match="withdraw the emergency of Olga: Otto is operator"):
             shown.withdraw(Person("Otto", Role.OPERATOR), "Olga")
         shown.withdraw(ENGINEER, "Olga")
-        assert shown.viewer.emergency().calls == ()
+        view = shown.viewer.emergency()
+        assert (view.who, view.calls) == ("safety table", ())
+        assert view.reason.startswith("every order is withdrawn; it ends when an operator")
         await asyncio.sleep(20.0)
         assert shown.summary().states == {"STOWED": 4}
         with pytest.raises(UnknownNameError, match="act of an emergency"):
@@ -452,6 +458,8 @@ def test_a_heliostat_out_of_service_is_moved_by_nobody() -> None:
         await asyncio.sleep(8.0)
         for each in (ticket, aims):
             assert each.blocked == {name: f"out of service: {lockout.text}"}
+            # Failed would mean that it was sent, and that its result is unknown.
+            assert each.counted() == {"refused": 1, "done": 3}
         for command in ("APPROACH", "TRACK", "UNLOCK", "JOG", "CLEAR_FAULT", "GOTO"):
             values = {"JOG": (0, 100), "GOTO": (0, 0)}.get(command, ())
             with pytest.raises(RefusedError, match=f"{command} {name}: out of service: washing"):

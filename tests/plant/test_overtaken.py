@@ -95,7 +95,7 @@ def test_who_waits_to_join_is_examined_when_its_turn_comes(tmp_path: Path, why: 
                 await bench.wait(0.5)
                 plant.authority.keep(OPERATOR, token)
             assert not [m for m in home.commands("TRACK") if last in (m.heliostats or home.names)]
-            assert ticket.stage(last) is Stage.FAILED
+            assert ticket.stage(last) is Stage.REFUSED
 
     run_virtual(main)
 

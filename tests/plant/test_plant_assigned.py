@@ -89,7 +89,7 @@ def test_what_cannot_be_kept_is_not_sent(tmp_path: Path) -> None:
 
     run_virtual(main)
     (record,) = [r for r in read(tmp_path / "audit.jsonl")[0] if r.what == "AIM"]
-    assert "1 failed" in record.result
+    assert "1 refused" in record.result
 
 
 def test_the_old_file_stays_until_the_new_one_is_whole(
@@ -543,7 +543,7 @@ def test_an_aim_that_is_given_up_before_its_turn_was_never_assigned(
             assert plant.movements.names == frozenset(lent)
             plant.release_authority(ENGINEER, token)
             await bench.wait(1.0)
-            assert ticket.stage(names[1]) is Stage.FAILED
+            assert ticket.stage(names[1]) is Stage.REFUSED
             assert "changed while it waited its turn" in ticket.refusals[names[1]]
             assert plant.aims[rows].tolist() == [list(target), list(AIM)]
             assert store.read()["AIM"] == places

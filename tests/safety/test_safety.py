@@ -215,7 +215,7 @@ def test_a_cause_that_has_just_gone_is_said_in_plain_words() -> None:
     run = Run("operator_emergency").feed(1.0, 1.0)
     refused = safety.acknowledge(run.state, "operator_emergency", "Ada", AcknowledgeRole.OPERATOR)
     assert refused[1] == (
-        "operator_emergency: the cause has not gone: a person has ordered an emergency. Keep "
+        "operator_emergency: the cause has not gone: an emergency order of a person stands. Keep "
         "people away from the receiver and the beams; find the cause, then withdraw the order and "
         "acknowledge."
     )

@@ -125,7 +125,7 @@ class JoinQueue:
     @staticmethod
     def _fail(job: JoiningJob, text: str, heliostats: frozenset[str] | None = None) -> None:
         gone = [name for name in job.waiting if heliostats is None or name in heliostats]
-        job.ticket.advance(gone, Stage.FAILED, text)
+        job.ticket.advance(gone, Stage.REFUSED, text)
         left = set(gone)
         job.waiting = deque(name for name in job.waiting if name not in left)
 

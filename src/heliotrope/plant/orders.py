@@ -237,7 +237,7 @@ class PlantOrders:
         try:
             self._write(f"{ticket.identity}.{self._messages}", recording)
         except DiskBusyError as error:
-            ticket.advance(heliostats, Stage.FAILED, f"not sent: {error}")
+            ticket.advance(heliostats, Stage.REFUSED, f"not sent: {error}")
 
     def _write(self, key: str, recording: _Recording) -> None:
         """Give the disk what must be on it before a command is sent."""
@@ -266,10 +266,10 @@ class PlantOrders:
                 self._owed.append(recording.store[1])
         elif recording.begun:
             text = f"not sent, because it cannot be stored: {error}"
-            ticket.advance(heliostats, Stage.FAILED, text)
+            ticket.advance(heliostats, Stage.REFUSED, text)
         elif ticket.identity in self._open and recording.begin is not None:
             text = f"not sent: its record could not be written: {error}"
-            ticket.advance(heliostats, Stage.FAILED, text)
+            ticket.advance(heliostats, Stage.REFUSED, text)
             # It was accepted, so it gets a record as soon as the disk takes one.
             self._owed.append(recording.begin)
 
@@ -278,7 +278,8 @@ class PlantOrders:
         try:
             send(recording.waited)
         except Exception as error:
-            recording.ticket.advance(recording.heliostats, Stage.FAILED, f"not sent: {error}")
+            stage = Stage.REFUSED if isinstance(error, RefusedError) else Stage.FAILED
+            recording.ticket.advance(recording.heliostats, stage, f"not sent: {error}")
             if recording.store is not None:
                 self._owed.append(recording.store[1])
             if not isinstance(error, RefusedError):
@@ -288,7 +289,7 @@ class PlantOrders:
     def _give_up_late(recording: _Recording, now: float) -> None:
         if now > recording.until:
             text = f"not sent: its record was not on the disk within {RECORDING:g} s"
-            recording.ticket.advance(recording.heliostats, Stage.FAILED, text)
+            recording.ticket.advance(recording.heliostats, Stage.REFUSED, text)
 
     def when_recorded(self, ticket: Ticket, send: Callable[[bool], None]) -> None:
         """Call ``send`` once the ticket's record is on the disk; never, if that takes too long.
@@ -317,7 +318,7 @@ class PlantOrders:
             ticket = recording.ticket
             if ticket.name not in _STILL:
                 names = [name for name in recording.heliostats if name in heliostats]
-                ticket.advance(names, Stage.FAILED, f"not sent: overtaken by {what}")
+                ticket.advance(names, Stage.REFUSED, f"not sent: overtaken by {what}")
         for identity in self._unsent:
             under = self._under.get(identity)
             if under is not None and under.ticket.name not in _STILL:
@@ -615,7 +616,7 @@ class PlantOrders:
         until = now + _LAST
         for recording in self._recording.values():
             text = "not sent: the plant was closed"
-            recording.ticket.advance(recording.heliostats, Stage.FAILED, text)
+            recording.ticket.advance(recording.heliostats, Stage.REFUSED, text)
         self.beat(now)
         await self._until(lambda: not self._recording, until)
         for identity, ticket in self._open.items():

@@ -36,7 +36,7 @@ class Ticket:
     refusals
         Reasons why it was refused or failed, by heliostat.
     blocked
-        Those of the reasons that are beams in keep-out volumes.
+        Those of the reasons for which the plant has not sent it.
     steps
         What each heliostat of an operation does or waits for now, or its result; none of a command.
     accepted_at
@@ -98,10 +98,10 @@ class Ticket:
             self.refusals.update(texts)
 
     def block(self, refusals: Mapping[str, str]) -> None:
-        """End the ticket for heliostats whose beams may not go there."""
+        """End the ticket for heliostats that are not sent the command, each with its reason."""
         self.blocked.update(refusals)
         for name, text in refusals.items():
-            self.advance((name,), Stage.FAILED, text)
+            self.advance((name,), Stage.REFUSED, text)
 
     def expect(self, heliostats: Iterable[str], until: float) -> None:
         """Set the time (monotonic s) by which heliostats must have acknowledged."""

@@ -283,14 +283,16 @@ class AutomaticControl:
         receiver: bool,
     ) -> None:
         """Calibrate a heliostat before all others; see `Operations.calibrate`."""
+        names = tuple(dict.fromkeys((heliostat, *together)))
+        for name, reason in self._locked(names).items():
+            each = {"what": "calibration of", "heliostat": name, "more": "", "reason": reason}
+            raise refusals.OUT_OF_SERVICE.error(**each)
         if target:
             self._plant.design.target(target)
             if why := self.service.closed(target):
                 why = f"target {target} is locked: {why}"
                 raise refusals.NO_CALIBRATION.error(heliostat=heliostat, why=why)
-        names = tuple(dict.fromkeys((heliostat, *together)))
-        for name in names:
-            self._check_calibration(name)
+        self._check_calibration(names)
         if self._calibrating is None:
             return
         if receiver:
@@ -311,15 +313,20 @@ class AutomaticControl:
         else:
             self._calibrating.ask(heliostat, target, search=search)
 
-    def _check_calibration(self, heliostat: str) -> None:
-        row = self._plant.field.place(heliostat)
-        why = self._why_not()
-        if not why and self.service.rows()[row]:
-            why = "it is out of service"
-        if not why and not self._raising.wanted[row]:
-            why = "automatic control does not have it"
-        if why or self._calibrating is None:
-            raise refusals.NO_CALIBRATION.error(heliostat=heliostat, why=why)
+    def _check_calibration(self, heliostats: Sequence[str]) -> None:
+        """Refuse a calibration that cannot be made; one that has to wait a little is accepted."""
+        idle, wanted = self._why_not(), self._raising.wanted
+        for name in heliostats:
+            why = "" if idle == _STARTING else idle
+            if not why and not wanted[self._plant.field.place(name)]:
+                why = "automatic control does not have it"
+            if why:
+                raise refusals.NO_CALIBRATION.error(heliostat=name, why=why)
+
+    def _locked(self, heliostats: Sequence[str]) -> dict[str, str]:
+        """Return the heliostats that persons' locks keep from their aims, and the reasons."""
+        aims = self._plant.aims[[self._plant.field.place(name) for name in heliostats]]
+        return self._plant.lockouts.blocked(heliostats, aims)
 
     # -- progress --------------------------------------------------------------------------
 
@@ -340,8 +347,7 @@ class AutomaticControl:
         """
         idle, visiting = self._why_idle(), self._visiting()
         field, age = self._plant.field, self._plant.now() - since
-        rows = [field.place(name) for name in heliostats]
-        out = self._plant.lockouts.blocked(heliostats, self._plant.aims[rows])
+        out = self._locked(heliostats)
         able, state = self._raising.able(), field.rows["state"]
         waits = self._raising.waits(heliostats)
         steps = {}

@@ -400,7 +400,8 @@ class Operations:
         places = self._places(heliostats, targets, receivers, tower=tower)
         names = self.automatic.hold(person, places, reason, hours)
         self._tell(person, f"{_named(places)} out of service: {reason}", "command")
-        return self.errands.begin("OUT_OF_SERVICE", names, self.automatic.service.progress, _PARKED)
+        progress = partial(self.automatic.service.progress, places)
+        return self.errands.begin("OUT_OF_SERVICE", names, progress, _PARKED)
 
     def unhold(
         self,

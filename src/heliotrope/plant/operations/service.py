@@ -19,6 +19,8 @@ from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.safety import Alarm, alarms
 from heliotrope.store.records import Kind, Lockout
 
+#: What is locked: its kind and name.
+Place = tuple[Kind, str]
 #: Orders to stow, until a heliostat out of service is seen there.
 PARKING = RetryLaw(
     "stow of a heliostat out of service",
@@ -54,8 +56,10 @@ class Service:
     ) -> None:
         self._plant, self._keeping, self.attempts = plant, keeping, Attempts(PARKING, tell)
         plant.lockouts.put(keeping.lockouts())
-        #: Since when each has been out of service and not been seen in stow, monotonic s.
-        self._unparked = dict.fromkeys(self._concerned(plant.lockouts), -math.inf)
+        #: Since when locks have sent heliostats to stow that were not seen there yet, monotonic s,
+        #: and what is locked. Their aims do not show it: a visit that ends gives others back.
+        self._unparked: dict[str, tuple[float, frozenset[Place]]] = {}
+        self._send_off(plant.lockouts, -math.inf)
 
     @property
     def out(self) -> tuple[Lockout, ...]:
@@ -63,13 +67,13 @@ class Service:
         return tuple(self._plant.lockouts)
 
     def rows(self) -> npt.NDArray[np.bool_]:
-        """Return which heliostats persons' locks keep in stow, (N,).
+        """Return which heliostats persons' locks keep in stow, or have sent there, (N,).
 
         They are locked themselves, their beams are aimed at something that is, or the tower is.
         """
         locks, field = self._plant.lockouts, self._plant.field
         found = np.full(len(field), bool(locks.on(Kind.TOWER, TOWER)))
-        found[[field.place(name) for name in locks.heliostats]] = True
+        found[[field.place(name) for name in (*locks.heliostats, *self._unparked)]] = True
         for near in locks.closed(self._plant.aims).values():
             found |= near
         return found
@@ -80,7 +84,7 @@ class Service:
         return locks.text(Kind.TARGET, target) or locks.text(Kind.TOWER, TOWER)
 
     def take(
-        self, person: Person, places: Sequence[tuple[Kind, str]], reason: str, hours: float
+        self, person: Person, places: Sequence[Place], reason: str, hours: float
     ) -> tuple[str, ...]:
         """Lock places for a person, and stow the heliostats concerned; return their names.
 
@@ -92,27 +96,39 @@ class Service:
             for kind, name in places
         ]
         self._plant.lockouts.put(locks)
-        concerned = self._concerned(locks)
-        self._unparked.update(dict.fromkeys(concerned, self._plant.now()))
+        concerned = self._send_off(locks, self._plant.now())
         if concerned:
             self._stow(person.name, concerned)
         self._keeping.lock_out(locks)
         return concerned
 
-    def _concerned(self, lockouts: Iterable[Lockout]) -> tuple[str, ...]:
-        """Return the heliostats that must be in stow under some locks."""
-        locks, field = Lockouts(self._plant.design), self._plant.field
-        locks.put(lockouts)
-        if locks.on(Kind.TOWER, TOWER):
-            return field.names
-        found = np.zeros(len(field), dtype=np.bool_)
-        found[[field.place(name) for name in locks.heliostats]] = True
-        for near in locks.closed(self._plant.aims).values():
-            found |= near & ~field.among((states.STOWED,), self._plant.now())
+    def _send_off(self, locks: Iterable[Lockout], since: float) -> tuple[str, ...]:
+        """Note the heliostats that must go to stow under some locks, and return them."""
+        field, found = self._plant.field, np.zeros(len(self._plant.field), dtype=np.bool_)
+        for lock in locks:
+            rows = self._under(lock)
+            for row in np.flatnonzero(rows):
+                _, before = self._unparked.get(field.names[row], (since, frozenset()))
+                self._unparked[field.names[row]] = since, before | {(lock.kind, lock.name)}
+            found |= rows
         return tuple(field.names[row] for row in np.flatnonzero(found))
 
+    def _under(self, lock: Lockout) -> npt.NDArray[np.bool_]:
+        """Return which heliostats must be in stow under one lock now, (N,)."""
+        field, found = self._plant.field, np.zeros(len(self._plant.field), dtype=np.bool_)
+        if lock.kind is Kind.HELIOSTAT:
+            found[field.place(lock.name)] = True
+        elif lock.kind is Kind.TOWER:
+            found[:] = True
+        else:
+            alone = Lockouts(self._plant.design)
+            alone.put((lock,))
+            for near in alone.closed(self._plant.aims).values():
+                found |= near & ~field.among((states.STOWED,), self._plant.now())
+        return found
+
     def give_back(
-        self, person: Person, places: Sequence[tuple[Kind, str]], owner: str = ""
+        self, person: Person, places: Sequence[Place], owner: str = ""
     ) -> tuple[Lockout, ...]:
         """Remove the locks of a person, or of another ``owner``; nothing moves.
 
@@ -128,10 +144,9 @@ class Service:
             removed += own
         for lock in removed:
             locks.remove(lock.kind, lock.name, lock.who)
-        still = frozenset(self._concerned(locks))
-        for name in [name for name in self._unparked if name not in still]:
-            del self._unparked[name]
-            self.attempts.done(name)
+        for name, (_, by) in list(self._unparked.items()):
+            if not any(locks.on(*place) for place in by):
+                self._done(name)
         self._keeping.put_back(removed, person.name, self._utc())
         return tuple(removed)
 
@@ -144,17 +159,21 @@ class Service:
         if not self._unparked:
             return
         there, away = field.among((states.STOWED,), now), field.among(states.UP, now)
-        for name, since in list(self._unparked.items()):
+        for name, (since, _) in list(self._unparked.items()):
             row = field.place(name)
             # A status from before the order says nothing: it may have been on its way from stow.
             if there[row] and field.heard[row] > since:
-                del self._unparked[name]
-                self.attempts.done(name)
+                self._done(name)
         due = sorted(name for name in self._unparked if self.attempts.due(name, now))
         if left := [name for name in due if away[field.place(name)]]:
             self._stow("out of service", left)
         for name in set(due).difference(left):
             self.attempts.failed(name, field.of(name, now).condition, now)
+
+    def _done(self, name: str) -> None:
+        """Note that a heliostat need not go to stow any more."""
+        del self._unparked[name]
+        self.attempts.done(name)
 
     def _stow(self, who: str, heliostats: Sequence[str]) -> None:
         """Send heliostats to stow; each is checked again after a while."""
@@ -163,21 +182,34 @@ class Service:
         for name in heliostats:
             self.attempts.failed(name, self._plant.field.of(name, now).condition, now)
 
-    def progress(self, heliostats: Sequence[str]) -> Mapping[str, Step]:
-        """Return how far heliostats are on their way out of service."""
-        return {name: self._step(name) for name in heliostats}
+    def progress(self, places: Sequence[Place], heliostats: Sequence[str]) -> Mapping[str, Step]:
+        """Return how far heliostats are on their way to stow, where they are sent by locks.
 
-    def _step(self, name: str) -> Step:
+        Parameters
+        ----------
+        places
+            What was locked.
+        heliostats
+            Names.
+        """
+        kept = self.rows()
+        stands = any(self._plant.lockouts.on(*place) for place in places)
+        return {name: self._step(name, kept, stands=stands) for name in heliostats}
+
+    def _step(self, name: str, kept: npt.NDArray[np.bool_], *, stands: bool) -> Step:
         field, now = self._plant.field, self._plant.now()
-        if not self.rows()[field.place(name)]:
-            return Step("it was given back to service", Stage.REFUSED)
-        if name not in self._unparked:
+        if name in self._unparked:
+            if self._plant.waits_to_stow(name):
+                return Step("it waits for its turn to go to stow")
+            return Step(f"on its way to stow: {field.of(name, now).condition}", Stage.ACKNOWLEDGED)
+        if kept[field.place(name)]:
             off = int(field.rows["flags"][field.place(name)]) & meanings.LOCAL_SWITCH
             more = "its drives are off at the mirror" if off else "switch its drives off there"
             return Step(f"parked in stow and locked out; {more}", Stage.DONE)
-        if self._plant.waits_to_stow(name):
-            return Step("it waits for its turn to go to stow")
-        return Step(f"on its way to stow: {field.of(name, now).condition}", Stage.ACKNOWLEDGED)
+        if stands:
+            text = "parked in stow; it may go up again, since its aim is on nothing that is locked"
+            return Step(text, Stage.DONE)
+        return Step("it was given back to service", Stage.REFUSED)
 
     def _utc(self) -> float:
         return self._plant.clock.utc().timestamp()
