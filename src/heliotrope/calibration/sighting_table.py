@@ -18,6 +18,7 @@ import numpy.typing as npt
 from heliotrope.calibration import plausibility
 from heliotrope.calibration.sightings import (
     LARGEST_SIGMA,
+    SMALLEST_SIGMA,
     Sightings,
     camera_target,
     is_covariance,
@@ -331,9 +332,15 @@ def _sigma(rows: Rows) -> FloatArray:
     unit = name.removeprefix("sigma_")
     given = rows.numbers(name, f"the ray's standard deviation in {unit}")
     # Division rounds once; 1e-3 itself is not exact in binary.
-    sigma = given if unit == "rad" else given / 1e3
-    rows.check(name, ~(sigma > 0.0) & np.isfinite(sigma), given, f" {unit} must be above 0")
-    rows.check(name, sigma > LARGEST_SIGMA, given, f" {unit} must be at most {LARGEST_SIGMA} rad")
+    scale = 1.0 if unit == "rad" else 1e3
+    sigma = given / scale
+    rows.check(
+        name,
+        (sigma < SMALLEST_SIGMA) | (sigma > LARGEST_SIGMA),
+        given,
+        f" {unit} is outside {scale * SMALLEST_SIGMA:g} to {scale * LARGEST_SIGMA:g} {unit}; is it "
+        "in another unit?",
+    )
     return sigma
 
 

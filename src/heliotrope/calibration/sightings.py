@@ -20,8 +20,9 @@ from heliotrope.geometry import FloatArray, as_float, as_numbers, azimuth_elevat
 from heliotrope.sun import Times, unix_seconds
 from heliotrope.values import Card, Value, amount, dots, span
 
-#: Largest standard deviation of a ray, rad: milliradians and degrees are mostly larger.
-LARGEST_SIGMA = 0.2
+#: Standard deviations of a ray, rad: no camera resolves less than the smallest, and values in
+#: milliradians or degrees are mostly larger than the largest.
+SMALLEST_SIGMA, LARGEST_SIGMA = 1e-6, 0.2
 #: Largest deviation from 1 of the length of a normalised vector: a few roundings.
 _UNIT = 2e-15
 
@@ -200,7 +201,7 @@ def sightings(
     Raises
     ------
     InputError
-        If a value is not finite, a direction is zero, sigma is not above 0, or a
+        If a value is not finite, a direction is zero, sigma is out of range, or a
         covariance is not symmetric and positive semidefinite; the text names the row.
     """
     table = np.atleast_2d(_numbers(counts, "counts"))
@@ -232,11 +233,11 @@ def sightings(
         ends.append(points)
     _finite(table, "counts")
     spreads = spread(sigma, "sigma")
-    wrong = ~((spreads <= LARGEST_SIGMA) & (spreads > 0))
+    wrong = ~((spreads <= LARGEST_SIGMA) & (spreads >= SMALLEST_SIGMA))
     if wrong.any():
         i = int(np.flatnonzero(wrong)[0])
         raise InputError(
-            f"sighting {i}: sigma {spreads[i]} rad must be above 0 and at most {LARGEST_SIGMA} "
+            f"sighting {i}: sigma {spreads[i]} rad must be {SMALLEST_SIGMA} to {LARGEST_SIGMA} "
             "rad; milliradians need a factor of 1e-3, degrees numpy.radians"
         )
     index, names = _named(heliostat)
