@@ -41,6 +41,11 @@ PLAY = float(np.radians(5.0))
 OFF, BEYOND = 0.5, 0.5
 #: A point nearer to the mirror than this lies on the mirror itself, m.
 NEAREST = 0.5
+#: Sightings with the same counts and the same point are one reading if their suns differ by less
+#: than this, rad: a minute. The centroids of two photographs differ in their last digit.
+SAME = float(np.radians(0.25))
+#: A beam at one point in this many sightings or more, of different suns, was not measured.
+REPEATED = 3
 
 Rows = npt.NDArray[np.bool_]
 #: A reason for all refused rows, or one for each of them.
@@ -100,8 +105,15 @@ def judge(
         rows, text, note = _contradicted(seen, site, reasons)
         _add(reasons, rows, text)
         notes += [note] if note else []
+    given = np.array([kind == "camera_target" for kind in kinds or [""] * len(seen)], np.bool_)
+    _add(
+        reasons,
+        _repeated(seen, given, reasons),
+        "the point of the beam is the same to the last digit in all sightings of this mirror, "
+        "though sun and counts change: it was not measured; if the beam was steered to a mark by "
+        "hand, leave kind empty",
+    )
     if surfaces and kinds:
-        given = np.array([kind == "camera_target" for kind in kinds], np.bool_)
         _add(reasons, *_off_target(seen, given & ~seen.destination_at_infinity, surfaces))
     if mechanism is not None and len(seen):
         for rows, text in _beyond_machine(seen, mechanism, reasons):
@@ -146,17 +158,47 @@ def _impossible(seen: Sightings, now: float | None) -> Iterator[tuple[Rows, Text
     low = seen.source_at_infinity & (seen.source[:, 2] < np.sin(LOWEST))
     angles = np.degrees(np.arcsin(np.clip(seen.source[low, 2], -1.0, 1.0)))
     yield low, [f"the sun is below the horizon: its elevation is {angle:.1f}°" for angle in angles]
-    yield copies(seen), "an exact copy of another sighting"
+    yield copies(seen), "a copy of another sighting"
 
 
 def copies(seen: Sightings) -> Rows:
-    """Return which sightings repeat an earlier one: same mirror, time, counts and ray, (M,)."""
-    known = np.nan_to_num(seen.time, nan=-np.inf)[:, None]
-    table = np.hstack([seen.heliostat[:, None], known, seen.counts, seen.source, seen.destination])
-    again = np.ones(len(seen), np.bool_)
-    if len(seen):
-        again[np.unique(table, axis=0, return_index=True)[1]] = False
+    """Return which sightings repeat an earlier one, (M,).
+
+    Mirror, counts and destination are the same to the last digit, and so is the source; a sun may
+    have moved by less than `SAME`.
+    """
+    again = np.zeros(len(seen), np.bool_)
+    if not len(seen):
+        return again
+    table = np.hstack([seen.heliostat[:, None], seen.counts, seen.destination])
+    _, group, count = np.unique(table, axis=0, return_inverse=True, return_counts=True)
+    rows = np.flatnonzero(count[group] > 1)
+    while len(rows):
+        # The first of each group that is left, and those that repeat it.
+        _, first, of_group = np.unique(group[rows], return_index=True, return_inverse=True)
+        lead = rows[first[of_group]]
+        gap = np.linalg.norm(seen.source[rows] - seen.source[lead], axis=1)
+        near = gap <= np.where(seen.source_at_infinity[rows], SAME, 0.0)
+        again[rows[near & (rows != lead)]] = True
+        rows = rows[~near]
     return again
+
+
+def _repeated(seen: Sightings, given: Rows, reasons: Mapping[int, str]) -> Rows:
+    """Return the sightings by a camera of mirrors whose beam never moved, though they did."""
+    rows = given & ~np.isin(np.arange(len(seen)), list(reasons))
+    mirror = seen.heliostat[rows]
+    if not len(mirror):
+        return rows
+
+    def different(values: FloatArray) -> npt.NDArray[np.int64]:
+        table = np.unique(np.hstack([mirror[:, None], values[rows]]), axis=0)
+        return np.bincount(table[:, 0].astype(np.intp))
+
+    stuck = (different(seen.destination) == 1) & (different(seen.counts) > 1)
+    stuck &= np.bincount(mirror) >= REPEATED
+    rows[rows] = stuck[mirror]
+    return rows
 
 
 def _contradicted(
