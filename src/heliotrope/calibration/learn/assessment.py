@@ -15,7 +15,7 @@ from heliotrope.calibration.learn.learned import (
     squared_distance,
 )
 from heliotrope.calibration.learn.learning import FEWEST
-from heliotrope.calibration.learn.misfits import ELSEWHERE
+from heliotrope.calibration.learn.misfits import ELSEWHERE, SCATTERED
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.frames import Framed, Labelled, Variable
@@ -29,6 +29,8 @@ FAR = 1e6
 ENOUGH = 20
 #: Share of such sightings from which a mirror is named, and share beyond which nothing agrees.
 SHARE, NOTHING = 0.15, 0.6
+#: Mirrors of one reason that are named, and standard deviations of a prior from which a value is.
+NAMED, STRAINED = 8, 10.0
 
 
 @dataclass(frozen=True)
@@ -304,22 +306,50 @@ def unexplained_mirrors(names: tuple[str, ...], learned: Learned) -> tuple[str, 
     learned
         The sightings that were not used are not considered.
     """
-    lines = [f"{names[misfit.row]}: {misfit.reason}" for misfit in learned.misfits]
+    reasons: dict[str, list[str]] = {}
+    for misfit in learned.misfits:
+        reasons.setdefault(misfit.reason, []).append(names[misfit.row])
+    lines = [f"{_listed(mirrors)}: {reason}" for reason, mirrors in reasons.items()]
+    misfits = {misfit.row for misfit in learned.misfits}
     odd = np.flatnonzero(learned.outlier)
     where = predict(learned, learned.sightings.take(odd)).errors.beam
     elsewhere = np.zeros(len(learned.sightings), dtype=np.bool_)
     elsewhere[odd[where > ELSEWHERE]] = True
     for i, (name, member) in enumerate(zip(names, learned.members, strict=True)):
+        if i in misfits:
+            continue
         mine = learned.used & (learned.sightings.heliostat == i)
         kept = learned.rows[i][~learned.outlier[learned.rows[i]]]
         white = np.linalg.norm(member.left_out()[1], axis=1)
         far = int((white * learned.sightings.sigma[kept] > ELSEWHERE).sum())
         beyond, count = int((learned.unusable & mine).sum()), int(mine.sum())
         strange = far + int((elsewhere & mine).sum())
-        if count < FEWEST or beyond + strange < 2 or beyond + strange < SHARE * count:
-            continue
-        lines.append(f"{name}: {_reason(beyond, strange, count)}")
+        if count >= FEWEST and beyond + strange >= max(2, SHARE * count):
+            lines.append(f"{name}: {_reason(beyond, strange, count)}")
+        if len(white) >= FEWEST and np.median(white) > SCATTERED:
+            lines.append(f"{name}: {_scatter(white, learned.sightings.sigma[kept])}")
+        strain = np.abs(learned.static.values[i] / learned.static.prior[i])
+        if count and strain.max(initial=0.0) > STRAINED:
+            p = int(np.argmax(strain))
+            lines.append(
+                f"{name}: {learned.model[p]} is {strain[p]:.0f} standard deviations of its prior "
+                "from the nominal value; check the heliostat's entry in the plant file"
+            )
     return tuple(lines)
+
+
+def _listed(names: list[str]) -> str:
+    """Return the first of some names, and the number of the others."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def _scatter(white: FloatArray, sigma: FloatArray) -> str:
+    beam = 1e3 * float(np.median(white * sigma))
+    return (
+        f"half of its beams are more than {beam:.2f} mrad, {np.median(white):.0f} times their "
+        "sigma, from where the others put them; give the true sigma, or check model and counts"
+    )
 
 
 def _reason(beyond: int, strange: int, count: int) -> str:
