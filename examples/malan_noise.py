@@ -99,7 +99,7 @@ def measure(drawn: Mechanism, truth: Mechanism, noise: float, seed: int) -> Sigh
         np.concatenate(counts),
         np.concatenate(sources),
         seen,
-        sigma=1e-7,
+        sigma=1e-6,
         destination_covariance=spread,
     )
 
@@ -204,7 +204,7 @@ def normalised(
         np.broadcast_to(counts, (*rows, 2)).reshape(-1, 2),
         np.repeat(sky["summer"], simulations, axis=0),
         spots.reshape(-1, 3),
-        sigma=1e-7,
+        sigma=1e-6,
         destination_covariance=max(level * size, 1e-3) ** 2 / 3.0 * np.diag([1.0, 1e-6, 1.0]),
     )
     priors = {name: wide * sigma for name, sigma in PRIORS.items()}

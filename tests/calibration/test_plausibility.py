@@ -56,14 +56,19 @@ def seen_of(
     shared: float = 0.0,
     fast: float = 0.0,
     noise: float = 0.15e-3,
+    wide: float = 0.0,
 ) -> Sightings:
-    """Return sightings over a day; the clock is ``fast`` by s, and the suns are its suns."""
+    """Return sightings over a day; the clock is ``fast`` by s, and the suns are its suns.
+
+    Aims lie within ``wide`` m of the middle of the target.
+    """
     rng, truth, target = np.random.default_rng(seed), machines(shared=shared), PLANT.targets[0]
     times = NOON + np.linspace(-3.5, 3.5, count) * 3600.0
     parts = []
     for row in rows:
         light = solar.vector(times, PLANT.site)
-        counts = np.round(track(NOMINAL[row], light, target.center).best_counts)
+        aims = target.point(wide * rng.uniform(-1.0, 1.0, (count, 2)) if wide else (0.0, 0.0))
+        counts = np.round(track(NOMINAL[row], light, aims).best_counts)
         pose = truth[np.full(count, row)].pose(counts)
         spots = target.intersect(pose.vertex, reflect(light, pose.normal))
         spots = spots + rng.normal(0.0, noise * 30.0, (count, 2)) @ target.axes
@@ -142,7 +147,33 @@ def test_copies_count_once() -> None:
     unknown = replace(seen, time=np.full(6, np.nan))
     for each in (seen, unknown):
         found = plausibility.judge(join([each, each]))
-        assert found.reasons == dict.fromkeys(range(6, 12), "an exact copy of another sighting")
+        assert found.reasons == dict.fromkeys(range(6, 12), "a copy of another sighting")
+
+
+def test_near_copies_count_once() -> None:
+    seen = seen_of([3, 15], count=6)
+    late = replace(seen, time=seen.time + 0.4, sigma=1.01 * seen.sigma)
+    moved = replace(late, source=solar.vector(late.time, PLANT.site))
+    found = plausibility.judge(join([seen, moved, seen]))
+    assert found.reasons == dict.fromkeys(range(12, 36), "a copy of another sighting")
+    # Another photograph at the same counts is no copy: its centroid differs.
+    other = replace(moved, destination=moved.destination + [1e-6, 0.0, 0.0])
+    assert not plausibility.judge(join([seen, other])).reasons
+    # Nor is a lamp that stands elsewhere.
+    near = replace(seen, source=seen.source * 50.0, source_at_infinity=np.zeros(12, np.bool_))
+    apart = replace(near, source=near.source + [1e-3, 0.0, 0.0])
+    assert not plausibility.judge(join([near, apart])).reasons
+
+
+def test_a_beam_that_never_moved_was_not_measured() -> None:
+    stuck = seen_of([3])
+    stuck = replace(stuck, destination=np.tile(PLANT.targets[0].center + [0.1, 0.0, 0.0], (20, 1)))
+    found = judge(join([seen_of([15]), stuck]))
+    assert sorted(found.reasons) == list(range(20, 40))
+    assert found.reasons[20].startswith("the point of the beam is the same to the last digit in")
+    assert not judge(stuck.take([0, 9])).reasons
+    # A camera in the field stands still: its sightings have another kind.
+    assert not plausibility.judge(stuck, kinds=["field_camera"] * 20).reasons
 
 
 def test_suns_of_other_times_are_a_note_where_most_rows_have_them() -> None:
@@ -216,6 +247,76 @@ def test_a_mirror_that_did_not_move_is_not_converged() -> None:
     half.counts[:, 0] = half.counts[0, 0]
     (misfit,) = find_misfits(NOMINAL, half)
     assert misfit.reason == "the counts of azimuth did not change; check motor and log"
+
+
+@pytest.mark.parametrize(
+    ("factors", "text"),
+    [
+        ([0.9, 0.9], "the counts of azimuth and elevation seem scaled: they are about 0.90 times"),
+        ([2.0, 2.0], "the counts of azimuth and elevation seem scaled: they are about 2.0"),
+        ([1.0, 1.25], "the counts of elevation seem scaled: they are about 1.2"),
+    ],
+)
+@pytest.mark.parametrize("every", [False, True])
+def test_scaled_counts_are_named(factors: list[float], text: str, every: bool) -> None:
+    seen = seen_of([2, 9, 15], noise=0.3e-3)
+    mine = (seen.heliostat == 2) | every
+    seen = replace(seen, counts=np.where(mine[:, None], seen.counts * factors, seen.counts))
+    learned = learning.learn(PLANT, seen, "guo6", rounds=2)
+    wrong = [2, 9, 15] if every else [2]
+    assert [misfit.row for misfit in learned.misfits] == wrong
+    assert all(misfit.reason.startswith(text) for misfit in learned.misfits)
+    assert list(np.flatnonzero(at_moment(NAMES, learned).learnt)) == [
+        row for row in (2, 9, 15) if row not in wrong
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "sign"),
+    [
+        ("mirrored left to right", [-1.0, 1.0]),
+        ("mirrored top to bottom", [1.0, -1.0]),
+        ("turned by half a turn", [-1.0, -1.0]),
+    ],
+)
+def test_mirrored_photographs_are_named_once(text: str, sign: list[float]) -> None:
+    target, seen = PLANT.targets[0], seen_of([0, 2, 9, 15], wide=0.7)
+    places = target.plane_coordinates(seen.destination)
+    wrong = replace(seen, destination=target.point(places * sign))
+    learned = learning.learn(PLANT, wrong, "guo6", rounds=2)
+    (line,) = unexplained_mirrors(NAMES, learned)
+    names = ", ".join(NAMES[row] for row in (0, 2, 9, 15))
+    assert line.startswith(f"{names}: the photographs of the targets seem {text}: read like that")
+    assert not at_moment(NAMES, learned).learnt.any()
+    assert learning.learn(PLANT, seen, "guo6", rounds=2).misfits == ()
+
+
+def test_one_reversed_motor_does_not_accuse_the_camera() -> None:
+    wrong = _reversed(0)(seen_of([2]))  # type: ignore[operator]
+    for others in ([], [0], [0, 7]):
+        seen = join([seen_of(others), wrong]) if others else wrong
+        (misfit,) = find_misfits(NOMINAL, seen, targets=PLANT.targets)
+        assert misfit.row == 2
+        assert misfit.reason.startswith("the motor of azimuth seems reversed")
+
+
+def test_sightings_that_contradict_each_other_are_not_learnt() -> None:
+    rng, target = np.random.default_rng(5), PLANT.targets[0]
+    wrong, good = seen_of([2]), seen_of([15])
+    places = target.plane_coordinates(wrong.destination)
+    places = places + rng.normal(0.0, 0.12, places.shape)
+    wrong = replace(wrong, destination=target.point(places))
+    learned = learning.learn(PLANT, join([good, wrong]), "guo6", rounds=2)
+    (line,) = unexplained_mirrors(NAMES, learned)
+    assert line.startswith(f"{NAMES[2]}: half of its ")
+    assert "times their sigma, from where the others put them: no parameters" in line
+    assert list(np.flatnonzero(at_moment(NAMES, learned).learnt)) == [15]
+    # Far beyond a sigma that is stated too small, but small: learnt, and said.
+    tight = replace(good, sigma=np.full(len(good), 1e-5))
+    learned = learning.learn(PLANT, tight, "guo6", rounds=2)
+    (line,) = unexplained_mirrors(NAMES, learned)
+    assert "give the true sigma, or check model and counts" in line
+    assert list(np.flatnonzero(at_moment(NAMES, learned).learnt)) == [15]
 
 
 def test_every_mirror_may_be_a_misfit() -> None:
@@ -389,5 +490,5 @@ def test_a_folder_with_a_bad_year_and_a_copy_is_read(tmp_path: Path) -> None:
     assert [line.split(": ", 1)[1].split(":")[0] for line in field.left_out] == [
         "the year is out of range",
         "the year is out of range, 1970 to 2099",
-        "an exact copy of another sighting",
+        "a copy of another sighting",
     ]

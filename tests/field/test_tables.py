@@ -404,6 +404,21 @@ def test_two_rows_for_a_photograph_are_refused_with_both_lines(tmp_path: Path) -
         _written(tmp_path, "log", change)
 
 
+@pytest.mark.parametrize(("name", "same"), [("17", True), ("17.jpg", False), ("19", False)])
+def test_a_file_and_an_id_of_one_photograph_are_refused(
+    name: str, same: bool, tmp_path: Path
+) -> None:
+    def change(t: list[list[str]]) -> bytes:
+        return _text([*t, [name, *t[2][1:]]]).encode()
+
+    if not same:
+        _written(tmp_path, "log", change)
+        return
+    says = r"line 2, column file: 17\.png and 17 of line 4 name one photograph; keep the true row"
+    with pytest.raises(FormatError, match=says):
+        _written(tmp_path, "log", change)
+
+
 def test_a_log_names_columns_times_and_rows_without_a_photograph(tmp_path: Path) -> None:
     for old, new, says in (
         ("axis_1", "achse_1", "there is no column axis_1_motor_position; add it"),

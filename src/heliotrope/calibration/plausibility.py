@@ -41,6 +41,11 @@ PLAY = float(np.radians(5.0))
 OFF, BEYOND = 0.5, 0.5
 #: A point nearer to the mirror than this lies on the mirror itself, m.
 NEAREST = 0.5
+#: Sightings with the same counts and the same point are one reading if their suns differ by less
+#: than this, rad: a minute. The centroids of two photographs differ in their last digit.
+SAME = float(np.radians(0.25))
+#: A beam at one point in this many sightings or more, of different suns, was not measured.
+REPEATED = 3
 
 Rows = npt.NDArray[np.bool_]
 #: A reason for all refused rows, or one for each of them.
@@ -72,7 +77,7 @@ def judge(
     kinds: Sequence[str] = (),
     now: float | None = None,
 ) -> Judgement:
-    """Return the impossible sightings and their reasons.
+    """Return which sightings cannot have happened, and why.
 
     A sighting gets the first reason that applies. The more is known of the plant, the more is
     judged.
@@ -88,7 +93,7 @@ def judge(
     surfaces
         Targets and receivers of the plant: for the destinations of kind "camera_target".
     kinds
-        Kind of each sighting, (M,); empty if unknown.
+        Kind of each sighting, (M,), "" if unknown.
     now
         The computer's clock, Unix seconds: for times that are still to come.
     """
@@ -100,12 +105,16 @@ def judge(
         rows, text, note = _contradicted(seen, site, reasons)
         _add(reasons, rows, text)
         notes += [note] if note else []
+    given = np.array([kind == "camera_target" for kind in kinds or [""] * len(seen)], np.bool_)
+    _add(
+        reasons,
+        _repeated(seen, given, reasons),
+        "the point of the beam is the same to the last digit in all sightings of this mirror, "
+        "though sun and counts change: it was not measured; if the beam was steered to a mark by "
+        "hand, leave kind empty",
+    )
     if surfaces and kinds:
-        camera_rows = np.array([kind == "camera_target" for kind in kinds], np.bool_)
-        _add(
-            reasons,
-            *_off_target(seen, camera_rows & ~seen.destination_at_infinity, surfaces),
-        )
+        _add(reasons, *_off_target(seen, given & ~seen.destination_at_infinity, surfaces))
     if mechanism is not None and len(seen):
         for rows, text in _beyond_machine(seen, mechanism, reasons):
             _add(reasons, rows, text)
@@ -113,11 +122,11 @@ def judge(
 
 
 def judge_in(
-    plant: Plant, sightings: Sightings, kinds: Sequence[str] = (), now: float | None = None
+    plant: Plant, seen: Sightings, kinds: Sequence[str] = (), now: float | None = None
 ) -> Judgement:
     """Return the judgement by all that a plant knows; rows are those of its heliostats."""
     return judge(
-        sightings,
+        seen,
         mechanism=plant.nominal if len(plant.groups) == 1 else None,
         site=plant.site,
         surfaces=(*plant.targets, *plant.receivers),
@@ -129,14 +138,14 @@ def judge_in(
 def _add(reasons: dict[int, str], rows: Rows, texts: Texts) -> None:
     """Give rows their reason, one text for all of them or one for each, where they have none."""
     places = np.flatnonzero(rows)
-    listed = [texts] * len(places) if isinstance(texts, str) else texts
-    for i, text in zip(places, listed, strict=True):
+    each = [texts] * len(places) if isinstance(texts, str) else texts
+    for i, text in zip(places, each, strict=True):
         reasons.setdefault(int(i), text)
 
 
-def _impossible(sightings: Sightings, now: float | None) -> Iterator[tuple[Rows, Texts]]:
+def _impossible(seen: Sightings, now: float | None) -> Iterator[tuple[Rows, Texts]]:
     """Yield what is impossible for any mirror anywhere."""
-    time = sightings.time
+    time = seen.time
     out = (time < EARLIEST) | (time > LATEST)
     yield out, YEAR
     if now is not None:
@@ -146,46 +155,68 @@ def _impossible(sightings: Sightings, now: float | None) -> Iterator[tuple[Rows,
             ahead,
             f"the time is more than a year ahead of this computer's clock, {clock}: correct one",
         )
-    low = sightings.source_at_infinity & (sightings.source[:, 2] < np.sin(LOWEST))
-    angles = np.degrees(np.arcsin(np.clip(sightings.source[low, 2], -1.0, 1.0)))
+    low = seen.source_at_infinity & (seen.source[:, 2] < np.sin(LOWEST))
+    angles = np.degrees(np.arcsin(np.clip(seen.source[low, 2], -1.0, 1.0)))
     yield low, [f"the sun is below the horizon: its elevation is {angle:.1f}°" for angle in angles]
-    yield copies(sightings), "an exact copy of another sighting"
+    yield copies(seen), "a copy of another sighting"
 
 
-def copies(sightings: Sightings) -> Rows:
-    """Return the mask of sightings that repeat an earlier one (mirror, time, counts, ray), (M,)."""
-    known = np.nan_to_num(sightings.time, nan=-np.inf)[:, None]
-    table = np.hstack(
-        [
-            sightings.heliostat[:, None],
-            known,
-            sightings.counts,
-            sightings.source,
-            sightings.destination,
-        ]
-    )
-    again = np.ones(len(sightings), np.bool_)
-    if len(sightings):
-        again[np.unique(table, axis=0, return_index=True)[1]] = False
+def copies(seen: Sightings) -> Rows:
+    """Return which sightings repeat an earlier one, (M,).
+
+    Mirror, counts and destination are the same to the last digit, and so is the source; a sun may
+    have moved by less than `SAME`.
+    """
+    again = np.zeros(len(seen), np.bool_)
+    if not len(seen):
+        return again
+    table = np.hstack([seen.heliostat[:, None], seen.counts, seen.destination])
+    _, group, count = np.unique(table, axis=0, return_inverse=True, return_counts=True)
+    rows = np.flatnonzero(count[group] > 1)
+    while len(rows):
+        # The first of each group that is left, and those that repeat it.
+        _, first, of_group = np.unique(group[rows], return_index=True, return_inverse=True)
+        lead = rows[first[of_group]]
+        gap = np.linalg.norm(seen.source[rows] - seen.source[lead], axis=1)
+        near = gap <= np.where(seen.source_at_infinity[rows], SAME, 0.0)
+        again[rows[near & (rows != lead)]] = True
+        rows = rows[~near]
     return again
 
 
+def _repeated(seen: Sightings, given: Rows, reasons: Mapping[int, str]) -> Rows:
+    """Return the sightings by a camera of mirrors whose beam never moved, though they did."""
+    rows = given & ~np.isin(np.arange(len(seen)), list(reasons))
+    mirror = seen.heliostat[rows]
+    if not len(mirror):
+        return rows
+
+    def different(values: FloatArray) -> npt.NDArray[np.int64]:
+        table = np.unique(np.hstack([mirror[:, None], values[rows]]), axis=0)
+        return np.bincount(table[:, 0].astype(np.intp))
+
+    stuck = (different(seen.destination) == 1) & (different(seen.counts) > 1)
+    stuck &= np.bincount(mirror) >= REPEATED
+    rows[rows] = stuck[mirror]
+    return rows
+
+
 def _contradicted(
-    sightings: Sightings, site: Site, reasons: Mapping[int, str]
+    seen: Sightings, site: Site, reasons: Mapping[int, str]
 ) -> tuple[Rows, Texts, str]:
     """Return the suns that did not stand there at their time; a note where a mirror has most."""
-    able = sightings.source_at_infinity & np.isfinite(sightings.time)
+    able = seen.source_at_infinity & np.isfinite(seen.time)
     able[list(reasons)] = False
     if not able.any():
         return able, "", ""
-    expected, away = np.zeros((len(sightings), 3)), np.zeros(len(sightings))
-    expected[able] = solar.vector(sightings.time[able], site)
-    away[able] = angle_between(sightings.source[able], expected[able])
+    expected, away = np.zeros((len(seen), 3)), np.zeros(len(seen))
+    expected[able] = solar.vector(seen.time[able], site)
+    away[able] = angle_between(seen.source[able], expected[able])
     rows = away > MOVED
-    contradicted, known = (np.bincount(sightings.heliostat[mask]) for mask in (rows, able))
+    wrong, known = (np.bincount(seen.heliostat[mask]) for mask in (rows, able))
     mostly = np.zeros(len(known), np.bool_)
-    mostly[: len(contradicted)] = 2 * contradicted > known[: len(contradicted)]
-    whole = rows & mostly[sightings.heliostat] if rows.any() else rows
+    mostly[: len(wrong)] = 2 * wrong > known[: len(wrong)]
+    whole = rows & mostly[seen.heliostat] if rows.any() else rows
     note = ""
     if whole.any():
         middle = float(np.degrees(np.median(away[whole])))
@@ -195,25 +226,22 @@ def _contradicted(
             "[site]"
         )
         rows = rows & ~whole
-    where, expected_angles = (
-        azimuth_elevation(sightings.source[rows]),
-        azimuth_elevation(expected[rows]),
-    )
+    where, there = azimuth_elevation(seen.source[rows]), azimuth_elevation(expected[rows])
     texts = [
         f"the sun is given at azimuth {a % 360.0:.1f}°, elevation {e:.1f}°, and stood at "
         f"{b % 360.0:.1f}°, {f:.1f}° at that time: correct one of them"
-        for a, e, b, f in zip(*np.degrees(where), *np.degrees(expected_angles), strict=True)
+        for a, e, b, f in zip(*np.degrees(where), *np.degrees(there), strict=True)
     ]
     return rows, texts, note
 
 
 def _off_target(
-    sightings: Sightings, camera_rows: Rows, surfaces: Sequence[Target | Receiver]
+    seen: Sightings, given: Rows, surfaces: Sequence[Target | Receiver]
 ) -> tuple[Rows, Texts]:
-    away = np.full((len(surfaces), len(sightings)), np.inf)
-    on = np.zeros(len(sightings), np.bool_)
+    away = np.full((len(surfaces), len(seen)), np.inf)
+    on = np.zeros(len(seen), np.bool_)
     for k, surface in enumerate(surfaces):
-        gap = sightings.destination - surface.center
+        gap = seen.destination - surface.center
         away[k] = np.linalg.norm(gap, axis=1)
         if isinstance(surface, Receiver):
             on |= away[k] <= np.hypot(surface.width, surface.height)
@@ -222,7 +250,7 @@ def _off_target(
             [surface.width, surface.height]
         )
         on |= (across <= OFF).all(axis=1) & (np.abs(gap @ surface.normal) <= OFF)
-    rows = camera_rows & ~on
+    rows = given & ~on
     nearest = np.argmin(away[:, rows], axis=0)
     texts = [
         f"the beam's point is on no target: {away[k, i]:.1f} m from the centre of "
@@ -233,65 +261,64 @@ def _off_target(
 
 
 def _beyond_machine(
-    sightings: Sightings, mechanism: Mechanism, reasons: Mapping[int, str]
+    seen: Sightings, mechanism: Mechanism, reasons: Mapping[int, str]
 ) -> Iterator[tuple[Rows, Texts]]:
     """Yield what the mirror of a sighting cannot do."""
-    mechanisms = mechanism[sightings.heliostat]
-    pose = mechanisms.pose(sightings.counts)
-    near = np.zeros(len(sightings), np.bool_)
+    each = mechanism[seen.heliostat]
+    pose = each.pose(seen.counts)
+    near = np.zeros(len(seen), np.bool_)
     for points, far in (
-        (sightings.source, sightings.source_at_infinity),
-        (sightings.destination, sightings.destination_at_infinity),
+        (seen.source, seen.source_at_infinity),
+        (seen.destination, seen.destination_at_infinity),
     ):
         near |= ~far & (np.linalg.norm(points - pose.vertex, axis=1) < NEAREST)
     yield near, f"the ray begins or ends within {NEAREST} m of the mirror"
     with np.errstate(invalid="ignore", divide="ignore"):
-        source, destination = ray_directions(sightings, pose.vertex)
-        total = source + destination
+        source, way = ray_directions(seen, pose.vertex)
+        total = source + way
         size = np.linalg.norm(total, axis=1)
         edge = ~near & ~(size > 2.0 * np.cos(EDGE_ON))
         miss = angle_between(pose.normal, total / np.maximum(size, 1e-9)[:, None])
     yield edge, f"the beam passes the mirror edge-on, {np.degrees(EDGE_ON):.0f}° from its normal"
     # Only a nominal mechanism that holds for most of a mirror's sightings judges the others.
-    good = np.flatnonzero(~(near | edge) & ~np.isin(np.arange(len(sightings)), list(reasons)))
+    good = np.flatnonzero(~(near | edge) & ~np.isin(np.arange(len(seen)), list(reasons)))
     holds = np.zeros(len(mechanism), np.bool_)
-    for row in np.unique(sightings.heliostat[good]):
-        mine = good[sightings.heliostat[good] == row]
+    for row in np.unique(seen.heliostat[good]):
+        mine = good[seen.heliostat[good] == row]
         holds[row] = np.nan_to_num(np.median(miss[mine]), nan=np.inf) < FAR
-    judged = holds[sightings.heliostat]
+    judged = holds[seen.heliostat]
     for drive, joint in enumerate(mechanism.driven):
-        value, low, high, most, unit = _reach(mechanisms, sightings.counts, drive)
+        value, low, high, most, unit = _reach(each, seen.counts, drive)
         rows = ~((value >= low) & (value <= high)) & (judged | ~(np.abs(value) <= most))
         yield (
             rows,
             [
-                f"the counts {sightings.counts[i, drive]:.10g} of "
-                f"{mechanism.joints[joint]} are beyond its stops: "
-                f"{value[i]:.5g}{unit} is outside {low[i]:.5g} to {high[i]:.5g}{unit}"
+                f"the counts {seen.counts[i, drive]:.10g} of {mechanism.joints[joint]} are beyond "
+                f"its stops: {value[i]:.5g}{unit} is outside {low[i]:.5g} to {high[i]:.5g}{unit}"
                 for i in np.flatnonzero(rows)
             ],
         )
     behind = judged & (
-        np.minimum((pose.normal * source).sum(axis=1), (pose.normal * destination).sum(axis=1))
+        np.minimum((pose.normal * source).sum(axis=1), (pose.normal * way).sum(axis=1))
         < -np.sin(PLAY)
     )
     yield behind, "the beam comes from the back of the mirror at these counts"
 
 
 def _reach(
-    mechanisms: Mechanism, counts: FloatArray, drive: int
+    each: Mechanism, counts: FloatArray, drive: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, str]:
-    """Return values of a drive, its limits with play, the greatest possible one, and the unit.
+    """Return what a drive did, its limits with play, what no zero or sense explains, and the unit.
 
     All (M,), in counts where the drive has limits of counts, else in degrees.
     """
-    table = mechanisms.drives.table[:, drive]
+    table = each.drives.table[:, drive]
     low, high = (table[:, SLOTS[name]] for name in ("min_count", "max_count"))
     if np.isfinite(low).all() and np.isfinite(high).all():
         play = 0.02 * (high - low)
         most = 2.0 * np.maximum(np.abs(low), np.abs(high))
         return counts[:, drive], low - play, high + play, most, " counts"
-    angle = mechanisms.drives.angles(counts)[:, drive]
+    angle = each.drives.angles(counts)[:, drive]
     low, high = (table[:, SLOTS[name]] for name in ("min_angle", "max_angle"))
     limits = np.clip(np.array([low - PLAY, high + PLAY]), -MOST_TURNS, MOST_TURNS)
     most = np.full(len(counts), np.degrees(MOST_TURNS))

@@ -20,8 +20,9 @@ from heliotrope.geometry import FloatArray, as_float, as_numbers, azimuth_elevat
 from heliotrope.sun import Times, unix_seconds
 from heliotrope.values import Card, Value, amount, dots, span
 
-#: Largest standard deviation of a ray, rad: milliradians and degrees are mostly larger.
-LARGEST_SIGMA = 0.2
+#: Standard deviations of a ray, rad: no camera resolves less than the smallest, and values in
+#: milliradians or degrees are mostly larger than the largest.
+SMALLEST_SIGMA, LARGEST_SIGMA = 1e-6, 0.2
 #: Largest deviation from 1 of the length of a normalised vector: a few roundings.
 _UNIT = 2e-15
 
@@ -200,7 +201,7 @@ def sightings(
     Raises
     ------
     InputError
-        If a value is not finite, a direction is zero, sigma is not above 0, or a
+        If a value is not finite, a direction is zero, sigma is out of range, or a
         covariance is not symmetric and positive semidefinite; the text names the row.
     """
     table = np.atleast_2d(_numbers(counts, "counts"))
@@ -219,11 +220,11 @@ def sightings(
     far_source = spread(source_at_infinity, "source_at_infinity", np.bool_)
     far_destination = spread(destination_at_infinity, "destination_at_infinity", np.bool_)
     ends = []
-    for name, end, far in (
+    for name, given, far in (
         ("source", source, far_source),
         ("destination", destination, far_destination),
     ):
-        points = np.array(_rows(_numbers(end, name), (*batch, 3), name)).reshape(rows, 3)
+        points = np.array(_rows(_numbers(given, name), (*batch, 3), name)).reshape(rows, 3)
         _finite(points, name)
         with np.errstate(over="ignore"):
             loose = far & (np.abs(np.linalg.norm(points, axis=-1) - 1.0) > _UNIT)
@@ -232,11 +233,11 @@ def sightings(
         ends.append(points)
     _finite(table, "counts")
     spreads = spread(sigma, "sigma")
-    invalid = ~((spreads <= LARGEST_SIGMA) & (spreads > 0))
-    if invalid.any():
-        i = int(np.flatnonzero(invalid)[0])
+    wrong = ~((spreads <= LARGEST_SIGMA) & (spreads >= SMALLEST_SIGMA))
+    if wrong.any():
+        i = int(np.flatnonzero(wrong)[0])
         raise InputError(
-            f"sighting {i}: sigma {spreads[i]} rad must be above 0 and at most {LARGEST_SIGMA} "
+            f"sighting {i}: sigma {spreads[i]} rad must be {SMALLEST_SIGMA} to {LARGEST_SIGMA} "
             "rad; milliradians need a factor of 1e-3, degrees numpy.radians"
         )
     index, names = _named(heliostat)
@@ -255,13 +256,13 @@ def sightings(
     )
 
 
-def _numbers(values: npt.ArrayLike, name: str) -> FloatArray:
+def _numbers(given: npt.ArrayLike, name: str) -> FloatArray:
     """Return an array of numbers, some of which may be NaN: the row is named later."""
     try:
-        return as_float(values)
+        return as_float(given)
     except (TypeError, ValueError):
         # Its error says what is wrong.
-        return as_numbers(values, f"sightings: {name}")
+        return as_numbers(given, f"sightings: {name}")
 
 
 def _rows(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
@@ -269,18 +270,18 @@ def _rows(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
     try:
         return np.broadcast_to(values, shape)
     except ValueError:
-        single = "3 numbers" if name in ("source", "destination") else "a number"
+        one = "3 numbers" if name in ("source", "destination") else "a number"
         raise InputError(
             f"sightings: {name} of shape {values.shape}; there are {shape[0]} rows of counts: give "
-            f"{single} for all of them, or shape {shape}"
+            f"{one} for all of them, or shape {shape}"
         ) from None
 
 
-def _heliostats(rows: npt.ArrayLike, batch: tuple[int, ...]) -> npt.NDArray[np.intp]:
-    values = _rows(_numbers(rows, "heliostat"), batch, "heliostat").ravel()
-    invalid = ~((values >= 0.0) & (values == np.floor(values)))
-    if invalid.any():
-        i = int(np.flatnonzero(invalid)[0])
+def _heliostats(given: npt.ArrayLike, batch: tuple[int, ...]) -> npt.NDArray[np.intp]:
+    values = _rows(_numbers(given, "heliostat"), batch, "heliostat").ravel()
+    wrong = ~((values >= 0.0) & (values == np.floor(values)))
+    if wrong.any():
+        i = int(np.flatnonzero(wrong)[0])
         raise InputError(
             f"sighting {i}: heliostat {values[i]:g} is not a row; give whole numbers from 0 on"
         )
@@ -289,13 +290,13 @@ def _heliostats(rows: npt.ArrayLike, batch: tuple[int, ...]) -> npt.NDArray[np.i
 
 def _named(heliostat: npt.ArrayLike) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return rows and their names, in the order in which the names occur; () for rows."""
-    array = np.asarray(heliostat)
-    if array.dtype.kind not in "UO":
-        return array, ()
-    names = tuple(dict.fromkeys(str(name) for name in array.ravel()))
+    given = np.asarray(heliostat)
+    if given.dtype.kind not in "UO":
+        return given, ()
+    names = tuple(dict.fromkeys(str(name) for name in given.ravel()))
     place = {name: i for i, name in enumerate(names)}
-    rows = np.array([place[str(name)] for name in array.ravel()], dtype=np.intp)
-    return rows.reshape(array.shape), names
+    rows = np.array([place[str(name)] for name in given.ravel()], dtype=np.intp)
+    return rows.reshape(given.shape), names
 
 
 def _along_first(times: FloatArray, batch: tuple[int, ...]) -> FloatArray:
@@ -305,20 +306,20 @@ def _along_first(times: FloatArray, batch: tuple[int, ...]) -> FloatArray:
     return times
 
 
-def _covariances(value: npt.ArrayLike, rows: int, name: str) -> FloatArray:
-    values = _numbers(value, name)
+def _covariances(given: npt.ArrayLike, rows: int, name: str) -> FloatArray:
+    values = _numbers(given, name)
     if values.ndim < 2:
         values = np.where(np.eye(3) > 0.0, values[..., None, None], 0.0)
     try:
         matrices = np.array(np.broadcast_to(values, (rows, 3, 3)))
     except ValueError:
         raise InputError(
-            f"sightings: {name} of shape {np.shape(value)}; give a variance, {rows} variances, "
+            f"sightings: {name} of shape {np.shape(given)}; give a variance, {rows} variances, "
             f"or matrices (3, 3) or ({rows}, 3, 3)"
         ) from None
-    invalid = ~is_covariance(matrices)
-    if invalid.any():
-        i = int(np.flatnonzero(invalid)[0])
+    wrong = ~is_covariance(matrices)
+    if wrong.any():
+        i = int(np.flatnonzero(wrong)[0])
         raise InputError(
             f"sighting {i}: {name} {matrices[i].tolist()} is not symmetric and positive "
             "semidefinite; give variances and covariances in m² of a point, rad² of a direction"
@@ -327,7 +328,7 @@ def _covariances(value: npt.ArrayLike, rows: int, name: str) -> FloatArray:
 
 
 def is_covariance(matrices: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return the mask of matrices (M, 3, 3) that are finite, symmetric and positive semidefinite.
+    """Return which matrices (M, 3, 3) are finite, symmetric and positive semidefinite.
 
     Tolerance: 1e-9 of the largest entry. Entries above 1e100 count as infinite.
     """
@@ -342,9 +343,9 @@ def is_covariance(matrices: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def _finite(values: FloatArray, name: str) -> None:
-    invalid = ~np.isfinite(values).all(axis=-1)
-    if invalid.any():
-        i = int(np.flatnonzero(invalid)[0])
+    wrong = ~np.isfinite(values).all(axis=-1)
+    if wrong.any():
+        i = int(np.flatnonzero(wrong)[0])
         raise InputError(f"sighting {i}: {name} {values[i]} is not finite; leave the row out")
 
 
@@ -356,8 +357,8 @@ def ray_directions(s: Sightings, vertex: npt.ArrayLike) -> tuple[FloatArray, Flo
         (s.source, s.source_at_infinity),
         (s.destination, s.destination_at_infinity),
     ):
-        direction = np.where(far[:, None], points, points - m)
-        ends.append(direction / np.linalg.norm(direction, axis=-1, keepdims=True))
+        way = np.where(far[:, None], points, points - m)
+        ends.append(way / np.linalg.norm(way, axis=-1, keepdims=True))
     return ends[0], ends[1]
 
 
@@ -381,24 +382,24 @@ def bisector_covariance(s: Sightings, vertex: npt.ArrayLike, axes: npt.ArrayLike
         Two unit axes across each bisector, (M, 2, 3).
     """
     m = as_float(vertex)
-    directions = ray_directions(s, m)
-    size = np.linalg.norm(directions[0] + directions[1], axis=-1)
+    ways = ray_directions(s, m)
+    size = np.linalg.norm(ways[0] + ways[1], axis=-1)
     across = as_float(axes) / size[:, None, None]
     # A turn ε of the ray t turns the bisector by the part of ε across the normal over |s + t|:
     # all of it across the plane of incidence, cos i of it within the plane.
-    turn = np.eye(3) - directions[1][:, :, None] * directions[1][:, None, :]
+    turn = np.eye(3) - ways[1][:, :, None] * ways[1][:, None, :]
     covariance = across @ turn @ np.swapaxes(across, -1, -2) * s.sigma[:, None, None] ** 2
-    for direction, points, far, spread in (
-        (directions[0], s.source, s.source_at_infinity, s.source_covariance),
-        (directions[1], s.destination, s.destination_at_infinity, s.destination_covariance),
+    for way, points, far, given in (
+        (ways[0], s.source, s.source_at_infinity, s.source_covariance),
+        (ways[1], s.destination, s.destination_at_infinity, s.destination_covariance),
     ):
-        rows = np.flatnonzero(spread.any(axis=(-1, -2)))
+        rows = np.flatnonzero(given.any(axis=(-1, -2)))
         if rows.size:
-            w = direction[rows]
+            w = way[rows]
             lever = np.where(far[rows], 1.0, np.linalg.norm(points[rows] - m[rows], axis=-1))
             turn = (np.eye(3) - w[:, :, None] * w[:, None, :]) / lever[:, None, None]
             part = across[rows] @ turn
-            covariance[rows] += part @ spread[rows] @ np.swapaxes(part, -1, -2)
+            covariance[rows] += part @ given[rows] @ np.swapaxes(part, -1, -2)
     return as_float(covariance)
 
 
@@ -421,7 +422,7 @@ def of_measurements(
     kept = rows >= 0
     strangers = sorted({n for n, ok in zip(measurements.heliostat, kept, strict=True) if not ok})
     left_out = [f"measurements of {name}: the plant has no such heliostat" for name in strangers]
-    observed = sightings(
+    seen = sightings(
         rows[kept],
         measurements.counts[kept],
         measurements.sun[kept],
@@ -429,7 +430,7 @@ def of_measurements(
         time=measurements.time[kept],
         sigma=sigma,
     )
-    return replace(observed, names=heliostats.names), left_out
+    return replace(seen, names=heliostats.names), left_out
 
 
 def camera_target(

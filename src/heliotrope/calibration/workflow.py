@@ -37,6 +37,7 @@ from heliotrope.errors import FormatError, InputError, require, shown
 from heliotrope.field.formats import measurements
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
+from heliotrope.field.target import Target
 from heliotrope.mechanism.chain import Mechanism
 
 #: How the sequential split learns on.
@@ -281,6 +282,7 @@ def evaluate(
     steps: Steps | None = None,
     learner: Learner = "stream",
     misfits: tuple[Misfit, ...] | None = None,
+    targets: Sequence[Target] = (),
 ) -> HeldOutEvaluation:
     """Learn from a part of each heliostat's sightings and assess the rest.
 
@@ -308,6 +310,8 @@ def evaluate(
         (`heliotrope.calibration.learn.stream`); "batch" learns every history afresh.
     misfits
         As for `learn`.
+    targets
+        Targets of the plant, for `find_misfits`.
 
     Raises
     ------
@@ -317,7 +321,7 @@ def evaluate(
     training, tested = evaluation.partition(sightings, split, fraction, seed)
     choice = None
     if misfits is None:
-        misfits = find_misfits(mechanism, sightings, training)
+        misfits = find_misfits(mechanism, sightings, training, targets)
     if model == "auto":
         fits = ~np.isin(sightings.heliostat, [misfit.row for misfit in misfits])
         choice = find_model(mechanism, sightings, training & fits, steps)
@@ -372,7 +376,7 @@ def calibrate(
     if fraction != 1.0:
         evaluation.check_fraction(fraction)
     names, mechanism = field.heliostats.names, field.heliostats.mechanism
-    misfits = find_misfits(mechanism, field.seen)
+    misfits = find_misfits(mechanism, field.seen, targets=field.plant.targets)
     fits = ~np.isin(field.seen.heliostat, [misfit.row for misfit in misfits])
     comparison: tuple[str, ...] = ()
     if model == "auto":

@@ -70,6 +70,7 @@ def evaluate(
             runner=runner,
             steps=steps,
             learner=learner,
+            targets=plant.targets,
         )
     document = {
         "split": split,

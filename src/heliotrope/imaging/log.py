@@ -63,10 +63,15 @@ class Log:
 
     def find(self, path: Path) -> Entry | None:
         """Return the entry of a photograph."""
-        for key in (str(path), path.name, path.stem, _number(path)):
+        for key in (str(path), path.name, *_short(path)):
             if key in self._entries:
                 return self._entries[key]
         return None
+
+
+def _short(path: Path) -> tuple[str, str]:
+    """Return the shorter names of a photograph, under which a log may have it."""
+    return path.stem, _number(path)
 
 
 def _number(path: Path) -> str:
@@ -118,6 +123,11 @@ def read_log(path: str | Path) -> Log:
             sun=_sun(numbers[2][i], numbers[3][i]),
             empty=(rows.path.parent / empties[i]).resolve() if empties[i] else None,
         )
+    for key, i in places.items():
+        for other in {*_short(Path(key))} - {key}:
+            if other in places:
+                text = f"{key} and {other} of {rows.places[places[other]]} name one photograph"
+                rows.refuse(i, "file", f"{text}; keep the true row")
     rows.refuse_bad()
     return Log(entries)
 

@@ -15,7 +15,7 @@ from heliotrope.calibration.learn.learned import (
     squared_distance,
 )
 from heliotrope.calibration.learn.learning import FEWEST
-from heliotrope.calibration.learn.misfits import ELSEWHERE
+from heliotrope.calibration.learn.misfits import ELSEWHERE, SCATTERED
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.frames import Framed, Labelled, Variable
@@ -29,6 +29,8 @@ FAR = 1e6
 ENOUGH = 20
 #: Share of such sightings from which a mirror is named, and share beyond which nothing agrees.
 SHARE, NOTHING = 0.15, 0.6
+#: Mirrors of one reason that are named, and standard deviations of a prior from which a value is.
+NAMED, STRAINED = 8, 10.0
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class HeliostatFigures:
 
     def document(self) -> dict[str, Any]:
         """Return the figures for JSON, in mrad."""
-        figures: dict[str, Any] = {
+        found: dict[str, Any] = {
             "n": self.count,
             "n_held_out": self.beam.count,
             "median_beam_mrad": 1e3 * self.beam.median,
@@ -84,11 +86,11 @@ class HeliostatFigures:
             "steps": self.steps,
         }
         if self.axes is not None:
-            figures["gamma_0_mrad"] = 1e3 * float(self.axes.gamma_0)
-            figures["sigma_gamma_mrad"] = 1e3 * float(self.axes.sigma_gamma)
-            figures["alpha_0_mrad"] = 1e3 * float(self.axes.alpha_0)
-            figures["sigma_alpha_mrad"] = 1e3 * float(self.axes.sigma_alpha)
-        return figures
+            found["gamma_0_mrad"] = 1e3 * float(self.axes.gamma_0)
+            found["sigma_gamma_mrad"] = 1e3 * float(self.axes.sigma_gamma)
+            found["alpha_0_mrad"] = 1e3 * float(self.axes.alpha_0)
+            found["sigma_alpha_mrad"] = 1e3 * float(self.axes.sigma_alpha)
+        return found
 
 
 @dataclass(frozen=True)
@@ -133,20 +135,14 @@ class Assessment(Framed):
 
     def _labelled(self) -> Labelled:
         row = ("heliostat",)
-        documents = [h.document() for h in self.heliostats]
+        each = [h.document() for h in self.heliostats]
         units = {"mrad": "mrad"}
-        names = [
-            n
-            for n in (documents[0] if documents else {})
-            if all(n in document for document in documents)
-        ]
+        names = [n for n in (each[0] if each else {}) if all(n in one for one in each)]
         return Labelled(
             row,
             {"heliostat": [h.name for h in self.heliostats]},
             {
-                n: Variable(
-                    row, np.array([document[n] for document in documents]), units.get(n[-4:], "")
-                )
+                n: Variable(row, np.array([one[n] for one in each]), units.get(n[-4:], ""))
                 for n in names
             },
         )
@@ -193,33 +189,33 @@ def assess(
         Mask of the sightings to test on, (M,); default: all that were not used.
     """
     rows = np.flatnonzero(~learned.used if tested is None else tested)
-    held_out = learned.sightings.take(rows)
+    seen = learned.sightings.take(rows)
     if found is None:
-        found = predict(learned, held_out)
-    fits = ~np.isin(held_out.heliostat, [misfit.row for misfit in learned.misfits])
+        found = predict(learned, seen)
+    fits = ~np.isin(seen.heliostat, [misfit.row for misfit in learned.misfits])
     beyond = rows[fits & ~found.usable]
     found = replace(found, usable=found.usable & fits)
     counts = np.bincount(learned.sightings.heliostat, minlength=len(names))
     figures = [
-        _figures(
+        _one(
             names[i],
             int(i),
             int(counts[i]),
             learned,
             found,
-            np.flatnonzero((held_out.heliostat == i) & found.usable),
-            held_out,
+            np.flatnonzero((seen.heliostat == i) & found.usable),
+            seen,
         )
         for i in np.flatnonzero(counts)
     ]
     judged = [h for h in figures if h.beam.count]
     fewest = ENOUGH if any(h.count >= ENOUGH for h in judged) else 0
     enough = [h for h in judged if h.count >= fewest]
-    inside = found.usable & np.isin(held_out.heliostat, [names.index(h.name) for h in enough])
+    inside = found.usable & np.isin(seen.heliostat, [names.index(h.name) for h in enough])
     far = squared_distance(found.plane, found.covariance) > BLUNDER**2
-    misplaced = inside & far & (found.errors.beam > ELSEWHERE)
+    strange = inside & far & (found.errors.beam > ELSEWHERE)
     means = [
-        found.errors.beam[(held_out.heliostat == names.index(h.name)) & inside & ~misplaced]
+        found.errors.beam[(seen.heliostat == names.index(h.name)) & inside & ~strange]
         for h in enough
     ]
     means = [m for m in means if len(m)]
@@ -233,40 +229,38 @@ def assess(
         summarise(found.errors.beam[inside]),
         fewest,
         int(far[inside].sum()),
-        rows[misplaced],
+        rows[strange],
         float(np.mean([m.mean() for m in means])) if means else np.nan,
         np.flatnonzero(unusable),
     )
 
 
-def _figures(
+def _one(
     name: str,
     i: int,
     count: int,
     learned: Learned,
-    prediction: Prediction,
+    found: Prediction,
     rows: npt.NDArray[np.intp],
-    held_out: Sightings,
+    seen: Sightings,
 ) -> HeliostatFigures:
     mine = learned.sightings.heliostat == i
-    beam = prediction.errors.beam[rows]
+    beam = found.errors.beam[rows]
     return HeliostatFigures(
         name=name,
         count=count,
         beam=summarise(beam),
-        normal=summarise(prediction.errors.normal[rows]),
+        normal=summarise(found.errors.normal[rows]),
         mean=float(beam.mean()) if len(rows) else np.nan,
-        coverage=float(prediction.inside[rows].mean()) if len(rows) else np.nan,
-        axes=_axes(learned, prediction.values[rows], held_out.take(rows))
-        if len(rows) > 1
-        else None,
+        coverage=float(found.inside[rows].mean()) if len(rows) else np.nan,
+        axes=_axes(learned, found.values[rows], seen.take(rows)) if len(rows) > 1 else None,
         outliers=int(learned.outlier[mine].sum()),
         regimes=len(np.unique(learned.regime[mine & (learned.regime >= 0)])),
         steps=len(learned.members[i].data.steps),
     )
 
 
-def _axes(learned: Learned, values: FloatArray, sightings: Sightings) -> AxisAccuracy | None:
+def _axes(learned: Learned, values: FloatArray, seen: Sightings) -> AxisAccuracy | None:
     """Return the zeros before the fit and the scatter after it, of held-out sightings.
 
     Guo's γ', α' are the drives' angles: those of the nominal drives for the zeros, (44) and
@@ -274,27 +268,23 @@ def _axes(learned: Learned, values: FloatArray, sightings: Sightings) -> AxisAcc
     learnt drives for the scatter, (45) and (47). His γ, α, (43), are the angles at which the
     learnt mechanism sends the source to the destination that was seen.
     """
-    moved = moved_by(learned.mechanism, sightings.heliostat, learned.names, values)
-    vertex = moved.pose(sightings.counts).vertex
-    source, destination = ray_directions(sightings, vertex)
-    aim = np.where(
-        sightings.destination_at_infinity[:, None],
-        vertex + FAR * destination,
-        sightings.destination,
-    )
-    solved = track(moved, source, aim, current=sightings.counts)
+    learnt = moved_by(learned.mechanism, seen.heliostat, learned.names, values)
+    vertex = learnt.pose(seen.counts).vertex
+    source, way = ray_directions(seen, vertex)
+    aim = np.where(seen.destination_at_infinity[:, None], vertex + FAR * way, seen.destination)
+    solved = track(learnt, source, aim, current=seen.counts)
     good = solved.reachable
-    driven = [moved.joints[j] for j in moved.driven]
+    driven = [learnt.joints[j] for j in learnt.driven]
     if good.sum() < 2 or len(driven) != 2:
         return None
     gamma = driven.index("azimuth") if "azimuth" in driven else 0
     alpha = 1 - gamma
     computed = solved.best_angles[good]
-    accuracies = []
-    for mechanism in (learned.mechanism[sightings.heliostat], moved):
-        angles = mechanism.drives.angles(sightings.counts)[good]
+    found = []
+    for mechanism in (learned.mechanism[seen.heliostat], learnt):
+        angles = mechanism.drives.angles(seen.counts)[good]
         try:
-            accuracies.append(
+            found.append(
                 axis_accuracy(
                     angles[:, alpha], angles[:, gamma], computed[:, alpha], computed[:, gamma]
                 )
@@ -302,7 +292,7 @@ def _axes(learned: Learned, values: FloatArray, sightings: Sightings) -> AxisAcc
         except InputError:
             # A mistaken sighting may lie over the top; its axes say nothing.
             return None
-    before, after = accuracies
+    before, after = found
     return replace(after, gamma_0=before.gamma_0, alpha_0=before.alpha_0)
 
 
@@ -316,37 +306,65 @@ def unexplained_mirrors(names: tuple[str, ...], learned: Learned) -> tuple[str, 
     learned
         The sightings that were not used are not considered.
     """
-    lines = [f"{names[misfit.row]}: {misfit.reason}" for misfit in learned.misfits]
+    reasons: dict[str, list[str]] = {}
+    for misfit in learned.misfits:
+        reasons.setdefault(misfit.reason, []).append(names[misfit.row])
+    lines = [f"{_listed(mirrors)}: {reason}" for reason, mirrors in reasons.items()]
+    misfits = {misfit.row for misfit in learned.misfits}
     odd = np.flatnonzero(learned.outlier)
     where = predict(learned, learned.sightings.take(odd)).errors.beam
     elsewhere = np.zeros(len(learned.sightings), dtype=np.bool_)
     elsewhere[odd[where > ELSEWHERE]] = True
     for i, (name, member) in enumerate(zip(names, learned.members, strict=True)):
+        if i in misfits:
+            continue
         mine = learned.used & (learned.sightings.heliostat == i)
         kept = learned.rows[i][~learned.outlier[learned.rows[i]]]
         white = np.linalg.norm(member.left_out()[1], axis=1)
         far = int((white * learned.sightings.sigma[kept] > ELSEWHERE).sum())
         beyond, count = int((learned.unusable & mine).sum()), int(mine.sum())
-        misplaced = far + int((elsewhere & mine).sum())
-        if count < FEWEST or beyond + misplaced < 2 or beyond + misplaced < SHARE * count:
-            continue
-        lines.append(f"{name}: {_reason(beyond, misplaced, count)}")
+        strange = far + int((elsewhere & mine).sum())
+        if count >= FEWEST and beyond + strange >= max(2, SHARE * count):
+            lines.append(f"{name}: {_reason(beyond, strange, count)}")
+        if len(white) >= FEWEST and np.median(white) > SCATTERED:
+            lines.append(f"{name}: {_scatter(white, learned.sightings.sigma[kept])}")
+        strain = np.abs(learned.static.values[i] / learned.static.prior[i])
+        if count and strain.max(initial=0.0) > STRAINED:
+            p = int(np.argmax(strain))
+            lines.append(
+                f"{name}: {learned.model[p]} is {strain[p]:.0f} standard deviations of its prior "
+                "from the nominal value; check the heliostat's entry in the plant file"
+            )
     return tuple(lines)
 
 
-def _reason(beyond: int, misplaced: int, count: int) -> str:
-    if beyond > misplaced:
+def _listed(names: list[str]) -> str:
+    """Return the first of some names, and the number of the others."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def _scatter(white: FloatArray, sigma: FloatArray) -> str:
+    beam = 1e3 * float(np.median(white * sigma))
+    return (
+        f"half of its beams are more than {beam:.2f} mrad, {np.median(white):.0f} times their "
+        "sigma, from where the others put them; give the true sigma, or check model and counts"
+    )
+
+
+def _reason(beyond: int, strange: int, count: int) -> str:
+    if beyond > strange:
         return (
             f"{beyond} of {count} sightings have counts beyond the reach of its drives. Probably "
             "the counts were recorded wrongly, or the properties of its drives are wrong."
         )
-    if misplaced > NOTHING * count:
+    if strange > NOTHING * count:
         return (
-            f"{misplaced} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from where "
-            "the others put them; no parameters explain them together. Probably the counts were "
+            f"{strange} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from where the "
+            "others put them; no parameters explain them together. Probably the counts were "
             "recorded wrongly."
         )
     return (
-        f"{misplaced} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from where the "
+        f"{strange} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from where the "
         "others, which agree, put them. Probably these photographs show another mirror's beam."
     )

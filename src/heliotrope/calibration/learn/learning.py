@@ -30,7 +30,7 @@ from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn import drift
 from heliotrope.calibration.learn.drift import DAY, Hyperparameters, Linear, Posterior
 from heliotrope.calibration.learn.learned import Learned, moved_by
-from heliotrope.calibration.learn.misfits import Misfit, find_misfits
+from heliotrope.calibration.learn.misfits import Misfit, find_misfits, scattered
 from heliotrope.calibration.learn.regimes import find_regimes
 from heliotrope.calibration.learn.unusable import find_unusable, is_usable
 from heliotrope.calibration.named import Field, Members, members
@@ -325,7 +325,7 @@ def learn(
     constant = names_of(model, nominal)
     keep = mask_of(used, len(sightings), "used")
     if misfits is None:
-        misfits = find_misfits(nominal, sightings, keep)
+        misfits = find_misfits(nominal, sightings, keep, field.around.targets)
     keep = keep & ~np.isin(sightings.heliostat, [misfit.row for misfit in misfits])
     task = Task(constant, dict(priors or {}), loss, own)
     with threadpool_limits(1, "blas"):
@@ -445,9 +445,16 @@ def _join(
         heliostats=names,
         **{name: np.concatenate([getattr(fit, name) for fit in fits]) for name in BY_HELIOSTAT},
     )
+    members = tuple(m for part in parts for m in part.members)
+    for i, member in enumerate(members):
+        kept = rows[i][~outlier[rows[i]]]
+        if len(kept) < FEWEST:
+            continue
+        white = np.linalg.norm(member.left_out()[1], axis=1)
+        misfit = scattered(i, white, sightings.sigma[kept])
+        misfits += () if misfit is None else (misfit,)
     for misfit in misfits:
         static.outcome[misfit.row] = misfit.outcome
-    members = tuple(m for part in parts for m in part.members)
     return Learned(
         field.mechanism,
         sightings,

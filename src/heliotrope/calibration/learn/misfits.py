@@ -3,11 +3,12 @@
 A mirror whose motor is connected the other way round, or whose rows belong to another mirror, fits
 no parameters, or fits absurd ones. Each likely mistake is a hypothesis: the sightings are read as
 if it had been made, and fitted as all others are. The hypothesis that explains them far better is
-the reason. Such a mirror is not learnt, and teaches the field nothing.
+the reason. Such a mirror is not learnt, and teaches the field nothing. Photographs that are
+mirrored or turned are a mistake of the camera, tested over all mirrors together.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -18,10 +19,12 @@ from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome, fit
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn.unusable import is_usable
 from heliotrope.calibration.sightings import Sightings, join, ray_directions
+from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, angle_between, bisector
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
-from heliotrope.mechanism.drives import SLOTS
+from heliotrope.mechanism.drives import SLOTS, Drive
+from heliotrope.mechanism.tracking import track
 from heliotrope.values import amount
 
 #: Parameters are doubtful from this sum of squares on, in standard deviations of their priors.
@@ -43,6 +46,21 @@ STILL, TURNED = 1e-3, 10e-3
 MOST, OTHERS = 40, 4
 #: Sightings by which those others are chosen.
 FEW = 5
+#: Counts are scaled if the drives ask for a factor that differs from 1 by more than this; the fit
+#: then finds it to this standard deviation.
+SCALED, LOOSE = 0.02, 0.05
+#: Sightings scatter if half of them are further than this many of their sigmas from where the
+#: others put them; no fit holds if that is more than this angle too, rad. The worst of 18 real
+#: mirrors has 1.6 and 1.0 mrad.
+SCATTERED, APART = 4.0, 2e-3
+#: Mirrors by which photographs are judged: those with the most sightings.
+MIRRORS = 10
+#: Mistakes of photographs: text, and the signs of right and up on the target.
+PHOTOGRAPHS = (
+    ("mirrored left to right", (-1.0, 1.0)),
+    ("mirrored top to bottom", (1.0, -1.0)),
+    ("turned by half a turn", (-1.0, -1.0)),
+)
 
 
 @dataclass(frozen=True)
@@ -68,6 +86,7 @@ def find_misfits(
     mechanism: Mechanism,
     sightings: Sightings,
     used: npt.NDArray[np.bool_] | None = None,
+    targets: Sequence[Target] = (),
 ) -> tuple[Misfit, ...]:
     """Return the mirrors that their sightings do not describe.
 
@@ -79,21 +98,23 @@ def find_misfits(
         M of these heliostats; names are used in the reasons.
     used
         Mask of the sightings to judge by, (M,).
+    targets
+        Targets of the plant; without them mirrored photographs are not looked for.
     """
-    chosen = sightings if used is None else sightings.take(used)
+    given = sightings if used is None else sightings.take(used)
     names = parameter_table.model("full", mechanism.parameters)
-    usable = is_usable(linearise(mechanism[chosen.heliostat], chosen, names))
-    reachable = chosen.take(usable)
-    unmoved = tuple(_unmoved(mechanism, reachable))
-    moved = reachable.take(~np.isin(reachable.heliostat, [misfit.row for misfit in unmoved]))
+    usable = is_usable(linearise(mechanism[given.heliostat], given, names))
+    seen = given.take(usable)
+    found = list(_unmoved(mechanism, seen))
+    found += _of_photographs(mechanism, _without(seen, found), names, targets)
+    moved = _without(seen, found)
     fitted = fit(mechanism, moved, names, adapt_scale=False)
     error = _median_errors(mechanism, moved, fitted)
-    misfits = list(unmoved)
     # Counts beyond the reach of its drives are named as such, unless a mistake explains them.
-    for row in np.setdiff1d(chosen.heliostat, reachable.heliostat):
-        reason = _mistake(mechanism, chosen.take(chosen.heliostat == row), int(row), names)
+    for row in np.setdiff1d(given.heliostat, seen.heliostat):
+        reason = _mistake(mechanism, given.take(given.heliostat == row), int(row), names)
         if reason is not None:
-            misfits.append(Misfit(int(row), FitOutcome.MISFIT, reason))
+            found.append(Misfit(int(row), FitOutcome.MISFIT, reason))
     for row in np.flatnonzero(fitted.count):
         outcome = FitOutcome(int(fitted.outcome[row]))
         strain = float(((fitted.values[row] / fitted.prior[row]) ** 2).sum())
@@ -103,13 +124,37 @@ def find_misfits(
             and error[row] < ELSEWHERE
         ):
             continue
-        own = moved.take(moved.heliostat == row)
-        reason = _mistake(mechanism, own, int(row), names)
+        one = moved.take(moved.heliostat == row)
+        reason = _mistake(mechanism, one, int(row), names)
         if reason is None:
-            reason = _hopeless(mechanism, own, outcome, strain, float(error[row]))
+            reason = _hopeless(mechanism, one, outcome, strain, float(error[row]))
         if reason is not None:
-            misfits.append(Misfit(int(row), FitOutcome.MISFIT, reason))
-    return tuple(sorted(misfits, key=lambda misfit: misfit.row))
+            found.append(Misfit(int(row), FitOutcome.MISFIT, reason))
+    return tuple(sorted(found, key=lambda misfit: misfit.row))
+
+
+def scattered(row: int, white: FloatArray, sigma: FloatArray) -> Misfit | None:
+    """Return the misfit of a mirror whose sightings contradict each other; None if they agree.
+
+    Parameters
+    ----------
+    row
+        Row of the heliostat.
+    white
+        How far each sighting is from where the others put it, in units of its sigma, (n,).
+    sigma
+        Standard deviations of the sightings, rad of beam, (n,).
+    """
+    if np.median(white) < SCATTERED or np.median(white * sigma) < APART:
+        return None
+    return Misfit(
+        row,
+        FitOutcome.MISFIT,
+        f"half of its {amount(len(white), 'beam')} are more than "
+        f"{1e3 * np.median(white * sigma):.1f} mrad, {np.median(white):.0f} times their sigma, "
+        "from where the others put them: no parameters explain them; check counts, gear ratio and "
+        "the log",
+    )
 
 
 def costs(fitted: FieldFit, mechanism: Mechanism) -> FloatArray:
@@ -123,12 +168,79 @@ def costs(fitted: FieldFit, mechanism: Mechanism) -> FloatArray:
     return np.asarray(np.where(broken & (fitted.count > 0), np.inf, cost))
 
 
-def _unmoved(mechanism: Mechanism, sightings: Sightings) -> Iterator[Misfit]:
-    pose = mechanism[sightings.heliostat].pose(sightings.counts)
-    bisectors = bisector(*ray_directions(sightings, pose.vertex))
-    for row in np.unique(sightings.heliostat):
-        mine = np.flatnonzero(sightings.heliostat == row)
-        if _span(pose.normal[mine]) < STILL and _span(bisectors[mine]) > TURNED:
+def _without(seen: Sightings, misfits: Sequence[Misfit]) -> Sightings:
+    return seen.take(~np.isin(seen.heliostat, [misfit.row for misfit in misfits]))
+
+
+def _is_better(cost: float, given: float) -> bool:
+    """Return whether sightings that are read otherwise fit far better than as they are given."""
+    return cost < given - GAIN and cost < SHARE * given
+
+
+def _of_photographs(
+    mechanism: Mechanism, seen: Sightings, names: tuple[str, ...], targets: Sequence[Target]
+) -> Iterator[Misfit]:
+    """Yield all mirrors with a beam on a target, if their photographs are mirrored or turned."""
+    on = [target.holds(seen.destination) & ~seen.destination_at_infinity for target in targets]
+    shown = seen.take(np.any(on, axis=0)) if targets else seen.take([])
+    counts = np.bincount(shown.heliostat, minlength=len(mechanism))
+    chosen = np.argsort(-counts, kind="stable")[:MIRRORS]
+    chosen = chosen[counts[chosen] >= FEW]
+    if not len(chosen):
+        return
+    parts = [_some(shown.take(shown.heliostat == row), MOST) for row in chosen]
+    part = join([one.renumbered(np.full(len(one), k)) for k, one in enumerate(parts)])
+    machines = mechanism[chosen]
+
+    def read(sign: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
+        other = replace(part, destination=_reflected(part.destination, targets, sign))
+        fitted = fit(machines, other, names, adapt_scale=False)
+        return costs(fitted, machines), _median_errors(machines, other, fitted)
+
+    given, error = read((1.0, 1.0))
+    # A mirror that fits in no manner says nothing about the photographs of the others.
+    good = np.isfinite(given)
+    trials = {text: read(sign) for text, sign in PHOTOGRAPHS}
+    best = min(trials, key=lambda text: float(trials[text][0][good].sum()))
+    cost, left = trials[best]
+    most = 2 * int((cost < given)[good].sum()) > len(given)
+    if not (most and _is_better(float(cost[good].sum()), float(given[good].sum()))):
+        return
+    if np.median(left) > ELSEWHERE:
+        return
+    text = (
+        f"the photographs of the targets seem {best}: read like that, the sightings of "
+        f"{amount(len(chosen), 'heliostat')} fit to {1e3 * np.median(left):.2f} mrad of beam "
+        f"instead of {1e3 * np.median(error):.2f}; correct the camera or what stores its frames"
+    )
+    for row in np.flatnonzero(counts):
+        yield Misfit(int(row), FitOutcome.MISFIT, text)
+
+
+def _reflected(
+    points: FloatArray, targets: Sequence[Target], sign: tuple[float, float]
+) -> FloatArray:
+    """Return points with their places right of and above the middle of their target reflected."""
+    moved, left = points.copy(), np.ones(len(points), np.bool_)
+    for target in targets:
+        on = left & target.holds(points)
+        left &= ~on
+        moved[on] += (target.plane_coordinates(points[on]) * (np.array(sign) - 1.0)) @ target.axes
+    return moved
+
+
+def _some(seen: Sightings, most: int) -> Sightings:
+    """Return at most so many sightings, spread over all."""
+    places = np.linspace(0, len(seen) - 1, min(most, len(seen))).round().astype(np.intp)
+    return seen.take(np.unique(places))
+
+
+def _unmoved(mechanism: Mechanism, seen: Sightings) -> Iterator[Misfit]:
+    pose = mechanism[seen.heliostat].pose(seen.counts)
+    wanted = bisector(*ray_directions(seen, pose.vertex))
+    for row in np.unique(seen.heliostat):
+        mine = np.flatnonzero(seen.heliostat == row)
+        if _span(pose.normal[mine]) < STILL and _span(wanted[mine]) > TURNED:
             yield Misfit(
                 int(row),
                 FitOutcome.UNMOVED,
@@ -142,91 +254,162 @@ def _span(directions: FloatArray) -> float:
     return float(angle_between(directions, directions[:1]).max(initial=0.0))
 
 
-def _median_errors(mechanism: Mechanism, sightings: Sightings, fitted: FieldFit) -> FloatArray:
-    beam = beam_errors(mechanism.with_parameters(fitted.parameters), sightings).beam
-    errors = np.zeros(len(mechanism))
+def _median_errors(mechanism: Mechanism, seen: Sightings, fitted: FieldFit) -> FloatArray:
+    beam = beam_errors(mechanism.with_parameters(fitted.parameters), seen).beam
+    found = np.zeros(len(mechanism))
     for row in np.flatnonzero(fitted.count):
-        errors[row] = np.median(beam[sightings.heliostat == row])
-    return errors
+        found[row] = np.median(beam[seen.heliostat == row])
+    return found
 
 
 def _hopeless(
-    mechanism: Mechanism, sightings: Sightings, outcome: FitOutcome, strain: float, error: float
+    mechanism: Mechanism, one: Sightings, outcome: FitOutcome, strain: float, error: float
 ) -> str | None:
-    """Return the reason to reject a fit that no mistake explains; None if it may hold."""
+    """Return why the fit of a mirror cannot hold, though no mistake explains it; None if it can."""
     still = [
         mechanism.joints[joint]
         for d, joint in enumerate(mechanism.driven)
-        if len(sightings) > 1 and np.ptp(sightings.counts[:, d]) == 0.0
+        if len(one) > 1 and np.ptp(one.counts[:, d]) == 0.0
     ]
     broken = outcome not in (FitOutcome.CONVERGED, FitOutcome.NOT_CONVERGED)
     if broken or error > HOPELESS:
         if still:
             return f"the counts of {' and '.join(still)} did not change; check motor and log"
-        rest = "" if broken else f", the best leave {1e3 * error:.0f} mrad of beam"
+        left = "" if broken else f", the best leave {1e3 * error:.0f} mrad of beam"
         return (
-            f"no plausible parameters explain its {amount(len(sightings), 'sighting')}{rest}; "
-            "check the counts, the heliostat's name and its entry in the plant file"
+            f"no plausible parameters explain its {amount(len(one), 'sighting')}{left}; check the "
+            "counts, the heliostat's name and its entry in the plant file"
         )
-    if len(sightings) < WITNESSES and strain > DOUBTFUL:
+    if len(one) < WITNESSES and strain > DOUBTFUL:
         return (
-            f"{amount(len(sightings), 'sighting')} would need parameters {np.sqrt(strain):.0f} "
-            f"standard deviations from the nominal ones; make at least {WITNESSES}"
+            f"{amount(len(one), 'sighting')} would need parameters {np.sqrt(strain):.0f} standard "
+            f"deviations from the nominal ones; make at least {WITNESSES}"
         )
     return None
 
 
-def _mistake(
-    mechanism: Mechanism, sightings: Sightings, row: int, names: tuple[str, ...]
-) -> str | None:
+def _mistake(mechanism: Mechanism, one: Sightings, row: int, names: tuple[str, ...]) -> str | None:
     """Return the mistake that explains the sightings of a mirror, None if there is none."""
-    part = sightings.take(
-        np.linspace(0, len(sightings) - 1, min(MOST, len(sightings))).round().astype(np.intp)
-    )
-    trials = list(_hypotheses(mechanism, part, row))
-    rows = np.array([trial[1] for trial in trials])
-    machines = mechanism[rows]
-    parts = [trial[2].renumbered(np.full(len(part), k)) for k, trial in enumerate(trials)]
-    joined = join(parts)
-    fitted = fit(machines, joined, names, adapt_scale=False)
-    error, cost = _median_errors(machines, joined, fitted), costs(fitted, machines)
-    # The first trial is the unchanged sightings. A mistake explains them no worse: a zero
+    part = _some(one, MOST)
+    trials = [*_hypotheses(mechanism, part, row), *_scaled(mechanism, part, row)]
+    machines = mechanism[np.array([trial.row for trial in trials])]
+    parts = [trial.seen.renumbered(np.full(len(part), k)) for k, trial in enumerate(trials)]
+    seen = join(parts)
+    priors = {
+        name: np.where([name in t.factors for t in trials], LOOSE, mechanism.parameter(name).prior)
+        for name in {name for trial in trials for name in trial.factors}
+    }
+    fitted = fit(machines, seen, names, priors=priors, adapt_scale=False)
+    error, each = _median_errors(machines, seen, fitted), costs(fitted, machines)
+    # The first trial is the sightings as they are given. A mistake explains them no worse: a zero
     # that is far off strains the priors too, but leaves smaller errors than another mirror does.
     least = 2.0 * float(np.median(part.sigma))
     enough = np.clip(np.nan_to_num(ALIKE * error[0], nan=np.inf), least, ELSEWHERE)
-    cost = np.where(error <= enough, cost, np.inf)
-    unchanged, best = costs(fitted, machines)[0], int(np.argmin(cost))
-    if best == 0 or not (cost[best] < unchanged - GAIN and cost[best] < SHARE * unchanged):
+    each = np.where(error <= enough, each, np.inf)
+    given, best = costs(fitted, machines)[0], int(np.argmin(each))
+    if best == 0 or not _is_better(each[best], given):
         return None
+    ratios = [
+        1.0 / (factor * (1.0 + fitted.parameters[name][best]))
+        for name, factor in trials[best].factors.items()
+    ]
+    text = trials[best].text.format(" and ".join(dict.fromkeys(f"{r:.2f}" for r in ratios)))
     return (
-        f"{trials[best][0]}; read like that, its {amount(len(sightings), 'sighting')} fit to "
+        f"{text}; read like that, its {amount(len(one), 'sighting')} fit to "
         f"{1e3 * error[best]:.2f} mrad of beam"
     )
 
 
-def _hypotheses(
-    mechanism: Mechanism, part: Sightings, row: int
-) -> Iterator[tuple[str, int, Sightings]]:
-    """Yield likely mistakes: text, row of the mechanism, and the sightings without the mistake."""
-    yield "", row, part
+@dataclass(frozen=True)
+class _Trial:
+    """A likely mistake.
+
+    Attributes
+    ----------
+    text
+        A clause for people.
+    row
+        Row of the mechanism.
+    seen
+        The sightings without the mistake.
+    factors
+        Factors of the counts by the parameters that refine them, whose prior is wide; ``text`` has
+        a place for them.
+    """
+
+    text: str
+    row: int
+    seen: Sightings
+    factors: Mapping[str, float] = field(default_factory=dict)
+
+
+def _scaled(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Trial]:
+    """Yield the factors of the counts that the rays ask of the nominal drives."""
+    if len(mechanism.driven) != 2 or len(part) < FEW:
+        return
+    one = mechanism[row]
+    source, way = ray_directions(part, one.pose(part.counts).vertex)
+    far = part.destination_at_infinity[:, None]
+    vertex = one.pose(part.counts).vertex
+    aim = np.where(far, vertex + 1e6 * way, part.destination)
+    solved = track(one.armature, source, aim)
+    joints = [mechanism.joints[joint] for joint in mechanism.driven]
+    for branch in (0, 1):
+        factors = [
+            _factor(
+                Drive(mechanism.drives.table[row, d]),
+                part.counts[:, d],
+                solved.angles[:, branch, d],
+            )
+            for d in range(2)
+        ]
+        for drives in ((0, 1), (0,), (1,)):
+            if not all(abs(factors[d] - 1.0) > SCALED for d in drives):
+                continue
+            counts = part.counts.copy()
+            counts[:, drives] *= [factors[d] for d in drives]
+            yield _Trial(
+                f"the counts of {' and '.join(joints[d] for d in drives)} seem scaled: they are "
+                "about {} times the true ones; check gear ratio and counts per turn",
+                row,
+                replace(part, counts=counts),
+                {f"{joints[d]}_scale": factors[d] for d in drives},
+            )
+
+
+def _factor(drive: Drive, counts: FloatArray, angles: FloatArray) -> float:
+    """Return the factor that makes counts run as the angles ask; 1 if there is none."""
+    order = np.argsort(counts, kind="stable")
+    wanted, given = drive.counts(np.unwrap(angles[order])), counts[order]
+    half = len(order) // 2
+    steps = given[half:] - given[: len(given) - half]
+    able = steps > 0.0
+    slopes = (wanted[half:] - wanted[: len(given) - half])[able] / steps[able]
+    slopes = slopes[np.isfinite(slopes) & (slopes > 0.0)]
+    return float(np.median(slopes)) if len(slopes) else 1.0
+
+
+def _hypotheses(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Trial]:
+    """Yield the sightings as they are, and without each of the likely mistakes."""
+    yield _Trial("", row, part)
     joints = [mechanism.joints[joint] for joint in mechanism.driven]
     back = [_reversed(mechanism, part, row, d) for d in range(len(joints))]
     for d, joint in enumerate(joints):
         counts = part.counts.copy()
         counts[:, d] = back[d]
-        yield (
+        yield _Trial(
             f"the motor of {joint} seems reversed: its counts run the other way",
             row,
             replace(part, counts=counts),
         )
     if len(joints) == 2:
-        yield (
+        yield _Trial(
             f"the motors of {' and '.join(joints)} both seem reversed",
             row,
             replace(part, counts=np.stack(back, axis=-1)),
         )
         turned = part.counts[:, ::-1].copy()
-        yield (
+        yield _Trial(
             f"its axes seem exchanged: the counts of {joints[0]} are those of {joints[1]}",
             row,
             replace(part, counts=turned),
@@ -234,7 +417,7 @@ def _hypotheses(
         for d, joint in enumerate(joints):
             other = turned.copy()
             other[:, d] = _reversed(mechanism, replace(part, counts=turned), row, d)
-            yield (
+            yield _Trial(
                 f"its axes seem exchanged, and {joint} reversed",
                 row,
                 replace(part, counts=other),
@@ -244,10 +427,11 @@ def _hypotheses(
         ("the azimuth of the sun seems to count from south", [-1.0, -1.0, 1.0]),
     ):
         far = part.source_at_infinity[:, None]
-        yield text, row, replace(part, source=np.where(far, part.source * sign, part.source))
+        source = np.where(far, part.source * sign, part.source)
+        yield _Trial(text, row, replace(part, source=source))
     for neighbour in _likely(mechanism, part, row):
         name = part.names[neighbour] if part.names else f"row {neighbour}"
-        yield f"its rows seem to be those of {name}", neighbour, part
+        yield _Trial(f"its rows seem to be those of {name}", neighbour, part)
 
 
 def _reversed(mechanism: Mechanism, part: Sightings, row: int, drive: int) -> FloatArray:
@@ -260,12 +444,12 @@ def _reversed(mechanism: Mechanism, part: Sightings, row: int, drive: int) -> Fl
 
 def _likely(mechanism: Mechanism, part: Sightings, row: int) -> list[int]:
     """Return the other mirrors that would come nearest to these sightings."""
-    some = part.take(np.unique(np.linspace(0, len(part) - 1, FEW).round().astype(np.intp)))
+    some = _some(part, FEW)
     count = len(some)
     every = np.repeat(np.arange(len(mechanism)), count)
-    repeated = some.take(np.tile(np.arange(count), len(mechanism)))
-    pose = mechanism[every].pose(repeated.counts)
-    miss = angle_between(pose.normal, bisector(*ray_directions(repeated, pose.vertex)))
+    seen = some.take(np.tile(np.arange(count), len(mechanism)))
+    pose = mechanism[every].pose(seen.counts)
+    miss = angle_between(pose.normal, bisector(*ray_directions(seen, pose.vertex)))
     middle = np.median(miss.reshape(-1, count), axis=1)
     middle[row] = np.inf
     return [int(k) for k in np.argsort(middle)[:OTHERS] if np.isfinite(middle[k])]
