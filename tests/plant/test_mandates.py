@@ -311,7 +311,7 @@ def test_who_takes_command_lets_a_single_visit_end(stage: str) -> None:
     async def scene(here: Scene) -> None:
         plant, name = here.live.plant, here.names[0]
         aims = plant.aims.copy()
-        whole = here.cycle._cycle
+        whole = here.cycle.cycle
         visit = asyncio.create_task(whole.run(ENGINEER, here.token, name, "left", here.tell))
         if stage == "LOCKED":
             await reached(here, stage, visit)
@@ -333,7 +333,7 @@ def test_who_takes_command_lets_a_single_visit_end(stage: str) -> None:
 def test_a_locked_mirror_of_a_single_visit_that_is_stowed_ends_in_stow() -> None:
     async def scene(here: Scene) -> None:
         plant, (name, other) = here.live.plant, here.names
-        whole = here.cycle._cycle
+        whole = here.cycle.cycle
         visit = asyncio.create_task(whole.run(ENGINEER, here.token, name, "left", here.tell))
         await reached(here, "LOCKED", visit)
         ticket = plant.stow("Vera", (name,))
