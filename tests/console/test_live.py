@@ -210,6 +210,16 @@ def test_ctl_at_the_plant_itself(ctl: Callable[..., Any], console: LiveConsole) 
     assert mine.exit_code != 0, mine.output
     withdrawn = ctl("engineer", *where, "emergency", "--withdraw", "--owner", "viewer")
     assert withdrawn.exit_code == 0, withdrawn.output
+    left = "every order is withdrawn; it ends when an operator acknowledges operator_emergency, 2 s"
+    assert left in withdrawn.stdout
+    assert left in ctl("viewer", *where, "status").stdout
+    again = ctl("engineer", *where, "emergency", "--withdraw")
+    assert again.exit_code != 0, again.output
+    assert f"no emergency order of engineer stands; {left}" in str(again.exception)
+    here = console.live.operations
+    console.until(lambda: any(a.waits for a in here.plant._sentinel.table.actions))
+    done = ctl("operator", *where, "acknowledge", "operator_emergency")
+    assert (done.exit_code, done.stdout) == (0, "acknowledged operator_emergency\n"), done.output
     console.calm()
     for words, text in (
         (("show", "accounts"), "leave out --data"),

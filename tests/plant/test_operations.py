@@ -412,14 +412,20 @@ def test_persons_come_before_the_automat() -> None:
         calls = [(call.who, call.act, call.reason) for call in shown.emergency_view().calls]
         assert calls == [("Vera", "STOW", "a fire"), ("Olga", "DEFOCUS", "somebody on the tower")]
         shown.withdraw(ENGINEER, "Vera")
+        view = shown.emergency_view()
+        assert (view.who, view.reason) == ("Olga", "somebody on the tower")
         await asyncio.sleep(40.0)
         assert shown.summary().emergency
-        with pytest.raises(RefusedError, match=r"Otto has ordered no emergency.*Olga \(DEFOCUS"):
+        with pytest.raises(
+            RefusedError, match=r"no emergency order of Otto stands.*Olga \(DEFOCUS"
+        ):
             shown.withdraw(Person("Otto", Role.OPERATOR))
         with pytest.raises(RefusedError, match="withdraw the emergency of Olga: Otto is operator"):
             shown.withdraw(Person("Otto", Role.OPERATOR), "Olga")
         shown.withdraw(ENGINEER, "Olga")
-        assert shown.emergency_view().calls == ()
+        view = shown.emergency_view()
+        assert (view.who, view.calls) == ("safety table", ())
+        assert view.reason.startswith("every order is withdrawn; it ends when an operator")
         await asyncio.sleep(20.0)
         assert shown.summary().states == {"STOWED": 4}
         with pytest.raises(UnknownNameError, match="act of an emergency"):

@@ -237,7 +237,7 @@ def test_it_holds_until_withdrawn_and_acknowledged_and_then_nothing_moves(tmp_pa
             plant.acknowledge(OPERATOR, "operator_emergency")
         with pytest.raises(RefusedError, match="Vera is viewer"):
             plant.withdraw_emergency(VIEWER)
-        with pytest.raises(RefusedError, match="Otto has ordered no emergency; it was ordered"):
+        with pytest.raises(RefusedError, match="no emergency order of Otto stands; it was ordered"):
             plant.withdraw_emergency(Person("Otto", Role.OPERATOR))
         plant.withdraw_emergency(OPERATOR)
         with pytest.raises(RefusedError, match="Vera is viewer"):
@@ -269,6 +269,56 @@ def test_it_holds_until_withdrawn_and_acknowledged_and_then_nothing_moves(tmp_pa
         "APPROACH",
     ]
     assert not any(r.what == "STOW" for r in records)
+
+
+def test_a_refusal_names_the_orders_that_stand_and_then_what_is_left_to_do(
+    tmp_path: Path,
+) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, otto = bench.plant, Person("Otto", Role.OPERATOR)
+        token = await bench.commanded()
+        plant.raise_emergency("Otto", reason="smoke at the tower")
+        plant.raise_emergency("Olga", reason="a person at the receiver")
+        await bench.wait(2.0)
+
+        def refused() -> str:
+            plant.authority.keep(OPERATOR, token)
+            with pytest.raises(RefusedError) as caught:
+                plant.command(OPERATOR, token, "TRACK", ("P2A",))
+            return str(caught.value)
+
+        both = "Otto: smoke at the tower; Olga: a person at the receiver"
+        text = "TRACK: not accepted now: an emergency holds (DEFOCUS; {})"
+        assert refused() == text.format(both)
+        plant.withdraw_emergency(otto)
+        one = "Olga: a person at the receiver"
+        assert refused() == text.format(one)
+        assert dict(plant.emergency_causes) == {"Olga": "a person at the receiver"}
+        # So it is when the table has made it a STOW.
+        for _ in range(8):
+            plant.authority.keep(OPERATOR, token)
+            await bench.wait(4.0)
+        assert refused() == text.format(one).replace("DEFOCUS", "STOW")
+        assert plant.emergency is not None
+        assert (plant.emergency.who, plant.emergency.reason) == ("safety table", one)
+        plant.withdraw_emergency(OPERATOR)
+        left = (
+            "every order is withdrawn; it ends when an operator acknowledges operator_emergency, "
+            "2 s after the last withdrawal"
+        )
+        assert refused().endswith(f"(STOW; safety table: {left})")
+        with pytest.raises(RefusedError) as again:
+            plant.withdraw_emergency(OPERATOR)
+        assert str(again.value) == f"withdraw: no emergency order of Olga stands; {left}"
+        await bench.wait(3.0)
+        plant.acknowledge(OPERATOR, "operator_emergency")
+        await bench.wait(1.0)
+        assert not plant.emergency_on
+        assert plant.emergency_causes == {}
+        with pytest.raises(RefusedError, match="Olga stands; no emergency holds"):
+            plant.withdraw_emergency(OPERATOR)
+
+    play(tmp_path, scene)
 
 
 def test_wind_defocuses_and_stows_with_hysteresis(tmp_path: Path) -> None:

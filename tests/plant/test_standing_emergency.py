@@ -105,6 +105,26 @@ def test_a_plant_begins_in_the_emergency_that_held_when_its_program_ended(tmp_pa
         assert keeper.emergency() == ""
 
 
+def test_a_plant_that_begins_in_an_emergency_names_the_orders_that_stand(tmp_path: Path) -> None:
+    async def before(bench: Bench) -> None:
+        bench.plant.raise_emergency("Otto", reason="smoke at the tower")
+        bench.plant.raise_emergency("Olga", reason="a person at the receiver")
+        await bench.wait(35.0)
+        bench.plant.withdraw_emergency(ENGINEER, "Otto")
+        await bench.wait(1.0)
+
+    async def after(bench: Bench) -> None:
+        plant, order = bench.plant, bench.plant.emergency
+        assert order is not None
+        text = "a person at the receiver; it held when the plant's program ended"
+        assert (order.act, order.who, order.reason) == (Act.STOW, "Olga", text)
+        token = plant.take_authority(OPERATOR).token
+        with pytest.raises(RefusedError, match=r"\(STOW; Olga: a person at the receiver\)"):
+            plant.command(OPERATOR, token, "TRACK", ("P2A",))
+
+    programs(tmp_path, before, after, record=Record(), settings=PlantSettings())
+
+
 def test_a_row_that_waits_for_an_acknowledgement_outlives_the_program(tmp_path: Path) -> None:
     record = Record()
 

@@ -33,7 +33,7 @@ ROWS = {row.name: row for row in CONDITIONS}
 #: Row: a bad value, a safe one, what is done to what, what the line says. Written by hand
 #: from the requirements, not from the table.
 TRIPS = {
-    "operator_emergency": (1.0, 0.0, Act.DEFOCUS, Scope.FIELD, "a person has ordered an emerg"),
+    "operator_emergency": (1.0, 0.0, Act.DEFOCUS, Scope.FIELD, "order of a person stands"),
     "emergency_line": (0.0, 1.0, Act.DEFOCUS, Scope.FIELD, "emergency line carries no current"),
     "nodes_unacknowledged": (1.0, 0.0, Act.DEFOCUS, Scope.FIELD, "emergency order: 1"),
     "flux_after_emergency": (0.11, 0.02, Act.STOW, Scope.FIELD, "is 11 % of nominal after an em"),
@@ -217,7 +217,7 @@ def test_a_cause_that_has_just_gone_is_said_in_plain_words() -> None:
     run = Run("operator_emergency").feed(1.0, 1.0)
     refused = safety.acknowledge(run.state, "operator_emergency", "Ada", AcknowledgeRole.OPERATOR)
     assert refused[1] == (
-        "operator_emergency: the cause has not gone: a person has ordered an emergency. Keep "
+        "operator_emergency: the cause has not gone: an emergency order of a person stands. Keep "
         "people away from the receiver and the beams; find the cause, then withdraw the order and "
         "acknowledge."
     )

@@ -238,6 +238,7 @@ def status(context: typer.Context, as_json: Json = False) -> None:
     print(f"{found['holder'] or 'nobody'} has the command authority")
     if found["emergency"]:
         print(f"EMERGENCY ({order['act']}): {order['text']}")
+        _print_causes(order)
     if found["resume"]:
         print(f"automatic control waits for Resume: {found['resume']}")
 
@@ -356,8 +357,15 @@ def emergency(
         else:
             found = client.ask("POST", "emergency", {"act": act.upper(), "reason": reason})
     print(f"emergency {'in force' if found['on'] else 'not in force'}: {found['text']}")
+    _print_causes(found)
+
+
+def _print_causes(found: dict[str, Any]) -> None:
+    """Print the orders of persons that stand; where none does, why an emergency holds."""
     for call in found["calls"]:
         print(f"ordered by {call['who']} ({call['act']}, {_utc(call['at'])}): {call['reason']}")
+    if found["on"] and not found["calls"]:
+        print(found["reason"])
 
 
 @app.command()
@@ -369,6 +377,7 @@ def acknowledge(
     """Acknowledge an alarm."""
     with _client(context) as client:
         client.ask("POST", "alarms/acknowledge", {"condition": condition, "subject": subject})
+    print(f"acknowledged {condition} {subject}".rstrip())
 
 
 @app.command()

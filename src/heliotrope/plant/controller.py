@@ -524,6 +524,11 @@ class PlantController:
         return self._sentinel.calls
 
     @property
+    def emergency_causes(self) -> Mapping[str, str]:
+        """Why an emergency holds, by the persons whose orders stand and the safety table."""
+        return self._sentinel.causes()
+
+    @property
     def emergency_on(self) -> bool:
         """Whether an emergency of the whole field holds."""
         return self._sentinel.on
@@ -669,15 +674,17 @@ class PlantController:
         Raises
         ------
         RefusedError
-            If the person has ordered none while others have, or their role is too low.
+            If no order of theirs, or of the owner, stands, or the person's role is too low.
         """
         person.must_be(Role.OPERATOR, "withdraw")
         who, calls = owner or person.name, self.calls
         if who != person.name:
             person.must_be(Role.ENGINEER, f"withdraw the emergency of {who}")
-        if calls and who not in {call.who for call in calls}:
+        if who not in {call.who for call in calls}:
             texts = "; ".join(call.text for call in calls)
-            raise refusals.NOT_CALLER.error(who=who, calls=texts)
+            rows = "; ".join(self.emergency_causes.values()) or "no emergency holds"
+            stands = f"it was ordered by {texts}" if calls else rows
+            raise refusals.NOT_CALLER.error(who=who, calls=stands)
         self._sentinel.withdraw(who)
         self.note(person, "WITHDRAW", f"emergency order of {who}")
 

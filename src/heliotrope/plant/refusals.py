@@ -142,9 +142,10 @@ NOT_OWNER = Refusal(
 )
 NOT_CALLER = Refusal(
     "not the caller",
-    "A person withdraws an emergency that only others have ordered.",
-    "withdraw: {who} has ordered no emergency; it was ordered by {calls}",
-    "Each person withdraws their own order; an engineer withdraws another's by the owner's name.",
+    "A person withdraws an emergency order of theirs, and none stands.",
+    "withdraw: no emergency order of {who} stands; {calls}",
+    "Each person withdraws their own order; an engineer withdraws another's by the owner's name. "
+    "Once every order is withdrawn, acknowledge `operator_emergency`.",
 )
 NOT_ACKNOWLEDGED = Refusal(
     "not acknowledged",

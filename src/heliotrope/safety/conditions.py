@@ -56,7 +56,7 @@ def _orders() -> tuple[Condition, ...]:
     return (
         Condition(
             "operator_emergency", _PLANT, "emergency_order", "yes/no", "emergency order",
-            "a person has ordered an emergency",
+            "an emergency order of a person stands",
             0.5, 0.4, _DEFOCUS, _FIELD, _EMERGENCY, 30.0, then_stow=_PATIENCE,
             role=_OPERATOR, release="the order is withdrawn",
             remedy="Keep people away from the receiver and the beams; find the cause, then withdraw"

@@ -7,7 +7,7 @@ acknowledged, and a person's order is withdrawn.
 
 import contextlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +25,7 @@ from heliotrope.plant.emergency.order import (
     switched_off,
 )
 from heliotrope.plant.emergency.standing import Call, EmergencyRecord, Standing, read_standing
-from heliotrope.plant.emergency.table import TableWatch
+from heliotrope.plant.emergency.table import ORDERED, TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.identity import Identities
 from heliotrope.plant.joining import JoinQueue
@@ -209,9 +209,9 @@ class Sentinel:
         """Order what the table demands, or go on with the emergency of the program before."""
         before, self._recalled = self._recalled, Standing()
         if before.act:
-            self._begin(max(act, Act[before.act]), _AGAIN, before.continued, before.who)
+            self._begin(max(act, Act[before.act]), _AGAIN, before.continued, before.giver)
         else:
-            self._begin(act, _TABLE, self.table.reasons(Act.DEFOCUS))
+            self._begin(act, _TABLE, _said(self.causes()))
 
     def _begin(
         self, act: Act, giver: tuple[str, str], reason: str, who: str = ""
@@ -240,6 +240,18 @@ class Sentinel:
     def calls(self) -> tuple[Call, ...]:
         """The orders of persons that have not been withdrawn, one for each person."""
         return tuple(self._calls.values())
+
+    def causes(self) -> dict[str, str]:
+        """Return why the emergency holds, by the persons whose orders stand and the safety table.
+
+        It is empty where none holds.
+        """
+        found = {call.who: call.reason for call in self.calls}
+        withdrawn = "" if found else self.table.withdrawn()
+        rows = self.table.reasons(Act.DEFOCUS, but=ORDERED)
+        if text := "; ".join(filter(None, (withdrawn, rows))):
+            found[_TABLE[0]] = text
+        return found
 
     def call(self, who: str, act: Act, reason: str, at: float) -> EmergencyOrder:
         """Order an emergency for a person; it holds until it is withdrawn.
@@ -453,9 +465,14 @@ class Sentinel:
     def refusal(self, clusters: Iterable[str]) -> str:
         """Return why no new motion may begin in some clusters, "" if it may."""
         if self.on and self.order is not None:
-            return f"an emergency holds ({self.order.act.name}: {self.order.reason})"
+            return f"an emergency holds ({self.order.act.name}; {_said(self.causes())})"
         texts = (self.table.reasons(Act.REFUSE_NEW, name) for name in sorted(set(clusters)))
         return next((text for text in texts if text), "")
+
+
+def _said(causes: Mapping[str, str]) -> str:
+    """Return the causes of an emergency in one line."""
+    return "; ".join(f"{who}: {reason}" for who, reason in causes.items())
 
 
 def _left_order(before: Standing, unproven: tuple[str, ...], clock: Clock) -> EmergencyOrder | None:

@@ -91,9 +91,15 @@ class Standing:
         return "" if self == Standing() else json.dumps(asdict(self))
 
     @property
+    def giver(self) -> str:
+        """The persons whose orders stand; where none does, whoever gave the order to the field."""
+        return ", ".join(call.who for call in self.calls) or self.who
+
+    @property
     def continued(self) -> str:
         """The reason, in words, of the order that continues this emergency."""
-        text = f"{self.reason}; it held when the plant's program ended"
+        reason = "; ".join(call.reason for call in self.calls) or self.reason
+        text = f"{reason}; it held when the plant's program ended"
         if not self.unproven:
             return text
         more = f" and {len(self.unproven) - 8} more" if len(self.unproven) > 8 else ""

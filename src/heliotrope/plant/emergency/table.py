@@ -52,6 +52,8 @@ OWN_READINGS = frozenset(
         "pointing_errors",
     }
 )
+#: Row of the orders of persons.
+ORDERED = "operator_emergency"
 #: Row of the night: the field rests at stow, and that is no emergency.
 NIGHT = "sun_below_horizon"
 #: Rows that follow from an emergency; by themselves they keep none going.
@@ -306,7 +308,23 @@ class TableWatch:
             a.act >= Act.DEFOCUS and a.condition not in CONSEQUENCES for a in self._demands()
         )
 
-    def reasons(self, least: Act, cluster: str = "") -> str:
-        """Return, in words, which rows demand at least an act of the field or a cluster."""
+    def reasons(self, least: Act, cluster: str = "", but: str = "") -> str:
+        """Return, in words, which rows demand at least an act of the field or a cluster.
+
+        ``but`` is the name of a row that is left out.
+        """
         demands = chain(self._demands(), self._demands(cluster) if cluster else ())
-        return "; ".join([a.text for a in demands if a.act >= least][:3])
+        return "; ".join([a.text for a in demands if a.act >= least and a.condition != but][:3])
+
+    def withdrawn(self) -> str:
+        """Return how an emergency ends that persons have ordered, "" where none of theirs holds.
+
+        It is for an emergency of which every person has withdrawn their order.
+        """
+        row = next((row for row in self._state.table if row.name == ORDERED), None)
+        if row is None or row.role is None or all(a.condition != ORDERED for a in self._demands()):
+            return ""
+        return (
+            f"every order is withdrawn; it ends when an {row.role.title} acknowledges {ORDERED}, "
+            f"{row.clear_for:g} s after the last withdrawal"
+        )

@@ -204,12 +204,14 @@ class Viewer:
                 False, order.act.name, order.who, order.reason, ago, 0, 0, 0, (), over
             )
         report = order.report(plant.now(), plant.drive_checks.shown)
+        # The orders that stand, and not who began: that person may have withdrawn.
+        causes = plant.emergency_causes or {order.who: order.reason}
         count = len(order.ticket.heliostats)
         return EmergencyView(
             True,
             order.act.name,
-            order.who,
-            order.reason,
+            ", ".join(causes),
+            "; ".join(causes.values()),
             plant.now() - order.at,
             count,
             count - len(report.unacknowledged),

@@ -635,7 +635,9 @@ class EmergencyView:
     on
         Whether it is active.
     act, who, reason
-        DEFOCUS or STOW, the person, the reason; "" if there was no order.
+        DEFOCUS or STOW; the persons whose orders stand, and the safety table; and why, or how it
+        ends once every order is withdrawn. When it is over: who gave it, and why. "" if there was
+        no order.
     seconds
         Time since the order, s.
     heliostats, acknowledged, done
