@@ -227,6 +227,10 @@ def test_a_cause_that_has_just_gone_is_said_in_plain_words() -> None:
         "operator_emergency: the order is withdrawn, and must stay so for 2 s; acknowledge again "
         "in 2 s"
     )
+    (action,) = run.actions
+    assert action.text == (
+        "operator_emergency: the order is withdrawn, and must stay so for 2 s; DEFOCUS of the field"
+    )
     (action,) = run.feed(0.0, 2.0).actions
     assert action.text == (
         "operator_emergency: the order is withdrawn; the cause has gone; DEFOCUS of the field "

@@ -928,6 +928,25 @@ class PlantController:
         """Return the heliostats in whose clusters no new motion may begin now, and the reasons."""
         return self._permission.held("APPROACH", heliostats)
 
+    def barred(
+        self, name: str, heliostats: Sequence[str], aims: FloatArray | None = None
+    ) -> dict[str, str]:
+        """Return the heliostats that may not be given a command now, whatever their paths are.
+
+        Parameters
+        ----------
+        name
+            The command.
+        heliostats
+            Names (K).
+        aims
+            Points that they get before they join them, ENU, m, (K, 3); None: no new ones.
+        """
+        names = tuple(heliostats)
+        barred = self._permission.barred(name, names, new_aims=aims)
+        locked = self.lockouts.blocked(name, names, aims)
+        return barred | self._permission.held(name, names) | locked
+
     def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
         return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
 

@@ -90,14 +90,33 @@ class Permission:
             If none may; the reason of the whole plant or of a cluster comes before their own.
         """
         held = self.held(name, names)
+        wrong = self.barred(name, names, token) | held
+        if wrong and len(wrong) == len(names):
+            if len(held) < len(names):
+                raise BeamError(name, wrong)
+            self.refuse_now(name, names)
+        return tuple(n for n in names if n not in wrong), wrong
+
+    def barred(
+        self,
+        name: str,
+        names: tuple[str, ...],
+        token: int = 0,
+        new_aims: FloatArray | None = None,
+    ) -> dict[str, str]:
+        """Return the heliostats that may not be given a command, and their own reasons; see `able`.
+
+        ``new_aims`` (K, 3) are points that they get before they join them; None: their last aims
+        count, and whether they were taken.
+        """
         wrong = {} if name == "LOCK" else self._identities.barred(names)
         if name in SETTINGS:
             wrong = wrong | self._visited(token, names)
         if name in MOTIONS:
             wrong = self._sync.differing(names) | self._orders.to_stow(names) | wrong
         if name in JOINING:
-            wrong |= self._sentinel.barred(names) | self._doubts.barred(names)
-            wrong |= self._untaken(names)
+            wrong |= self._sentinel.barred(names) | self._doubts.barred(names, new_aims)
+            wrong |= self._untaken(names) if new_aims is None else {}
         elif name in _TO_STANDBY:
             wrong |= self._sentinel.barred(self._off(names), ASTRAY)
             wrong |= self._sentinel.barred(names, UNPROVEN)
@@ -108,12 +127,7 @@ class Permission:
         elif name in _STILL:
             for row in _SENT_OFF:
                 wrong |= self._sentinel.barred(names, row)
-        wrong |= held
-        if wrong and len(wrong) == len(names):
-            if len(held) < len(names):
-                raise BeamError(name, wrong)
-            self.refuse_now(name, names)
-        return tuple(n for n in names if n not in wrong), wrong
+        return wrong
 
     def _visited(self, token: int, names: tuple[str, ...]) -> dict[str, str]:
         """Return the heliostats that are in other visits, and the reasons."""
