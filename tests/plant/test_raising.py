@@ -15,11 +15,14 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Stage
 from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.operations import Logbook
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.raising import Raising
+from heliotrope.plant.refusals import NoFreePath
 from heliotrope.plant.settings import PlantSettings
+from heliotrope.safety import Act
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 #: The sun stands at 5°: below the limit of automatic control, above that of the safety table.
@@ -121,6 +124,83 @@ def test_a_cluster_that_may_not_move_keeps_no_other_at_stow(tmp_path: Path) -> N
         assert ticket.refusals[NAME].startswith("cluster_time_differs")
         with pytest.raises(RefusedError, match="APPROACH: not accepted now: cluster_time_differs"):
             plant.command(ENGINEER, token, "APPROACH", (NAME,))
+
+    play(tmp_path, scene)
+
+
+def test_what_an_emergency_left_unproven_is_raised_at_once_when_it_is_proven(
+    tmp_path: Path,
+) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, cluster = bench.plant, bench.cluster_of(NAME)
+        log = Logbook(bench.clock)
+        raising = Raising(plant, log, ENGINEER, most=1, patience=60.0, clearance=0.0, wanted=False)
+        raising.want((NAME, "P1B"), wanted=True)
+        none = np.zeros(len(plant.field), dtype=np.bool_)
+        cluster.untold.add(NAME)  # no step counts from after the order prove it
+        await bench.wait(2.0)
+        plant.raise_emergency("Olga", Act.STOW)
+        await bench.wait(5.0)
+        plant.withdraw_emergency(ENGINEER, "Olga")
+        await bench.wait(3.0)
+        plant.acknowledge(ENGINEER, "operator_emergency")
+        await bench.wait(2.0)
+        token = await bench.commanded(ENGINEER)
+
+        async def step() -> list[tuple[str, ...]]:
+            before = len(cluster.commands("APPROACH"))
+            plant.authority.keep(ENGINEER, token)
+            await raising.step(token, frozenset, none)
+            await bench.wait(2.0)
+            return [each.heliostats for each in cluster.commands("APPROACH")[before:]]
+
+        waits = raising.waits((NAME, "P1B"))
+        assert waits.keys() == {NAME}, waits
+        assert waits[NAME].startswith("unproven_after_emergency P1A: ")
+        # It keeps no other waiting, and it is no matter of its path.
+        assert await step() == [("P1B",)]
+        assert await step() == []
+        assert raising.why_not(NAME) == ""
+        cluster.untold.clear()
+        for _ in range(20):
+            plant.authority.keep(ENGINEER, token)
+            await bench.wait(1.0)
+            if not raising.waits((NAME,)):
+                break
+        assert await step() == [(NAME,)]
+        assert not any(row.condition == "beam_blocked" for row in log.alarms())
+
+    play(tmp_path, scene)
+
+
+def test_a_refusal_that_is_no_matter_of_the_path_raises_no_alarm_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is refused when its command is given, or its turn comes, is tried again soon."""
+
+    async def scene(bench: Bench) -> None:
+        plant, cluster = bench.plant, bench.cluster_of(NAME)
+        log = Logbook(bench.clock)
+        raising = Raising(plant, log, ENGINEER, most=9, patience=60.0, clearance=0.0, wanted=False)
+        raising.want((NAME,), wanted=True)
+        cluster.set(states.STOWED, NAME)
+        await bench.wait(2.0)
+        token = await bench.commanded(ENGINEER)
+        reasons = ("a reason that was not there before", NoFreePath("enters mast"))
+        for reason, named in zip(reasons, (False, True), strict=True):
+            with monkeypatch.context() as patch:
+                patch.setattr(plant._ways, "clear", refusing({NAME: reason}))
+                await raising.step(token, frozenset, np.zeros(len(plant.field), dtype=np.bool_))
+            assert bool(raising.why_not(NAME)) is named
+            assert any(row.condition == "beam_blocked" for row in log.alarms()) is named
+            await bench.wait(6.0)
+            plant.authority.keep(ENGINEER, token)
+
+    def refusing(wrong: dict[str, str]) -> Callable[..., None]:
+        def clear(name: str, *_: object) -> None:
+            raise BeamError(name, wrong)
+
+        return clear
 
     play(tmp_path, scene)
 

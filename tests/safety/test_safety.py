@@ -31,7 +31,7 @@ ROWS = {row.name: row for row in CONDITIONS}
 #: Row: a bad value, a safe one, what is done to what, what the line says. Written by hand
 #: from the requirements, not from the table.
 TRIPS = {
-    "operator_emergency": (1.0, 0.0, Act.DEFOCUS, Scope.FIELD, "a person has ordered an emerg"),
+    "operator_emergency": (1.0, 0.0, Act.DEFOCUS, Scope.FIELD, "order of a person stands"),
     "emergency_line": (0.0, 1.0, Act.DEFOCUS, Scope.FIELD, "emergency line carries no current"),
     "nodes_unacknowledged": (1.0, 0.0, Act.DEFOCUS, Scope.FIELD, "emergency order: 1"),
     "flux_after_emergency": (0.11, 0.02, Act.STOW, Scope.FIELD, "is 11 % of nominal after an em"),
@@ -224,6 +224,10 @@ def test_a_cause_that_has_just_gone_is_said_in_plain_words() -> None:
     assert refused[1] == (
         "operator_emergency: the order is withdrawn, and must stay so for 2 s; acknowledge again "
         "in 2 s"
+    )
+    (action,) = run.actions
+    assert action.text == (
+        "operator_emergency: the order is withdrawn, and must stay so for 2 s; DEFOCUS of the field"
     )
     (action,) = run.feed(0.0, 2.0).actions
     assert action.text == (

@@ -21,7 +21,7 @@ from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.leaving import way_out
 from heliotrope.plant.ordered import Ordered
 from heliotrope.plant.parameters import Tables
-from heliotrope.plant.refusals import BEAM_REFUSED, STILL_MOVING, RefusedError
+from heliotrope.plant.refusals import BEAM_REFUSED, SOON, STILL_MOVING, NoFreePath, RefusedError
 from heliotrope.plant.unsent import TURNS, UnsentBeams
 from heliotrope.plant.ways import Ways
 from heliotrope.safety import Act, Reading
@@ -138,7 +138,7 @@ class BeamWatch:
             every = self.points.possible("STANDBY", np.arange(len(self._field)))
             wrong |= self._check.glare(rows, wanted, every, light)
         if wrong:
-            raise BeamError(name, wrong)
+            raise BeamError(name, _paths(wrong))
 
     def _early(self, name: str, rows: Rows) -> dict[str, str]:
         """Return which heliostats may not have a new point before they are heard again, and why.
@@ -196,6 +196,7 @@ class BeamWatch:
         else:
             path = self._by_counts(name, values, rows)
             wrong = self._check.moving(rows, path, self._sun(0.0)) | self.ordered.unshown(rows)
+        wrong = _paths(wrong)
         if wrong and len(wrong) == len(heliostats):
             raise BeamError(name, wrong)
         return tuple(n for n in heliostats if n not in wrong), wrong
@@ -363,7 +364,7 @@ class BeamWatch:
                     found |= self._check.on_the_way(*to)
                 if name == "SEARCH":
                     found |= self._check.around(known, places, values[1], light)
-        return found
+        return _paths(found)
 
     def _begins(self, rows: Rows) -> list[tuple[npt.NDArray[np.bool_], FloatArray]]:
         """Return where motions of heliostats (K,) may begin: which, (K,), and their counts (M, 2).
@@ -508,3 +509,8 @@ class BeamWatch:
         turned = np.abs(self._angles(rows, end) - self._angles(rows, begin)).max(axis=-1)
         far = np.where(np.isfinite(stow), begin[each, other] == stow, turned > _FROM_STOW)
         return np.asarray(np.equal(state, states.APPROACHING) & far)
+
+
+def _paths(reasons: Mapping[str, str]) -> dict[str, str]:
+    """Mark the reasons of heliostats whose paths are not free; the others only wait for reports."""
+    return {n: text if text in SOON else NoFreePath(text) for n, text in reasons.items()}

@@ -862,6 +862,22 @@ class PlantController:
         """Return the heliostats in whose clusters no new motion may begin now, and the reasons."""
         return self._guards.held("APPROACH", heliostats)
 
+    def blocked(
+        self, name: str, heliostats: Sequence[str], aims: FloatArray | None = None
+    ) -> dict[str, str]:
+        """Return the heliostats that may not be given a command now, whatever their paths are.
+
+        Parameters
+        ----------
+        name
+            The command.
+        heliostats
+            Names (K).
+        aims
+            Points that they get before they join them, ENU, m, (K, 3); None: no new ones.
+        """
+        return self._guards.reasons(Asked(name, tuple(heliostats), aims))
+
     def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
         return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
 

@@ -66,10 +66,10 @@ class Guards:
     aims: FloatArray
 
     def reasons(self, asked: Asked, *kinds: Refusal) -> dict[str, str]:
-        """Return the heliostats that guards with some refusals stop, and the reasons."""
+        """Return the heliostats that guards with some refusals, or any, stop, and the reasons."""
         found: dict[str, str] = {}
         for guard in GUARDS:
-            if guard.refusal in kinds and asked.name in guard.commands:
+            if guard.refusal in (kinds or (guard.refusal,)) and asked.name in guard.commands:
                 reasons = guard.check(self, asked)
                 for name, reason in zip(asked.heliostats, reasons, strict=True):
                     if reason:
@@ -184,6 +184,14 @@ def _astray(plant: Guards, asked: Asked) -> Iterable[str | None]:
     )
 
 
+def _unacknowledged(plant: Guards, asked: Asked) -> Iterable[str | None]:
+    """Stop heliostats that have not acknowledged their aims, unless they get new ones before."""
+    return (
+        plant.given.untaken("AIM", name) if asked.points is None else None
+        for name in asked.heliostats
+    )
+
+
 def _doubted(plant: Guards, asked: Asked) -> Iterable[str | None]:
     """Stop heliostats in doubt on their way to a receiver; a photograph on a target ends it."""
     points = plant.destined(asked)
@@ -233,9 +241,7 @@ GUARDS: tuple[Guard, ...] = (
         _ORDERS | messages.SAFE,
         _cluster(lambda plant, name: plant.rivals.refusal((name,))),
     ),
-    Guard(
-        BEAM_REFUSED, messages.JOINING, _each(lambda plant, name: plant.given.untaken("AIM", name))
-    ),
+    Guard(BEAM_REFUSED, messages.JOINING, _unacknowledged),
     Guard(BEAM_REFUSED, TO_AIMS, _doubted),
     Guard(BEAM_REFUSED, messages.JOINING, _alarm()),
     Guard(

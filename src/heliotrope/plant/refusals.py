@@ -22,6 +22,15 @@ class RefusedError(HeliotropeError):
     """A command that is not accepted; nothing was sent and nothing moves."""
 
 
+class NoFreePath(str):
+    """The reason why the path of a beam is not free: that changes with the sun, aim or volumes.
+
+    Other reasons end by themselves, or have alarms of their own.
+    """
+
+    __slots__ = ()
+
+
 def by_reason(reasons: Mapping[str, str], most: int = 3) -> str:
     """Return the reasons of heliostats in one line, each once, with the number that it stops.
 

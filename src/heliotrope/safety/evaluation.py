@@ -295,7 +295,9 @@ def _action(
     new = before.tripped_at is None or _act(row, last - since) != act
     waits = after.cleared
     text = f"{row.name}{f' {subject}' if subject else ''}: {_said(row, after, now)}"
-    if now - since >= 1.0 and not (row.ages or waits):
+    if not waits and row.safe(_counting(row, after.value, after.seen, now)):
+        text += f", and must stay so for {row.clear_for:g} s"
+    elif now - since >= 1.0 and not (row.ages or waits):
         text += f", for {now - since:.0f} s"
     kind = row.scope.name.lower()
     place = f"{kind} {subject}" if subject else f"the {kind}"

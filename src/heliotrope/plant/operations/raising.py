@@ -19,8 +19,9 @@ from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import alarms
 
-#: Time before a heliostat whose beam has no clear way is tried again, s.
-_BLOCKED = 300.0
+#: Time before a heliostat is tried again whose beam has no free path, and one that was refused
+#: for another reason, s.
+_BLOCKED, _REFUSED = 300.0, 5.0
 #: Time after which a heliostat that can only go on from stow is sent there, s.
 _HALTED = 10.0
 #: Heliostats that were lost, or could not go on from where they were, after they had been raised.
@@ -33,6 +34,8 @@ RAISING = RetryLaw(
     memory=1800.0,
     alarm=alarms.RAISING_GIVEN_UP,
 )
+#: The next command of a heliostat on its way to the receiver, by its state.
+_NEXT = {states.STOWED: "APPROACH", states.DEFOCUSED: "IDLE", states.IDLE: "TRACK"}
 
 Rows = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
@@ -79,7 +82,7 @@ class Raising:
     ) -> None:
         self._plant, self._log, self._person = plant, log, person
         self._most, self._patience = most, patience
-        count = len(plant.field)
+        self._names, count = plant.field.names, len(plant.field)
         self.wanted: Mask = np.full(count, wanted, dtype=np.bool_)
         self._by_people: Mask = np.zeros(count, dtype=np.bool_)
         self._busy_until = np.full(count, -math.inf)
@@ -138,13 +141,36 @@ class Raising:
     def waits(self, heliostats: Sequence[str]) -> dict[str, str]:
         """Return the wanted heliostats that wait for more than their turn, and for what."""
         plant, found = self._plant, dict(self._plant.held(heliostats))
-        if why := plant.witnesses.refusal:
-            joins = self.able() & plant.field.among((states.IDLE,), plant.now())
-            for name in heliostats:
-                row = plant.field.place(name)
-                if joins[row] and (self._clear[row] or plant.beliefs.record(name) is not None):
-                    found.setdefault(name, why)
+        asked = np.zeros(len(plant.field), dtype=np.bool_)
+        asked[[plant.field.place(name) for name in heliostats]] = True
+        for state, command in _NEXT.items():
+            there = asked & plant.field.among((state,), plant.now())
+            if command == "TRACK":
+                there &= self._known() & self.able()
+            found |= self._stopped(command, np.flatnonzero(there))
         return found
+
+    def _known(self) -> Mask:
+        """Return which heliostats are known well enough to go to the receiver, (N,)."""
+        calibrated = [self._plant.beliefs.record(name) is not None for name in self._names]
+        return (self._clear | np.array(calibrated, dtype=np.bool_)) & bool(self._aims)
+
+    def _stopped(self, command: str, rows: Rows) -> dict[str, str]:
+        """Return the heliostats of some rows (K,) that may not be given a command, and why.
+
+        Whether their paths are free is shown by the command.
+        """
+        names, joins = [self._names[row] for row in rows], command == "TRACK"
+        if not names:
+            return {}
+        aims = np.stack([self._aims[name] for name in names]) if joins else None
+        return self._plant.blocked(command, names, aims)
+
+    def _first(self, command: str, rows: Rows) -> Rows:
+        """Return the first rows (K,) of heliostats that may be given a command."""
+        blocked = self._stopped(command, rows)
+        free = [row for row in rows if self._names[row] not in blocked]
+        return np.array(free[: self._most], dtype=np.intp)
 
     def give_up(self) -> None:
         """Take all heliostats out of automatic control."""
@@ -215,27 +241,24 @@ class Raising:
         self._look_at_blocked()
         busy = (self._busy_until >= now) & (self._told_in == plant.field.rows["state"])
         free = self.wanted & ~busy & ~resting
-        # A cluster that may begin no motion, as one with a wrong clock, keeps no other waiting.
-        out = (*visiting(), *plant.held(plant.field.names))
-        free[[plant.field.place(name) for name in out]] = False
+        free[[plant.field.place(name) for name in visiting()]] = False
+        # One that may not move now, as in a cluster with a wrong clock, keeps no other waiting.
         unknown = plant.standby_unknown & plant.field.among((states.STOWED,), now)
-        if rows := np.flatnonzero(free & unknown)[: self._most].tolist():
-            await self._rest_again(np.array(rows), token)
+        if len(rows := self._first("STANDBY", np.flatnonzero(free & unknown))):
+            await self._rest_again(rows, token)
         free &= ~unknown
         strayed = (states.TRACKING, "IDLE", self._on_targets(plant.aims))
         here = np.ones(len(free), dtype=np.bool_)
         for state, name, where in (
             (states.STOWED, "APPROACH", here), (states.DEFOCUSED, "IDLE", self.able()), strayed
         ):  # fmt: skip
-            rows = np.flatnonzero(free & where & plant.field.among((state,), now))[: self._most]
-            if len(rows):
+            rows = np.flatnonzero(free & where & plant.field.among((state,), now))
+            if len(rows := self._first(name, rows)):
                 give = functools.partial(plant.command, self._person, token, name)
                 self._give(rows, state, give)
-        calibrated = np.array([plant.beliefs.record(n) is not None for n in plant.field.names])
-        able = free & (self._clear | calibrated) & plant.field.among((states.IDLE,), now)
-        rows = np.flatnonzero(able)[: self._most]
-        witnessed = not plant.witnesses.refusal
-        if len(rows) and self._aims and witnessed and plant.waiting < self._most:
+        able = free & self._known() & plant.field.among((states.IDLE,), now)
+        rows = self._first("TRACK", np.flatnonzero(able))
+        if len(rows) and plant.waiting < self._most:
             await self._join(rows, token, visiting)
 
     async def _rest_again(self, rows: Rows, token: int) -> None:
@@ -293,14 +316,14 @@ class Raising:
         return None
 
     def _block(self, wrong: Mapping[str, str], state: int) -> None:
-        """Leave heliostats where they are until the sun has moved on."""
+        """Leave heliostats without a free path for a while, and try others again soon."""
         for name, text in wrong.items():
-            if text in refusals.SOON:  # it is tried again at the next turn
-                continue
-            row = self._plant.field.place(name)
-            self._busy_until[row], self._told_in[row] = self._plant.now() + _BLOCKED, state
-            self._blocked[name] = text
-            self._log.take_alarm(alarms.BEAM_BLOCKED.raised(name, reason=text))
+            row, blocked = self._plant.field.place(name), isinstance(text, refusals.NoFreePath)
+            self._busy_until[row] = self._plant.now() + (_BLOCKED if blocked else _REFUSED)
+            self._told_in[row] = state
+            if blocked:
+                self._blocked[name] = text
+                self._log.take_alarm(alarms.BEAM_BLOCKED.raised(name, reason=text))
 
     def _look_at_blocked(self) -> None:
         """Raise alarms of beams that were blocked when their turn came; end those that are over."""
