@@ -71,7 +71,7 @@ class Guards:
         for guard in GUARDS:
             if guard.refusal in (kinds or (guard.refusal,)) and asked.name in guard.commands:
                 reasons = guard.check(self, asked)
-                for name, reason in zip(asked.heliostats, reasons, strict=True):
+                for name, reason in zip(asked.heliostats, reasons, strict=False):
                     if reason:
                         found.setdefault(name, reason)
         return {name: found[name] for name in asked.heliostats if name in found}
@@ -131,7 +131,7 @@ class Guards:
         return np.asarray(self.aims[rows])
 
 
-#: Gives the reason for each heliostat of a command (K), nothing where there is none.
+#: Gives the reason for each heliostat of a command (K), None where there is none; () for all.
 Check = Callable[[Guards, Asked], Iterable[str | None]]
 
 
@@ -165,23 +165,31 @@ def _cluster(reason: Callable[[Guards, str], str]) -> Check:
         field = plant.field
         rows = [field.cluster[field.place(name)] for name in asked.heliostats]
         reasons = {row: reason(plant, field.clusters[row]) for row in set(rows)}
-        return (reasons[row] for row in rows)
+        return (reasons[row] for row in rows) if any(reasons.values()) else ()
+
+    return check
+
+
+def _among(reasons: Callable[[Guards, Asked], dict[str, str]]) -> Check:
+    """Look the heliostats up among those that have a reason."""
+
+    def check(plant: Guards, asked: Asked) -> Iterable[str | None]:
+        found = reasons(plant, asked)
+        return map(found.get, asked.heliostats) if found else ()
 
     return check
 
 
 def _alarm(condition: str = "") -> Check:
     """Stop heliostats that a row of the safety table, or any, keeps from their aims."""
-    return lambda plant, asked: map(plant.sentinel.table.barred(condition).get, asked.heliostats)
+    return _among(lambda plant, _: plant.sentinel.table.barred(condition))
 
 
-def _astray(plant: Guards, asked: Asked) -> Iterable[str | None]:
+def _astray(plant: Guards, _: Asked) -> dict[str, str]:
     """Stop beams that went astray, and are off: they would go astray again."""
-    astray, state = plant.sentinel.table.barred("pointing_disagrees"), plant.field.rows["state"]
-    index = plant.field.index
-    return (
-        astray.get(name) if state[index[name]] in states.AWAY else None for name in asked.heliostats
-    )
+    state, place = plant.field.rows["state"], plant.field.place
+    astray = plant.sentinel.table.barred("pointing_disagrees")
+    return {name: text for name, text in astray.items() if state[place(name)] in states.AWAY}
 
 
 def _unacknowledged(plant: Guards, asked: Asked) -> Iterable[str | None]:
@@ -199,14 +207,14 @@ def _doubted(plant: Guards, asked: Asked) -> Iterable[str | None]:
     return plant.doubts.reasons(asked.heliostats, points)
 
 
-def _visited(plant: Guards, asked: Asked) -> Iterable[str | None]:
+def _visited(plant: Guards, asked: Asked) -> dict[str, str]:
     """Stop what would disturb a measurement, unless the visit orders it, or the plant."""
     visited = {} if asked.token is None else plant.authority.visited()
-    others = {name: each for name, each in visited.items() if each.token != asked.token}
-    return (
-        refusals.IN_VISIT.text.format(where=others[name].where) if name in others else None
-        for name in asked.heliostats
-    )
+    return {
+        name: refusals.IN_VISIT.text.format(where=visit.where)
+        for name, visit in visited.items()
+        if visit.token != asked.token
+    }
 
 
 #: Commands that need the command authority; DEFOCUS and STOW do not, and nothing stops them.
@@ -220,8 +228,8 @@ GUARDS: tuple[Guard, ...] = (
     Guard(
         OUT_OF_SERVICE,
         _ORDERS - messages.HARMLESS,
-        lambda plant, asked: map(
-            plant.lockouts.blocked(asked.heliostats, plant.destined(asked)).get, asked.heliostats
+        _among(
+            lambda plant, asked: plant.lockouts.blocked(asked.heliostats, plant.destined(asked))
         ),
     ),
     # The plant itself gives STOW after a visit, and does not while an emergency holds.
@@ -250,11 +258,11 @@ GUARDS: tuple[Guard, ...] = (
         _each(lambda plant, name: plant.given.unknown("STANDBY", name)),
     ),
     Guard(BEAM_REFUSED, messages.TO_STANDBY, _alarm(UNPROVEN)),
-    Guard(BEAM_REFUSED, messages.TO_STANDBY, _astray),
+    Guard(BEAM_REFUSED, messages.TO_STANDBY, _among(_astray)),
     # A heliostat that is being sent off is not stopped.
     Guard(BEAM_REFUSED, messages.RELEASES, _alarm("beam_unsent")),
     Guard(BEAM_REFUSED, messages.RELEASES, _alarm("keep_out_predicted")),
-    Guard(BEAM_REFUSED, messages.SETTINGS, _visited),
+    Guard(BEAM_REFUSED, messages.SETTINGS, _among(_visited)),
     Guard(
         BEAM_REFUSED,
         _ORDERS - messages.STOPS,
