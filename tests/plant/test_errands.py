@@ -111,7 +111,7 @@ def test_a_lock_on_a_target_parks_what_gets_its_aim_back_on_the_way_to_stow() ->
 
     async def work(plant: LivePlant) -> None:
         shown, (first, second, third, _) = plant.operations, plant.names
-        await until(lambda: all(shown.heliostat(n).state == "TRACKING" for n in plant.names))
+        await until(lambda: all(shown.viewer.heliostat(n).state == "TRACKING" for n in plant.names))
         token = shown.take_authority(ENGINEER).token
         shown.aim_at(ENGINEER, token, (first, second), "left")
         await asyncio.sleep(6.0)
@@ -130,8 +130,8 @@ def test_a_lock_on_a_target_parks_what_gets_its_aim_back_on_the_way_to_stow() ->
         assert ticket.good, said
         assert "parked in stow; it may go up again" in ticket.text
         # The lock stands, and they go back to work at the receiver.
-        assert [lock.name for lock in shown.holds()] == ["left"]
-        await until(lambda: shown.heliostat(first).state == "TRACKING")
+        assert [lock.name for lock in shown.automatic.service.out] == ["left"]
+        await until(lambda: shown.viewer.heliostat(first).state == "TRACKING")
 
     live(work, BY_HAND)
 
@@ -140,7 +140,7 @@ def test_a_lock_on_a_target_parks_what_gets_its_aim_back_on_the_way_to_stow() ->
 def test_a_calibration_waits_for_the_start_and_names_the_lock(place: str) -> None:
     async def work(plant: LivePlant) -> None:
         shown, name = plant.operations, plant.names[0]
-        await until(lambda: shown.calibration().on)
+        await until(lambda: shown.automatic.view().on)
         shown.release_authority(ENGINEER, shown.take_authority(ENGINEER).token)
         ticket = shown.calibrate(OPERATOR, name)
         assert ticket.steps[name] == "it waits: it is starting"

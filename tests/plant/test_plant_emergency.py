@@ -299,8 +299,8 @@ def test_a_refusal_names_the_orders_that_stand_and_then_what_is_left_to_do(
             plant.authority.keep(OPERATOR, token)
             await bench.wait(4.0)
         assert refused() == text.format(one).replace("DEFOCUS", "STOW")
-        assert plant.emergency is not None
-        assert (plant.emergency.who, plant.emergency.reason) == ("safety table", one)
+        assert plant.sentinel.order is not None
+        assert (plant.sentinel.order.who, plant.sentinel.order.reason) == ("safety table", one)
         plant.withdraw_emergency(OPERATOR)
         left = (
             "every order is withdrawn; it ends when an operator acknowledges operator_emergency, "
@@ -313,7 +313,7 @@ def test_a_refusal_names_the_orders_that_stand_and_then_what_is_left_to_do(
         await bench.wait(3.0)
         plant.acknowledge(OPERATOR, "operator_emergency")
         await bench.wait(1.0)
-        assert not plant.emergency_on
+        assert not plant.sentinel.on
         assert plant.emergency_causes == {}
         with pytest.raises(RefusedError, match="Olga stands; no emergency holds"):
             plant.withdraw_emergency(OPERATOR)

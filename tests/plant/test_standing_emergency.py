@@ -114,7 +114,7 @@ def test_a_plant_that_begins_in_an_emergency_names_the_orders_that_stand(tmp_pat
         await bench.wait(1.0)
 
     async def after(bench: Bench) -> None:
-        plant, order = bench.plant, bench.plant.emergency
+        plant, order = bench.plant, bench.plant.sentinel.order
         assert order is not None
         text = "a person at the receiver; it held when the plant's program ended"
         assert (order.act, order.who, order.reason) == (Act.STOW, "Olga", text)
