@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from heliotrope.calibration.sighting_table import read_sightings
 from heliotrope.cli import main
@@ -184,6 +185,55 @@ def test_sightings_name_what_is_left_out(folder: Path, call: Any) -> None:
     assert left["p4.png"] == "the plant has no heliostat H9"
     assert left["p5.png"].startswith("nothing is known about it")
     assert "p6.png" in left
+
+
+def _without_pose(folder: Path) -> None:
+    camera = replace(CAMERA, position=None, R_enu_camera=None)
+    plant = read_plant(folder / "plant.toml")
+    write_plant(replace(plant, cameras=(camera,)), folder / "plant.toml")
+
+
+def test_the_orientation_is_taken_on_trust_without_a_pose(folder: Path, call: Any) -> None:
+    words = (folder / "photographs", "--plant", folder / "plant.toml", "--no-pictures")
+    says = "the orientation of the frames is taken on trust"
+    assert says not in call(*words)[1]
+    assert json.loads(call(*words, "--json")[1])["notes"] == []
+    _without_pose(folder)
+    code, out, err = call(*words)
+    assert code == 0, err
+    assert out.count(says) == 1
+    (note,) = json.loads(call(*words, "--json")[1])["notes"]
+    assert note.startswith(f"{says}: the marks of target look the same turned or mirrored, and no")
+    code, _, err = call(*words, "--live", "--limit", 2)
+    assert code == 0
+    assert err.count(says) == 1
+
+
+def test_photographs_without_any_target_are_refused(folder: Path, call: Any) -> None:
+    dark = replace(_photograph((0.5, 0.3), 1).frame, pixels=np.zeros((600, 800), np.uint8))
+    write_image(dark, folder / "photographs" / "dark.png")
+    words = ("--plant", folder / "plant.toml", "--no-pictures")
+    code, _, err = call(folder / "photographs" / "dark.png", *words)
+    assert code == 2
+    assert err == "heliotrope: no target was found in 1 photograph: none could be read\n"
+    assert call(folder / "photographs", *words)[0] == 0
+
+
+def test_pictures_of_another_kind_in_a_folder_are_named(folder: Path, call: Any) -> None:
+    frames = [Image.new("L", (800, 600), value) for value in (10, 200)]
+    file = folder / "photographs" / "anim.gif"
+    frames[0].save(file, save_all=True, append_images=frames[1:])
+    words = ("--plant", folder / "plant.toml", "--no-pictures")
+    code, out, err = call(folder / "photographs", *words)
+    assert code == 0, err
+    assert f"left out: {file}: this is a GIF file; convert it to a PNG" in out
+    code, out, _ = call(folder / "photographs", *words, "--json")
+    found = json.loads(out)
+    assert len(found["images"]) == 3
+    assert found["unreadable"] == []
+    assert found["left_out"][0].startswith(f"{file}: this is a GIF")
+    # Given by name, it is an error.
+    assert call(file, *words)[0] == 2
 
 
 def test_processes_change_nothing(folder: Path, call: Any) -> None:

@@ -30,7 +30,12 @@ from heliotrope.imaging.synthetic.rendering import (
     exposed,
     render,
 )
-from heliotrope.imaging.targets.finding import FoundTarget, find_targets, symmetries
+from heliotrope.imaging.targets.finding import (
+    FoundTarget,
+    find_targets,
+    symmetries,
+    without_orientation,
+)
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.optics.mirror_image import gaussian_beam
 from support.data import juelich
@@ -345,8 +350,31 @@ def test_symmetries_of_marks() -> None:
     marks = (replace(TARGET.marks[0], kind="disc", stroke=0.0), *TARGET.marks[1:])
     assert [share for _, share in symmetries(marks, plane)] == [0.75, 0.75, 0.75]
     assert len(symmetries(TARGET.marks, plane * [1.0, 1.4])) == 1
+    assert without_orientation([TARGET]) == (TARGET.name,)
+    # A turned mark spoils each turn and each reflection, a disc at one corner too.
+    other = replace(TARGET.marks[0], turn=TARGET.marks[0].turn + 0.5 * np.pi)
+    for first in (other, marks[0]):
+        assert without_orientation([replace(TARGET, marks=(first, *TARGET.marks[1:]))]) == ()
     tags = with_marks("tag", 4, 0.5)
     assert symmetries(tags.marks, tags.plane_coordinates([m.point for m in tags.marks])) == []
+    assert without_orientation([tags]) == ()
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_tees_that_are_mirrored_alike(half: bool) -> None:
+    """Four tees in two rows: stems down in both look alike mirrored; inwards, also turned."""
+    lower = np.pi if half else 0.0
+    across, up = TARGET.axes
+    marks = tuple(
+        Mark(f"m{k}", "tee", TARGET.center + x * across + y * up, 0.6, 0.1, turn)
+        for k, (x, y, turn) in enumerate(
+            [(-2.0, 2.0, 0.0), (2.0, 2.0, 0.0), (-2.0, -1.0, lower), (2.0, -1.0, lower)]
+        )
+    )
+    target = replace(TARGET, marks=marks)
+    plane = target.plane_coordinates(np.array([m.point for m in marks]))
+    assert (1.0 in [share for _, share in symmetries(marks, plane)]) is half
+    assert without_orientation([target]) == (target.name,)
 
 
 # -- what is known beforehand ----------------------------------------------------------

@@ -276,6 +276,8 @@ def _huge(data: bytes) -> bytes:
 
 
 PNG, JPEG, TIFF = _encode(".png", COLOUR), _encode(".jpg", COLOUR), _tiff(RAMP)
+#: Colour that is hidden by its alpha.
+CLEAR = np.dstack([COLOUR, np.zeros(COLOUR.shape[:2], COLOUR.dtype)])
 BMP, WEBP = _encode(".bmp", COLOUR), _encode(".webp", COLOUR)
 PAGES = TIFF[:130] + struct.pack("<I", len(TIFF)) + TIFF[134:]
 BAD: dict[str, tuple[bytes, str]] = {
@@ -299,6 +301,7 @@ BAD: dict[str, tuple[bytes, str]] = {
     "png animated": (
         _png(0, 8, (32, 20), ROWS, _chunk(b"acTL", bytes(8))), "this PNG is animated"
     ),
+    "png transparent": (_encode(".png", CLEAR), "every pixel is transparent: it shows nothing"),
     "jpeg half": (JPEG[: len(JPEG) // 2], "this JPEG is truncated: it ends after 1031 bytes"),
     "jpeg start": (JPEG[:30], "this JPEG is truncated: it ends after 30 bytes"),
     "jpeg no end": (JPEG[:-2], "this JPEG is truncated"),

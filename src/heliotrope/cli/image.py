@@ -85,13 +85,16 @@ def image(
     """Find spots on targets: in metres with covariance, or the reason why not."""
     from heliotrope.imaging import campaign
     from heliotrope.imaging.log import read_log
+    from heliotrope.values import amount
 
     place = open_place(plant)
     if live:
         job = _job(place, target, crop, camera, empty, None, None)
+        if job.trust:
+            print(f"heliotrope: {job.trust}", file=sys.stderr)
         _follow(paths, place, job, limit, burst, archive, memory, as_json)
         return
-    files = _files([Path(path) for path in paths])
+    files, others = _files([Path(path) for path in paths])
     table: Log | None = None if log is None else read_log(log)
     entries = campaign.entries_of(files, table, heliostat)
     job = _job(place, target, crop, camera, empty, memory, annotated if pictures else None)
@@ -104,16 +107,23 @@ def image(
             client=client,
             progress=advance,
         )
-    left_out: list[str] = []
+    left_out = [o.problem for o in outcomes if o.problem and o.path in others]
     count = 0
     if to_sightings is not None:
         count, left_out = _write(to_sightings, outcomes, entries, place)
-    _show(outcomes, as_json, to_sightings, count, left_out)
-    broken = [o for o in outcomes if o.problem]
-    for outcome in broken:
-        print(f"heliotrope: {outcome.problem}", file=sys.stderr)
+    outcomes = [o for o in outcomes if not (o.problem and o.path in others)]
+    _show(outcomes, as_json, to_sightings, count, left_out, job.trust)
+    broken = [o.problem for o in outcomes if o.problem]
+    if not broken and not any(_shows_a_target(o) for o in outcomes):
+        broken = [f"no target was found in {amount(len(files), 'photograph')}: none could be read"]
+    for problem in broken:
+        print(f"heliotrope: {problem}", file=sys.stderr)
     if broken or (to_sightings is not None and not count):
         raise typer.Exit(2)
+
+
+def _shows_a_target(outcome: "Outcome") -> bool:
+    return any(reading["found"] for reading in outcome.document["targets"])
 
 
 def _follow(
@@ -186,20 +196,23 @@ def open_place(path: Path) -> Place:
     return place
 
 
-def _files(paths: Sequence[Path]) -> list[Path]:
+def _files(paths: Sequence[Path]) -> tuple[list[Path], set[Path]]:
+    """Return the photographs, and those of folders whose suffix is of another kind."""
     from heliotrope.errors import FormatError
-    from heliotrope.imaging.files import find_images
+    from heliotrope.imaging.files import IMAGE_SUFFIXES, OTHER_SUFFIXES, find_images
 
     files: list[Path] = []
+    others: set[Path] = set()
     for path in paths:
         if path.is_dir():
-            found = find_images(path)
+            found = find_images(path, suffixes=IMAGE_SUFFIXES + OTHER_SUFFIXES)
             if not found:
                 raise FormatError(path, "no image in this folder; give PNG, JPEG or TIFF")
             files += found
+            others |= {item for item in found if item.suffix.lower() in OTHER_SUFFIXES}
         else:
             files.append(path)
-    return files
+    return files, others
 
 
 def _job(
@@ -275,6 +288,7 @@ def _show(
     table: Path | None,
     count: int,
     left_out: list[str],
+    trust: str,
 ) -> None:
     read = [o for o in outcomes if not o.problem]
     if as_json:
@@ -286,6 +300,7 @@ def _show(
                 ],
                 "sightings": None if table is None else {"file": str(table), "count": count},
                 "left_out": left_out,
+                "notes": [trust] if trust else [],
             }
         )
         return
@@ -302,6 +317,8 @@ def _show(
         reasons = Counter(line.split(": ", 1)[-1].split(":")[0] for line in left_out[12:])
         listed = ", ".join(f"{count} × {reason}" for reason, count in reasons.most_common())
         print(f"left out: {len(left_out) - 12} more ({listed}); all with --json")
+    if trust:
+        print(trust)
     drawn = [o.annotated for o in read if o.annotated is not None]
     if drawn:
         print(f"annotated pictures: {drawn[0] if len(drawn) == 1 else drawn[0].parent}")

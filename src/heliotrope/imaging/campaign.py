@@ -30,6 +30,7 @@ from heliotrope.imaging.photograph import (
     read_photograph,
 )
 from heliotrope.imaging.spots.placed import PlacedSpot
+from heliotrope.imaging.targets.finding import without_orientation
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.processes import pool
@@ -82,6 +83,23 @@ class Job:
     target: str = ""
     annotated: Path | None = None
     without: Frame | None = None
+
+    @property
+    def trust(self) -> str:
+        """A line on what no frame can show: whether it is turned or mirrored. Empty if it can."""
+        if self.crop:
+            cause = "a crop shows one target without its surroundings"
+        elif self.camera is not None and self.camera.position is not None:
+            return ""
+        elif names := without_orientation(self.targets):
+            cause = f"the marks of {', '.join(names)} look the same turned or mirrored, and no pose"
+            cause += " of the camera is known"
+        else:
+            return ""
+        return (
+            f"the orientation of the frames is taken on trust: {cause}; a mark that is unlike the "
+            "others, or the camera's pose in the plant file, would show a mirrored frame"
+        )
 
 
 @dataclass(frozen=True)

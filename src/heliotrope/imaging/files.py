@@ -4,7 +4,8 @@ Pillow opens every file, checks that it is complete and decodes it. It has no 16
 OpenCV decodes such files, after Pillow has checked them.
 
 The orientation that a file asks for (EXIF, TIFF) is *not* applied: a camera's calibration belongs
-to the rows and columns of its sensor, however the camera was held. Alpha is dropped. Colour
+to the rows and columns of its sensor, however the camera was held. Alpha is dropped; a file that
+is transparent everywhere is refused. Colour
 profiles and gamma are not applied.
 """
 
@@ -42,6 +43,8 @@ from heliotrope.imaging.frame import Frame, Pixels
 
 #: Suffixes that `find_images` looks for; `read_image` goes by the content instead.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+#: Suffixes of pictures that `read_image` refuses: in a folder they are named.
+OTHER_SUFFIXES = (".gif", ".heic", ".heif", ".avif", ".jp2", ".fits")
 #: Default limit of `read_image`, pixels.
 LIMIT = PIXELS
 #: Smallest side of an image that can show a target, px.
@@ -133,8 +136,9 @@ def read_image(
     Raises
     ------
     FormatError
-        If there is no such image; if it is damaged, truncated, too large or too small; or if it
-        cannot be kept as it is: CMYK, float, several pages, animated.
+        If there is no such image; if it is damaged, truncated, too large, too small or
+        transparent everywhere; or if it cannot be kept as it is: CMYK, float, several pages,
+        animated.
     """
     file = Path(path)
     data, changed = _content(file, limit)
@@ -156,10 +160,21 @@ def read_image(
     )
 
 
-def find_images(folder: str | Path, recursive: bool = False) -> list[Path]:
+def find_images(
+    folder: str | Path, recursive: bool = False, suffixes: tuple[str, ...] = IMAGE_SUFFIXES
+) -> list[Path]:
     """Return the image files of a folder by their suffix, 2.png before 10.png.
 
     Hidden files are left out: other programs use them for files they are still writing.
+
+    Parameters
+    ----------
+    folder
+        The folder.
+    recursive
+        Whether to search the folders in it too.
+    suffixes
+        In lower case.
 
     Raises
     ------
@@ -173,7 +188,7 @@ def find_images(folder: str | Path, recursive: bool = False) -> list[Path]:
         found = [
             item
             for item in check_entries(place, place.rglob("*") if recursive else place.iterdir())
-            if item.suffix.lower() in IMAGE_SUFFIXES
+            if item.suffix.lower() in suffixes
             and not any(part.startswith(".") for part in item.relative_to(place).parts)
             and not item.is_dir()
         ]
@@ -349,6 +364,9 @@ def _further_pages(data: bytes) -> Iterator[int]:
 def _decode(file: Path, container: _Container) -> Pixels:
     kind, image, data = container.kind, container.image, container.data
     size = image.size
+    if _is_transparent(image):
+        text = "every pixel is transparent: it shows nothing; save it without alpha"
+        raise FormatError(file, text)
     orientation = image.tag_v2.get(274, 1) if kind == "TIFF" else 1  # type: ignore[attr-defined]
     try:
         pixels = _deep_colour(file, container) if _is_deep_colour(container) else _eight_bit(image)
@@ -365,6 +383,15 @@ def _decode(file: Path, container: _Container) -> Pixels:
             f"{size[0]} × {size[1]}; convert it to a PNG",
         )
     return cast("Pixels", np.ascontiguousarray(pixels))
+
+
+def _is_transparent(image: ImageFile.ImageFile) -> bool:
+    """Return whether alpha is 0 everywhere; a file that cannot be decoded is refused later."""
+    if image.mode not in ("RGBA", "LA", "PA"):
+        return False
+    with suppress(*_FAULTS):
+        return bool(np.asarray(image.getchannel("A")).max() == 0)
+    return False
 
 
 def _is_deep_colour(container: _Container) -> bool:

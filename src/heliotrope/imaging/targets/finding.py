@@ -446,32 +446,75 @@ def symmetries(marks: Sequence[Mark], plane: FloatArray) -> list[tuple[FloatArra
         Their places, m, (M, 2).
     """
     found = []
-    middle = plane.mean(axis=0)
-    extent = float(np.ptp(plane, axis=0).max())
     for quarter, (cos, sin) in enumerate(((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)), start=1):
         turn = np.array([[cos, -sin], [sin, cos]])
-        places = middle + (plane - middle) @ turn.T
-        apart = np.linalg.norm(places[:, None] - plane[None], axis=-1)
-        other = np.argmin(apart, axis=1)
-        near = apart[np.arange(len(marks)), other] < 0.05 * extent
-        same = [
-            bool(near[k]) and _alike(mark, marks[j], 0.5 * np.pi * quarter)
-            for k, (mark, j) in enumerate(zip(marks, other, strict=True))
-        ]
-        share = float(np.mean(same))
+        turns = [mark.turn + 0.5 * np.pi * quarter for mark in marks]
+        share = _share_alike(marks, plane, turn, turns)
         if share >= 0.5:
             found.append((turn, share))
     return found
 
 
-def _alike(a: Mark, b: Mark, turned: float) -> bool:
-    """Return whether a mark turned by an angle (rad) looks like another."""
+def without_orientation(targets: Sequence[Target]) -> tuple[str, ...]:
+    """Return the names of targets whose marks look the same in a turned or mirrored frame."""
+    names: list[str] = []
+    for face in faces(tuple(targets)):
+        marks, plane = face_marks(face)
+        alike = marks and (
+            any(share == 1.0 for _, share in symmetries(marks, plane))
+            or any(_is_mirrored_alike(marks, plane, axis) for axis in (0, 1))
+        )
+        names += [target.name for target in face.targets] if alike else []
+    return tuple(names)
+
+
+def _is_mirrored_alike(marks: Sequence[Mark], plane: FloatArray, axis: int) -> bool:
+    """Return whether marks look the same with right and left (0) or top and bottom (1) exchanged.
+
+    A drawing has an axis of its own: a corner's points down to the right, a tee's down.
+    """
+    mirror = np.diag([-1.0, 1.0] if axis == 0 else [1.0, -1.0])
+    about = np.pi if axis == 0 else 0.0
+    own = {"corner": -0.25 * np.pi, "tee": -0.5 * np.pi}
+    turns = [about - 2.0 * own.get(mark.kind, 0.0) - mark.turn for mark in marks]
+    return _share_alike(marks, plane, mirror, turns) == 1.0
+
+
+def _share_alike(
+    marks: Sequence[Mark], plane: FloatArray, moved: FloatArray, turns: Sequence[float]
+) -> float:
+    """Return the share of marks that look like another after a linear map about their middle.
+
+    Parameters
+    ----------
+    marks, plane
+        As for `symmetries`.
+    moved
+        The map, (2, 2).
+    turns
+        Turn of each mark after it, rad.
+    """
+    middle = plane.mean(axis=0)
+    extent = float(np.ptp(plane, axis=0).max())
+    places = middle + (plane - middle) @ moved.T
+    apart = np.linalg.norm(places[:, None] - plane[None], axis=-1)
+    other = np.argmin(apart, axis=1)
+    near = apart[np.arange(len(marks)), other] < 0.05 * extent
+    same = [
+        bool(near[k]) and _alike(mark, marks[j], turns[k])
+        for k, (mark, j) in enumerate(zip(marks, other, strict=True))
+    ]
+    return float(np.mean(same))
+
+
+def _alike(a: Mark, b: Mark, turn: float) -> bool:
+    """Return whether a mark of another turn (rad) looks like another."""
     if a.kind in ("tag", "picture") or (a.kind, a.size, a.stroke) != (b.kind, b.size, b.stroke):
         return False
     if a.kind == "disc":
         return True
     period = 0.5 * np.pi if a.kind == "square" else 2.0 * np.pi
-    rest = (a.turn + turned - b.turn) / period
+    rest = (turn - b.turn) / period
     return bool(abs(rest - np.round(rest)) * period < 0.1)
 
 
