@@ -46,7 +46,7 @@ def test_faults_are_named_and_the_other_mirror_is_learnt(call: Any, tmp_path: Pa
     text = calibrated(call, tmp_path, join([wrong, rows, good.take([9, 9])]))
     assert f"{NAMES[3]}: the motor of azimuth seems reversed" in text
     assert "17 heliostats not learnt: parameters unchanged" in text
-    assert "left out: 2 measurements, the first: line 42, heliostat P6A, an exact copy" in text
+    assert "left out: 2 measurements, the first: line 42, heliostat P6A, a copy of another" in text
     left = (tmp_path / "out" / "left_out.txt").read_text(encoding="utf-8").splitlines()
     assert [line.split(", ", 2)[-1].split(":")[0] for line in left] == [
         "the sun is below the horizon",
