@@ -35,7 +35,7 @@ class GivingBack:
 
     Parameters
     ----------
-    field, authority, orders, permission, commands
+    field, authority, orders, guards, commands
         The plant's.
     movements, locks, stepping
         What visits have taken.
