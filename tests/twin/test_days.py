@@ -353,7 +353,14 @@ def visited(
     observer.__dict__["_noted"] = lambda *_: None
     for i in range(names):
         accounts[f"H{i}"] = SimpleNamespace(
-            kept=0, last=0, version=0, told=0, before=None, vain=0, searched=0, pictures=[]
+            kept=0,
+            last=0,
+            version=0,
+            result_version=0,
+            before=None,
+            vain=0,
+            searched=0,
+            pictures=[],
         )
     beliefs = SimpleNamespace(record=lambda _: None, seen=lambda _: None, present=lambda _: None)
     operations: Any = SimpleNamespace(plant=SimpleNamespace(beliefs=beliefs))

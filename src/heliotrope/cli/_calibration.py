@@ -56,17 +56,17 @@ SchedulerOption = Annotated[
 ]
 
 
-def parse_priors(given: list[str]) -> dict[str, float]:
+def parse_priors(texts: list[str]) -> dict[str, float]:
     """Return standard deviations by parameter from texts NAME=VALUE (rad, m or 1)."""
-    found = {}
-    for text in given:
+    priors = {}
+    for text in texts:
         name, _, value = text.partition("=")
         refusal = (
             f"--prior {shown(text)}: write NAME=VALUE with a value above 0 in rad, m or 1, for "
             "example tilt_north=0.005"
         )
-        (found[name.strip()],) = parse_numbers(value, refusal, least=1e-9)
-    return found
+        (priors[name.strip()],) = parse_numbers(value, refusal, least=1e-9)
+    return priors
 
 
 def parse_model(text: str) -> str | tuple[str, ...]:

@@ -22,7 +22,7 @@ def missing(error: ModuleNotFoundError, command: str) -> InputError | None:
     error
         What the import raised.
     command
-        Name of the command, "" if unknown.
+        Name of the command; empty if unknown.
     """
     package = (error.name or "").partition(".")[0]
     extra = EXTRAS.get(package)

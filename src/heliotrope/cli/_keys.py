@@ -54,9 +54,9 @@ def new(file: PlantFile, clusters: Clusters, to: FolderOption) -> None:
     """Make a key for each cluster, in the plant's file and in one to carry to the cluster."""
     from heliotrope.links.keys import carried_files
 
-    found = _open(file)
+    keys = _open(file)
     carried_files(to, clusters)  # refuses before anything is written
-    _carry(to, found.new(clusters))
+    _carry(to, keys.new(clusters))
     print(f"{file}: new keys for {', '.join(clusters)}")
 
 
@@ -65,9 +65,9 @@ def rotate(file: PlantFile, clusters: Clusters, to: FolderOption) -> None:
     """Make a second key for each cluster; plant and cluster may both keep running."""
     from heliotrope.links.keys import carried_files
 
-    found = _open(file)
+    keys = _open(file)
     carried_files(to, clusters)  # refuses before anything is written
-    _carry(to, found.rotate(clusters))
+    _carry(to, keys.rotate(clusters))
     print(f"{file}: new keys beside the old ones for {', '.join(clusters)}")
 
 
@@ -80,10 +80,10 @@ def take(
     from heliotrope.errors import InputError
     from heliotrope.links.keys import fingerprint
 
-    found = _open(carried).links
-    if list(found) != ["plant"] or len(found["plant"]) != 1:
+    links = _open(carried).links
+    if list(links) != ["plant"] or len(links["plant"]) != 1:
         raise InputError(f"{carried}: it carries no key of a cluster; make one with keys rotate")
-    (key,) = found["plant"]
+    (key,) = links["plant"]
     _open(file).take(key)
     print(f"{file}: key {fingerprint(key)} taken; delete {carried}")
 
@@ -134,32 +134,32 @@ def _bus(path: Path) -> "BusKeyFile":
 @bus_app.command(name="new")
 def bus_new(file: BusFile) -> None:
     """Make the key of a bus; the cluster gives it to its local controllers."""
-    found = _bus(file)
-    found.new()
-    _show(found)
+    keys = _bus(file)
+    keys.new()
+    _show(keys)
 
 
 @bus_app.command(name="rotate")
 def bus_rotate(file: BusFile) -> None:
     """Make a second key beside the present one; the cluster keeps running."""
-    found = _bus(file)
-    found.rotate()
-    _show(found)
+    keys = _bus(file)
+    keys.rotate()
+    _show(keys)
 
 
 @bus_app.command(name="end")
 def bus_end(file: BusFile) -> None:
     """Remove the old key, once the new one signs."""
-    found = _bus(file)
-    found.end()
-    _show(found)
+    keys = _bus(file)
+    keys.end()
+    _show(keys)
 
 
 @bus_app.command(name="off")
 def bus_off(file: BusFile) -> None:
     """Remove all keys; the cluster takes them from its local controllers, while these stand."""
-    found = _bus(file)
-    found.off()
+    keys = _bus(file)
+    keys.off()
     print(f"{file}: no key; local controllers lose theirs while their mirrors stand")
 
 
@@ -173,12 +173,12 @@ def bus_list(file: BusFile) -> None:
     _show(_bus(file))
 
 
-def _show(found: "BusKeyFile") -> None:
+def _show(file: "BusKeyFile") -> None:
     from heliotrope.links.keys import fingerprint
 
-    keys = [fingerprint(key) for key in found.keys]
-    told = f"key {keys[0]}" if keys else "no key"
-    print(f"{found.path}: {told}" + (f", old key {keys[1]}" if len(keys) > 1 else ""))
+    keys = [fingerprint(key) for key in file.keys]
+    newest = f"key {keys[0]}" if keys else "no key"
+    print(f"{file.path}: {newest}" + (f", old key {keys[1]}" if len(keys) > 1 else ""))
 
 
 def _carry(folder: Path, keys: dict[str, bytes]) -> None:

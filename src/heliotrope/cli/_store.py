@@ -35,14 +35,14 @@ def info(place: Place, as_json: JsonOption = False) -> None:
     from heliotrope.store.database import Database
 
     with Database(place) as database:
-        found = summary(database)
+        figures = summary(database)
     for name in ("first_sighting", "last_sighting"):
-        found[name] = format_time(found[name]) if found.get(name) is not None else ""
+        figures[name] = format_time(figures[name]) if figures.get(name) is not None else ""
     if as_json:
-        print_json(found)
+        print_json(figures)
         return
-    rows = found.pop("rows")
-    for name, value in found.items():
+    rows = figures.pop("rows")
+    for name, value in figures.items():
         print(f"{name.replace('_', ' ')}: {value}")
     if rows:
         print_table(["table", "rows"], [[name, str(count)] for name, count in rows.items()])
@@ -181,7 +181,7 @@ def verify(
     files = [Path(text) for text in head or () if Path(text).is_file()]
     typed = [text for text in head or () if not Path(text).is_file()]
     known = [Head.read(word) for text in typed for word in text.split()]
-    exported = [found for file in files for found in chain.read_heads(file)]
+    exported = [entry for file in files for entry in chain.read_heads(file)]
     if place.endswith(_LINES):
         from heliotrope.plant import audit
 
@@ -191,12 +191,12 @@ def verify(
     with Database(place) as database:
         database.require()
         with database.reading() as connection:
-            found = chain.verify(connection, [*known, *exported])
+            result = chain.verify(connection, [*known, *exported])
     if head:
-        all_of = len(found.fitting) + len(found.old)
-        old = ", those of earlier events could not be checked" if found.old else ""
-        print(f"{len(found.fitting)} of {all_of} heads fit; {chain.kept_since(found.since)}{old}")
-    print(f"{place}: every record fits; {' '.join(map(str, found.heads))}")
+        all_of = len(result.fitting) + len(result.old)
+        old = ", those of earlier events could not be checked" if result.old else ""
+        print(f"{len(result.fitting)} of {all_of} heads fit; {chain.kept_since(result.since)}{old}")
+    print(f"{place}: every record fits; {' '.join(map(str, result.heads))}")
 
 
 @app.command()
@@ -228,11 +228,11 @@ def _telemetry(database: Any) -> Path | None:
     return folder if folder.is_dir() else None
 
 
-def _tell(found: Any, done: str, as_json: bool) -> None:
+def _tell(result: Any, done: str, as_json: bool) -> None:
     if as_json:
-        print_json({**vars(found), "folder": str(found.folder)})
+        print_json({**vars(result), "folder": str(result.folder)})
     else:
         print(
-            f"backup {found.folder} of {found.made} {done}: {found.size / 1e6:.1f} MB, revision "
-            f"{found.revision}"
+            f"backup {result.folder} of {result.made} {done}: {result.size / 1e6:.1f} MB, revision "
+            f"{result.revision}"
         )

@@ -56,11 +56,11 @@ def _document(
 
     parameters, pivot = of_mechanism(mechanism)
     demanded = guo.mirror_normal(aim - pivot, sun, parameters.offset)
-    found = guo.track(aim - pivot, sun, parameters)
+    solution = guo.track(aim - pivot, sun, parameters)
     armature = tracking.track(mechanism, sun, aim)
     branches = []
     for b in range(2):
-        gamma, alpha = float(found.gamma[b]), float(found.alpha[b])
+        gamma, alpha = float(solution.gamma[b]), float(solution.alpha[b])
         # The armature's solution that stands nearest, for the turn of the azimuth too.
         apart = angle_between(guo.forward(alpha, gamma, parameters), armature.normal)
         over = np.abs(wrap_signed(armature.angles[:, 1] - alpha))
@@ -75,8 +75,8 @@ def _document(
                 "angles_rad": [gamma, alpha],
                 "counts": mechanism.drives.counts(np.array([gamma, alpha])),
                 "from_armature_mrad": 1e3 * apart[other],
-                "reachable": bool(found.reachable),
-                "residual_mrad": 1e3 * found.residual,
+                "reachable": bool(solution.reachable),
+                "residual_mrad": 1e3 * solution.residual,
                 "text": tracking.TrackingStatus(int(armature.status[other])).text,
             }
         )
@@ -87,7 +87,7 @@ def _document(
         "sun_vector": sun,
         "aim": aim,
         "guo": in_his_names(parameters),
-        "normal": found.normal,
+        "normal": solution.normal,
         "theta_deg": np.degrees(demanded.theta),
         "tau_mrad": 1e3 * demanded.tau,
         "branches": branches,

@@ -16,7 +16,7 @@ def refusal(error: TyperException) -> str | None:
 
 
 def _number(error: TyperException) -> str | None:
-    """Return what a number has to be; None for other errors.
+    """Return the limits of a number in words; None for other errors.
 
     Each numeric option of the command line declares its limits, ``min`` and ``max``.
     """

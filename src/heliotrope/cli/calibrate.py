@@ -72,13 +72,13 @@ def calibrate(
 def _print_guo(content: "CalibrationReport") -> None:
     from heliotrope.mechanism.guo_names import NAMES
 
-    found = content.guo
-    if found is None:
+    parameters = content.guo
+    if parameters is None:
         return
     six = [name for name, (_, _, unit) in NAMES.items() if unit == "°"]
     print_table(
         ["heliostat", *(NAMES[name][0] for name in six)],
-        [[row, *(f"{values[f'{n}_deg']:.4f}" for n in six)] for row, values in found.items()],
+        [[row, *(f"{values[f'{n}_deg']:.4f}" for n in six)] for row, values in parameters.items()],
         title="Guo's six parameters, °",
     )
 

@@ -173,10 +173,10 @@ def _from_marks(
     if len(sizes) > 1:
         listed = ", ".join(f"{w} × {h}" for w, h in sorted(sizes))
         raise InputError(f"camera {name}: frames of {listed} px; give pictures of one size")
-    seen = teaching.see_marks(plant, places[0].parent, frames, old)
-    fit = teaching.fit_marks(frames[0].size, seen, old, name, anew)
+    marks = teaching.see_marks(plant, places[0].parent, frames, old)
+    fit = teaching.fit_marks(frames[0].size, marks, old, name, anew)
     camera = replace(
-        fit.camera, targets=old.targets if old else seen.targets, source=old.source if old else ""
+        fit.camera, targets=old.targets if old else marks.targets, source=old.source if old else ""
     )
     teaching.write_with_pictures(teaching.with_camera(plant, camera), places[1], places[0].parent)
     if as_json:
@@ -185,12 +185,12 @@ def _from_marks(
                 **_document(camera),
                 **_fit_document(fit),
                 "marks": len(fit.residuals),
-                "not_found": list(seen.reasons),
+                "not_found": list(marks.reasons),
                 "written": str(places[1]),
             }
         )
         return
-    for reason in seen.reasons:
+    for reason in marks.reasons:
         print(reason)
     _print_fit(fit, len(fit.residuals), "marks")
     print(f"camera {name} written to {places[1]}")
@@ -235,17 +235,17 @@ def teach(
     loaded = open_plant(plant)
     surface = loaded.target(target)
     frame = _read(image)
-    given = dict(_at(text) for text in at or [])
+    points = dict(_at(text) for text in at or [])
     wishes, wish = _wishes(kind or [], size or [], stroke or [])
     if click:
         from heliotrope.imaging.targets.click_page import click_points
 
-        given |= click_points(surface, frame, given, image.name, _announcer(as_json))
+        points |= click_points(surface, frame, points, image.name, _announcer(as_json))
     taught = teaching.teach(
         loaded,
         target,
         frame,
-        given,
+        points,
         camera=camera,
         wishes=wishes,
         wish=wish,
@@ -267,9 +267,9 @@ def _announcer(quiet: bool) -> Callable[[str], None]:
 
 
 def _at(text: str) -> tuple[str, tuple[float, float]]:
-    name, found, pair = text.rpartition("=")
+    name, sign, pair = text.rpartition("=")
     refusal = f"--at {text!r}: write NAME=X,Y in pixels, as upper_left=812.5,304"
-    if not found or not name:
+    if not sign or not name:
         raise InputError(refusal)
     x, y = parse_numbers(pair, refusal, count=2)
     return name, (x, y)
@@ -302,13 +302,13 @@ def _wishes(
 
 def _split(texts: Sequence[str], read: Callable[[str], Value]) -> dict[str, Value]:
     """Return values by the name before "="; the value without a name is under ""."""
-    found: dict[str, Value] = {}
+    values: dict[str, Value] = {}
     for text in texts:
         name, _, value = text.rpartition("=")
-        if name in found:
+        if name in values:
             raise InputError(f"{text!r}: given twice" + (f" for point {name}" if name else ""))
-        found[name] = read(value)
-    return found
+        values[name] = read(value)
+    return values
 
 
 def _show_taught(taught: "Taught", place: Path, as_json: bool) -> None:
@@ -393,7 +393,7 @@ def receiver(
     ] = 1.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Take the reference by which a camera measures the flux on the receiver."""
+    """Take the reference for a camera's measurements of the flux on the receiver."""
     from heliotrope.imaging.receiver_file import write_reference
     from heliotrope.imaging.receiver_light import ReceiverSight, take_reference
     from heliotrope.imaging.sources import average
@@ -414,7 +414,7 @@ def receiver(
         sight,
         average(_read(path) for path in capped),
         average(plain),
-        [_lit(text) for text in lit],
+        [_lit_frame(text) for text in lit],
         8 * plain[0].pixels.dtype.itemsize,
     )
     write_reference(reference, out)
@@ -453,10 +453,10 @@ def _outline(texts: Sequence[str], camera: "Camera", receiver: "Receiver") -> An
     return project(camera, receiver.face.corners)
 
 
-def _lit(text: str) -> "tuple[Frame, float]":
-    name, found, share = text.rpartition("=")
+def _lit_frame(text: str) -> "tuple[Frame, float]":
+    name, sign, share = text.rpartition("=")
     refusal = f"--lit {text!r}: write FILE=SHARE, as lit.png=0.1"
-    if not found or not name:
+    if not sign or not name:
         raise InputError(refusal)
     (value,) = parse_numbers(share, refusal)
     return _read(Path(name)), value
@@ -476,11 +476,11 @@ def show(
     if not loaded.cameras and not as_json:
         print(f"{plant}: no cameras; heliotrope camera teach adds one")
         return
-    seen = {camera.name: sights(camera, loaded.targets) for camera in loaded.cameras}
+    views = {camera.name: sights(camera, loaded.targets) for camera in loaded.cameras}
     if as_json:
         print_json(
             [
-                {**_document(camera), "targets": {s.target: vars(s) for s in seen[camera.name]}}
+                {**_document(camera), "targets": {s.target: vars(s) for s in views[camera.name]}}
                 for camera in loaded.cameras
             ]
         )
@@ -496,7 +496,7 @@ def show(
             f"{100 * s.share:.0f}",
             str(s.marks),
         ]
-        for name, listed in seen.items()
+        for name, listed in views.items()
         for s in listed
     ]
     if table:

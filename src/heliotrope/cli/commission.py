@@ -197,10 +197,10 @@ def _fleets(
             installed=installed,
             progress=step,
         )
-    seen = set() if made is None else {plant.names[i] for i in np.unique(made.heliostat)}
+    measured = set() if made is None else {plant.names[i] for i in np.unique(made.heliostat)}
     labels = [name for fleet in fleets for name in fleet.labels]
     if not flight[0]:
-        return fleets, np.array([name in seen for name in labels]), None
+        return fleets, np.array([name in measured for name in labels]), None
     fleets, summary = _flown(plant, fleets, model, flight, quiet)
     return fleets, np.ones(len(labels), dtype=np.bool_), summary
 
@@ -239,9 +239,9 @@ def _flown(
         )
         for fleet in fleets
     ]
-    found = flown.summary()
+    summary = flown.summary()
     keys = ("drones", "sorties", "hours", "working_days", "calibration_points")
-    return after, {key: found[key] for key in keys}
+    return after, {key: summary[key] for key in keys}
 
 
 def _planned(

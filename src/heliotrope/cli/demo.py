@@ -46,9 +46,9 @@ def demo(
     say(f"plant: {len(plant)} heliostats, installed with errors of about 10 mrad")
     days = tuple(DAY - timedelta(days=back) for back in range(7, 0, -2))
     with compiling():
-        seen = measure(group.mechanism, truth, target, plant.site, days, seed=seed)
-    say(f"measured: {len(seen)} sightings on the target in the week before")
-    report = calibrate(FieldSightings(plant, "azel", seen, (), ()), MODEL, seed=seed)
+        sightings = measure(group.mechanism, truth, target, plant.site, days, seed=seed)
+    say(f"measured: {len(sightings)} sightings on the target in the week before")
+    report = calibrate(FieldSightings(plant, "azel", sightings, (), ()), MODEL, seed=seed)
     calibrated = plant.with_calibration(report.results)
     write_plant(calibrated, into / "plant.toml")
     day = track_day(calibrated.groups["azel"], truth, target.center, plant.site, DAY)
@@ -58,7 +58,7 @@ def demo(
         page = write_report(report, into / "report", advance, most=SECTIONS)
     figures: dict[str, Any] = {
         "heliostats": len(report.names),
-        "sightings": len(seen),
+        "sightings": len(sightings),
         "before_mrad": 1e3 * float(np.median([row.before.median for row in report.rows])),
         "held_out_mrad": 1e3 * float(np.median([row.held.median for row in report.rows])),
         "date": str(DAY),

@@ -58,7 +58,7 @@ def evaluate(
         )
         freed = _unobstructed(field) if neighbours else None
     with shared.workers(scheduler) as runner, shared.progress_of_steps(as_json) as steps:
-        found = workflow.evaluate(
+        outcome = workflow.evaluate(
             field.heliostats.names,
             field.heliostats.mechanism,
             field.seen if freed is None else freed.seen,
@@ -76,16 +76,16 @@ def evaluate(
         "split": split,
         "fraction": fraction,
         "seed": seed,
-        **found.document(),
+        **outcome.document(),
         "left_out": list(field.left_out),
     }
-    clock = workflow.clock_of(field, found.learned)
+    clock = workflow.clock_of(field, outcome.learned)
     document["clock"] = None if clock is None else clock.document()
     if freed is not None:
         document["neighbours"] = freed.summary()
-    document["unexplained_mirrors"] = unexplained_mirrors(field.heliostats.names, found.learned)
-    document["unusable_sightings"] = [field.ids[k] for k in found.assessment.unusable]
-    document["unexplained_sightings"] = [field.ids[k] for k in found.assessment.unexplained]
+    document["unexplained_mirrors"] = unexplained_mirrors(field.heliostats.names, outcome.learned)
+    document["unusable_sightings"] = [field.ids[k] for k in outcome.assessment.unusable]
+    document["unexplained_sightings"] = [field.ids[k] for k in outcome.assessment.unexplained]
     if as_json:
         print_json(document)
         return
@@ -96,7 +96,7 @@ def evaluate(
     shared.print_left_out(field.left_out)
     if freed is not None:
         print(freed)
-    for line in found.choice.describe() if found.choice else ():
+    for line in outcome.choice.describe() if outcome.choice else ():
         print(line)
 
 

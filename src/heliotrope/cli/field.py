@@ -30,8 +30,8 @@ def check(
     from heliotrope.plant.aims import BeamCheck
 
     findings = plant_file.check_plant(file)
-    wrong = any(finding.severity == "error" for finding in findings)
-    if not wrong:
+    invalid = any(finding.severity == "error" for finding in findings)
+    if not invalid:
         design = plant_file.read_plant(file)
         unsafe = BeamCheck(design, design.names).at_stow()
         if unsafe:
@@ -39,17 +39,17 @@ def check(
             text = f"{len(unsafe)} heliostats cannot be stowed where the file says: {name}: {text}"
             findings.append(plant_file.Finding("warning", text))
     if as_json:
-        print_json({"file": str(file), "ok": not wrong, "findings": [vars(f) for f in findings]})
+        print_json({"file": str(file), "ok": not invalid, "findings": [vars(f) for f in findings]})
     else:
         for finding in findings:
             print(f"{finding.severity}: {finding.text}")
-        if not wrong:
+        if not invalid:
             plant = plant_file.read_plant(file)
             print(
                 f"{file}: {len(plant)} heliostats, {len(plant.targets)} targets: "
                 f"{'it can run; see the warnings above' if findings else 'no problems found'}"
             )
-    if wrong:
+    if invalid:
         raise typer.Exit(2)
 
 
@@ -65,32 +65,32 @@ def safety(
     from heliotrope.field.formats import plant_file
     from heliotrope.safety import CONDITIONS, limited, settings_of
 
-    given = plant_file.read_plant(file).safety
-    found = [
+    limits = plant_file.read_plant(file).safety
+    numbers = [
         {
             "condition": row.name,
             "key": key,
-            "value": one.shown(row),
-            "default": one.shown(usual),
-            "low": one.low,
-            "high": one.high,
-            "changed": getattr(row, one.number) != getattr(usual, one.number),
+            "value": setting.shown(row),
+            "default": setting.shown(usual),
+            "low": setting.low,
+            "high": setting.high,
+            "changed": getattr(row, setting.number) != getattr(usual, setting.number),
         }
-        for row, usual in zip(limited(CONDITIONS, given), CONDITIONS, strict=True)
-        for key, one in settings_of(usual).items()
-        if one.main
+        for row, usual in zip(limited(CONDITIONS, limits), CONDITIONS, strict=True)
+        for key, setting in settings_of(usual).items()
+        if setting.main
     ]
     if as_json:
-        print_json(found)
+        print_json(numbers)
         return
     rows = [
         (
-            f"{one['condition']}.{one['key']}{'*' if one['changed'] else ''}",
-            f"{one['value']:g}",
-            f"{one['default']:g}",
-            f"{one['low']:g} to {one['high']:g}",
+            f"{setting['condition']}.{setting['key']}{'*' if setting['changed'] else ''}",
+            f"{setting['value']:g}",
+            f"{setting['default']:g}",
+            f"{setting['low']:g} to {setting['high']:g}",
         )
-        for one in found
+        for setting in numbers
     ]
     print_table(("number", "in force", "default", "range"), rows)
 
@@ -118,9 +118,9 @@ def defocus(
     if not design.receivers or not len(design):
         raise InputError(f"{file}: no receiver or no heliostats; nothing to defocus from")
     check = BeamCheck(design, design.names)
-    given = default_aims(design, design.names, check.armature.origin_1, None)
-    aims, center = np.stack(list(given.values())), design.receivers[0].center
-    found = []
+    defaults = default_aims(design, design.names, check.armature.origin_1, None)
+    aims, center = np.stack(list(defaults.values())), design.receivers[0].center
+    documents = []
     for bearing, elevation in _SUNS:
         # The highest suns stand on the side of the equator.
         azimuth = bearing + (0.0 if design.site.latitude_deg < 0.0 else 180.0)
@@ -131,9 +131,9 @@ def defocus(
             hot = hottest(check.together(angles, sun), center, _AROUND)
             away = float(np.linalg.norm(hot.point - center))
             row |= {f"{name}_suns": hot.suns, f"{name}_m": away, f"{name}_reach_m": hot.reach}
-        found.append(row)
+        documents.append(row)
     if as_json:
-        print_json(found)
+        print_json(documents)
         return
     heads = ("sun", "same angles", "as in the file", "above 10 suns")
     rows = [
@@ -143,7 +143,7 @@ def defocus(
             f"{row['spread_suns']:.0f} suns, {row['spread_m']:.0f} m away",
             f"within {row['spread_reach_m']:.0f} m",
         )
-        for row in found
+        for row in documents
     ]
     print_table(heads, rows)
 
@@ -178,20 +178,20 @@ def change(
     from heliotrope.errors import InputError
     from heliotrope.field.formats import plant_edit
 
-    given = {}
+    changes = {}
     for text in values or ():
         name, sign, value = text.partition("=")
-        if not sign or name in given:
+        if not sign or name in changes:
             raise InputError(f"{text!r}: give each value once, as NAME=VALUE")
-        given[name] = value
-    if not given:
-        found = plant_edit.values(file, who)
+        changes[name] = value
+    if not changes:
+        parameters = plant_edit.values(file, who)
         if as_json:
-            print_json({"name": who, "values": found})
+            print_json({"name": who, "values": parameters})
         else:
-            print_table((who, "value"), list(found.items()))
+            print_table((who, "value"), list(parameters.items()))
         return
-    edited = plant_edit.edit(file, who, given, note=note, dry=dry)
+    edited = plant_edit.edit(file, who, changes, note=note, dry=dry)
     if as_json:
         print_json({**vars(edited), "name": who, "changes": [vars(c) for c in edited.changes]})
         return
@@ -213,13 +213,13 @@ def versions(
     """List the stored versions of a plant file, each with the change that ended it."""
     from heliotrope.field.formats import plant_edit
 
-    found = plant_edit.versions(file)
+    stored = plant_edit.versions(file)
     if as_json:
-        print_json([vars(one) for one in found])
+        print_json([vars(version) for version in stored])
         return
-    for one in found:
-        print(f"{one.name}  {one.note}")
-    if not found:
+    for version in stored:
+        print(f"{version.name}  {version.note}")
+    if not stored:
         print(f"{file}: no stored versions")
 
 

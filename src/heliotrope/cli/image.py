@@ -187,10 +187,10 @@ def open_place(path: Path) -> Place:
         tower = read_tower(path)
         place = Place(tower.targets, (), Site(*tower.origin), (), path.parent)
     else:
-        found = open_plant(path)
+        plant = open_plant(path)
         folder = path if path.is_dir() else path.parent
-        machines = found.nominal if len(found.groups) == 1 else None
-        place = Place(found.targets, found.cameras, found.site, found.names, folder, machines)
+        machines = plant.nominal if len(plant.groups) == 1 else None
+        place = Place(plant.targets, plant.cameras, plant.site, plant.names, folder, machines)
     if not place.targets:
         raise InputError(f"{path}: the plant has no targets; add [[targets]] with their marks")
     return place
@@ -205,11 +205,11 @@ def _files(paths: Sequence[Path]) -> tuple[list[Path], set[Path]]:
     others: set[Path] = set()
     for path in paths:
         if path.is_dir():
-            found = find_images(path, suffixes=IMAGE_SUFFIXES + OTHER_SUFFIXES)
-            if not found:
+            images = find_images(path, suffixes=IMAGE_SUFFIXES + OTHER_SUFFIXES)
+            if not images:
                 raise FormatError(path, "no image in this folder; give PNG, JPEG or TIFF")
-            files += found
-            others |= {item for item in found if item.suffix.lower() in OTHER_SUFFIXES}
+            files += images
+            others |= {item for item in images if item.suffix.lower() in OTHER_SUFFIXES}
         else:
             files.append(path)
     return files, others
@@ -273,13 +273,13 @@ def _write(
 
     # A tower file names no heliostats; use those of the log.
     names = place.names or tuple(sorted({e.heliostat for e in entries if e and e.heliostat}))
-    seen, left_out = to_sightings(
+    sightings, left_out = to_sightings(
         outcomes, entries, names, place.site, mechanism=place.mechanism, now=time.time()
     )
-    if seen is None:
+    if sightings is None:
         return 0, left_out
-    write_sightings(path, seen, names, ["camera_target"] * len(seen))
-    return len(seen), left_out
+    write_sightings(path, sightings, names, ["camera_target"] * len(sightings))
+    return len(sightings), left_out
 
 
 def _show(

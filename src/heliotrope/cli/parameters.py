@@ -33,8 +33,8 @@ def parameters(
         return
     rows = [
         [whose, name, f"{value + 0.0:.6g}"]
-        for whose, found in document.items()
-        for name, value in found.items()
+        for whose, converted in document.items()
+        for name, value in converted.items()
         if isinstance(value, float)
     ]
     print_table(["in the names of", "parameter", "value"], rows)
@@ -43,12 +43,12 @@ def parameters(
 
 
 def _parsed(values: list[str]) -> dict[str, float]:
-    found = {}
+    parsed = {}
     for text in values:
         name, _, value = text.partition("=")
         refusal = f"{shown(text)}: write NAME=VALUE with a number, for example psi_t=1.854"
-        (found[name.strip()],) = parse_numbers(value, refusal)
-    return found
+        (parsed[name.strip()],) = parse_numbers(value, refusal)
+    return parsed
 
 
 def _machine(source: Names, values: dict[str, float]) -> "GuoParameters":

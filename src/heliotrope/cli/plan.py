@@ -198,12 +198,12 @@ def span_of(begin: str, end: str | None, days: float | None) -> tuple[datetime, 
     return start, stop
 
 
-def targets_of(plant: "Plant", wanted: list[str] | None) -> "tuple[Target, ...]":
+def targets_of(plant: "Plant", names: list[str] | None) -> "tuple[Target, ...]":
     """Return the targets by name, or all."""
-    found = tuple(plant.target(name) for name in dict.fromkeys(wanted or ())) or plant.targets
-    if not found:
+    targets = tuple(plant.target(name) for name in dict.fromkeys(names or ())) or plant.targets
+    if not targets:
         raise InputError("this plant has no target; a measurement with a camera needs one")
-    return found
+    return targets
 
 
 def made_so_far(plant: "Plant", path: Path | None) -> "Sightings | None":
@@ -213,17 +213,17 @@ def made_so_far(plant: "Plant", path: Path | None) -> "Sightings | None":
     from heliotrope.calibration.plausibility import judge_in
     from heliotrope.calibration.sighting_table import read_sightings
 
-    seen, _, left_out = read_sightings(
-        path, plant.names, lambda seen, kinds: judge_in(plant, seen, kinds).reasons
+    sightings, _, left_out = read_sightings(
+        path, plant.names, lambda sightings, kinds: judge_in(plant, sightings, kinds).reasons
     )
-    if not len(seen):
+    if not len(sightings):
         reason = f"; the first: {left_out[0]}" if left_out else ""
         raise FormatError(path, f"no sighting can be used{reason}")
     for line in left_out[:3]:
         print(f"left out: {line}", file=sys.stderr)
     if len(left_out) > 3:
         print(f"left out: {len(left_out) - 3} more", file=sys.stderr)
-    return seen
+    return sightings
 
 
 def _plans(
@@ -244,7 +244,7 @@ def _plans(
             criterion=criterion,
             progress=step,
         )
-    tables = {name: report.plan_rows(name, one) for name, one in plans.items()}
+    tables = {name: report.plan_rows(name, mirror_plan) for name, mirror_plan in plans.items()}
     if order.csv is not None:
         report.write_table(order.csv, [row for rows in tables.values() for row in rows])
     if order.picture is not None:
@@ -253,12 +253,12 @@ def _plans(
         document = report.plans_document(plans, fleets, order.target_names)
         order.print_json({"criterion": criterion, **document})
         return
-    for name, one in plans.items():
-        _print_plan(name, one, tables[name])
+    for name, mirror_plan in plans.items():
+        _print_plan(name, mirror_plan, tables[name])
     order.print_files()
 
 
-def _print_plan(name: str, one: "SightingPlan", rows: list[dict[str, Any]]) -> None:
+def _print_plan(name: str, mirror_plan: "SightingPlan", rows: list[dict[str, Any]]) -> None:
     print_table(
         ["time", "target", "sun azimuth", "elevation", "rank", "error"],
         [
@@ -272,8 +272,8 @@ def _print_plan(name: str, one: "SightingPlan", rows: list[dict[str, Any]]) -> N
             ]
             for r in rows
         ],
-        title=f"{name}: expected beam error {1e3 * one.before:.2f} mrad before, "
-        f"{1e3 * one.error[-1]:.2f} mrad after",
+        title=f"{name}: expected beam error {1e3 * mirror_plan.before:.2f} mrad before, "
+        f"{1e3 * mirror_plan.error[-1]:.2f} mrad after",
     )
 
 
@@ -286,7 +286,7 @@ def _campaign(
     from heliotrope.calibration.plan.campaign import plan_campaign
 
     with progress("scheduling", order.as_json) as step:
-        found = plan_campaign(
+        campaign = plan_campaign(
             fleets,
             plant.site,
             order.targets,
@@ -298,23 +298,23 @@ def _campaign(
             count=order.count,
             progress=step,
         )
-    document = report.campaign_document(found, fleets, order.target_names)
+    document = report.campaign_document(campaign, fleets, order.target_names)
     rows = document["measurements"]
     if order.csv is not None:
         report.write_table(order.csv, rows)
     if order.picture is not None:
         position = np.concatenate([fleet.mechanism.position for fleet in fleets])
-        figure = report.campaign_picture(found, position, order.target_names)
+        figure = report.campaign_picture(campaign, position, order.target_names)
         report.write_picture(order.picture, figure)
     if order.as_json:
         order.print_json(document)
         return
     _print_campaign(rows)
     print(
-        f"{len(rows):,} measurements in {found.slots:,} slots, "
-        f"{len(np.unique(found.heliostat)):,} of {sum(map(len, fleets)):,} heliostats; expected "
-        f"beam error of the field: {1e3 * found.before:.2f} mrad before, "
-        f"{1e3 * found.after:.2f} mrad after"
+        f"{len(rows):,} measurements in {campaign.slots:,} slots, "
+        f"{len(np.unique(campaign.heliostat)):,} of {sum(map(len, fleets)):,} heliostats; expected "
+        f"beam error of the field: {1e3 * campaign.before:.2f} mrad before, "
+        f"{1e3 * campaign.after:.2f} mrad after"
     )
     order.print_files()
 

@@ -69,28 +69,28 @@ def simulate(
         worlds = mixed(number) if world == [ANY] else tuple(world or ())
         seconds = length_of(worlds, hours)
         plans.append(RunPlan(number, seconds, heliostats, pause, tuple(only or ()), worlds=worlds))
-    found = run_many(
+    result = run_many(
         plans,
         processes=processes,
         budget=float("inf") if minutes is None else 60.0 * minutes,
         progress=progress,
     )
-    document = _document(found)
+    document = _document(result)
     if results is not None:
         about = {"commit": _commit(), "worlds": world or [], "seeds": [seed, seed + runs - 1]}
         write_text(results, json.dumps(about | document, indent=1) + "\n")
-    if shrink and found.broken:
-        document["shrunk"] = _shrunk(plans, found)
+    if shrink and result.broken:
+        document["shrunk"] = _shrunk(plans, result)
     if as_json:
         print_json(document)
     else:
         _print(document)
-    if found.broken:
+    if result.broken:
         raise typer.Exit(1)
 
 
 def _commit() -> str:
-    """Return the commit of the program, "" if it does not run from a repository."""
+    """Return the commit of the program; empty outside a repository."""
     git = shutil.which("git")
     if git is None:
         return ""
@@ -101,31 +101,31 @@ def _commit() -> str:
     return done.stdout.strip()
 
 
-def _document(found: Any) -> dict[str, Any]:
+def _document(result: Any) -> dict[str, Any]:
     from heliotrope.lcu import states
     from heliotrope.twin.invariants.invariants import TITLES, named
 
     return {
-        "runs": found.runs,
-        "hours": found.seconds / 3600.0,
-        "faults": dict(sorted(found.faults.items())),
-        "emergencies": found.counts["emergencies"],
-        "proofs": found.counts["proofs"],
-        "states": {states.STATES[k]: v for k, v in sorted(found.states.items())},
+        "runs": result.runs,
+        "hours": result.seconds / 3600.0,
+        "faults": dict(sorted(result.faults.items())),
+        "emergencies": result.counts["emergencies"],
+        "proofs": result.counts["proofs"],
+        "states": {states.STATES[k]: v for k, v in sorted(result.states.items())},
         "checks": [
-            {"number": n, "name": named(n), "invariant": title, "checks": found.checks[n]}
+            {"number": n, "name": named(n), "invariant": title, "checks": result.checks[n]}
             for n, title in TITLES.items()
         ],
-        "broken": found.broken,
+        "broken": result.broken,
     }
 
 
-def _shrunk(plans: list[Any], found: Any) -> list[str]:
+def _shrunk(plans: list[Any], result: Any) -> list[str]:
     """Return the reduced faults of the first run that failed."""
     from heliotrope.twin.world.simulation import run, shrink
 
     for plan in plans:
-        if any(f"--seed {plan.seed} " in line for line in found.broken):
+        if any(f"--seed {plan.seed} " in line for line in result.broken):
             outcome = run(plan)
             if not outcome.good:
                 less = shrink(outcome)

@@ -53,14 +53,14 @@ def sun(
         import pandas as pd
 
         moments = pd.DatetimeIndex([moment]).tz_convert("UTC")
-    found = solar.position(moments, site, algorithm=algorithm)
+    position = solar.position(moments, site, algorithm=algorithm)
     rows = [
         {
             "time": t.isoformat(),
-            "azimuth_deg": float(np.degrees(found.azimuth[i])),
-            "elevation_deg": float(np.degrees(found.elevation[i])),
-            "true_elevation_deg": float(np.degrees(found.true_elevation[i])),
-            "vector": found.vector[i],
+            "azimuth_deg": float(np.degrees(position.azimuth[i])),
+            "elevation_deg": float(np.degrees(position.elevation[i])),
+            "true_elevation_deg": float(np.degrees(position.true_elevation[i])),
+            "vector": position.vector[i],
         }
         for i, t in enumerate(moments)
     ]

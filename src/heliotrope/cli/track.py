@@ -116,9 +116,9 @@ def track(
             raise typer.Exit(1)
         return
     own = _sun_of(field) if sun is None and time is None else None
-    given = normalize(parse_point(sun, "sun"), "sun") if sun is not None else own
-    vector = solar.vector(moment, plant.site) if given is None else given
-    _check_sun(heliostat, vector, moment.isoformat() if given is None else "")
+    direction = normalize(parse_point(sun, "sun"), "sun") if sun is not None else own
+    vector = solar.vector(moment, plant.site) if direction is None else direction
+    _check_sun(heliostat, vector, moment.isoformat() if direction is None else "")
     result = tracking.track(mechanism, vector, goal, local=local)
     _check_pose(heliostat, tracking.TrackingStatus(int(result.chosen(result.status))))
     if not local:

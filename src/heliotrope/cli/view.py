@@ -44,18 +44,18 @@ def view(
     if kind not in (".html", ".glb"):
         raise InputError(f"view: {out.name}; give a file that ends in .html or .glb")
     plant = open_plant(field)
-    one = plant[heliostat]
-    mechanism, width, height = one.calibrated, one.width, one.height
+    mirror = plant[heliostat]
+    mechanism, width, height = mirror.calibrated, mirror.width, mirror.height
     goal = np.array(aim_of(plant, heliostat, aim, target))
     times = sunlit(parse_time(time), plant.site, every, _LEAST)
     light = np.asarray(solar.vector(times, plant.site))
-    found = tracking.track(mechanism, light, goal)
-    good = found.reachable
-    check_front(plant, heliostat, goal, found.chosen(found.vertex)[good])
+    solution = tracking.track(mechanism, light, goal)
+    good = solution.reachable
+    check_front(plant, heliostat, goal, solution.chosen(solution.vertex)[good])
     if not good.any():
         raise InputError(f"heliostat {heliostat}: the beam reaches the aim at no time of this day")
-    angles = np.unwrap(found.best_angles[good], axis=0)
-    chosen = [at for at, one in zip(times, good, strict=True) if one]
+    angles = np.unwrap(solution.best_angles[good], axis=0)
+    chosen = [at for at, reached in zip(times, good, strict=True) if reached]
     seconds = np.array([(at - chosen[0]).total_seconds() for at in chosen]) / _PACE
     if kind == ".glb":
         data = animation.glb(mechanism, angles, seconds, width, height)

@@ -49,21 +49,21 @@ def read_members(
         with zipfile.ZipFile(file) as archive:
             entries = {entry.filename: entry for entry in archive.infolist()}
             check_count(file, len(entries), MEMBERS, "members", f"it should be {what}")
-            wanted = list(names) or list(entries)
-            missing = [name for name in wanted if name not in entries]
+            required = list(names) or list(entries)
+            missing = [name for name in required if name not in entries]
             if missing:
                 kind = "array" if missing[0].endswith(".npy") else "member"
                 short = [name.removesuffix(".npy") for name in (missing[0], *entries)]
-                there = ", ".join(short[1:9]) or "nothing"
-                raise FormatError(file, f"no {kind} {short[0]!r} in it, only {there:.200}")
-            size = sum(entries[name].file_size for name in wanted)
+                present = ", ".join(short[1:9]) or "nothing"
+                raise FormatError(file, f"no {kind} {short[0]!r} in it, only {present:.200}")
+            size = sum(entries[name].file_size for name in required)
             if size > most:
                 raise FormatError(
                     file,
                     f"{file.stat().st_size / MIB:.3g} MiB expand to {size / MIB:,.0f} MiB, above "
                     f"the limit of {most / MIB:.0f} MiB; it should be {what}",
                 )
-            return {name: _expanded(archive, entries[name]) for name in wanted}
+            return {name: _expanded(archive, entries[name]) for name in required}
     except FormatError:
         raise
     except _DAMAGED as error:

@@ -61,7 +61,7 @@ class Rows:
     columns
         Cells by column, (M,) each.
     header
-        Place of the column names in the file, "" if not known.
+        Place of the column names in the file; empty if unknown.
     heliostat
         Name of the heliostat in each row, for messages, (M,).
     reasons
@@ -97,13 +97,13 @@ class Rows:
     @property
     def problems(self) -> list[FormatError]:
         """The errors of the rows that cannot be used, where a table is used whole or not at all."""
-        found = []
+        errors = []
         for i, (column, reason) in sorted(self.reasons.items()):
             name = self._heliostat(i)
             where = f"{self.places[i]}, column {column}" if column else self.places[i]
             text = " ".join(f"{name}: {reason}".split()) if name else " ".join(reason.split())
-            found.append(FormatError(self.path, text, where))
-        return found
+            errors.append(FormatError(self.path, text, where))
+        return errors
 
     def refuse_bad(self) -> None:
         """Raise the first of `problems`, if there is one."""
@@ -136,9 +136,11 @@ class Rows:
         """Raise FormatError if one of the columns is not there."""
         for name in names:
             if name not in self.columns:
-                there = ", ".join(list(self.columns)[:12]) or "none"
+                present = ", ".join(list(self.columns)[:12]) or "none"
                 raise FormatError(
-                    self.path, f"there is no column {name}; add it. There are {there}", self.header
+                    self.path,
+                    f"there is no column {name}; add it. There are {present}",
+                    self.header,
                 )
 
     def refuse(self, i: "int | np.integer[Any]", column: str, reason: str) -> None:
@@ -152,7 +154,7 @@ class Rows:
         return ["" if _empty(cell) else str(cell) for cell in self.columns[column]]
 
     def filled(self, column: str) -> npt.NDArray[np.bool_]:
-        """Return which cells are not empty, (M,)."""
+        """Return the mask of the cells that are not empty, (M,)."""
         return np.array([not _empty(cell) for cell in self.columns[column]], dtype=np.bool_)
 
     def numbers(self, column: str, what: str, empty: float | None = None) -> FloatArray:
@@ -303,12 +305,12 @@ def read_cells(
 def _separator(line: str, separators: str) -> str:
     """Return the separator of a row, which may have decimal commas between semicolons."""
     bare = re.sub(r'"[^"]*"', "", line)
-    counts = {each: bare.count(each) for each in separators}
+    counts = {separator: bare.count(separator) for separator in separators}
     if counts.get(";") and all(piece.count(",") < 2 for piece in bare.split(";")):
         return ";"
     # Blanks separate only where nothing else does.
     blanks = counts.pop(" ", 0)
-    best = max(counts, key=lambda each: counts[each])
+    best = max(counts, key=lambda separator: counts[separator])
     return best if counts[best] else " " if blanks else ","
 
 
@@ -348,12 +350,12 @@ def rows_under(
     place, names = header[0], [_tidy(cell) for cell in header[1]]
     while names and not names[-1]:
         names.pop()
-    seen: set[str] = set()
+    taken: set[str] = set()
     for k, name in enumerate(names):
-        if not name or name in seen:
-            wrong = f"column {name} occurs twice" if name else f"column {k + 1} has no name"
-            raise FormatError(path, f"{wrong}; name each column once", place)
-        seen.add(name)
+        if not name or name in taken:
+            problem = f"column {name} occurs twice" if name else f"column {k + 1} has no name"
+            raise FormatError(path, f"{problem}; name each column once", place)
+        taken.add(name)
     rows = Rows(path, places, {}, place)
     # Empty columns at the end; in a single row a further cell has moved all others.
     widths = {len(cells) for cells in table}
@@ -444,9 +446,9 @@ def find_heliostats(rows: Rows, column: str, names: Sequence[str]) -> npt.NDArra
     """Return the row of each heliostat named in the table; unknown names are left out."""
     index = rows_of(names)
     rows.heliostat = rows.texts(column)
-    found = np.array([index.get(n, index.get(n.strip(), -1)) for n in rows.heliostat], np.intp)
+    indices = np.array([index.get(n, index.get(n.strip(), -1)) for n in rows.heliostat], np.intp)
     reasons = {"": "the cell is empty; name a heliostat"}
-    for i in np.flatnonzero(found < 0):
+    for i in np.flatnonzero(indices < 0):
         name = rows.heliostat[i]
         if name not in reasons:
             # Close names are looked for among all names: seconds in a table of another field.
@@ -456,7 +458,7 @@ def find_heliostats(rows: Rows, column: str, names: Sequence[str]) -> npt.NDArra
                 else f"there is no heliostat {_shown(name)}"
             )
         rows.refuse(i, column, reasons[name])
-    return found
+    return indices
 
 
 def alike(name: str) -> str:
@@ -495,15 +497,15 @@ def check_names(what: str, names: Iterable[str]) -> None:
     forms = re.sub(r"[^\S\n]+", "", text).split("\n") if listed else []
     if len(forms) == len(listed) == len(set(forms)) and all(forms):
         return
-    seen: dict[str, str] = {}
+    taken: dict[str, str] = {}
     for name in listed:
         if not name.strip():
             raise InputError(f"{what}: an empty name; each {what} needs one")
-        if other := seen.get(alike(name), ""):
+        if other := taken.get(alike(name), ""):
             twice = "the name occurs twice; names are unique"
             close = f"there is {other} too; names differ by more than case and blanks"
             raise InputError(f"{what} {name}: {twice if other == name else close}")
-        seen[alike(name)] = name
+        taken[alike(name)] = name
 
 
 def _numbers(cells: Cells) -> FloatArray:
@@ -529,7 +531,7 @@ def _number(cell: Any) -> float:
 
 
 def _hint(text: str) -> str:
-    """Return what to do about a number written in the fashion of another country, "" if none is."""
+    """Return the remedy for a number in the notation of another country, or an empty text."""
     if _DECIMAL_COMMA.fullmatch(text):
         return "write a point, not a comma"
     if _THOUSANDS.fullmatch(text):

@@ -40,8 +40,8 @@ class JsonNode:
         if not isinstance(self.value, dict):
             raise self.fail(f"expected an object with {key!r}, found {self.value!r:.60}")
         if key not in self.value:
-            there = ", ".join(list(self.value)[:8]) or "nothing"
-            raise self.fail(f"{key!r} is missing; there is {there}")
+            present = ", ".join(list(self.value)[:8]) or "nothing"
+            raise self.fail(f"{key!r} is missing; there is {present}")
         return JsonNode(self.path, self.value[key], f"{self.where}.{key}" if self.where else key)
 
     def any_of(self, *keys: str) -> "JsonNode":

@@ -82,7 +82,7 @@ _OWN: tuple[tuple[bytes, str, str, str], ...] = (
 
 
 def foreign(path: Path, start: bytes) -> str:
-    """Return what a file is that nothing here reads, and what to do; "" for any other.
+    """Return the kind of a file that no reader accepts, and the remedy; "" for any other.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def foreign(path: Path, start: bytes) -> str:
 
 
 def instead(start: bytes, what: str, own: str = "") -> str:
-    """Return what a file is that is not ``what``, and which command reads it; "" if not known.
+    """Return the kind of a file that is not ``what``, and the command that reads it; or "".
 
     Parameters
     ----------

@@ -25,10 +25,10 @@ def moment(text: str) -> datetime:
     ValueError
         If it is not a time.
     """
-    found = _SECOND_60.fullmatch(text.strip())
-    if found is None:
+    match = _SECOND_60.fullmatch(text.strip())
+    if match is None:
         return datetime.fromisoformat(text.strip())
-    time = datetime.fromisoformat(f"{found[1]}59{found[2]}") + timedelta(seconds=1)
+    time = datetime.fromisoformat(f"{match[1]}59{match[2]}") + timedelta(seconds=1)
     after = time if time.tzinfo is None else time.astimezone(UTC)
     if (after.day, after.hour, after.minute, after.second) != (1, 0, 0, 0):
         raise ValueError("second 60 exists only at 23:59 UTC on the last day of a month")
@@ -43,12 +43,12 @@ def parse_time(text: str) -> float:
     InputError
         If it is not a time, or has no time zone.
     """
-    found = _TIME.fullmatch(text.strip())
-    if found is None:
+    match = _TIME.fullmatch(text.strip())
+    if match is None:
         raise InputError(
             f"{shown(text)} is not an ISO 8601 time; write it like 2026-06-21T12:00:00Z"
         )
-    day, clock, digits, zone = found.groups()
+    day, clock, digits, zone = match.groups()
     if zone is None:
         raise InputError(
             f"{text.strip()} has no time zone; append Z if it is UTC, or an offset such as +02:00"

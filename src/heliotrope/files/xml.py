@@ -81,8 +81,8 @@ def read_xml(path: str | Path, what: str) -> Document:
     tags = content.count(b"<")
     check_count(file, tags, 2 * XML_PARTS, "tags", f"divide it; it should be {what}")
     # The attributes of a tag are in memory as a whole before they can be counted.
-    if (found := _LONG_TAG.search(content)) is not None:
-        line = content.count(b"\n", 0, found.start()) + 1
+    if (tag := _LONG_TAG.search(content)) is not None:
+        line = content.count(b"\n", 0, tag.start()) + 1
         raise FormatError(
             file,
             f"a tag or a text exceeds the limit of {XML_TAG // 1024:,} KiB; it should be {what}",
@@ -119,9 +119,9 @@ class _Builder:
             f"line {self.parser.CurrentLineNumber}",
         )
 
-    def _start(self, tag: str, given: list[str]) -> None:
+    def _start(self, tag: str, attributes: list[str]) -> None:
         line = self.parser.CurrentLineNumber
-        self._parts += 1 + len(given) // 2
+        self._parts += 1 + len(attributes) // 2
         name, limit = "elements and attributes", XML_PARTS
         check_count(self._file, self._parts, limit, name, "divide the file", f"line {line}")
         if len(self._open) >= DEPTH:
@@ -130,7 +130,7 @@ class _Builder:
                 f"nested too deeply: more than {DEPTH} levels; write it flatter",
                 f"line {line}",
             )
-        pairs = zip(map(_qualified, given[::2]), given[1::2], strict=True)
+        pairs = zip(map(_qualified, attributes[::2]), attributes[1::2], strict=True)
         self._open.append((_qualified(tag), tuple(pairs), [], line))
 
     def _end(self, _tag: str) -> None:

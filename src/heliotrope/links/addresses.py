@@ -70,10 +70,10 @@ def check_encryption(path: Path, host: str, where: str, accepted: bool) -> None:
         Clear text beyond this machine.
     """
     try:
-        here = ip_address(host).is_loopback
+        local = ip_address(host).is_loopback
     except ValueError:
-        here = host == "localhost"
-    if not (here or accepted):
+        local = host == "localhost"
+    if not (local or accepted):
         raise FormatError(
             path,
             f"{host} is not this machine, and the link is not encrypted; set up TLS, or write "

@@ -136,9 +136,9 @@ class VirtualClock:
 
 async def sleep_until(clock: Clock, instant: float) -> None:
     """Wait until `clock` reaches `instant`, in s of its monotonic time."""
-    while (left := instant - clock.monotonic()) > 0.0:
+    while (remaining := instant - clock.monotonic()) > 0.0:
         # A remainder left by rounding would not advance a virtual clock.
-        await asyncio.sleep(max(left, 1e-6))
+        await asyncio.sleep(max(remaining, 1e-6))
 
 
 # -- the GPS scale ---------------------------------------------------------------------
@@ -264,9 +264,9 @@ class _NumberedTask(asyncio.Task[Any]):
     A `TaskGroup` cancels a set of tasks in the order of their hashes, which are else addresses.
     """
 
-    def __init__(self, coro: Coroutine[Any, Any, Any], number: int, **given: Any) -> None:
+    def __init__(self, coro: Coroutine[Any, Any, Any], number: int, **options: Any) -> None:
         self._number = number
-        super().__init__(coro, **given)
+        super().__init__(coro, **options)
 
     def __hash__(self) -> int:
         return self._number
@@ -288,14 +288,14 @@ class _NoWait(selectors.SelectSelector):
         return super().register(fileobj, events, data)
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        found = super().select(0.0)
-        if not found and timeout is None:
+        events = super().select(0.0)
+        if not events and timeout is None:
             raise RuntimeError(
                 "virtual time stands still: every task waits, and no timer is left to wake one"
             )
-        if not found and timeout is not None:
+        if not events and timeout is not None:
             self.now += max(0.0, timeout)
-        return found
+        return events
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
@@ -325,7 +325,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             self._ready: _Drawn = _Drawn(random.Random(seed), nothing)
         numbers = itertools.count()
         self.set_task_factory(
-            lambda loop, coro, **given: _NumberedTask(coro, next(numbers), loop=loop, **given)
+            lambda loop, coro, **options: _NumberedTask(coro, next(numbers), loop=loop, **options)
         )
 
     def time(self) -> float:

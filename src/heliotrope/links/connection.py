@@ -136,7 +136,7 @@ class CarriedLink:
 
     @property
     def problem(self) -> str:
-        """Why the link is not connected, "" if it is."""
+        """Why the link is not connected; empty while it is."""
         return "" if self.connected else self._problem
 
     @property

@@ -110,7 +110,7 @@ class GpsdReader:
     receiver
         As last reported.
     error
-        Last error reported by gpsd, "" if none.
+        Last error reported by gpsd; empty without one.
     refused
         Count of lines that do not come from gpsd.
     """
@@ -210,7 +210,7 @@ class Gpsd:
 
     @property
     def problem(self) -> str:
-        """Why there is no fix, "" if there is one (or there has hardly been time for one)."""
+        """Why there is no fix; empty with a fix, and during the time that the first one takes."""
         now = self._clock.monotonic()
         if now - max(self._fixed_at, self._begun) <= _PATIENCE:
             return ""

@@ -217,9 +217,9 @@ class _MemoryCarrier:
             if isinstance(item, bytes):
                 return item
             # At least 1 µs: a remainder left by rounding would not advance a virtual clock.
-            left = None if item is None else max(1e-6, item - self._in.clock.monotonic())
+            remaining = None if item is None else max(1e-6, item - self._in.clock.monotonic())
             try:
-                async with asyncio.timeout(left):
+                async with asyncio.timeout(remaining):
                     await self._in.news.wait()
             except TimeoutError:
                 continue

@@ -55,7 +55,7 @@ class KeyRing:
 
     @property
     def newest(self) -> bytes:
-        """The newest key, b"" if there is none."""
+        """The newest key; empty without a key."""
         return self.keys[0] if self.keys else b""
 
 
@@ -68,10 +68,10 @@ def ring_of(name: str, key: bytes | KeyRing) -> KeyRing:
         A key of less than 16 bytes, or a name that is empty or longer than 64 bytes.
     """
     ring = key if isinstance(key, KeyRing) else KeyRing(key)
-    for each in ring.keys or (b"",):
-        if len(each) < _SHORTEST_KEY:
+    for secret in ring.keys or (b"",):
+        if len(secret) < _SHORTEST_KEY:
             raise InputError(
-                f"cluster {name}: a key of {len(each)} bytes; give at least {_SHORTEST_KEY} "
+                f"cluster {name}: a key of {len(secret)} bytes; give at least {_SHORTEST_KEY} "
                 "random ones"
             )
     if not 0 < len(name.encode()) <= _LONGEST_NAME:
@@ -136,7 +136,7 @@ class Keys:
         values = value if isinstance(value, list) else [value]
         if not 1 <= len(values) <= most:
             raise FormatError(self._path, f"{len(values)} keys; give 1 to {most}", name)
-        keys = tuple(self._key(name, each) for each in values)
+        keys = tuple(self._key(name, entry) for entry in values)
         if len(set(keys)) < len(keys):
             raise FormatError(self._path, "the same key twice; give each once", name)
         return keys
@@ -203,9 +203,9 @@ class KeyFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._held: Keys | None = None
-        there = path.exists() and path.stat().st_size > 0
-        self._table = HELIOSTATS if there and HELIOSTATS in read_toml(path, "a key file") else ""
-        if there or path.exists():
+        filled = path.exists() and path.stat().st_size > 0
+        self._table = HELIOSTATS if filled and HELIOSTATS in read_toml(path, "a key file") else ""
+        if filled or path.exists():
             self._held = Keys(path, self._table or CLUSTERS)
 
     @property
@@ -213,8 +213,8 @@ class KeyFile:
         """The keys of links, by name: of clusters, or ``plant`` of a cluster's own file."""
         if self._held is None:
             return {}
-        found = {"plant": self._held.plant} if self._held.plant else {}
-        return found if self._table else {**found, **self._held.members}
+        own = {"plant": self._held.plant} if self._held.plant else {}
+        return own if self._table else {**own, **self._held.members}
 
     def new(self, clusters: Sequence[str]) -> dict[str, bytes]:
         """Make a key for each cluster that has none; return them.
@@ -371,9 +371,9 @@ def write_private(path: Path, text: str, *, new: bool = False) -> None:
         with os.fdopen(handle, "wb") as stream:
             os.fchmod(stream.fileno(), 0o600)
             if path.exists() and not new:
-                there = path.stat()
-                if (there.st_uid, there.st_gid) != (os.geteuid(), os.getegid()):
-                    os.fchown(stream.fileno(), there.st_uid, there.st_gid)
+                status = path.stat()
+                if (status.st_uid, status.st_gid) != (os.geteuid(), os.getegid()):
+                    os.fchown(stream.fileno(), status.st_uid, status.st_gid)
             stream.write(text.encode())
             stream.flush()
             os.fsync(stream.fileno())

@@ -180,7 +180,7 @@ class Link(Protocol):
 
     @property
     def problem(self) -> str:
-        """Why the link is not connected, "" if it is."""
+        """Why the link is not connected; empty while it is."""
         ...
 
     @property
@@ -233,7 +233,7 @@ class Bus(Protocol):
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return the answer, b"" if there is none."""
+        """Send a frame and return the answer; empty without one."""
         ...
 
     async def transmit(
@@ -325,8 +325,8 @@ class Heartbeat:
             due = self._clock.monotonic() + self._period
             await beat()
             # Not a timeout, which cancels the task twice a second: a field has hundreds of links.
-            left = max(1e-6, due - self._clock.monotonic())
-            alarm = asyncio.get_running_loop().call_later(left, self._now.set)
+            remaining = max(1e-6, due - self._clock.monotonic())
+            alarm = asyncio.get_running_loop().call_later(remaining, self._now.set)
             try:
                 await self._now.wait()
             finally:

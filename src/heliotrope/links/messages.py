@@ -281,8 +281,8 @@ Message = (
     | Answer
 )
 _KINDS: dict[str, type[Any]] = {
-    each.kind: each
-    for each in (
+    message.kind: message
+    for message in (
         Lease,
         Command,
         Emergency,
@@ -326,12 +326,12 @@ def decode(data: bytes) -> Message:
     if kind is None:
         raise ProtocolError(f"message of unknown kind {fields.get('kind')!r}")
     values: dict[str, Any] = {"block": block} if hasattr(kind, "block") else {}
-    for name, wanted, read in _FIELDS[kind.kind]:
+    for name, expected, read in _FIELDS[kind.kind]:
         if name in fields:
             value = values[name] = read(fields[name])
             if value is None:
-                given = fields[name]
-                raise ProtocolError(f"{kind.kind}: {name} is {given!r:.60}, not {wanted}")
+                received = fields[name]
+                raise ProtocolError(f"{kind.kind}: {name} is {received!r:.60}, not {expected}")
     try:
         message: Message = kind(**values)
     except TypeError as error:
@@ -384,9 +384,9 @@ _READERS: dict[Any, Callable[[Any], Any]] = {
 #: For each kind: names, types and converters of the fields of its line.
 _FIELDS: dict[str, tuple[tuple[str, Any, Callable[[Any], Any]], ...]] = {
     kind: tuple(
-        (each.name, each.type, _READERS[each.type])
-        for each in dataclasses.fields(of)
-        if each.name != "block"
+        (field.name, field.type, _READERS[field.type])
+        for field in dataclasses.fields(of)
+        if field.name != "block"
     )
     for kind, of in _KINDS.items()
 }

@@ -249,7 +249,7 @@ class _MqttCarrier:
 
 
 def _asked_of_broker(longest: int) -> Properties:
-    """Return what the broker is asked when connecting: no packets with more than a payload."""
+    """Return the requests to the broker at connection: no packet larger than a payload."""
     properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
     properties.MaximumPacketSize = longest + _ROOM
     return properties

@@ -30,22 +30,22 @@ class _Renewal:
 
     def __init__(self, files: Sequence[Path], take: Callable[[], None]) -> None:
         self._files, self._take = tuple(files), take
-        self._seen: tuple[_State, ...] | None = None
+        self._last_state: tuple[_State, ...] | None = None
 
     def look(self) -> str:
-        """Take the files if they have changed; return why they cannot be used, "" if they can.
+        """Take changed files; return why they cannot be used, or an empty text.
 
-        Files that cannot be used are tried again at each look.
+        Files that cannot be used are tried again at each check.
         """
-        found = tuple(_state(file) for file in self._files)
-        if found == self._seen:
+        current = tuple(_state(file) for file in self._files)
+        if current == self._last_state:
             return ""
         try:
             self._take()
         except HeliotropeError as error:
-            self._seen = None
+            self._last_state = None
             return str(error)
-        self._seen = found
+        self._last_state = current
         return ""
 
 
@@ -54,17 +54,17 @@ class _Certificate:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._seen: _State = None
+        self._last_state: _State = None
         self.end: datetime | None = None
         self.problem = ""
 
     def look(self) -> None:
         """Read its end again if the file has changed."""
-        found = _state(self.path)
-        if self.end is not None and found == self._seen:
+        current = _state(self.path)
+        if self.end is not None and current == self._last_state:
             return
         try:
-            self.end, self.problem, self._seen = end_of(self.path), "", found
+            self.end, self.problem, self._last_state = end_of(self.path), "", current
         except HeliotropeError as error:
             self.end, self.problem = None, str(error)
 
@@ -99,7 +99,7 @@ class Papers:
         self._renewals: dict[str, _Renewal] = {}
         self._certificates: list[_Certificate] = []
         self._problems: dict[str, str] = {}
-        self._told: dict[Path, tuple[int | None, str]] = {}
+        self._reported: dict[Path, tuple[int | None, str]] = {}
 
     def renew(self, name: str, files: Sequence[Path], take: Callable[[], None]) -> None:
         """Call ``take`` in a thread whenever one of some files changes, and once at the start."""
@@ -111,10 +111,10 @@ class Papers:
 
     def lines(self) -> list[str]:
         """Return the end of each certificate in words."""
-        for each in self._certificates:
-            each.look()
+        for certificate in self._certificates:
+            certificate.look()
         now = self._clock.utc()
-        return [each.line(now) for each in self._certificates]
+        return [certificate.line(now) for certificate in self._certificates]
 
     @contextlib.asynccontextmanager
     async def watched(self, on_alarm: Callable[[Alarm], None]) -> AsyncIterator[None]:
@@ -138,42 +138,42 @@ class Papers:
 
     def look(self) -> list[Alarm]:
         """Take files that have changed; return alarms that begin, end, or come again."""
-        found = []
+        changes = []
         for name, renewal in self._renewals.items():
             problem = renewal.look()
             if problem != self._problems.get(name, ""):
                 kind = alarms.RENEWAL
-                found.append(kind.raised(name, problem=problem) if problem else kind.ended(name))
+                changes.append(kind.raised(name, problem=problem) if problem else kind.ended(name))
             self._problems[name] = problem
         now = self._clock.utc()
-        for each in self._certificates:
-            each.look()
-            found += self._end_of(each, now)
-        return found
+        for certificate in self._certificates:
+            certificate.look()
+            changes += self._end_of(certificate, now)
+        return changes
 
-    def _end_of(self, each: _Certificate, now: datetime) -> list[Alarm]:
-        kind, days, path = alarms.CERTIFICATE, each.days(now), each.path
-        state = (days, each.problem)
-        if self._told.get(path) == state:
+    def _end_of(self, certificate: _Certificate, now: datetime) -> list[Alarm]:
+        kind, days, path = alarms.CERTIFICATE, certificate.days(now), certificate.path
+        state = (days, certificate.problem)
+        if self._reported.get(path) == state:
             return []
-        stood = path in self._told
+        stood = path in self._reported
         name = path.name
         # A new day is a new occurrence, even for somebody who acknowledged the last one.
         over = [kind.ended(name)] if stood else []
         if days is not None and days >= DAYS:
-            self._told.pop(path, None)
+            self._reported.pop(path, None)
             return over
-        self._told[path] = state
+        self._reported[path] = state
         worse = days is not None and days < 0
-        return [*over, kind.raised(name, worse=worse, problem=each.line(now))]
+        return [*over, kind.raised(name, worse=worse, problem=certificate.line(now))]
 
 
 def _state(path: Path) -> _State:
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return None
-    return found.st_mtime_ns, found.st_ino, found.st_size, found.st_mode
+    return status.st_mtime_ns, status.st_ino, status.st_size, status.st_mode
 
 
 def end_of(path: Path) -> datetime:
@@ -193,8 +193,8 @@ def end_of(path: Path) -> datetime:
             "cryptography is not installed; say pip install 'heliotrope[control]'"
         ) from None
     try:
-        found = x509.load_pem_x509_certificates(path.read_bytes())
-        ends = [each.not_valid_after_utc for each in found]
+        certificates = x509.load_pem_x509_certificates(path.read_bytes())
+        ends = [certificate.not_valid_after_utc for certificate in certificates]
     except OSError as error:
         raise FormatError(path, f"cannot be read ({error.strerror})") from None
     except ValueError:

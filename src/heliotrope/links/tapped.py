@@ -70,7 +70,7 @@ class TappedLink:
 
     @property
     def problem(self) -> str:
-        """Why the link is not connected, "" if it is."""
+        """Why the link is not connected; empty while it is."""
         return self.inner.problem
 
     @property

@@ -62,7 +62,7 @@ class _Pipe(asyncio.Protocol):
         self._paused = False
         self._readable = asyncio.Event()
         self._writable = asyncio.Event()
-        self._gone = asyncio.Event()
+        self._ended = asyncio.Event()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Configure the socket, and report to the server, if there is one."""
@@ -135,7 +135,7 @@ class _Pipe(asyncio.Protocol):
         """Note that the transport has ended."""
         self._lost = self._lost or (str(exc) if exc else "the other end closed the connection")
         self._transport = None
-        self._gone.set()
+        self._ended.set()
         self._readable.set()
         self._writable.set()
 
@@ -152,7 +152,7 @@ class _Pipe(asyncio.Protocol):
         """End the connection at once, and wait until it is gone."""
         self.lose("closed")
         if self._transport is not None:
-            await self._gone.wait()
+            await self._ended.wait()
 
     async def read(self) -> bytes:
         while not self._frames:
@@ -294,14 +294,14 @@ class _Client:
             await asyncio.get_running_loop().create_connection(
                 lambda: pipe, self.host, self.port, ssl=context_of(self.tls)
             )
-            found = await _introduce(pipe, self.name, key, self.ring)
+            seal = await _introduce(pipe, self.name, key, self.ring)
         except BaseException as error:
             # The server may not have the new key yet: the next attempt is with the old one.
             self._turn = self._turn + 1 if isinstance(error, LinkError) else 0
             await pipe.close()
             raise
         self._turn = 0
-        return pipe, found
+        return pipe, seal
 
 
 class _Newcomers:
@@ -314,19 +314,19 @@ class _Newcomers:
     """
 
     def __init__(self, clusters: int) -> None:
-        self._most, self._each = clusters + _NEWCOMERS, clusters + _NEWCOMERS_EACH
+        self._most, self._most_by_address = clusters + _NEWCOMERS, clusters + _NEWCOMERS_EACH
         self._pipes: dict[_Pipe, None] = {}
 
     def enter(self, pipe: _Pipe) -> None:
         """Let a connection in; beyond the limits end the oldest of the busiest address."""
         self._pipes[pipe] = None
-        counts = Counter(one.address for one in self._pipes)
+        counts = Counter(other.address for other in self._pipes)
         busiest = pipe.address
-        if counts[busiest] <= self._each:
+        if counts[busiest] <= self._most_by_address:
             if len(self._pipes) <= self._most:
                 return
             busiest = counts.most_common(1)[0][0]
-        oldest = next(one for one in self._pipes if one.address == busiest)
+        oldest = next(other for other in self._pipes if other.address == busiest)
         self.leave(oldest)
         oldest.lose(f"{busiest} has too many connections in their handshake; the oldest ends")
 
@@ -441,7 +441,7 @@ class TcpServer:
         *,
         tls: TlsSource = None,
     ) -> None:
-        self._host, self._wanted = host, port
+        self._host, self._requested = host, port
         self._rings = {name: ring_of(name, key) for name, key in keys.items()}
         self._settings = settings or LinkSettings()
         self._tls = tls
@@ -481,11 +481,11 @@ class TcpServer:
         """
         try:
             server = await asyncio.get_running_loop().create_server(
-                lambda: _Pipe(_GREETING, self._arrive), self._host, self._wanted
+                lambda: _Pipe(_GREETING, self._arrive), self._host, self._requested
             )
         except OSError as error:
             raise LinkError(
-                f"cannot listen on {self._host}:{self._wanted} ({error.strerror or error}); is "
+                f"cannot listen on {self._host}:{self._requested} ({error.strerror or error}); is "
                 "another plant running there?"
             ) from None
         self.port = server.sockets[0].getsockname()[1]

@@ -28,10 +28,10 @@ class Buckets:
     def take(self, key: str) -> float:
         """Take a token; return the time until there is one again, s; 0 if one was taken."""
         now = self._now()
-        left, at = self._kept.pop(key, (self._burst, now))
-        left = min(self._burst, left + self._rate * (now - at))
-        wait = 0.0 if left >= 1.0 else (1.0 - left) / self._rate
-        self._kept[key] = (left - 1.0 if wait == 0.0 else left, now)
+        tokens, at = self._kept.pop(key, (self._burst, now))
+        tokens = min(self._burst, tokens + self._rate * (now - at))
+        wait = 0.0 if tokens >= 1.0 else (1.0 - tokens) / self._rate
+        self._kept[key] = (tokens - 1.0 if wait == 0.0 else tokens, now)
         if len(self._kept) > self._largest:
             self._kept.popitem(last=False)
         return wait

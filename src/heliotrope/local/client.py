@@ -194,10 +194,10 @@ def _receive(raw: socket.socket) -> Frame:
 
 
 def _exactly(raw: socket.socket, count: int) -> bytes:
-    found = bytearray()
-    while len(found) < count:
-        part = raw.recv(min(count - len(found), 1 << 20))
+    received = bytearray()
+    while len(received) < count:
+        part = raw.recv(min(count - len(received), 1 << 20))
         if not part:
             raise EOFError("the connection has ended")
-        found += part
-    return bytes(found)
+        received += part
+    return bytes(received)

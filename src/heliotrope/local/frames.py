@@ -3,7 +3,7 @@
 A frame is the mark ``HLP1``, the lengths of head and blob (uint32 each, little-endian), the head (a
 JSON object) and the blob (bytes). A request has ``id``, ``call``, ``arguments`` and, if a console
 makes it, ``for``: the person on whose behalf. An answer has the ``id`` with a ``value``, or with
-``error`` (its kind) and ``text``. The first frame of a connection says who is calling: ``key`` or
+``error`` (its kind) and ``text``. The first frame of a connection identifies the caller: ``key`` or
 ``token``.
 """
 
@@ -80,14 +80,14 @@ def head_of(data: bytes) -> dict[str, Any]:
     """
     try:
         # As text: of bytes json would accept surrogates, and UTF-16.
-        found = json.loads(data.decode(), parse_constant=_no_number, parse_float=_number)
+        head = json.loads(data.decode(), parse_constant=_no_number, parse_float=_number)
         if b"\\u" in data:
-            json.dumps(found, ensure_ascii=False).encode()
+            json.dumps(head, ensure_ascii=False).encode()
     except (ValueError, RecursionError):
         raise FrameError(f"local interface: a head of {len(data)} bytes that is not JSON") from None
-    if not isinstance(found, dict):
+    if not isinstance(head, dict):
         raise FrameError("local interface: a head that is not a JSON object")
-    return found
+    return head
 
 
 def _no_number(text: str) -> float:
@@ -95,19 +95,19 @@ def _no_number(text: str) -> float:
 
 
 def _number(text: str) -> float:
-    found = float(text)
-    if not math.isfinite(found):
+    value = float(text)
+    if not math.isfinite(value):
         raise ValueError(text)
-    return found
+    return value
 
 
 async def read_frame(
     reader: asyncio.StreamReader,
     most_head: int = ANSWER_HEAD,
     most_blob: int = ANSWER_BLOB,
-    wanted: Callable[[dict[str, Any]], bool] = lambda _: True,
+    accepts: Callable[[dict[str, Any]], bool] = lambda _: True,
 ) -> Frame:
-    """Read one frame; a blob that is not ``wanted`` with its head is passed over, not kept.
+    """Read one frame; a blob is kept if ``accepts`` holds for its head, else it is passed over.
 
     Raises
     ------
@@ -117,9 +117,9 @@ async def read_frame(
         If the connection ends.
     """
     head, blob = lengths(await reader.readexactly(PREFIX), most_head, most_blob)
-    found = head_of(await reader.readexactly(head))
-    if wanted(found):
-        return Frame(found, await reader.readexactly(blob))
+    content = head_of(await reader.readexactly(head))
+    if accepts(content):
+        return Frame(content, await reader.readexactly(blob))
     while blob:
         blob -= len(await reader.readexactly(min(blob, _PART)))
-    return Frame(found)
+    return Frame(content)

@@ -56,12 +56,12 @@ class LocalLimits:
     Attributes
     ----------
     strangers, callers, reserved
-        Connections that have not said who they are, those that have, and those of consoles: one
-        that begins may meet one that ends.
+        Connections without identification, those with it, and those of consoles: a new one
+        may meet one that ends.
     under_way, console_under_way
         Requests under way in one connection, and in one of a console, which many persons share.
     hello_s, answer_s
-        Time to say who is calling, and to take an answer, s.
+        Time to identify the caller, and to take an answer, s.
     pace_s
         Time between two new connections, s.
     """
@@ -216,23 +216,25 @@ class LocalServer(Generic[C]):
     async def _talk(self, reader: asyncio.StreamReader, peer: _Peer, caller: C) -> None:
         limits = self._limits
         most = limits.console_under_way if caller.reserved else limits.under_way
-        room, wanted = asyncio.Semaphore(most), functools.partial(self._blob, caller)
+        room, accepts = asyncio.Semaphore(most), functools.partial(self._blob, caller)
         works = set[asyncio.Task[None]]()
         async with asyncio.TaskGroup() as group:
             try:
                 while True:
                     await room.acquire()
-                    frame = await read_frame(reader, REQUEST_HEAD, REQUEST_BLOB, wanted)
+                    frame = await read_frame(reader, REQUEST_HEAD, REQUEST_BLOB, accepts)
                     if type(frame.head.get("id")) is not int:
                         raise FrameError("local interface: a request without a number")
-                    work = group.create_task(self._one(frame, peer, caller, room))
+                    work = group.create_task(self._answer_one(frame, peer, caller, room))
                     works.add(work)
                     work.add_done_callback(works.discard)
             except (FrameError, EOFError, OSError):
                 for work in works:
                     work.cancel()
 
-    async def _one(self, frame: Frame, peer: _Peer, caller: C, room: asyncio.Semaphore) -> None:
+    async def _answer_one(
+        self, frame: Frame, peer: _Peer, caller: C, room: asyncio.Semaphore
+    ) -> None:
         """Answer one request."""
         number, blob = frame.head["id"], b""
         try:

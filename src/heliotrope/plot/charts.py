@@ -249,13 +249,13 @@ def ellipses(
 def _draw_ellipses(ax: "Axes", points: FloatArray, covariance: npt.ArrayLike) -> None:
     from matplotlib.patches import Ellipse
 
-    given = np.asarray(covariance, dtype=np.float64)
-    if given.shape not in ((2, 2), (len(points), 2, 2)):
+    array = np.asarray(covariance, dtype=np.float64)
+    if array.shape not in ((2, 2), (len(points), 2, 2)):
         raise InputError(
-            f"covariance: shape {given.shape}; give (2, 2), or ({len(points)}, 2, 2), one for "
+            f"covariance: shape {array.shape}; give (2, 2), or ({len(points)}, 2, 2), one for "
             "each point"
         )
-    matrices = np.broadcast_to(given, (len(points), 2, 2))
+    matrices = np.broadcast_to(array, (len(points), 2, 2))
     known = np.isfinite(matrices).all(axis=(1, 2)) & np.isfinite(points).all(axis=1)
     for point, matrix in zip(points[known], matrices[known], strict=True):
         size, turn = np.linalg.eigh(matrix)
@@ -426,17 +426,17 @@ def drift(
             f"values {table.shape} and covariance {spread.shape} for {len(dates)} times and {size} "
             f"names; give ({len(dates)}, {size}) and ({len(dates)}, {size}, {size})"
         )
-    wanted = [n for n in names if shown_in(n) == shown_in(names[0])] if shown is None else shown
-    for name in wanted:
+    selected = [n for n in names if shown_in(n) == shown_in(names[0])] if shown is None else shown
+    for name in selected:
         if name not in names:
             raise UnknownNameError("parameter", name, names)
-    units = list(dict.fromkeys(shown_in(name) for name in wanted))
+    units = list(dict.fromkeys(shown_in(name) for name in selected))
     if len(units) != 1:
         listed = " and ".join(unit or "no unit" for _, unit in units) or "none"
         raise InputError(f"shown: parameters in {listed}; give some of one unit")
     ((scale, unit),) = units
     ax = _axes(ax)
-    for k, name in enumerate(wanted):
+    for k, name in enumerate(selected):
         p = list(names).index(name)
         middle, wide = scale * table[:, p], scale * np.sqrt(spread[:, p, p])
         colour = COLOURS[k % len(COLOURS)]

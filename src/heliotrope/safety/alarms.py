@@ -56,7 +56,7 @@ class AlarmKind:
     consequence, remedy
         What happens by itself, and what the operator should do: a sentence each.
     over
-        Text when it is over; "" if it never ends by itself.
+        Text when it is over; empty for an alarm that never ends by itself.
     worse
         Severity in the worse case that ``meaning`` names, if there is one.
     """

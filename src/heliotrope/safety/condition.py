@@ -62,7 +62,7 @@ class Severity(StrEnum):
         Upper case is accepted. An unknown word counts as `ALARM`: no alarm is lost because of its
         severity.
         """
-        return next((each for each in cls if each == word.lower()), cls.ALARM)
+        return next((severity for severity in cls if severity == word.lower()), cls.ALARM)
 
 
 class AcknowledgeRole(IntEnum):
@@ -211,7 +211,7 @@ class Condition:
 
     @property
     def worst(self) -> float:
-        """The value that stands for a missing reading."""
+        """The value that replaces a missing reading."""
         return math.inf if self.above else -math.inf
 
     def beyond(self, value: float) -> bool:

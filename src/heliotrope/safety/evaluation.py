@@ -147,11 +147,11 @@ def start(
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"condition {name}: it stands twice in the table")
-    given = dict(subjects or {})
-    for name in given:
+    subjects_of = dict(subjects or {})
+    for name in subjects_of:
         if name not in names:
             raise UnknownNameError("condition", name, names)
-    keys = ((row.name, subject) for row in rows for subject in given.get(row.name, ("",)))
+    keys = ((row.name, subject) for row in rows for subject in subjects_of.get(row.name, ("",)))
     return SafetyState(rows, now, {key: Track(seen=now) for key in keys})
 
 
@@ -249,20 +249,20 @@ def evaluate(
 
 def _advance(row: Condition, track: Track, reading: Reading | None, now: float) -> Track:
     """Return the track after a reading, or after none, at ``now``."""
-    value, seen, fresh = track.value, track.seen, False
-    if reading is not None and math.isfinite(reading.value) and seen <= reading.at <= now:
+    value, read_at, fresh = track.value, track.seen, False
+    if reading is not None and math.isfinite(reading.value) and read_at <= reading.at <= now:
         # Of two readings with the same time the worse counts.
         worse = value is None or (reading.value > value if row.above else reading.value < value)
-        if reading.at > seen or worse:
-            value, seen, fresh = reading.value, reading.at, True
-    counts = _counting(row, value, seen, now)
+        if reading.at > read_at or worse:
+            value, read_at, fresh = reading.value, reading.at, True
+    counts = _counting(row, value, read_at, now)
     beyond = row.beyond(counts)
     beyond_since = (now if track.beyond_since is None else track.beyond_since) if beyond else None
     safe_since = track.safe_since
     if not row.safe(counts):
         safe_since = None
     elif fresh and safe_since is None:
-        safe_since = seen
+        safe_since = read_at
     tripped_at, cleared, by = track.tripped_at, track.cleared, track.acknowledged_by
     if beyond_since is not None and now - beyond_since >= row.delay:
         # A second trip needs a second acknowledgement.
@@ -270,15 +270,15 @@ def _advance(row: Condition, track: Track, reading: Reading | None, now: float) 
         cleared, by = False, "" if track.tripped_at is None else by
     elif tripped_at is not None:
         # Safe time counts up to the last reading only, so that silence releases nothing.
-        cleared = safe_since is not None and seen - safe_since >= row.clear_for
+        cleared = safe_since is not None and read_at - safe_since >= row.clear_for
         if cleared and not row.latched:
             tripped_at, cleared = None, False
-    return Track(seen, value, beyond_since, safe_since, tripped_at, cleared, by)
+    return Track(read_at, value, beyond_since, safe_since, tripped_at, cleared, by)
 
 
-def _counting(row: Condition, value: float | None, seen: float, now: float) -> float:
+def _counting(row: Condition, value: float | None, read_at: float, now: float) -> float:
     """Return the value that the row is judged by now."""
-    age = now - seen
+    age = now - read_at
     if row.ages:
         return (0.0 if value is None else value) + age
     if age > row.stale_after:
@@ -366,7 +366,7 @@ def _strangers(readings: Mapping[Key, Reading], state: SafetyState, now: float) 
 def acknowledge(
     state: SafetyState, condition: str, who: str, role: AcknowledgeRole, subject: str = ""
 ) -> tuple[SafetyState, str]:
-    """Return the state after a person's acknowledgement, and why it was refused ("" if it was not).
+    """Return the state after a person's acknowledgement, and the reason of a refusal or "".
 
     Parameters
     ----------
@@ -400,7 +400,7 @@ def acknowledge(
 
 
 def _remains(row: Condition, track: Track, now: float) -> str:
-    """Return why a row whose cause has not gone for long enough cannot be acknowledged."""
+    """Return the refusal to acknowledge a row before its safe time is over."""
     if not row.safe(_counting(row, track.value, track.seen, now)):
         return f"the cause has not gone: {_said(row, track, now)}. {row.remedy}"
     safe = 0.0 if track.safe_since is None else track.seen - track.safe_since

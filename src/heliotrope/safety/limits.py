@@ -76,14 +76,14 @@ def settings_of(row: Condition) -> dict[str, Setting]:
     """Return the numbers of a row that a plant may set, by key; none if the row has no range."""
     if row.site is None:
         return {}
-    found: list[Setting] = []
+    settings: list[Setting] = []
     for end, size in _UNITS[row.unit].items():
         # Small angles read best in mrad, elevations in degrees.
         main = row.unit != "rad" or (row.site[1] < _SMALL) == (end == "_mrad")
         low, high = (float(f"{value / size:.4g}") for value in row.site)
         # The release lies on the safe side of the trip.
         free = (0.0, high) if row.above else (low, float(f"{_SAFEST[row.unit] / size:.4g}"))
-        found += [
+        settings += [
             Setting(f"trips{end}", "trips", size, low, high, main),
             Setting(f"releases{end}", "releases", size, *free, main),
         ]
@@ -92,8 +92,8 @@ def settings_of(row: Condition) -> dict[str, Setting]:
         if number in ("stale_after", "then_stow") and idle:
             continue
         most = min(high, row.then_stow) if number == "then_stow" else high
-        found.append(Setting(f"{number}_s", number, 1.0, low, most))
-    return {setting.key: setting for setting in found}
+        settings.append(Setting(f"{number}_s", number, 1.0, low, most))
+    return {setting.key: setting for setting in settings}
 
 
 def limited(table: Iterable[Condition], limits: Limits) -> tuple[Condition, ...]:
@@ -106,8 +106,8 @@ def limited(table: Iterable[Condition], limits: Limits) -> tuple[Condition, ...]
         contradict themselves or each other; the text begins with the row and the key.
     """
     rows = {row.name: row for row in table}
-    for name, given in limits.items():
-        rows[name] = _changed(_known(rows, name), given)
+    for name, row_limits in limits.items():
+        rows[name] = _changed(_known(rows, name), row_limits)
     for row in rows.values():
         if row.name in limits:
             _ordered(row, rows.values())
@@ -125,7 +125,7 @@ def numbers(table: Iterable[Condition]) -> dict[str, float]:
 
 
 def differences(before: Mapping[str, float], after: Mapping[str, float]) -> list[str]:
-    """Return what differs between two results of `numbers`, a line each: old, then new."""
+    """Return the differences of two results of `numbers`, a line each: old, then new."""
     return [
         f"{key}: {before[key]:g} → {value:g}"
         for key, value in after.items()
@@ -170,10 +170,10 @@ def _near(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
-def _changed(row: Condition, given: Mapping[str, float]) -> Condition:
+def _changed(row: Condition, row_limits: Mapping[str, float]) -> Condition:
     """Return a row with its numbers in a file."""
-    settings, found = settings_of(row), dict[str, float]()
-    for key, value in given.items():
+    settings, changes = settings_of(row), dict[str, float]()
+    for key, value in row_limits.items():
         setting = settings.get(key)
         if setting is None:
             known = f"; it takes {', '.join(settings)}"
@@ -182,10 +182,10 @@ def _changed(row: Condition, given: Mapping[str, float]) -> Condition:
             raise InputError(
                 f"{row.name}.{key} {value:g} is not within {setting.low:g} to {setting.high:g}"
             )
-        if setting.number in found:
+        if setting.number in changes:
             raise InputError(f"{row.name}.{key}: {setting.number} is given twice")
-        found[setting.number] = value * setting.size
-    trips, releases = found.get("trips", row.trips), found.get("releases", row.releases)
+        changes[setting.number] = value * setting.size
+    trips, releases = changes.get("trips", row.trips), changes.get("releases", row.releases)
     if not (releases < trips if row.above else releases > trips):
         side = "below" if row.above else "above"
         raise InputError(
@@ -194,7 +194,7 @@ def _changed(row: Condition, given: Mapping[str, float]) -> Condition:
         )
     try:
         # dataclasses.replace takes fields of several types; these are all floats.
-        changed = replace(row, **found)  # type: ignore[arg-type]
+        changed = replace(row, **changes)  # type: ignore[arg-type]
     except InputError as error:
         raise InputError(str(error).removeprefix("condition ")) from None
     latest = NOTICED.get(row.act, row.budget)

@@ -87,7 +87,7 @@ class ProofReport:
 
     @property
     def basis(self) -> str:
-        """What of the proof is measured and what is believed, in one line."""
+        """The measured and the believed parts of the proof, in one line."""
         parts = [self.flux.value]
         if self.flux is not FluxProof.BELOW and (self.complete or self.believed or self.followed):
             parts[0] += ", so this is believed: a stalled drive reports the same"
@@ -175,21 +175,21 @@ class Proof:
 
         Only the first report of a heliostat counts. One that it is done acknowledges the order too.
         """
-        told, ready = dict(acknowledged or {}), dict(done or {})
-        good_told = {node: at for node, at in told.items() if self._counts(node, at)}
-        good_ready = {node: at for node, at in ready.items() if self._counts(node, at)}
-        wrong = len(told) + len(ready) - len(good_told) - len(good_ready)
+        orders, ends = dict(acknowledged or {}), dict(done or {})
+        taken = {node: at for node, at in orders.items() if self._counts(node, at)}
+        ended = {node: at for node, at in ends.items() if self._counts(node, at)}
+        rejected = len(orders) + len(ends) - len(taken) - len(ended)
         return replace(
             self,
-            acknowledged={**good_ready, **good_told, **self.acknowledged},
-            done={**good_ready, **self.done},
-            refused=self.refused + wrong,
+            acknowledged={**ended, **taken, **self.acknowledged},
+            done={**ended, **self.done},
+            refused=self.refused + rejected,
         )
 
     def without(self, nodes: Iterable[str]) -> "Proof":
         """Return the proof without what some heliostats had done: it holds no longer."""
-        gone = frozenset(nodes)
-        return replace(self, done={n: at for n, at in self.done.items() if n not in gone})
+        undone = frozenset(nodes)
+        return replace(self, done={n: at for n, at in self.done.items() if n not in undone})
 
     def with_flux(self, share: float, at: float) -> "Proof":
         """Return the proof with a flux reading, as a share of the nominal."""

@@ -1,6 +1,6 @@
 """The records of a plant: a database of records and people, and an archive of telemetry.
 
-`Records` is the protocol by which a plant keeps its records; module ``keeper`` has `Keeper`, which
+`Records` is the protocol of a plant's records; module ``keeper`` has `Keeper`, which
 keeps them in SQLite or PostgreSQL. Modules ``backup``, ``export`` and ``people`` work on the same
 database; ``telemetry`` writes the archive and ``telemetry_query`` answers questions about it in
 SQL. These modules need the extra ``store``; the names below do not.

@@ -82,18 +82,18 @@ def sighting_rows(
     covariances = {end: getattr(s, f"{end}_covariance") for end in _ENDS}
     rows: list[Row] = []
     for i, row in enumerate(s.heliostat.tolist()):
-        found: Row = {
+        cells: Row = {
             "number": int(numbers[i]), "heliostat": names[row], "kind": kind, "target": target,
             "campaign": campaign, "time": s.time[i], "counts": s.counts[i].tolist(),
             "sigma": float(s.sigma[i]),
         }  # fmt: skip
         for end in _ENDS:
-            found[f"{end}_at_infinity"] = bool(getattr(s, f"{end}_at_infinity")[i])
+            cells[f"{end}_at_infinity"] = bool(getattr(s, f"{end}_at_infinity")[i])
             point = getattr(s, end)[i].tolist()
-            found.update({f"{end}_{axis}": x for axis, x in zip(_AXES, point, strict=True)})
+            cells.update({f"{end}_{axis}": x for axis, x in zip(_AXES, point, strict=True)})
             matrix = covariances[end][i]
-            found[f"{end}_covariance"] = matrix.tolist() if matrix.any() else None
-        rows.append(found)
+            cells[f"{end}_covariance"] = matrix.tolist() if matrix.any() else None
+        rows.append(cells)
     return rows
 
 
@@ -112,14 +112,14 @@ def kept_sightings(rows: Sequence[SqlRow[Any]]) -> KeptSightings:
         return np.stack([array(f"{end}_{axis}") for axis in _AXES], axis=-1)
 
     def matrices(end: str) -> FloatArray:
-        given = columns[f"{end}_covariance"]
-        known = [i for i, cell in enumerate(given) if cell is not None]
-        found = np.zeros((len(rows), 3, 3))
-        found[known] = np.array([given[i] for i in known], np.float64).reshape(-1, 3, 3)
-        return found
+        cells = columns[f"{end}_covariance"]
+        known = [i for i, cell in enumerate(cells) if cell is not None]
+        filled = np.zeros((len(rows), 3, 3))
+        filled[known] = np.array([cells[i] for i in known], np.float64).reshape(-1, 3, 3)
+        return filled
 
     drives = len(columns["counts"][0]) if rows else 2
-    seen = Sightings(
+    sightings = Sightings(
         np.array([index[name] for name in columns["heliostat"]], np.intp),
         array("time"),
         array("counts").reshape(len(rows), drives),
@@ -132,7 +132,7 @@ def kept_sightings(rows: Sequence[SqlRow[Any]]) -> KeptSightings:
         matrices("destination"),
     )
     texts = [tuple(columns[name]) for name in ("kind", "target", "campaign")]
-    return KeptSightings(array("number", np.int64), names, seen, *texts)
+    return KeptSightings(array("number", np.int64), names, sightings, *texts)
 
 
 # -- calibrations ------------------------------------------------------------------------
@@ -141,7 +141,7 @@ def kept_sightings(rows: Sequence[SqlRow[Any]]) -> KeptSightings:
 def behind_rows(
     record: HeliostatCalibration, standing: Mapping[int, bool]
 ) -> tuple[list[Row], list[int]]:
-    """Return what a version changes in the table ``parameter_sighting``.
+    """Return the changes of a version to the table ``parameter_sighting``.
 
     Parameters
     ----------
@@ -158,19 +158,19 @@ def behind_rows(
     misses = np.concatenate([record.residual_before, record.residual_after], axis=1)
     whole = np.concatenate([misses, nothing])
     numbers = (*record.sightings.tolist(), *record.left_out.tolist())
-    wanted = {number: place < len(misses) for place, number in enumerate(numbers)}
+    use_of = {number: place < len(misses) for place, number in enumerate(numbers)}
     made = [
         {
             "heliostat": record.heliostat,
             "sighting": number,
             "version": record.version,
-            "used": wanted[number],
+            "used": use_of[number],
             **dict(zip(_MISSES, whole[place].tolist(), strict=True)),
         }
         for place, number in enumerate(numbers)
-        if standing.get(number) is not wanted[number]
+        if standing.get(number) is not use_of[number]
     ]
-    return made, [number for number, used in standing.items() if wanted.get(number) is not used]
+    return made, [number for number, used in standing.items() if use_of.get(number) is not used]
 
 
 class Behind:
@@ -182,16 +182,16 @@ class Behind:
         Its rows of the table ``parameter_sighting``, in the order of the numbers.
     """
 
-    def __init__(self, found: Sequence[RowMapping]) -> None:
+    def __init__(self, rows: Sequence[RowMapping]) -> None:
         def column(name: str, dtype: npt.DTypeLike) -> Any:
-            return np.array([row[name] for row in found], dtype=dtype)
+            return np.array([row[name] for row in rows], dtype=dtype)
 
         self._number, self._used = column("sighting", np.int64), column("used", np.bool_)
         self._from = column("version", np.int64)
         last = np.iinfo(np.int64).max
-        ends = [last if row["until"] is None else row["until"] for row in found]
+        ends = [last if row["until"] is None else row["until"] for row in rows]
         self._until = np.array(ends, np.int64)
-        self._misses = np.array([[row[name] for name in _MISSES] for row in found]).reshape(-1, 4)
+        self._misses = np.array([[row[name] for name in _MISSES] for row in rows]).reshape(-1, 4)
 
     def of(self, version: int) -> dict[str, Any]:
         """Return the fields of a version; what a sighting missed by where it is new, else NaN."""

@@ -56,10 +56,10 @@ def finish(connection: Connection, identity: str, result: str, at: str) -> None:
 def finish_open(connection: Connection, result: str, at: str) -> int:
     """Give one result to all records without one; return their number."""
     query = select(_AUDIT.c.identity).where(_AUDIT.c.result == "").order_by(_AUDIT.c.number)
-    left = connection.scalars(query).all()
-    for identity in left:
+    identities = connection.scalars(query).all()
+    for identity in identities:
         finish(connection, identity, result, at)
-    return len(left)
+    return len(identities)
 
 
 def entries(connection: Connection, limit: int = 100, before: int = 0) -> list[AuditEntry]:
@@ -72,8 +72,8 @@ def entries(connection: Connection, limit: int = 100, before: int = 0) -> list[A
 
 def _find(connection: Connection, identity: str) -> AuditEntry | None:
     query = select(_AUDIT).where(_AUDIT.c.identity == identity)
-    found = rows.records(connection, AuditEntry, query)
-    return found[0] if found else None
+    matches = rows.records(connection, AuditEntry, query)
+    return matches[0] if matches else None
 
 
 def probe(connection: Connection) -> None:
@@ -89,11 +89,11 @@ def probe(connection: Connection) -> None:
 
 def points(connection: Connection) -> dict[str, dict[str, tuple[float, ...]]]:
     """Return the assigned points by kind and heliostat."""
-    found: dict[str, dict[str, tuple[float, ...]]] = {}
+    places_of: dict[str, dict[str, tuple[float, ...]]] = {}
     for row in connection.execute(select(tables.assigned_point)).mappings():
         place = (row["east"], row["north"], row["up"])
-        found.setdefault(row["kind"], {})[row["heliostat"]] = place
-    return found
+        places_of.setdefault(row["kind"], {})[row["heliostat"]] = place
+    return places_of
 
 
 def doubt_points(connection: Connection) -> None:
@@ -111,14 +111,14 @@ def doubt_points(connection: Connection) -> None:
 
 
 def change_points(
-    connection: Connection, new: Mapping[str, Places], gone: Mapping[str, Iterable[str]]
+    connection: Connection, new: Mapping[str, Places], removed: Mapping[str, Iterable[str]]
 ) -> None:
     """Replace the assigned points, by kind."""
     table = tables.assigned_point
-    left = [{"of": kind, "named": name} for kind, names in gone.items() for name in names]
-    if left:
+    keys = [{"of": kind, "named": name} for kind, names in removed.items() for name in names]
+    if keys:
         which = (table.c.kind == bindparam("of")) & (table.c.heliostat == bindparam("named"))
-        connection.execute(delete(table).where(which), left)
+        connection.execute(delete(table).where(which), keys)
     for kind, places in new.items():
         rows.replace(
             connection,

@@ -147,13 +147,13 @@ def check(folder: str | Path, *, signed_by: PublicKey | None = None) -> Backup:
     try:
         manifest: Any = json.loads(data)
         files, revision, made = manifest["files"], manifest["revision"], manifest["made"]
-        wanted = dict(files.items())
+        checksums = dict(files.items())
     except (ValueError, KeyError, TypeError, AttributeError):
         raise FormatError(path, "this is not the manifest of a backup") from None
-    if FILE not in wanted:
+    if FILE not in checksums:
         raise FormatError(path, f"{FILE} is not in it; this is not the manifest of a backup")
     size = 0
-    for name, sum_ in wanted.items():
+    for name, sum_ in checksums.items():
         file = place / name
         if ".." in Path(name).parts or Path(name).is_absolute():
             raise FormatError(path, f"the file {name!r} lies outside the backup")
@@ -163,7 +163,7 @@ def check(folder: str | Path, *, signed_by: PublicKey | None = None) -> Backup:
             raise FormatError(file, "its checksum differs; use another backup")
         size += file.stat().st_size
     for file in _files(place):
-        if str(file.relative_to(place)) not in {*wanted, MANIFEST, SIGNATURE}:
+        if str(file.relative_to(place)) not in {*checksums, MANIFEST, SIGNATURE}:
             raise FormatError(
                 file, "the manifest does not name it; remove it, or use another backup"
             )
@@ -207,7 +207,7 @@ def restore(
     StoreError
         If there is a store already, another process holds it, or it cannot be written.
     """
-    found = check(folder, signed_by=signed_by)
+    restored = check(folder, signed_by=signed_by)
     database = Database(place)
     try:
         if database.file is not None:
@@ -217,14 +217,14 @@ def restore(
             raise StoreError(
                 f"store {database.name}: it exists already; give an empty place, or move it away"
             )
-        if telemetry is not None and (found.folder / TELEMETRY).is_dir():
+        if telemetry is not None and (restored.folder / TELEMETRY).is_dir():
             if Path(telemetry).exists() and any(Path(telemetry).iterdir()):
                 raise StoreError(f"telemetry {telemetry}: it is not empty; move it away")
-            shutil.copytree(found.folder / TELEMETRY, telemetry, dirs_exist_ok=True)
+            shutil.copytree(restored.folder / TELEMETRY, telemetry, dirs_exist_ok=True)
         if database.file is not None:
             beside = database.file.with_name(f".{database.file.name}.{os.getpid()}.part")
             try:
-                shutil.copyfile(found.folder / FILE, beside)
+                shutil.copyfile(restored.folder / FILE, beside)
                 beside.chmod(PRIVATE)
                 _sync(beside)
                 beside.rename(database.file)
@@ -232,12 +232,12 @@ def restore(
             finally:
                 beside.unlink(missing_ok=True)
         else:
-            _copy_tables(Database(found.folder / FILE), database)
+            _copy_tables(Database(restored.folder / FILE), database)
     except OSError as error:
         raise StoreError(f"store {database.name}: {error.strerror}") from None
     finally:
         database.close()
-    return found
+    return restored
 
 
 def summary(database: Database) -> dict[str, Any]:
@@ -251,23 +251,23 @@ def summary(database: Database) -> dict[str, Any]:
     revision = database.revision()
     if not revision:
         database.require()
-    found: dict[str, Any] = {"store": database.name, "revision": revision, "rows": {}}
+    figures: dict[str, Any] = {"store": database.name, "revision": revision, "rows": {}}
     if revision != HEAD:
-        return found
+        return figures
     with database.reading() as connection:
         for table in tables.metadata.sorted_tables:
             count = connection.scalar(select(func.count()).select_from(table))
-            found["rows"][table.name] = int(count or 0)
+            figures["rows"][table.name] = int(count or 0)
         time = tables.sighting.c.time
         first, last = connection.execute(select(func.min(time), func.max(time))).one()
         open_ = select(func.count()).where(tables.audit.c.result == "")
-        found["audit_without_result"] = int(connection.scalar(open_) or 0)
+        figures["audit_without_result"] = int(connection.scalar(open_) or 0)
     # No time is NULL, which the column's type reads as NaN.
     times = {"first_sighting": first, "last_sighting": last}
-    found.update({name: None if math.isnan(at) else at for name, at in times.items()})
+    figures.update({name: None if math.isnan(at) else at for name, at in times.items()})
     if database.file is not None:
-        found["bytes"] = database.file.stat().st_size
-    return found
+        figures["bytes"] = database.file.stat().st_size
+    return figures
 
 
 def migrate(place: str | Path) -> tuple[str, Path | None]:
@@ -282,23 +282,23 @@ def migrate(place: str | Path) -> tuple[str, Path | None]:
         If there is no store, another process holds it, it is newer than the program, or it fails.
     """
     with Database(place) as database:
-        found = database.revision()
-        if not found or found > HEAD:
+        revision = database.revision()
+        if not revision or revision > HEAD:
             database.require()
-        if found == HEAD:
-            return found, None
+        if revision == HEAD:
+            return revision, None
         copy = None
         database.lock()
         try:
             if database.file is not None:
-                copy = database.file.with_name(f"{database.file.stem}.before-{found}.sqlite")
+                copy = database.file.with_name(f"{database.file.stem}.before-{revision}.sqlite")
                 if not copy.exists():
                     _copy_file(database.file, copy)
                     _sync(copy)
             database.migrate()
         except (OSError, sqlite3.Error) as error:
             raise StoreError(f"store {database.name}: cannot be copied ({error})") from None
-        return found, copy
+        return revision, copy
 
 
 def checksum(path: Path) -> str:
@@ -381,8 +381,8 @@ def _copy_tables(source: Database, target: Database) -> None:
 
 
 def _parts(connection: Connection, table: Any) -> Iterator[list[dict[str, Any]]]:
-    found = connection.execute(select(table).execution_options(yield_per=_ROWS)).mappings()
-    for part in found.partitions():
+    mappings = connection.execute(select(table).execution_options(yield_per=_ROWS)).mappings()
+    for part in mappings.partitions():
         yield [{c.key: row[c] for c in table.columns} for row in part]
 
 

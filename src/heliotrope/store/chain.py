@@ -122,12 +122,12 @@ def forget_events(connection: Connection, before: float) -> None:
     last = connection.scalar(select(func.max(e.number)))
     end = kept if kept is not None else (last or 0) + 1
     links = _LINKS[EVENT]
-    gone = select(links.c.number, links.c.digest).where(links.c.number < end)
-    newest = connection.execute(gone.order_by(links.c.number.desc()).limit(1)).first()
+    removed = select(links.c.number, links.c.digest).where(links.c.number < end)
+    newest = connection.execute(removed.order_by(links.c.number.desc()).limit(1)).first()
     if newest is not None:
         anchor = {ANCHOR_NUMBER: str(newest[0]), ANCHOR: str(newest[1])}
-        found = [{"name": name, "value": value} for name, value in anchor.items()]
-        rows.replace(connection, tables.about, found)
+        anchors = [{"name": name, "value": value} for name, value in anchor.items()]
+        rows.replace(connection, tables.about, anchors)
         # A chain without links begins where the last one ended.
         connection.info.pop(EVENT, None)
     connection.execute(links.delete().where(links.c.number < end))
@@ -140,7 +140,7 @@ def forget_events(connection: Connection, before: float) -> None:
 HEADS = "heads"
 
 
-def write_heads(folder: Path, found: Iterable[Head], at: datetime) -> None:
+def write_heads(folder: Path, new: Iterable[Head], at: datetime) -> None:
     """Add heads to the file `HEADS` of a folder; they are on the disk when this returns.
 
     Raises
@@ -148,7 +148,7 @@ def write_heads(folder: Path, found: Iterable[Head], at: datetime) -> None:
     StoreError
         If they cannot be written.
     """
-    line = f"{at.isoformat(timespec='seconds')} {' '.join(map(str, found))}\n"
+    line = f"{at.isoformat(timespec='seconds')} {' '.join(map(str, new))}\n"
     path = folder / HEADS
     try:
         handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
@@ -173,10 +173,12 @@ def read_heads(path: Path) -> list[Head]:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    found = [Head.read(each) for each in re.findall(r"\b(?:event|audit):\d+:[0-9a-f]{64}\b", text)]
-    if not found:
+    listed = [
+        Head.read(match) for match in re.findall(r"\b(?:event|audit):\d+:[0-9a-f]{64}\b", text)
+    ]
+    if not listed:
         raise InputError(f"{path}: holds no head; give a file that --heads or syslog wrote")
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(listed))
 
 
 # -- checking ----------------------------------------------------------------------------
@@ -239,8 +241,8 @@ def kept_since(since: float | None) -> str:
 
 def _verify_events(connection: Connection) -> None:
     before, links = _anchor(connection, EVENT), _LINKS[EVENT].c
-    found = connection.execute(select(links.number, links.digest))
-    kept = {int(number): str(digest) for number, digest in found}
+    linked = connection.execute(select(links.number, links.digest))
+    kept = {int(number): str(digest) for number, digest in linked}
     query = select(_EVENT).order_by(_EVENT.c.number)
     for row in connection.execute(query).mappings():
         digest = digest_of(before, _event(row))

@@ -165,7 +165,7 @@ class Database:
             ) from None
 
     def revision(self) -> str:
-        """Return the revision of the tables, "" if there are none.
+        """Return the revision of the tables; empty without tables.
 
         Raises
         ------
@@ -187,13 +187,14 @@ class Database:
         StoreError
             If they do not.
         """
-        found = self.revision()
-        if not found:
+        revision = self.revision()
+        if not revision:
             raise StoreError(f"store {self.name}: no store here; `heliotrope run` makes one")
-        if found != HEAD:
+        if revision != HEAD:
             raise StoreError(
-                f"store {self.name}: its tables have revision {found}, this program needs {HEAD}; "
-                + ("run `heliotrope store migrate`" if found < HEAD else "update the program")
+                f"store {self.name}: its tables have revision {revision}, this program needs "
+                f"{HEAD}; "
+                + ("run `heliotrope store migrate`" if revision < HEAD else "update the program")
             )
 
     def prepare(self) -> None:
@@ -323,8 +324,8 @@ def tighten(folder: Path) -> None:
 
     Files that a plant did not make are left alone, and so is a folder that is shared by its nature.
     """
-    there = folder.stat()
-    if there.st_mode & stat.S_ISVTX or there.st_uid != os.geteuid():
+    status = folder.stat()
+    if status.st_mode & stat.S_ISVTX or status.st_uid != os.geteuid():
         return
     folder.chmod(_PRIVATE_FOLDER)
     made = [*folder.glob(f"{FILE}*"), *(folder / name for name in _MADE)]

@@ -64,16 +64,16 @@ def export(
         for name in heliostats or ():
             if name not in known:
                 raise UnknownNameError("heliostat in the store", name, known)
-        wanted = known if heliostats is None else list(dict.fromkeys(heliostats))
-        for done, name in enumerate(wanted, 1):
-            seen = _sightings(connection, name)
+        selected = known if heliostats is None else list(dict.fromkeys(heliostats))
+        for done, name in enumerate(selected, 1):
+            kept = _sightings(connection, name)
             history = calibration_history(connection, name)
-            _write_heliostat(place / folder_name(name), name, seen, history)
-            index.append(_index_row(name, seen, history))
+            _write_heliostat(place / folder_name(name), name, kept, history)
+            index.append(_index_row(name, kept, history))
             if progress is not None:
-                progress(done, len(wanted))
+                progress(done, len(selected))
     _write(place / "heliostats.csv", _INDEX, index)
-    return wanted
+    return selected
 
 
 def folder_name(heliostat: str) -> str:
@@ -96,15 +96,15 @@ def _sightings(connection: Connection, name: str) -> KeptSightings:
 
 
 def _write_heliostat(
-    place: Path, name: str, seen: KeptSightings, history: Sequence[HeliostatCalibration]
+    place: Path, name: str, kept: KeptSightings, history: Sequence[HeliostatCalibration]
 ) -> None:
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{place}: {error.strerror}; give a folder to write to") from None
-    kinds = [kind if kind in KINDS else "" for kind in seen.kinds]
-    write_sightings(place / "sightings.csv", seen.sightings, seen.names or (name,), kinds)
-    _write(place / "residuals.csv", _RESIDUALS, _residuals(seen, history))
+    kinds = [kind if kind in KINDS else "" for kind in kept.kinds]
+    write_sightings(place / "sightings.csv", kept.sightings, kept.names or (name,), kinds)
+    _write(place / "residuals.csv", _RESIDUALS, _residuals(kept, history))
     _write(place / "versions.csv", _VERSIONS, map(_version, history))
     _write(place / "parameters.csv", _PARAMETERS, _parameters(history))
     _write(place / "covariance.csv", _COVARIANCE, _covariance(history))
@@ -132,11 +132,11 @@ _INDEX = (
 
 
 def _index_row(
-    name: str, seen: KeptSightings, history: Sequence[HeliostatCalibration]
+    name: str, kept: KeptSightings, history: Sequence[HeliostatCalibration]
 ) -> Sequence[Any]:
     last = history[-1] if history else None
     tail = ("", "", "") if last is None else (format_time(last.at), last.before, last.after)
-    return (name, folder_name(name), len(seen), len(history), *tail)
+    return (name, folder_name(name), len(kept), len(history), *tail)
 
 
 #: ``row`` counts the rows of sightings.csv from 1, without the header.
@@ -147,9 +147,9 @@ _RESIDUALS = (
 
 
 def _residuals(
-    seen: KeptSightings, history: Sequence[HeliostatCalibration]
+    kept: KeptSightings, history: Sequence[HeliostatCalibration]
 ) -> Iterable[Sequence[Any]]:
-    row_of = {int(number): row for row, number in enumerate(seen.identities)}
+    row_of = {int(number): row for row, number in enumerate(kept.identities)}
     for version in history:
         before, after = version.residual_before, version.residual_after
         # What a sighting missed by is kept for the version that begins to use it.
@@ -157,7 +157,7 @@ def _residuals(
         for i in np.flatnonzero(known):
             sighting = version.sightings[i]
             row = row_of.get(int(sighting))
-            place = ("", "") if row is None else (row + 1, seen.sightings.time[row])
+            place = ("", "") if row is None else (row + 1, kept.sightings.time[row])
             yield (
                 version.version,
                 place[0],

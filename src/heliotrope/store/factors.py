@@ -33,7 +33,7 @@ _BYTES = 32
 
 @dataclass(frozen=True)
 class Used:
-    """A code that was right: whether it was a recovery code, and how many of those are left."""
+    """A correct code: whether it was a recovery code, and how many of those remain."""
 
     recovery: bool
     left: int
@@ -75,8 +75,8 @@ class Factors:
         made = self._secret(name, word)
 
         def work(connection: Connection) -> None:
-            found = _find(connection, name)
-            if found is not None and found.confirmed:
+            factor = _find(connection, name)
+            if factor is not None and factor.confirmed:
                 raise InputError(f"account {name}: it has a second factor; remove that one first")
             connection.execute(_FACTOR.delete().where(_FACTOR.c.name == name))
             row = {"name": name, "word": word, "since": now, "confirmed": False, "used": 0}
@@ -98,16 +98,18 @@ class Factors:
         codes = tuple(self._recovery_code() for _ in range(CODES))
 
         def work(connection: Connection) -> None:
-            found = _find(connection, name)
-            if found is None or found.confirmed:
+            factor = _find(connection, name)
+            if factor is None or factor.confirmed:
                 raise InputError(f"account {name}: begin to set up a second factor first")
-            step = self._step(name, found.word, 0, code, now)
+            step = self._step(name, factor.word, 0, code, now)
             if step is None:
                 raise InputError("the code is wrong; check the clock of the device that made it")
             mine = _FACTOR.update().where(_FACTOR.c.name == name)
             connection.execute(mine.values(confirmed=True, used=step))
             connection.execute(_RECOVERY.delete().where(_RECOVERY.c.name == name))
-            rows = [{"digest": _digest(name, one), "name": name} for one in codes]
+            rows = [
+                {"digest": _digest(name, recovery_code), "name": name} for recovery_code in codes
+            ]
             connection.execute(_RECOVERY.insert(), rows)
 
         self._writer.do(work)
@@ -123,20 +125,20 @@ class Factors:
         """
 
         def work(connection: Connection) -> Used | None:
-            found = _find(connection, name)
-            if found is None or not found.confirmed:
+            factor = _find(connection, name)
+            if factor is None or not factor.confirmed:
                 return None
             mine = _RECOVERY.c.name == name
             which = mine & (_RECOVERY.c.digest == _digest(name, code))
             recovery = connection.execute(_RECOVERY.delete().where(which)).rowcount == 1
             if not recovery:
-                step = self._step(name, found.word, found.used, code, now)
+                step = self._step(name, factor.word, factor.used, code, now)
                 if step is None:
                     return None
                 update = _FACTOR.update().where(_FACTOR.c.name == name)
                 connection.execute(update.values(used=step))
-            left = connection.execute(select(_RECOVERY.c.digest).where(mine)).all()
-            return Used(recovery, len(left))
+            remaining = connection.execute(select(_RECOVERY.c.digest).where(mine)).all()
+            return Used(recovery, len(remaining))
 
         return self._writer.do(work)
 

@@ -93,12 +93,12 @@ class Keeper:
 
     @property
     def problem(self) -> str:
-        """Why records cannot be written now, "" if they can."""
+        """Why records cannot be written now; empty while they can."""
         return self.writer.problem or self.writer.crowded
 
     @property
     def refused(self) -> str:
-        """The last record that the database refused for its content, "" if none."""
+        """The last record that the database refused for its content; empty without one."""
         return self.writer.refused
 
     @property
@@ -225,11 +225,11 @@ class Keeper:
         if campaign:
             query = query.where(s.campaign == campaign)
         with self.database.reading() as connection:
-            found = connection.execute(query).all()
+            matches = connection.execute(query).all()
         if heliostats is not None and len(heliostats) > _MANY:
-            wanted = set(heliostats)
-            found = [row for row in found if row.heliostat in wanted]
-        return rows.kept_sightings(found)
+            selected = set(heliostats)
+            matches = [row for row in matches if row.heliostat in selected]
+        return rows.kept_sightings(matches)
 
     def latest_calibrations(
         self, heliostats: Sequence[str] | None = None
@@ -245,11 +245,11 @@ class Keeper:
         query = select(table).join(last, same).order_by(table.c.heliostat)
         if heliostats is not None and len(heliostats) <= _MANY:
             query = query.where(table.c.heliostat.in_(list(heliostats)))
-        wanted = None if heliostats is None else set(heliostats)
+        selected = None if heliostats is None else set(heliostats)
         return {
             record.heliostat: record
             for record in self._records(HeliostatCalibration, query)
-            if wanted is None or record.heliostat in wanted
+            if selected is None or record.heliostat in selected
         }
 
     def calibration_history(self, heliostat: str) -> list[HeliostatCalibration]:
@@ -291,16 +291,16 @@ class Keeper:
         return self._records(FlightEntry, select(tables.flight).order_by(tables.flight.c.at))
 
     def record_learning(self, entry: LearningEntry) -> None:
-        """Record what was learnt of a group."""
+        """Record a group's learned hyperparameters."""
         row = rows.row_of(tables.learning, entry)
         self.writer.put(lambda c: rows.insert(c, tables.learning, [row]))
 
     def learnings(self) -> list[LearningEntry]:
-        """Return what was learnt last of each group."""
-        found = self._records(
+        """Return the latest learned hyperparameters of each group."""
+        entries = self._records(
             LearningEntry, select(tables.learning).order_by(tables.learning.c.version)
         )
-        return list({entry.group: entry for entry in found}.values())
+        return list({entry.group: entry for entry in entries}.values())
 
     def record_timetable(self, timetable: TimetableRecord) -> None:
         """Record a timetable; it replaces one of the same time."""
@@ -454,16 +454,16 @@ class Keeper:
             self._holds = {**self._holds, **new}
 
     def unhold(self, holds: Sequence[Lockout], person: str, at: float) -> None:
-        """End locks; ``person`` is who has removed them, ``at`` when, POSIX s."""
-        gone = {_locked(hold): hold for hold in holds}
+        """End locks that ``person`` removed at the time ``at``, POSIX s."""
+        ended = {_locked(hold): hold for hold in holds}
 
         def work(connection: Connection) -> None:
-            for hold in gone.values():
+            for hold in ended.values():
                 _end_hold(connection, hold, person, at)
 
         with self._mine:
             self.writer.put(work)
-            self._holds = {k: hold for k, hold in self._holds.items() if k not in gone}
+            self._holds = {k: hold for k, hold in self._holds.items() if k not in ended}
 
     def holds(self) -> tuple[Lockout, ...]:
         """Return the locks that stand."""
@@ -483,13 +483,13 @@ class Keeper:
         return {} if before is None else dict(json.loads(before))
 
     def emergency(self) -> str:
-        """Return the document about the emergency that stands, "" if none does."""
+        """Return the document about the emergency in force; empty without one."""
         about = tables.about
         query = select(about.c.value).where(about.c.name == _EMERGENCY)
         return str(self.do(lambda connection: connection.scalar(query)) or "")
 
     def keep_emergency(self, document: str) -> None:
-        """Replace the document about the emergency that stands; "" if none does any more."""
+        """Replace the document about the emergency in force; empty: it has ended."""
         row = {"name": _EMERGENCY, "value": document}
         self.writer.put(lambda connection: rows.replace(connection, tables.about, [row]))
 
@@ -511,10 +511,10 @@ def _change_behind(connection: Connection, record: HeliostatCalibration) -> None
     """Record the sightings behind a version: those that the one before does not rest on alike."""
     used = tables.parameter_sighting.c
     mine = and_(used.heliostat == record.heliostat, used.until.is_(None))
-    found = connection.execute(select(used.sighting, used.used).where(mine))
-    made, gone = rows.behind_rows(record, {number: bool(use) for number, use in found})
-    for k in range(0, len(gone), _MANY):
-        ended = and_(mine, used.sighting.in_(gone[k : k + _MANY]))
+    uses = connection.execute(select(used.sighting, used.used).where(mine))
+    made, dropped = rows.behind_rows(record, {number: bool(use) for number, use in uses})
+    for k in range(0, len(dropped), _MANY):
+        ended = and_(mine, used.sighting.in_(dropped[k : k + _MANY]))
         connection.execute(
             update(tables.parameter_sighting).where(ended).values(until=record.version)
         )
@@ -541,7 +541,7 @@ def _last_versions(connection: Connection) -> dict[str, int]:
 
 
 def _locked(hold: Lockout) -> tuple[str, str, str]:
-    """Return what is locked, and by whom: of these there is one standing lock."""
+    """Return the key of a lock: the place, and the person. One lock of a key can be in force."""
     return hold.kind, hold.name, hold.who
 
 

@@ -228,8 +228,8 @@ class People:
         StoreError
             If it could not be written.
         """
-        given = {"password_hash": password_hash, "role": role, "disabled": disabled}
-        new = {key: value for key, value in given.items() if value is not None}
+        changes = {"password_hash": password_hash, "role": role, "disabled": disabled}
+        new = {key: value for key, value in changes.items() if value is not None}
         if role is not None:
             _check_role(role)
         if password_hash == "":
@@ -370,8 +370,8 @@ class People:
         role = _ACCOUNT.c.role.label("owner_role")
         query = select(_TOKEN, role, _ACCOUNT.c.disabled).join(_ACCOUNT)
         with self._database.reading() as connection:
-            found = connection.execute(query.where(_TOKEN.c.key == _key(secret)))
-            row = found.mappings().first()
+            result = connection.execute(query.where(_TOKEN.c.key == _key(secret)))
+            row = result.mappings().first()
         if row is None or row["disabled"]:
             return None
         # Earlier programs made tokens that last for years, or for ever.
@@ -413,12 +413,12 @@ class People:
         StoreError
             If they could not be removed.
         """
-        found, keys = [], []
+        expired, keys = [], []
         with self._database.reading() as connection:
             for table, label in ((_SESSION, None), (_TOKEN, _TOKEN.c.label)):
                 query = select(table.c.key, table.c.name, literal("") if label is None else label)
                 for key, name, text in connection.execute(query.where(table.c.expires <= now)):
-                    found.append(Expired(table is _TOKEN, name, text))
+                    expired.append(Expired(table is _TOKEN, name, text))
                     keys.append((table, key))
 
         def work(connection: Connection) -> None:
@@ -427,7 +427,7 @@ class People:
 
         if keys:
             self._writer.do(work)
-        return tuple(found)
+        return tuple(expired)
 
     def _secret(self) -> str:
         return self._entropy(_SECRET).hex()
@@ -460,15 +460,15 @@ def _set_due(connection: Connection, name: str, *, due: bool) -> None:
 
 
 def _find(connection: Connection, name: str) -> Account | None:
-    found = rows.records(connection, Account, _accounts().where(_ACCOUNT.c.name == name))
-    return found[0] if found else None
+    accounts = rows.records(connection, Account, _accounts().where(_ACCOUNT.c.name == name))
+    return accounts[0] if accounts else None
 
 
 def _need(connection: Connection, name: str) -> Account:
-    found = _find(connection, name)
-    if found is None:
+    account = _find(connection, name)
+    if account is None:
         raise UnknownNameError("account", name, connection.scalars(select(_ACCOUNT.c.name)))
-    return found
+    return account
 
 
 def _check_engineers(connection: Connection, name: str) -> None:

@@ -288,18 +288,18 @@ class FlightEntry:
 
 @dataclass(frozen=True)
 class LearningEntry:
-    """What was learnt of a group of mirrors: its hyperparameters.
+    """The learned hyperparameters of a group of mirrors.
 
     Attributes
     ----------
     group, version
         Name of the group in the plant file, and 1, 2, ... for each.
     at, person
-        When it was learnt, POSIX s, and who ordered it.
+        Time of learning, POSIX s, and the person who ordered it.
     heliostats, sightings
-        Numbers of each that it was learnt from.
+        Numbers of heliostats and sightings that it was learned from.
     gain
-        Rise of a sighting's log probability density, foretold from those before it.
+        Rise of a sighting's log probability density, predicted from those before it.
     document
         The model and the hyperparameters as JSON; see `calibration.learn.group`.
     """
@@ -376,12 +376,12 @@ class Records(Protocol):
 
     @property
     def problem(self) -> str:
-        """Why records cannot be written now, "" if they can; the text of an alarm."""
+        """Why records cannot be written now, as the text of an alarm; empty while they can."""
         ...
 
     @property
     def refused(self) -> str:
-        """The last record that was refused for its content, "" if none."""
+        """The last record that was refused for its content; empty without one."""
         ...
 
     @property
@@ -427,7 +427,7 @@ class Records(Protocol):
         ...
 
     def record_learning(self, entry: LearningEntry) -> None:
-        """Record what was learnt of a group."""
+        """Record a group's learned hyperparameters."""
         ...
 
     def record_timetable(self, timetable: TimetableRecord) -> None:
@@ -467,7 +467,7 @@ class Records(Protocol):
         ...
 
     def unhold(self, holds: Sequence[Lockout], person: str, at: float) -> None:
-        """End locks; ``person`` is who has removed them, ``at`` when, POSIX s."""
+        """End locks that ``person`` removed at the time ``at``, POSIX s."""
         ...
 
     def holds(self) -> tuple[Lockout, ...]:
@@ -479,11 +479,11 @@ class Records(Protocol):
         ...
 
     def emergency(self) -> str:
-        """Return the document about the emergency that stands, "" if none does."""
+        """Return the document about the emergency in force; empty without one."""
         ...
 
     def keep_emergency(self, document: str) -> None:
-        """Replace the document about the emergency that stands; "" if none does any more."""
+        """Replace the document about the emergency in force; empty: it has ended."""
         ...
 
     async def confirm(self) -> None:
@@ -538,7 +538,7 @@ class Records(Protocol):
         ...
 
     def learnings(self) -> list[LearningEntry]:
-        """Return what was learnt last of each group."""
+        """Return the latest learned hyperparameters of each group."""
         ...
 
     def timetables(self) -> list[TimetableRecord]:

@@ -1,6 +1,6 @@
 """Signatures of backups: Ed25519, with a private key that stays out of every backup.
 
-The private key is a PEM file (PKCS 8) of mode 600; its public half stands beside it as FILE.pub,
+The private key is a PEM file (PKCS 8) of mode 600; its public half is FILE.pub in the same folder,
 and belongs on the machine that restores.
 """
 
@@ -77,12 +77,12 @@ class SigningKey:
             mode = path.stat().st_mode & 0o777
             raise FormatError(path, f"others may read it (mode {mode:o}); run chmod 600 on it")
         try:
-            found = load_pem_private_key(data, None)
+            key = load_pem_private_key(data, None)
         except (ValueError, TypeError):
-            found = None
-        if not isinstance(found, ed25519.Ed25519PrivateKey):
+            key = None
+        if not isinstance(key, ed25519.Ed25519PrivateKey):
             raise FormatError(path, "it is no private key that heliotrope store key has made")
-        self._key: Ed25519PrivateKey = found
+        self._key: Ed25519PrivateKey = key
 
     def sign(self, data: bytes) -> bytes:
         """Return the signature of some data, one line of text."""
@@ -110,14 +110,14 @@ class PublicKey:
 
         self.path = path
         try:
-            found = load_pem_public_key(_read(path))
+            key = load_pem_public_key(_read(path))
         except ValueError:
-            found = None
-        if not isinstance(found, ed25519.Ed25519PublicKey):
+            key = None
+        if not isinstance(key, ed25519.Ed25519PublicKey):
             raise FormatError(
                 path, f"it is no public key of backups; give the file {PUBLIC} of store key"
             )
-        self._key: Ed25519PublicKey = found
+        self._key: Ed25519PublicKey = key
 
     def signed(self, data: bytes, signature: bytes) -> bool:
         """Whether a signature of the private key belongs to some data."""

@@ -159,7 +159,7 @@ class Name(_Converted):
 
 
 class SeverityRank(_Converted):
-    """A severity, as its rank, by which the database compares severities."""
+    """A severity, stored as its rank, so that the database can compare severities."""
 
     impl = Integer
     cache_ok = True
@@ -245,7 +245,7 @@ parameter_sighting = Table(
     ),
     Column("version", Integer, primary_key=True, autoincrement=False),
     Column("until", Integer),
-    *(_figure_of(f"{when}_{way}") for when in ("before", "after") for way in ("right", "above")),
+    *(_figure_of(f"{when}_{side}") for when in ("before", "after") for side in ("right", "above")),
     Column("used", Boolean, nullable=False),
     ForeignKeyConstraint(
         ["heliostat", "version"], [parameter_version.c.heliostat, parameter_version.c.version]

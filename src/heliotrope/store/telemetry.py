@@ -172,8 +172,8 @@ class Telemetry:
         look
             N rows; must not be changed afterwards.
         """
-        gone = at - self._looked_at
-        if 0.0 <= gone < self.settings.period:
+        elapsed = at - self._looked_at
+        if 0.0 <= elapsed < self.settings.period:
             return 0
         last = self._last
         key = last is None or self._lost or not 0.0 <= at - self._keyed_at < self.settings.keyframe
@@ -279,7 +279,7 @@ class _Segment:
 
 
 def changed(last: Look, look: Look, deadband: int) -> npt.NDArray[np.bool_]:
-    """Return which rows differ, (N,): in state, fault or flags, or counts beyond a deadband.
+    """Return the mask of changed rows, (N,): state, fault, flags, or counts beyond a deadband.
 
     Nothing is known of a row that was and is stale, so it does not differ.
     """
@@ -358,7 +358,7 @@ def _new_file(path: Path, how: int) -> BinaryIO:
 
 def retain(folder: Path, days: int, today: date) -> list[str]:
     """Remove the days of an archive that are older than some days; return them."""
-    gone = []
+    removed = []
     for place in sorted(folder.glob("????-??-??")):
         try:
             day = date.fromisoformat(place.name)
@@ -366,5 +366,5 @@ def retain(folder: Path, days: int, today: date) -> list[str]:
             continue
         if today - day > timedelta(days=days):
             shutil.rmtree(place)
-            gone.append(place.name)
-    return gone
+            removed.append(place.name)
+    return removed

@@ -98,9 +98,9 @@ def _line(error: Exception) -> str:
 def _content(folder: Path) -> tuple[list[str], pa.Table]:
     """Return the Parquet files, and the rows of parts that are not among them."""
     for _ in range(_TRIES):
-        found = sorted(folder.glob("????-??-??/*.*"))
-        files = [p for p in found if p.suffix == ".parquet"]
-        parts = [p for p in found if p.suffix == ".part" and p.with_suffix(".parquet") not in files]
+        paths = sorted(folder.glob("????-??-??/*.*"))
+        files = [p for p in paths if p.suffix == ".parquet"]
+        parts = [p for p in paths if p.suffix == ".part" and p.with_suffix(".parquet") not in files]
         try:
             batches = [batch for part in parts for batch in read_part(part)]
         except FileNotFoundError:

@@ -84,7 +84,7 @@ class Writer:
 
     @property
     def crowded(self) -> str:
-        """Why no more work is accepted, "" if there is room."""
+        """Why no more work is accepted; empty while there is room."""
         if len(self._queue) < self._limit:
             return ""
         return (
@@ -207,33 +207,33 @@ class Writer:
         return True
 
     def _write(self, batch: list[_Entry]) -> bool:
-        wanted = [e for e in batch if e.future is None or e.future.set_running_or_notify_cancel()]
+        entries = [e for e in batch if e.future is None or e.future.set_running_or_notify_cancel()]
         try:
-            results = self._transact(wanted)
+            results = self._transact(entries)
         except Exception as error:  # noqa: BLE001 - whatever work does, the thread goes on
             if _is_of_database(error):
-                self._fail(wanted, error)
+                self._fail(entries, error)
                 return False
-            if len(wanted) > 1:
-                return self._write_singly(batch, wanted)
+            if len(entries) > 1:
+                return self._write_singly(batch, entries)
             self._remove(batch)
-            self._refuse(wanted[0], error)
+            self._refuse(entries[0], error)
         else:
             self._remove(batch)
             self.problem = ""
-            self._deliver(wanted, results)
+            self._deliver(entries, results)
         return True
 
-    def _write_singly(self, batch: list[_Entry], wanted: list[_Entry]) -> bool:
+    def _write_singly(self, batch: list[_Entry], entries: list[_Entry]) -> bool:
         """Find the work that was refused; the rest of its batch is written."""
-        left = {id(entry) for entry in wanted}
-        self._remove([entry for entry in batch if id(entry) not in left])
-        for count, entry in enumerate(wanted):
+        retried = {id(entry) for entry in entries}
+        self._remove([entry for entry in batch if id(entry) not in retried])
+        for count, entry in enumerate(entries):
             try:
                 results = self._transact([entry])
             except Exception as error:  # noqa: BLE001 - whatever work does, the thread goes on
                 if _is_of_database(error):
-                    self._fail(wanted[count:], error)
+                    self._fail(entries[count:], error)
                     return False
                 self._remove([entry])
                 self._refuse(entry, error)
@@ -288,8 +288,8 @@ class Writer:
         why = str(error) if isinstance(error, StoreError) else cause(error)
         self.problem = f"store {self._database.name}: cannot be written ({why}); see to its disk"
         with self._news:
-            gone = {id(e) for e in entries if not e.kept}
-            kept = [e for e in self._queue if id(e) not in gone and not _cancelled(e)]
+            dropped = {id(e) for e in entries if not e.kept}
+            kept = [e for e in self._queue if id(e) not in dropped and not _cancelled(e)]
             self._queue.clear()
             self._queue.extend(kept)
         for entry in entries:

@@ -72,9 +72,9 @@ def _combined(weights: tuple[float, ...], knots: tuple[Vector, ...], divisor: fl
 
 def fast_vector(utc_s: float, site: Site) -> FloatArray:
     """Return the unit vector to the apparent sun, ENU, (3,), from `vector_and_rate`."""
-    here, _ = vector_and_rate(utc_s, site)
+    direction, _ = vector_and_rate(utc_s, site)
     # No cubic follows the jump below the horizon.
-    return vector(utc_s, site) if here[2] < 0.0 else np.array(here)
+    return vector(utc_s, site) if direction[2] < 0.0 else np.array(direction)
 
 
 def broadcast_values(second: int, utc_s: float, site: Site) -> tuple[int, ...] | None:
@@ -89,9 +89,9 @@ def broadcast_values(second: int, utc_s: float, site: Site) -> tuple[int, ...] |
     site
         Place and air.
     """
-    here, rate = vector_and_rate(utc_s, site)
-    if here[2] < LOWEST_BROADCAST:
+    direction, rate = vector_and_rate(utc_s, site)
+    if direction[2] < LOWEST_BROADCAST:
         return None
-    numbers = [round(value * _UNIT) for value in here]
+    numbers = [round(value * _UNIT) for value in direction]
     rates = [max(-_LARGEST_RATE, min(_LARGEST_RATE, round(value * _RATE))) for value in rate]
     return (second & 0xFFFFFFFF, *numbers, *rates)

@@ -203,7 +203,9 @@ class SunPosition(Value, Framed):
         if np.ndim(self.time) != 1:
             own["time"] = Variable((), frame_times(self.time))
             return batched(np.shape(self.time), own, {"axis": ENU})
-        rows = {name: replace(one, axes=("time", *one.axes)) for name, one in own.items()}
+        rows = {
+            name: replace(variable, axes=("time", *variable.axes)) for name, variable in own.items()
+        }
         return Labelled(("time",), {"time": frame_times(self.time), "axis": ENU}, rows)
 
 
@@ -269,10 +271,10 @@ def position(times: Times, site: Site, *, algorithm: str = "spa") -> SunPosition
     seconds = unix_seconds(times)
     _check_years(seconds, site)
     if algorithm == "grena2008":
-        found = _grena(seconds.ravel(), site)
+        angles = _grena(seconds.ravel(), site)
     else:
-        found = np.radians(_spa(seconds.ravel(), site))
-    azimuth, elevation, true_elevation = found.reshape(3, *seconds.shape)
+        angles = np.radians(_spa(seconds.ravel(), site))
+    azimuth, elevation, true_elevation = angles.reshape(3, *seconds.shape)
     azimuth = wrap_positive(azimuth)
     return SunPosition(
         time=seconds,
@@ -575,8 +577,8 @@ def unix_seconds(times: Times, *, unknown: bool = False) -> FloatArray:
         seconds = as_float(times)  # without loading pandas
     else:
         seconds = _seconds_of(times)
-    wrong = np.isinf(seconds) if unknown else ~np.isfinite(seconds)
-    for index in np.argwhere(wrong)[:1]:
+    invalid = np.isinf(seconds) if unknown else ~np.isfinite(seconds)
+    for index in np.argwhere(invalid)[:1]:
         value = np.asarray(times, dtype=object)[tuple(index)]
         raise _no_time(value, index)
     # Milliseconds of our time are tens of thousands of years away.

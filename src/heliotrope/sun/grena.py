@@ -70,8 +70,8 @@ def grena2008(
 def _heliocentric_longitude(t: FloatArray) -> FloatArray:
     """Return the earth's heliocentric longitude, rad: line, ellipse, moon, planets, remainder."""
     year = 1.72019e-2 * t - 0.0563
-    found = 1.740940 + 1.7202768683e-2 * t + 3.34118e-2 * np.sin(year)
-    found = found + 3.488e-4 * np.sin(2.0 * year)
+    longitude = 1.740940 + 1.7202768683e-2 * t + 3.34118e-2 * np.sin(year)
+    longitude = longitude + 3.488e-4 * np.sin(2.0 * year)
     for size, rate, phase in (
         (3.13e-5, 2.127730e-1, -0.585),
         (1.26e-5, 4.243e-3, 1.46),
@@ -80,7 +80,7 @@ def _heliocentric_longitude(t: FloatArray) -> FloatArray:
         (2.75e-5, 2.1551e-2, -1.98),
         (1.26e-5, 3.1490e-2, -0.80),
     ):
-        found = found + size * np.sin(rate * t + phase)
+        longitude = longitude + size * np.sin(rate * t + phase)
     k = 1e-3 * t
     remainder = ((-2.30796e-7 * k + 3.7976e-6) * k - 2.0458e-5) * k + 3.976e-5
-    return as_float(found + remainder * k * k)
+    return as_float(longitude + remainder * k * k)

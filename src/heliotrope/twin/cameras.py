@@ -86,11 +86,11 @@ class ExactCamera:
     def __init__(
         self, sight: FieldSnapshot, covariance: npt.ArrayLike = 1e-4, seed: int = 0
     ) -> None:
-        given = np.asarray(covariance, dtype=np.float64)
-        plane = given * np.eye(2) if given.ndim == 0 else given
+        array = np.asarray(covariance, dtype=np.float64)
+        plane = array * np.eye(2) if array.ndim == 0 else array
         if plane.shape != (2, 2) or not np.isfinite(plane).all():
             raise InputError(
-                f"exact camera: a covariance of shape {given.shape}; give a variance or (2, 2), m²"
+                f"exact camera: a covariance of shape {array.shape}; give a variance or (2, 2), m²"
             )
         values, vectors = np.linalg.eigh(plane)
         if not np.allclose(plane, plane.T, rtol=1e-9, atol=0.0) or values.min() < 0.0:
@@ -142,7 +142,7 @@ class ExactCamera:
         at = await self._sight.exposure()
         mirrors = {mirror.heliostat: mirror for mirror in self._sight.mirrors()}
         sun = self._sight.sun()
-        places = {name: mirror.lit(target, sun)[0] for name, mirror in mirrors.items()}
+        places = {name: mirror.lit_centroid(target, sun)[0] for name, mirror in mirrors.items()}
         true = places.get(heliostat, np.full(3, np.nan))
         point = true + (self._root @ self._chance.standard_normal(2)) @ target.axes
         reasons = []
@@ -156,8 +156,8 @@ class ExactCamera:
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
         """Photograph a target; see `light`."""
-        seen = await self.light(target, view)
-        return Exposed.read(seen)
+        light = await self.light(target, view)
+        return Exposed.read(light)
 
     async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
         """Return the light on a target: each beam a Gaussian at its true place, with noise."""
@@ -171,7 +171,7 @@ class ExactCamera:
         values = _PAINT + _GRAIN * self._chance.standard_normal((len(y), len(x)))
         points = np.stack(np.meshgrid(x, y), axis=-1)
         for mirror in self._sight.mirrors():
-            place, share = mirror.lit(target, sun)
+            place, share = mirror.lit_centroid(target, sun)
             if not within(target, place, NEAR):
                 continue
             size = mirror.width, mirror.height
@@ -182,9 +182,9 @@ class ExactCamera:
             peak = _SUN * power / (2.0 * np.pi * np.sqrt(np.linalg.det(shape)))
             values += peak * np.exp(-0.5 * form)
         self._keep(target, np.full(3, np.nan), (SEVERAL,))
-        seen = np.ones(values.shape, dtype=np.bool_)
+        mask = np.ones(values.shape, dtype=np.bool_)
         first = np.array([x[0], y[0]])
-        return TargetLight(values.astype(np.float32), step, first, seen, 1.0, at)
+        return TargetLight(values.astype(np.float32), step, first, mask, 1.0, at)
 
     def _keep(self, target: Target, point: FloatArray, lines: tuple[str, ...]) -> None:
         centroid = None
@@ -297,8 +297,8 @@ class RenderedCamera:
     def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
         """Read later photographs by a camera and a target's marks; the true ones stay."""
         self._known = {
-            name: (camera if known.name == camera.name else known, there)
-            for name, (known, there) in self._known.items()
+            name: (camera if known.name == camera.name else known, surface)
+            for name, (known, surface) in self._known.items()
         }
         self._known[target.name] = camera, target
         known = {**self._settings.pictures, **pictures}
@@ -314,8 +314,8 @@ class RenderedCamera:
         UnknownNameError
             There is no scene of the target.
         """
-        seen, _ = await self._take(target)
-        reading = seen.reading(target)
+        picture, _ = await self._take(target)
+        reading = picture.reading(target)
         if reading.spots:
             place = reading.spots[0].plane
             raise InputError(
@@ -324,7 +324,7 @@ class RenderedCamera:
             )
         if not reading.found.found:
             raise InputError(f"target {target}: {reading.found.reason}; look at the camera")
-        self._empty[target] = seen.frame
+        self._empty[target] = picture.frame
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
         """Return the beam seen on a target; the camera does not know its heliostat.
@@ -335,8 +335,8 @@ class RenderedCamera:
             There is no scene of the target.
         """
         del heliostat
-        seen, at = await self._take(target.name)
-        return shot_of(seen, target.name, at)
+        picture, at = await self._take(target.name)
+        return shot_of(picture, target.name, at)
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
         """Photograph a target; see `plant.visits.target_light.LightCamera`.
@@ -397,9 +397,9 @@ class RenderedCamera:
         shown, at = await self._expose(name)
         (camera, target), settings = self._known[name], self._settings
         frame = await self._drawn(shown)
-        seen, jpeg = await self._worker(
+        picture, jpeg = await self._worker(
             beam_of, frame, (target,), camera, settings, self._empty.get(name)
         )
         self.last = self._frames[name] = frame
-        self._views.keep(name, shown.time.timestamp(), seen, jpeg)
-        return seen, at
+        self._views.keep(name, shown.time.timestamp(), picture, jpeg)
+        return picture, at

@@ -84,10 +84,10 @@ class Exposure:
     def draw(self) -> Frame:
         """Return the frame; the brightest of paint and beams sets the exposure."""
         target = self.scene.targets[0]
-        beams = [one.beam for one in thrown(target, self.mirrors, self.sun, self.optics)]
+        beams = [spot.beam for spot in thrown(target, self.mirrors, self.sun, self.optics)]
         light = (Thrown(target.name, Beam.together(beams)),) if beams else ()
-        lit = exposed(replace(self.scene, beams=light), PEAK)
-        return render(lit, self.seed, name=self.title, time=self.time).frame
+        scene = exposed(replace(self.scene, beams=light), PEAK)
+        return render(scene, self.seed, name=self.title, time=self.time).frame
 
 
 class Drawer:
@@ -120,17 +120,17 @@ class Drawer:
             line = self._begun()
             try:
                 line.send(exposure)
-                found = line.recv()
+                answer = line.recv()
             except (EOFError, OSError) as error:
                 self._end()
                 raise FetchError(
                     f"{exposure.title}: the process that draws photographs has ended; "
                     "the next photograph begins another"
                 ) from error
-        if isinstance(found, str):
-            raise InputError(found)
-        assert isinstance(found, Frame)
-        return found
+        if isinstance(answer, str):
+            raise InputError(answer)
+        assert isinstance(answer, Frame)
+        return answer
 
     def close(self) -> None:
         """End the process at once; who waits for a photograph is refused it."""
@@ -168,23 +168,23 @@ def _drawing(line: Connection) -> None:
             exposure: Exposure = line.recv()
         except (EOFError, OSError):
             return
-        found: Frame | str
+        answer: Frame | str
         try:
-            found = exposure.draw()
+            answer = exposure.draw()
         except HeliotropeError as error:
-            found = str(error)
-        line.send(found)
+            answer = str(error)
+        line.send(answer)
 
 
 def thrown(
     target: Target, mirrors: Sequence[TrueMirror], sun: FloatArray, optics: Optics
 ) -> tuple[Thrown, ...]:
     """Return the beams of mirrors on a target, and near enough beside it."""
-    found = []
+    beams = []
     for mirror in mirrors:
         if not within(target, mirror.on(target, sun), NEAR):
             continue
-        if mirror.lit(target, sun, _COARSE)[1] < LEAST:
+        if mirror.lit_centroid(target, sun, _COARSE)[1] < LEAST:
             continue
         # Facets are canted at the distance of the target, wherever the mirror looks.
         slant = float(np.linalg.norm(target.center - mirror.vertex))
@@ -203,5 +203,5 @@ def thrown(
             neighbours=mirror.neighbours,
             step=_STEP,
         )
-        found.append(Thrown(target.name, beam))
-    return tuple(found)
+        beams.append(Thrown(target.name, beam))
+    return tuple(beams)

@@ -211,7 +211,7 @@ class EmergencyDisk:
         self._document = ""
 
     def emergency(self) -> str:
-        """Return the document, "" if none is kept."""
+        """Return the document, or ""."""
         return self._document
 
     def keep_emergency(self, document: str) -> None:

@@ -45,7 +45,8 @@ class FluxSensor:
     ) -> None:
         self.names = frozenset({FLUX_READING})
         self._apertures = [
-            (each.center, 0.5 * math.hypot(each.width, each.height)) for each in receivers
+            (receiver.center, 0.5 * math.hypot(receiver.width, receiver.height))
+            for receiver in receivers
         ]
         self._clock, self._stand, self._sun = clock, stand, sun
         self._read_at = -math.inf
@@ -87,10 +88,10 @@ def light_share(
     s, point = np.asarray(sun, dtype=np.float64), np.asarray(middle, dtype=np.float64)
     cosine = normal @ s
     rays = 2.0 * cosine[:, None] * normal - s
-    way = point - vertex
-    along = np.einsum("ij,ij->i", way, rays)
-    off = np.sqrt(np.maximum(0.0, np.einsum("ij,ij->i", way, way) - along**2))
-    unit = way / np.linalg.norm(way, axis=1)[:, None]
+    offset = point - vertex
+    along = np.einsum("ij,ij->i", offset, rays)
+    off = np.sqrt(np.maximum(0.0, np.einsum("ij,ij->i", offset, offset) - along**2))
+    unit = offset / np.linalg.norm(offset, axis=1)[:, None]
     nominal = np.sqrt(np.maximum(0.0, 0.5 * (1.0 + unit @ s)))
     on = (along > 0.0) & (off <= radius)
     return float(np.maximum(cosine, 0.0)[on].sum() / nominal.sum())

@@ -44,7 +44,7 @@ class TrueMirror:
     height: float = 2.0
     neighbours: Neighbours | None = None
 
-    def lit(
+    def lit_centroid(
         self, target: Target, sun: FloatArray, elements: int = _ELEMENTS
     ) -> tuple[FloatArray, float]:
         """Return where its centroid is on the plane of a target, ENU, m, (3,), and its lit share.
@@ -57,7 +57,7 @@ class TrueMirror:
             return point, 1.0
         slant = float(np.linalg.norm(point - self.vertex))
         facets = equal_facets(self.width, self.height, (1, 1), slant)
-        found = centroid_shift(
+        effect = centroid_shift(
             target,
             self.vertex,
             sun,
@@ -67,7 +67,7 @@ class TrueMirror:
             facet_focal=slant,
             elements=elements,
         )
-        return point + found.shift @ target.axes, 1.0 - found.hidden
+        return point + effect.shift @ target.axes, 1.0 - effect.hidden
 
     def on(self, target: Target, sun: FloatArray) -> FloatArray:
         """Return where its ray meets the plane of a target, ENU, m, (3,); NaN if it does not."""
@@ -124,7 +124,7 @@ def mirrors_near(
         along = ((middle - vertex) @ target.normal) / (rays @ target.normal)
     away = np.linalg.norm(vertex + along[:, None] * rays - middle, axis=-1)
     hits = np.flatnonzero((cosine > GRAZING) & (along > 0.0) & (away <= limit)).tolist()
-    found = []
+    mirrors = []
     for i in hits:
         size = float(sizes[i, 0]), float(sizes[i, 1])
         hiding = None
@@ -133,8 +133,8 @@ def mirrors_near(
             others = Neighbours(vertex[near], facing[near], *sizes[near].T)
             hides = others.before(vertex[i], facing[i], size, sun, rays[i])
             hiding = others.of(hides) if hides.any() else None
-        found.append(TrueMirror(names[i], vertex[i], facing[i], *size, hiding))
-    return found
+        mirrors.append(TrueMirror(names[i], vertex[i], facing[i], *size, hiding))
+    return mirrors
 
 
 def within(target: Target, point: FloatArray, share: float = 0.0) -> bool:

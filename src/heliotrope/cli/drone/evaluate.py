@@ -103,13 +103,13 @@ def evaluate(
 
 
 def _show(result: "CampaignResult", out: Path) -> None:
-    given = sum(len(f.photos) + len(f.problems) for f in result.data)
+    total = sum(len(f.photos) + len(f.problems) for f in result.data)
     used = sum(len(f.evaluation.photos) for f in result.flights)
     mirrors = sum(len(s.mirror) for f in result.flights for s in f.evaluation.seen)
     reflections = sum(len(f.evaluation.reflections) for f in result.flights)
     flights = f"{len(result.flights)} of {len(result.data)} flights, "
     print(
-        f"{flights if len(result.data) > 1 else ''}{used} of {given} photographs used, {mirrors} "
+        f"{flights if len(result.data) > 1 else ''}{used} of {total} photographs used, {mirrors} "
         f"pictures of mirrors, {reflections} reflections"
     )
     print(result.campaign.offset_text())

@@ -131,7 +131,7 @@ def plan(
 
     plant = open_plant(field)
     air, place = _airspace(plant, airspace, tower, (min_height, max_height))
-    wanted = shared.formats(formats)
+    chosen = shared.formats(formats)
     settings = PlanSettings(
         size=size,
         spread=float(np.radians(spread_deg)),
@@ -163,7 +163,7 @@ def plan(
     with progress("choosing directions", as_json) as step:
         made = plan_flight(plant, settings, step)
     with progress("writing sorties", as_json) as step:
-        written = write_plan(made, into, formats=wanted, aircraft=aircraft, progress=step)
+        written = write_plan(made, into, formats=chosen, aircraft=aircraft, progress=step)
     write_picture(into / "map.png", flight_map(made))
     summary = made.summary()
     if as_json:
@@ -171,8 +171,8 @@ def plan(
         return
     _print(summary)
     print(f"plan: {into / 'plan.json'}, commands: {into / 'commands.csv'}, map: {into / 'map.png'}")
-    if wanted:
-        print(f"waypoints of {summary['sorties']} sorties: {into} ({', '.join(wanted)})")
+    if chosen:
+        print(f"waypoints of {summary['sorties']} sorties: {into} ({', '.join(chosen)})")
 
 
 def _selection(

@@ -53,7 +53,7 @@ def rtk(
             calibration.connected(scheduler) as client,
             calibration.progress("reading", as_json) as advance,
         ):
-            seen = read_many(
+            readings = read_many(
                 flight.photos,
                 flight.camera,
                 flight.stand,
@@ -63,8 +63,8 @@ def rtk(
                 progress=advance,
             )
         priors = Priors(position=1e-3 * survey_mm)
-        check, found = check_rtk(flight.photos, seen, flight.camera, flight.stand, priors)
-        problems = (*flight.problems, *found)
+        check, unusable = check_rtk(flight.photos, readings, flight.camera, flight.stand, priors)
+        problems = (*flight.problems, *unusable)
     for line in problems:
         print(f"heliotrope: {line}", file=sys.stderr)
     out.mkdir(parents=True, exist_ok=True)

@@ -202,7 +202,7 @@ class _Drawing:
 
 
 def _campaign(
-    drawing: _Drawing, plan: Path, wanted: str, mirrors: "Heliostats", folder: Path
+    drawing: _Drawing, plan: Path, selection: str, mirrors: "Heliostats", folder: Path
 ) -> None:
     """Render the stations of a plan, each into its folder CLUSTER-POINT."""
     from heliotrope.airborne.plan.stations import read_stations
@@ -211,7 +211,7 @@ def _campaign(
 
     stations = read_stations(plan, mirrors.names)
     names = [s.name for s in stations]
-    chosen = [name.strip() for name in wanted.split(",") if name.strip()] or names
+    chosen = [name.strip() for name in selection.split(",") if name.strip()] or names
     for name in chosen:
         if name not in names:
             raise UnknownNameError("station", name, names)

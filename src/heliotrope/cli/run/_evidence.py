@@ -109,17 +109,17 @@ async def export(live: PlantAssembly, keeper: Keeper, folder: Path | None) -> No
 
     def write() -> tuple[Head, ...]:
         with keeper.database.reading() as connection:
-            found = chain.heads(connection)
+            heads = chain.heads(connection)
         if folder is not None:
-            chain.write_heads(folder, found, now)
-        return found
+            chain.write_heads(folder, heads, now)
+        return heads
 
     try:
-        found = await asyncio.to_thread(write)
+        heads = await asyncio.to_thread(write)
     except HeliotropeError as error:
         live.logbook.take_alarm(kind.raised(problem=error))
         return
     if live.logbook.stands(kind):
         live.logbook.take_alarm(kind.ended())
-    for head in found:
+    for head in heads:
         live.operations.security.note(SecurityEvent.CHAIN_HEAD, detail=str(head))

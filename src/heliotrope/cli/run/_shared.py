@@ -181,8 +181,8 @@ def one_error() -> Iterator[None]:
     try:
         yield
     except BaseExceptionGroup as group:
-        found = _leaves(group)
-        known = [error for error in found if isinstance(error, HeliotropeError | OSError)]
+        errors = _leaves(group)
+        known = [error for error in errors if isinstance(error, HeliotropeError | OSError)]
         if not known:
             raise
         raise known[0] from None
@@ -349,7 +349,7 @@ async def interface(
 
 
 def first_account(live: PlantAssembly, keeper: Keeper, shown: Shown, folder: Path) -> str | None:
-    """Return what to print of the password of a new first account, None if there is none.
+    """Return the text about a new first account's password; None for an account that exists.
 
     It is written to the store, which may be slow, so this comes before the plant begins.
     """
@@ -369,9 +369,9 @@ async def watch(
     pause = speed * shown.every * (_SELDOM if shown.console and shown.every == EVERY else 1.0)
     until = None if shown.minutes is None else loop.time() + 60.0 * shown.minutes
     while not asked.is_set() and (until is None or loop.time() < until):
-        left = pause if until is None else min(pause, until - loop.time())
+        wait = pause if until is None else min(pause, until - loop.time())
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(max(left, 0.01)):
+            async with asyncio.timeout(max(wait, 0.01)):
                 await asked.wait()
         lines.print(line(live))
 
@@ -383,11 +383,11 @@ async def stow(live: PlantAssembly, at_once: asyncio.Event, lines: Lines) -> boo
     """
     stowing = asyncio.ensure_future(live.stowed())
     waiting = asyncio.ensure_future(at_once.wait())
-    left: set[asyncio.Future[Any]] = {stowing, waiting}
-    while left == {stowing, waiting}:
+    running: set[asyncio.Future[Any]] = {stowing, waiting}
+    while running == {stowing, waiting}:
         if going := _on_the_way(live):
             lines.print(f"{going}; Ctrl-C again ends at once")
-        _, left = await asyncio.wait(left, timeout=_SAID, return_when=asyncio.FIRST_COMPLETED)
+        _, running = await asyncio.wait(running, timeout=_SAID, return_when=asyncio.FIRST_COMPLETED)
     waiting.cancel()
     stowing.cancel()
     done = await asyncio.gather(stowing, return_exceptions=True)
@@ -400,15 +400,15 @@ async def stow(live: PlantAssembly, at_once: asyncio.Event, lines: Lines) -> boo
 
 
 def _on_the_way(live: PlantAssembly) -> str:
-    """Return how many heliostats go to stow, from which states, and for how long; "" if none do."""
-    found, seconds = live.to_stow()
-    if not found:
+    """Return the count, states and remaining time of heliostats on their path to stow, or ""."""
+    by_state, seconds = live.to_stow()
+    if not by_state:
         return ""
-    counts = ", ".join(f"{count:,} {state.lower()}" for state, count in found.items())
+    counts = ", ".join(f"{count:,} {state.lower()}" for state, count in by_state.items())
     # To ten seconds: the paths round volumes are longer than the axes' turns.
     known = math.isfinite(seconds)
     about = f"about {max(1, math.ceil(0.1 * seconds)) * 10} s" if known else "of unknown position"
-    return f"stowing {sum(found.values()):,} heliostats ({counts}), {about}"
+    return f"stowing {sum(by_state.values()):,} heliostats ({counts}), {about}"
 
 
 def line(live: PlantAssembly) -> str:

@@ -349,11 +349,12 @@ def _only_real(**simulated: bool) -> None:
     """Refuse options of a simulation, by name, for a real plant."""
     from heliotrope.errors import InputError
 
-    given = ", ".join(f"--{name}" for name, there in simulated.items() if there)
-    if given:
+    options = ", ".join(f"--{name}" for name, used in simulated.items() if used)
+    if options:
         raise InputError(
-            f"run: {given}: only in simulation; real clusters follow the sun of now, by the clocks "
-            "of their computers: leave it out, or leave out --clusters to simulate this plant"
+            f"run: {options}: only in simulation; real clusters follow the sun of now, by the "
+            "clocks of their computers: leave it out, or leave out --clusters to simulate this "
+            "plant"
         )
 
 

@@ -126,10 +126,10 @@ def _check(
     sensors = outside.sensors(cameras, clock)
     ports = Ports(outside.all_links, clock, Forgetful(), cameras, sensors)
     PlantAssembly(design, ports, settings)
-    seen = 0 if cameras is None else sum(cameras.sees(t.name) for t in design.targets)
+    watched = 0 if cameras is None else sum(cameras.sees(t.name) for t in design.targets)
     print(
         f"{design.name}: {len(design):,} heliostats on {len(clusters_of(design))} clusters, "
-        f"{seen} of {len(design.targets)} targets with a camera"
+        f"{watched} of {len(design.targets)} targets with a camera"
     )
     bare = [name for name, group in design.groups.items() if not group.machines]
     if bare:
@@ -146,14 +146,20 @@ class _Outside:
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
         """Run servers, links and local clusters for the time of a block."""
-        parts = [*self.links.parts, *(part for one in self.local for part in one.parts)]
-        async with running(*parts), running(*(one.cluster for one in self.local)):
+        parts = [
+            *self.links.parts,
+            *(part for local in self.local for part in local.parts),
+        ]
+        async with running(*parts), running(*(local.cluster for local in self.local)):
             yield
 
     @property
     def all_links(self) -> "dict[str, Link]":
         """The links to all clusters, by name."""
-        return {**self.links.links, **{one.cluster.config.name: one.link for one in self.local}}
+        return {
+            **self.links.links,
+            **{local.cluster.config.name: local.link for local in self.local},
+        }
 
     def sensors(self, cameras: RealCameras | None, clock: SystemClock) -> Sensors:
         """Return the sensors of the plant."""
@@ -231,10 +237,10 @@ async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outsid
         if live.plant.sentinel.table.unwatched:
             print(f"no readings for: {', '.join(live.plant.sentinel.table.unwatched)}", flush=True)
         papers = _papers(outside, shown)
-        for each in outside.local:
-            file = each.installation.bus_key_file
+        for local in outside.local:
+            file = local.installation.bus_key_file
             if file is not None:
-                name = f"key of the bus of {each.installation.config.name}"
-                papers.renew(name, [file], each.installation.take_bus_keys)
+                name = f"key of the bus of {local.installation.config.name}"
+                papers.renew(name, [file], local.installation.take_bus_keys)
         async with papers.watched(live.logbook.take_alarm):
             await at_work(live, keeper, shown, folder, ending, stows=True)

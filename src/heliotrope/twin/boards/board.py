@@ -123,7 +123,7 @@ class Board:
         self.tilt: tuple[float, float] | None = None
         self.switched_off, self.powered = False, True
         self._out = bytearray()
-        self._looked = -math.inf
+        self._last_pass = -math.inf
         self._restless = False
         self._posed: tuple[float, float] | None = None
         self._pose: tuple[FloatArray, FloatArray] = np.zeros(3), np.zeros(3)
@@ -146,7 +146,7 @@ class Board:
             axis.turned - count
             for axis, count in zip(self.axes, (journal.primary, journal.secondary), strict=True)
         ]
-        self._looked = -math.inf
+        self._last_pass = -math.inf
         try:
             self.node = Node(
                 self.flash,
@@ -266,7 +266,7 @@ class Board:
         self._to(now)
         if self.node is None:
             return b""
-        self._looked = now
+        self._last_pass = now
         self._restless = False
         try:
             self.node.on_tick(self.ticks.at(now))
@@ -287,7 +287,7 @@ class Board:
         if node is None:
             return math.inf
         if self._restless or not node.controller.motion.still():
-            return self._looked + MOVING
+            return self._last_pass + MOVING
         own = node.controller
         busy = own.state in (states.APPROACHING, states.SEARCHING, states.STOWING)
         pause = RESTING
@@ -295,9 +295,9 @@ class Board:
             pause = MOVING if busy else FOLLOWING
         if own.sun.fresh():
             # At the end of the lease the loop runs at once, as on a real board.
-            left = (own.config.lease_ms - own.sun.age_ms() + 1) / 1000.0
-            pause = min(pause, max(0.0, now - self._looked) + left)
-        return self._looked + pause
+            remaining = (own.config.lease_ms - own.sun.age_ms() + 1) / 1000.0
+            pause = min(pause, max(0.0, now - self._last_pass) + remaining)
+        return self._last_pass + pause
 
     # -- truth -------------------------------------------------------------------------
 
@@ -349,7 +349,7 @@ class Board:
     ) -> float:
         """Return the distance of the ray from a point, m; infinite if it leads away from it."""
         # By single numbers: for three of them numpy takes several times as long.
-        vertex, normal = (each.tolist() for each in self.mirror(believed=believed))
+        vertex, normal = (vector.tolist() for vector in self.mirror(believed=believed))
         (a, b, c), (i, j, k), (s, t, u) = vertex, normal, sun.tolist()
         twice = 2.0 * (i * s + j * t + k * u)
         x, y, z = point[0] - a, point[1] - b, point[2] - c

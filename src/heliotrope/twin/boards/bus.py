@@ -25,7 +25,7 @@ class Station(Protocol):
     """A device connected to a bus."""
 
     def hear(self, data: bytes, now: float) -> bytes:
-        """Take bytes at a time in s, and return the immediate answer, b"" if there is none."""
+        """Take bytes at a time in s; return the immediate answer, or b""."""
         ...
 
 
@@ -37,7 +37,7 @@ class Tap(Protocol):
         ...
 
     def heard(self, place: int, data: bytes, how: str, now: float) -> None:
-        """Note bytes that a station is about to receive, and how: "whole", or by which fault."""
+        """Note bytes that a station is about to receive, and how: "whole", or a fault's name."""
         ...
 
     def answered(self, data: bytes, how: str, now: float) -> None:
@@ -190,7 +190,7 @@ class TwinBus:
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return the answer, b"" if there is none.
+        """Send a frame and return the answer, or b"".
 
         Raises
         ------

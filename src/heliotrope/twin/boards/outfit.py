@@ -104,7 +104,7 @@ def outfits(count: int, seed: int = 0, places: Sequence[tuple[float, float]] = (
     if not 1 <= count <= MOST:
         raise InputError(f"{count} heliostats on a bus; give 1 to {MOST}")
     chance = random.Random(seed)
-    found = []
+    fits = []
     for i in range(count):
         bearing = math.radians(-35.0 + 70.0 * (i + chance.uniform(0.2, 0.8)) / count)
         away = chance.uniform(60.0, 130.0)
@@ -114,7 +114,7 @@ def outfits(count: int, seed: int = 0, places: Sequence[tuple[float, float]] = (
         mechanism = perfect.with_parameters(causes)
         address = 11 + i
         key = sha256(b"key %d" % address)
-        found.append(
+        fits.append(
             Outfit(
                 f"H{i + 1:02d}",
                 address,
@@ -125,7 +125,7 @@ def outfits(count: int, seed: int = 0, places: Sequence[tuple[float, float]] = (
                 {**items_of(mechanism, MACHINE), **own_items(address)},
             )
         )
-    return found
+    return fits
 
 
 def _perfect(places: npt.ArrayLike) -> Mechanism:
@@ -155,9 +155,9 @@ def stow_beams(
 
 def mechanisms(fits: Sequence[Outfit]) -> Mechanism:
     """Return the true mechanisms of heliostats as one, (N,)."""
-    perfect = _perfect(np.stack([each.mechanism.position for each in fits]))
+    perfect = _perfect(np.stack([fit.mechanism.position for fit in fits]))
     return perfect.with_parameters(
-        {name: np.array([each.causes[name] for each in fits]) for name in CAUSES}
+        {name: np.array([fit.causes[name] for fit in fits]) for name in CAUSES}
     )
 
 

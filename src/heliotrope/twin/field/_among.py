@@ -10,7 +10,7 @@ Bools = npt.NDArray[np.bool_]
 
 @lru_cache(maxsize=64)
 def _table(members: tuple[int, ...]) -> Bools:
-    """Whether each code is a member, by index; the last entry stands for -1: no power."""
+    """Whether each code is a member, by index; the last entry means -1: no power."""
     table = np.zeros(16, dtype=np.bool_)
     table[list(members)] = True
     return table

@@ -82,8 +82,8 @@ def _slot(axes, i, k, held):
     distance = b["direction"] * (b["leg"] - b["count"]) * SCALE - b["phase"]
     speed = slower
     if not (held or b["braking"] or distance < _stopping(slower, b["change"])):
-        wanted = min(b["speed"] + b["change"], b["top"], _fastest(distance, b["change"]))
-        speed = max(slower, wanted)
+        faster = min(b["speed"] + b["change"], b["top"], _fastest(distance, b["change"]))
+        speed = max(slower, faster)
     moved = b["phase"] + speed
     axes[i, k]["speed"] = speed
     axes[i, k]["phase"] = moved % SCALE

@@ -32,11 +32,11 @@ def pieces(corners: FloatArray, origin: FloatArray) -> tuple[FloatArray, npt.NDA
     out[:, 0] = corners[:, 0]
     place = np.ones(len(corners), dtype=np.int64)
     for c in range(parts.shape[1]):
-        first, way = corners[:, c], corners[:, c + 1] - corners[:, c]
+        first, leg = corners[:, c], corners[:, c + 1] - corners[:, c]
         for k in range(1, int(parts[:, c].max()) + 1):
             rows = np.flatnonzero(k <= parts[:, c])
             n = parts[rows, c, None]
-            inner: Any = first[rows] + way[rows] * k / n
+            inner: Any = first[rows] + leg[rows] * k / n
             out[rows, place[rows]] = np.where(k == n, corners[rows, c + 1], inner)
             place[rows] += 1
     return out, length

@@ -138,9 +138,9 @@ class Field:
         self._defocus = np.zeros((count, 2))
         self._senses = np.ones((count, 2))
         self.axes = np.zeros((count, 2), dtype=AXIS)
-        for one, rows in self.journals.machines():
-            self._stow[rows], self._defocus[rows] = one.stow, one.defocus
-            for i, axis in enumerate(one.axes):
+        for table, rows in self.journals.machines():
+            self._stow[rows], self._defocus[rows] = table.stow, table.defocus
+            for i, axis in enumerate(table.axes):
                 _limit(self.axes, rows, i, axis)
         for name in ("count", "goal", "leg"):
             self.axes[name] = self._stow
@@ -170,7 +170,7 @@ class Field:
         self._path = np.zeros((count, 1, 3))
         self._length = np.zeros(count, dtype=np.int64)
         self._place = np.zeros(count, dtype=np.int64)
-        self._way, self._way_length = self._all_ways()
+        self._safe_path, self._safe_path_length = self._all_safe_paths()
         self._sun = np.zeros((2, 3), dtype=np.int64)
         self._sun_ms = 0
         self._sunned = np.full(count, -RECENT_MS)  # when each took it last, ms
@@ -180,9 +180,11 @@ class Field:
 
     # -- the safe way ----------------------------------------------------------------------
 
-    def _all_ways(self) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    def _all_safe_paths(self) -> tuple[FloatArray, npt.NDArray[np.int64]]:
         """Return the points from the ground to standby, (N, P, 3), and how many there are."""
-        made = [(rows, *self._ways(one.way, rows)) for one, rows in self.journals.machines()]
+        made = [
+            (rows, *self._safe_paths(table.way, rows)) for table, rows in self.journals.machines()
+        ]
         out = np.zeros((len(self), max(points.shape[1] for _, points, _ in made), 3))
         lengths = np.zeros(len(self), dtype=np.int64)
         for rows, points, length in made:
@@ -190,20 +192,20 @@ class Field:
             lengths[rows] = length
         return out, lengths
 
-    def _ways(
-        self, given: tuple[tuple[float, float, float], ...], rows: Rows
+    def _safe_paths(
+        self, configured: tuple[tuple[float, float, float], ...], rows: Rows
     ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
         books = self.journals
-        origin, here, standby = books.origin[rows], books.position[rows], books.standby[rows]
-        if given:
-            corners = np.broadcast_to(np.array(given), (len(here), len(given), 3))
+        origin, position, standby = books.origin[rows], books.position[rows], books.standby[rows]
+        if configured:
+            corners = np.broadcast_to(np.array(configured), (len(position), len(configured), 3))
             return pieces(np.concatenate([corners, standby[:, None]], axis=1), origin)
-        half = 0.5 * (standby - here)
+        half = 0.5 * (standby - position)
         sine, cosine = 0.5, 0.866
-        aside, foot = here.copy(), standby.copy()
+        aside, foot = position.copy(), standby.copy()
         aside[:, 0] += cosine * half[:, 0] - sine * half[:, 1]
         aside[:, 1] += sine * half[:, 0] + cosine * half[:, 1]
-        foot[:, 2] = here[:, 2]
+        foot[:, 2] = position[:, 2]
         return pieces(np.stack([aside, foot, standby], axis=1), origin)
 
     # -- poses -----------------------------------------------------------------------------
@@ -226,11 +228,11 @@ class Field:
         """Angles turned away by the defocus; the other way where a stop is near."""
         low, high = self._low[rows], self._high[rows]
         turn = self._senses[rows] * self._defocus[rows]
-        one, other = angles + turn, angles - turn
+        turned, other = angles + turn, angles - turn
         stop = np.where(angles - low > high - angles, low, high)
         inside = (low <= other) & (other <= high)
         back = np.where(inside, other, stop)
-        return np.asarray(np.where((low <= one) & (one <= high), one, back))
+        return np.asarray(np.where((low <= turned) & (turned <= high), turned, back))
 
     def still(self, rows: Rows | None = None) -> Bools:
         """Whether each heliostat is at rest, (N,), or (M,) for some rows."""
@@ -243,16 +245,16 @@ class Field:
 
     def ready(self, rows: Rows) -> Bools:
         """Whether heliostats have come to standby by the safe way, (M,)."""
-        found: Bools = self._ready[rows]
-        return found
+        arrived: Bools = self._ready[rows]
+        return arrived
 
     def at_stow(self, rows: Rows | None = None) -> Bools:
-        """Whether each heliostat stands at stow, (N,), or (M,) for some rows."""
+        """Whether each heliostat is at stow and still, (N,), or (M,) for some rows."""
         count, stow = self.axes["count"], self._stow
         if rows is not None:
             count, stow = count[rows], stow[rows]
-        there: Bools = (count == stow).all(axis=1)
-        return self.still(rows) & there
+        at_counts: Bools = (count == stow).all(axis=1)
+        return self.still(rows) & at_counts
 
     # -- motions ---------------------------------------------------------------------------
 
@@ -299,7 +301,7 @@ class Field:
         kernels.go_rows(self.axes, self._order, rows, self._turn_goals[rows], both)
 
     def _leaving(self, rows: Rows) -> Bools:
-        """Return which heliostats make a motion that takes the beam off: `Motion.leaving`."""
+        """Return the mask of heliostats whose motion takes the beam off: `Motion.leaving`."""
         turns = (self.kind[rows] == DEFOCUS) & (self._aside[rows] == TURNING)
         return np.asarray(among(self.kind[rows], STOW, RETURN) | turns)
 
@@ -316,33 +318,35 @@ class Field:
     def _down(self, rows: Rows) -> tuple[FloatArray, FloatArray]:
         """Return points (M, 3) and angles (M, 2) down the safe way, or NaN: `Motion._turn`."""
         points, angles = np.full((len(rows), 3), np.nan), np.full((len(rows), 2), np.nan)
-        there = (self._target[rows] == self.journals.standby[rows]).all(axis=1)
-        held = self._ready[rows] & (self.kind[rows] == HOLD) & there
+        at_standby = (self._target[rows] == self.journals.standby[rows]).all(axis=1)
+        held = self._ready[rows] & (self.kind[rows] == HOLD) & at_standby
         stands = held | (self.kind[rows] == STANDBY)
-        place = np.where(stands, self._way_length[rows] - 1, self._place[rows])
-        knows = self.now_ms - self._sunned[rows] < RECENT_MS
-        left = np.flatnonzero(knows & (stands | (self.kind[rows] == APPROACH)))
+        place = np.where(stands, self._safe_path_length[rows] - 1, self._place[rows])
+        recent = self.now_ms - self._sunned[rows] < RECENT_MS
+        remaining = np.flatnonzero(recent & (stands | (self.kind[rows] == APPROACH)))
         begin = self._angles_at(self.axes["count"][rows], rows)
-        ground = np.where(stands, self._way[rows, 0, 2], self._path[rows, 0, 2])
-        while len(left := left[place[left] > 0]):
-            place[left] -= 1
-            chosen, at = rows[left], place[left]
+        ground = np.where(stands, self._safe_path[rows, 0, 2], self._path[rows, 0, 2])
+        while len(remaining := remaining[place[remaining] > 0]):
+            place[remaining] -= 1
+            chosen, at = rows[remaining], place[remaining]
             up = self._path[chosen, np.minimum(at, self._path.shape[1] - 1)]
-            tried = np.where(stands[left, None], self._way[chosen, at % self._way.shape[1]], up)
-            found, good = self._pose(chosen, tried, 0)
-            turn = np.abs(found - begin[left])
+            tried = np.where(
+                stands[remaining, None], self._safe_path[chosen, at % self._safe_path.shape[1]], up
+            )
+            tried_angles, good = self._pose(chosen, tried, 0)
+            turn = np.abs(tried_angles - begin[remaining])
             good &= turn.max(axis=1) <= FAR
-            points[left[good]], angles[left[good]] = tried[good], found[good]
-            more = (turn < self._defocus[chosen]).all(axis=1) & (tried[:, 2] > ground[left])
-            left = left[good & more]
+            points[remaining[good]], angles[remaining[good]] = tried[good], tried_angles[good]
+            more = (turn < self._defocus[chosen]).all(axis=1) & (tried[:, 2] > ground[remaining])
+            remaining = remaining[good & more]
         return points, angles
 
     def _sense(self, rows: Rows) -> None:
         """Choose in which sense heliostats turn away: `Motion._turn`."""
         self._senses[rows] = 1.0
-        knows = self.now_ms - self._sunned[rows] < RECENT_MS
+        recent = self.now_ms - self._sunned[rows] < RECENT_MS
         aims = among(self.kind[rows], TRACK)
-        leaves = rows[~aims & knows & np.isfinite(self.aim[rows, 0])]
+        leaves = rows[~aims & recent & np.isfinite(self.aim[rows, 0])]
         some, off = self._off(leaves, self.aim[leaves])
         self._senses[some] = np.copysign(1.0, off * self._defocus[some])
         tracks = rows[aims]
@@ -351,7 +355,7 @@ class Field:
         self._senses[some] = np.where(nearer, -1.0, 1.0)
 
     def _off(self, rows: Rows, points: FloatArray) -> tuple[Rows, FloatArray]:
-        """Return which can reach a point each, and their angles less those there, rad."""
+        """Return the rows that can reach their points, and their angles less those there, rad."""
         if not len(rows):
             return rows, np.empty((0, 2))
         angles, good = self._pose(rows, points, 0)
@@ -385,15 +389,15 @@ class Field:
             return self._path[i, : max(0, self._place[i])][::-1].copy()
         if not self._ready[i]:
             return np.zeros((0, 3))
-        way = self._way[i, : self._way_length[i]][::-1]
+        path = self._safe_path[i, : self._safe_path_length[i]][::-1]
         if self.kind[i] == TRACK:
-            corners = np.concatenate([self.aim[i][None], way])[None]
+            corners = np.concatenate([self.aim[i][None], path])[None]
             long, length = pieces(corners, self.journals.origin[i][None])
             return np.asarray(long[0, 1 : length[0]])
         if self.kind[i] == DEFOCUS:
             top = min(self.journals.standby[i, 2], self._target[i, 2])
-            return np.asarray(way[way[:, 2] < top])
-        return np.asarray(way)
+            return np.asarray(path[path[:, 2] < top])
+        return np.asarray(path)
 
     def _set_path(self, i: np.intp, points: FloatArray) -> None:
         if len(points) > self._path.shape[1]:
@@ -470,7 +474,7 @@ class Field:
         elif name == "APPROACH":
             chosen = chosen[(state == states.STOWED) & (self._lease[chosen] > 0)]
             for i in chosen:
-                self._set_path(i, self._way[i, : self._way_length[i]])
+                self._set_path(i, self._safe_path[i, : self._safe_path_length[i]])
             self.kind[chosen], self._place[chosen] = APPROACH, -1
             self._ready[chosen] = False
             self._enter(chosen, states.APPROACHING)
@@ -651,8 +655,8 @@ class Field:
         self.edition += 1
         self.now_ms += TICK_MS
         self._sun_ms += TICK_MS
-        for left in (self._lease, self._heard):
-            np.maximum(left - TICK_MS, 0, out=left)
+        for timer in (self._lease, self._heard):
+            np.maximum(timer - TICK_MS, 0, out=timer)
         fresh, silent = self._lease > 0, self._heard == 0
         follows = among(self.kind, STANDBY, TRACK) | (
             (self.kind == DEFOCUS) & among(self._base, STANDBY, TRACK)
@@ -683,14 +687,14 @@ class Field:
         if len(alone):
             self._stow_directly(alone)
             self.state[alone] = states.STOWING
-        left = np.flatnonzero(latched & dark & (self.kind != STOW))
-        if len(left):
-            self._stow_directly(left[~self._leaving(left) & ~self.at_stow(left)])
+        dark_rows = np.flatnonzero(latched & dark & (self.kind != STOW))
+        if len(dark_rows):
+            self._stow_directly(dark_rows[~self._leaving(dark_rows) & ~self.at_stow(dark_rows)])
 
     def _move(self) -> None:
         """`Motion.tick`."""
-        for left in (self._knot, self._renew):
-            np.maximum(left - TICK_MS, 0, out=left)
+        for timer in (self._knot, self._renew):
+            np.maximum(timer - TICK_MS, 0, out=timer)
         np.minimum(self._since + TICK_MS, KNOT_MS, out=self._since)
         kind = self.kind.copy()
         arrived = np.flatnonzero((kind == STOW) & self.at_stow())
@@ -736,12 +740,12 @@ class Field:
         new = rows[self._knot[rows] <= 0]
         lost = new[:0]
         if len(new):
-            here, good = self._pose(new, self._target[new], RENEW_MS // 2)
-            there, reached = self._pose(new, self._target[new], RENEW_MS // 2 + KNOT_MS)
-            change = there - here
+            start, good = self._pose(new, self._target[new], RENEW_MS // 2)
+            end, reached = self._pose(new, self._target[new], RENEW_MS // 2 + KNOT_MS)
+            change = end - start
             smooth = reached & (np.abs(change).max(axis=1) <= KNOT_LIMIT)
             lost = new[~good]
-            self._start[new] = here
+            self._start[new] = start
             self._slope[new] = np.where(smooth[:, None], change / KNOT_MS, 0.0)
             self._knot[new] = np.where(smooth, KNOT_MS, RENEW_MS)
             self._knot[lost] = self._since[lost]
@@ -778,8 +782,8 @@ class Field:
         counts = self.axes["count"].astype(np.float64)
         angles, good = self.journals.pose(rows, sun, aims, counts)
         pose = self.mechanism.pose(np.floor(self.journals.drives(rows).counts(angles) + 0.5))
-        wanted = bisector(sun, normalize(aims - pose.vertex))
-        off = np.linalg.norm(np.cross(pose.normal, wanted), axis=-1)
+        required = bisector(sun, normalize(aims - pose.vertex))
+        off = np.linalg.norm(np.cross(pose.normal, required), axis=-1)
         return np.where(good, np.arcsin(np.clip(off, 0.0, 1.0)), np.nan)
 
     def flux(self, sun: npt.ArrayLike, receiver: npt.ArrayLike, radius: float) -> float:

@@ -117,7 +117,7 @@ class FieldBus:
         self._gates = Gates(field, rows, keys) if keys else None
         self._closing = asyncio.Event()
         #: Payloads of every STATUS, and the edition of the field that they are valid for.
-        self._told: list[bytes] = []
+        self._status_payloads: list[bytes] = []
         self._edition = -1
 
     @property
@@ -160,7 +160,7 @@ class FieldBus:
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return the answer, b"" if there is none."""
+        """Send a frame and return the answer, or b""."""
         del timeout, expires, complete
         if urgent:
             # In an emergency all buses and the plant take turns.
@@ -212,7 +212,7 @@ class FieldBus:
         if not 0 <= place < len(self._rows):
             return b""
         if name == "QUERY_BUS":
-            return self._answer(place, sequence, "BUS", _BUS.pack(*gates.told(place)))
+            return self._answer(place, sequence, "BUS", _BUS.pack(*gates.reported(place)))
         if name == "SET_BUS_KEY":
             result = gates.take_key(frame, place)
         else:
@@ -244,26 +244,26 @@ class FieldBus:
         """
         field = self._field
         if self._edition != field.edition:
-            left, state = field.leases(self._all), field.state[self._all]
+            lease, state = field.leases(self._all), field.state[self._all]
             made = np.zeros(len(self._rows), dtype=_STATUS)
-            fresh = left > 0
+            fresh = lease > 0
             made["f0"] = np.maximum(state, 0)
             made["f1"] = _SOUND + _SUN_FRESH * fresh + _AT_STOW * field.at_stow(self._all)
             made["f1"] += (_READY * field.ready(self._all)).astype(np.uint32)
             made["f2"] = field.fault[self._all]
-            made["f4"] = np.where(fresh, LEASE_MS - left, _NEVER)
+            made["f4"] = np.where(fresh, LEASE_MS - lease, _NEVER)
             made["f5"], made["f6"], made["f8"] = 24_000, 25, 1
             if self._gates is not None:
                 made["f1"] += self._gates.flags()
                 made["f8"] = self._gates.boots
             made["f7"] = field.journals.checksums[self._all]
             data, size = made.tobytes(), made.itemsize
-            self._told = [data[i : i + size] for i in range(0, len(data), size)]
+            self._status_payloads = [data[i : i + size] for i in range(0, len(data), size)]
             self._edition = field.edition
-        return self._told
+        return self._status_payloads
 
     def _answer(self, place: int, sequence: int, name: str, payload: bytes) -> bytes:
-        """Return a heliostat's frame, b"" if its power is cut."""
+        """Return a heliostat's frame; b"" without power."""
         if self._field.state[self._rows[place]] < 0:
             return b""
         head = _HEADER.pack(wire.VERSION, wire.CLUSTER_ADDRESS, place + 1, sequence, _NUMBERS[name])
@@ -276,8 +276,8 @@ class FieldBus:
     def _command(self, name: str, number: int, payload: bytes, place: int, sequence: int) -> bytes:
         result, row = messages.REFUSED_STATE, self._rows[place]
         if name == "QUERY_STORED":
-            found = stored(self._field, row, payload[0])
-            return self._answer(place, sequence, "STORED", payload[:1] + found)
+            item = stored(self._field, row, payload[0])
+            return self._answer(place, sequence, "STORED", payload[:1] + item)
         if name == "STANDBY" or messages.who_of(number) == messages.KEY:
             result = self._store(name, number, payload, row)
         elif name in KNOWN:
@@ -310,7 +310,7 @@ class FieldBus:
 
 
 def _unstuffed(data: bytes) -> bytes:
-    """Undo `_stuffed` and its final zero; b"" if that is not possible."""
+    """Undo `_stuffed` and its final zero; b"" where that is not possible."""
     if data.find(0) != len(data) - 1:
         return b""
     out, place, end = bytearray(data), 0, len(data) - 1

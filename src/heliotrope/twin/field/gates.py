@@ -77,7 +77,7 @@ class Gates:
         return len(back) > 0
 
     def flags(self) -> Flags:
-        """Return the flags of STATUS that tell of keys and sessions, (N,)."""
+        """Return the flags of STATUS about keys and sessions, (N,)."""
         return np.array(
             [_KEYED * gate.keyed() + _WANTS * gate.waits() for gate in self._gates], dtype=np.uint32
         )
@@ -86,13 +86,13 @@ class Gates:
         """Return DONE if a frame may act at a row, else why not."""
         if self._off[place]:
             return messages.REFUSED_STATE
-        found = self._gates[place].judge(frame, self._field.now_ms, self._second)
+        result = self._gates[place].judge(frame, self._field.now_ms, self._second)
         values = frame.values()
-        if found == messages.DONE and frame.name == "TIME" and values is not None:
+        if result == messages.DONE and frame.name == "TIME" and values is not None:
             self._second = int(values[0] * WEEK + values[1] // 1000)
-        return found
+        return result
 
-    def told(self, place: int) -> tuple[int, ...]:
+    def reported(self, place: int) -> tuple[int, ...]:
         """Return the numbers of BUS."""
         return self._keys_of(place).told()
 
@@ -101,22 +101,22 @@ class Gates:
         gate, bus, values = self._gates[place], self._keys_of(place), frame.values()
         if values is None:
             return messages.BAD_VALUE
-        found = gate.judge_key(frame, values[2])
+        result = gate.judge_key(frame, values[2])
         row = self._rows[place]
-        if found == messages.DONE and self._field.state[row] not in HARMLESS:
+        if result == messages.DONE and self._field.state[row] not in HARMLESS:
             return messages.REFUSED_STATE
-        if found == messages.DONE:
+        if result == messages.DONE:
             keyed, stored = bus.keyed, bus.with_key(frame.payload)
             self._field.store(row, {"bus_keys": stored, "edition": frame.payload[8:12]})
             gate.edition = values[2]
             bus.take(stored)
             if not keyed:
                 gate.replay.epoch = -1  # anybody may have set it
-        return found
+        return result
 
 
 def stored(field: Field, row: int, number: int) -> bytes:
-    """Return what QUERY_STORED tells of an item by its number, b"" of a secret or unknown one."""
+    """Return the answer to QUERY_STORED for an item's number; b"" for a secret or unknown one."""
     if not 0 < number <= len(journal.ITEMS):
         return b""
     name = journal.ITEMS[number - 1][0]

@@ -56,23 +56,23 @@ class Journals:
             [crc32(struct.pack("<18d", *row)) for row in self.armatures], dtype=np.uint32
         )
         self.standby = np.full((count, 3), np.nan)
-        for one, rows in self.machines():
+        for table, rows in self.machines():
             # The limits of the motors are stops: a pose beyond them is no pose.
-            for i, axis in enumerate(one.axes):
+            for i, axis in enumerate(table.axes):
                 own = self._drives[rows, i]
                 self._drives[rows, i, slot.MIN_COUNT] = np.maximum(own[:, slot.MIN_COUNT], axis.low)
                 self._drives[rows, i, slot.MAX_COUNT] = np.minimum(
                     own[:, slot.MAX_COUNT], axis.high
                 )
-            if one.standby is not None:
-                self.standby[rows] = one.standby
+            if table.standby is not None:
+                self.standby[rows] = table.standby
 
     def machines(self) -> list[tuple[Machine, Rows]]:
         """Return each machine table with the rows of its heliostats."""
         rows: dict[Machine, list[int]] = {}
-        for row, one in enumerate(self._machines):
-            rows.setdefault(one, []).append(row)
-        return [(one, np.array(members, dtype=np.intp)) for one, members in rows.items()]
+        for row, table in enumerate(self._machines):
+            rows.setdefault(table, []).append(row)
+        return [(table, np.array(members, dtype=np.intp)) for table, members in rows.items()]
 
     @property
     def origin(self) -> FloatArray:
@@ -104,7 +104,7 @@ class Journals:
         counts
             Present step counts, (M, 2): the pose that moves least is chosen.
         """
-        found = track(
+        solution = track(
             Armature(self.armatures[rows]),
             sun,
             aims,
@@ -112,8 +112,8 @@ class Journals:
             current=counts,
             tolerance=2e-10,
         )
-        good = np.asarray(found.chosen(found.status) == TrackingStatus.OK)
-        return np.asarray(found.best_angles), good
+        good = np.asarray(solution.chosen(solution.status) == TrackingStatus.OK)
+        return np.asarray(solution.best_angles), good
 
     def items(self, row: int) -> dict[str, bytes]:
         """Return the items that a controller stores."""

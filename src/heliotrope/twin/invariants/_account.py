@@ -42,24 +42,24 @@ def fingerprint(board: Board, *, gate: bool, clock: bool) -> dict[str, object]:
     """
     node = board.node
     assert node is not None
-    own, way = node.controller, node.controller.motion
-    found: dict[str, object] = {
-        "state": own.state, "motion": way.kind, "aim": way.aim, "ready": way.ready,
-        "primary goal": way.goal(0), "secondary goal": way.goal(1), "fault": own.fault,
+    own, moves = node.controller, node.controller.motion
+    values: dict[str, object] = {
+        "state": own.state, "motion": moves.kind, "aim": moves.aim, "ready": moves.ready,
+        "primary goal": moves.goal(0), "secondary goal": moves.goal(1), "fault": own.fault,
         "standby": own.config.standby, "journal": id(node.journal.items),
     }  # fmt: skip
     if clock:
-        found |= {
+        values |= {
             "second": own.clock.second,
             "millisecond": own.clock.ms,
             "flags": own.flags(),
             "sun age": own.sun.age_ms(),
         }
     if own.gate is not None:
-        found |= {"token": own.gate.token, "edition": own.gate.edition}
+        values |= {"token": own.gate.token, "edition": own.gate.edition}
         if gate and clock:
-            found |= {"epoch": own.gate.replay.epoch, "count": own.gate.replay.count}
-    return found
+            values |= {"epoch": own.gate.replay.epoch, "count": own.gate.replay.count}
+    return values
 
 
 def steps_from_stow(board: Board) -> int:
@@ -80,9 +80,9 @@ class HeliostatAccount:
         Index of the last frame received whole, except questions and safe orders.
     in_hand, how, forged, quiet, before, good
         The frame being received: the cluster's frame, how it arrived, the forged frame, the
-        invariant by which it must change nothing, the fingerprint before, frames counted as good
+        invariant that forbids it any change, the fingerprint before, frames counted as good
         before.
-    told
+    statuses
         Times (s) and values of the last STATUS answers that the cluster received.
     from_stow
         Whether it has left stow and has not tracked since.
@@ -117,7 +117,7 @@ class HeliostatAccount:
         self.quiet = 0
         self.before: dict[str, object] = {}
         self.good = 0
-        self.told: deque[tuple[float, tuple[Any, ...]]] = deque(maxlen=64)
+        self.statuses: deque[tuple[float, tuple[Any, ...]]] = deque(maxlen=64)
         self.from_stow = False
         self.stows = {STOW}
         self.by_way = False
@@ -166,11 +166,11 @@ class HeliostatAccount:
         """When it entered its state, or booted, s."""
         return self._history[-1][0]
 
-    def was_in(self, wanted: tuple[int, ...], since: float) -> bool:
+    def was_in(self, choice: tuple[int, ...], since: float) -> bool:
         """Whether the heliostat was in one of some states at any time since."""
         begun = [state for at, state in self._history if at <= since][-1:]
         later = [state for at, state in self._history if at > since]
-        return any(state in wanted for state in begun + later)
+        return any(state in choice for state in begun + later)
 
     def cut(self, now: float) -> None:
         """Note that the power is off."""
@@ -219,24 +219,26 @@ class HeliostatAccount:
         return changed
 
     def mixture(self, held: dict[str, bytes]) -> str:
-        """Return what a journal holds that belongs to neither the old nor the new record, or ""."""
+        """Return the items of a journal from neither the old nor the new record in words, or ""."""
         old = dict(self._items)
         if held in (old, {**old, **self._pending}):
             return ""
-        wrong = [name for name in {**old, **held} if held.get(name) != old.get(name)]
-        return "other values of " + ", ".join(sorted(wrong))
+        differing = [name for name in {**old, **held} if held.get(name) != old.get(name)]
+        return "other values of " + ", ".join(sorted(differing))
 
     # -- steps -----------------------------------------------------------------------------
 
     def place(self) -> tuple[int, int]:
         """Return the step counts, as handed to the timers."""
-        one, two = (a.emitted - s for a, s in zip(self.board.axes, self.board.slip, strict=True))
-        return one, two
+        azimuth, elevation = (
+            a.emitted - s for a, s in zip(self.board.axes, self.board.slip, strict=True)
+        )
+        return azimuth, elevation
 
     def stow(self) -> tuple[int, int]:
         """Return the stow position that its journal holds, steps."""
-        one, two = unpack("<ii", self._items["stow"])
-        return one, two
+        azimuth, elevation = unpack("<ii", self._items["stow"])
+        return azimuth, elevation
 
     def stands_at_stow(self) -> bool:
         """Whether its axes stand at the stow position in truth, not only by its counts."""
@@ -246,9 +248,9 @@ class HeliostatAccount:
         """Take steps handed to a timer now; return what is wrong with their rate, or ""."""
         self.stepped_at = now
         limit = float(LIMITS[0])
-        gone = limit * (now - self._filled_at[axis])
+        drained = limit * (now - self._filled_at[axis])
         self._filled_at[axis] = now
-        level = self._level[axis] = max(0.0, self._level[axis] - gone) + count
+        level = self._level[axis] = max(0.0, self._level[axis] - drained) + count
         if level <= AHEAD * limit:
             return ""
         return f"axis {axis} is {level:.0f} steps ahead of {limit:.0f} steps/s"
@@ -258,15 +260,15 @@ class HeliostatAccount:
         most = LIMITS[1] * SLOT * SLOT + 2.0
         begin = max(now, self._slot_ends[axis])
         before = self._slot_steps[axis]
-        wrong = ""
+        error = ""
         if begin - self._slot_ends[axis] > PAUSE or before * steps < 0:  # it has stopped since
             if abs(before) > most:
-                wrong = f"axis {axis} stopped from {before} steps in a slot, limit {most:.0f}"
+                error = f"axis {axis} stopped from {before} steps in a slot, limit {most:.0f}"
             before = 0
         if abs(steps - before) > most:
-            wrong = f"axis {axis} went from {before} to {steps} steps in a slot, limit {most:.0f}"
+            error = f"axis {axis} went from {before} to {steps} steps in a slot, limit {most:.0f}"
         self._slot_ends[axis], self._slot_steps[axis] = begin + SLOT, steps
-        return "" if self.ticks_jumped else wrong
+        return "" if self.ticks_jumped else error
 
     def order(self, axis: int) -> str | None:
         """Take a segment; return an error in the order of the axes, "", or None if any will do."""
@@ -274,8 +276,10 @@ class HeliostatAccount:
         if self._stowing_since is not None and board.now - self._stowing_since > BRAKING:
             if axis == 1:
                 return ""
-            wrong = self.place()[1] not in {elevation for _, elevation in self.stows}
-            return f"azimuth moves to stow while elevation is at {self.place()[1]}" if wrong else ""
+            raised = self.place()[1] not in {elevation for _, elevation in self.stows}
+            return (
+                f"azimuth moves to stow while elevation is at {self.place()[1]}" if raised else ""
+            )
         if self._leg == 0 or board.state != states.APPROACHING:
             return None
         if axis == 1:
@@ -331,12 +335,12 @@ class HeliostatAccount:
 
     def deadlines(self, now: float) -> list[tuple[str, float]]:
         """Return the causes for which it has to leave, each with its time, s."""
-        found = list(self._ordered.items())
+        causes = list(self._ordered.items())
         if now - self._served_at > SERVED:
-            found.append(("it was cut off", self._served_at))
+            causes.append(("it was cut off", self._served_at))
         if self.unlisted_at is not None:
-            found.append((UNLISTED, self.unlisted_at))
-        return found
+            causes.append((UNLISTED, self.unlisted_at))
+        return causes
 
     def must_stow(self, why: str) -> bool:
         """Whether the cause requires stow, not only defocus."""

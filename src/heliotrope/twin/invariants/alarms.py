@@ -102,9 +102,9 @@ class AlarmObserver:
         self.checks: Counter[int] = Counter()
         self._start, self._alone = start, "twice" not in worlds
         self._works, self._began_at = "days" in worlds, start
-        sound = [kind for kind, ways in MISLED.items() if ways.isdisjoint(worlds)]
+        sound = [kind for kind, causes in MISLED.items() if causes.isdisjoint(worlds)]
         self._by_faults = BY_FAULTS | dict.fromkeys(sound, inf)
-        self._boards = {each.outfit.name: each for some in boards.values() for each in some}
+        self._boards = {board.outfit.name: board for some in boards.values() for board in some}
         self._clusters = {name: [b.outfit.name for b in some] for name, some in boards.items()}
         self._active: dict[tuple[str, str], float] = {}
         self._new: list[tuple[Alarm, bool]] = []  # and whether an emergency was called by then
@@ -185,7 +185,10 @@ class AlarmObserver:
         """
         self._wrote_at = self._wrote_at if writes else now
         rests = dict(rest)
-        rests |= {name: max(rest[each] for each in some) for name, some in self._clusters.items()}
+        rests |= {
+            name: max(rest[heliostat] for heliostat in some)
+            for name, some in self._clusters.items()
+        }
         rests |= {written: rest[name] for name, written in files.items() if written}
         rests[""] = max(rest.values())
         new, self._new = self._new, []
@@ -205,8 +208,8 @@ class AlarmObserver:
             self._check(passed <= limit, now, subject, saw)
         for cluster, some in self._clusters.items():
             self._named_cluster(cluster, now)
-            there = cluster in carried
-            self._well[cluster] = min(self._well[cluster], now) if there else inf
+            connected = cluster in carried
+            self._well[cluster] = min(self._well[cluster], now) if connected else inf
             for name in some:
                 self._named(name, max(self._well[cluster], self._runs_since), now, files)
 

@@ -99,14 +99,14 @@ class AnswerObserver:
         self.quiet: Callable[[], Collection[str]] = frozenset
         self.utc: Callable[[], float] = lambda: 0.0
         self._cluster, self._start = cluster, start
-        self._boards = {each.address: _Board(each) for each in accounts}
+        self._boards = {account.address: _Board(account) for account in accounts}
         self._late_at = -inf
         self._later: list[tuple[bool, str, str]] = []
 
     def _calmly(self, good: bool, subject: str, saw: str) -> None:
         """Check what need not hold if something has just failed: at the next look, which knows."""
         if subject == self._cluster:
-            calm = all(each.account.name in self.quiet() for each in self._boards.values())
+            calm = all(board.account.name in self.quiet() for board in self._boards.values())
         else:
             calm = subject in self.quiet()
         if calm:
@@ -116,7 +116,7 @@ class AnswerObserver:
         """Judge what has been said since the last look, where nothing has failed meanwhile."""
         later, self._later = self._later, []
         calm = self.quiet()
-        whole = all(each.account.name in calm for each in self._boards.values())
+        whole = all(board.account.name in calm for board in self._boards.values())
         for good, subject, saw in later:
             if subject in calm or (subject == self._cluster and whole):
                 self._check(good, now, subject, saw)
@@ -154,11 +154,11 @@ class AnswerObserver:
     def _status(self, board: _Board, values: Sequence[Any], now: float) -> None:
         account = board.account
         state, flags, fault, uptime, age_ms, supply, warmth, crc, boots = values
-        told = f"STATUS says {states.STATES[account.state]}: "
+        prefix = f"STATUS says {states.STATES[account.state]}: "
         name = account.name
 
         def check(good: bool, saw: str) -> None:
-            self._check(good, now, name, told + saw)
+            self._check(good, now, name, prefix + saw)
 
         check(state == account.state, f"state {state}, and it is {account.state}")
         check((supply, warmth) == (0, 0), f"{supply} mV, {warmth} °C; it measures neither")
@@ -176,7 +176,7 @@ class AnswerObserver:
             check(near, f"{uptime} s since a boot of {since:.1f} s ago")
             if flags & _SUN_FRESH:
                 age = now - account.sun_at
-                saw = f"{told}a sun of {age_ms} ms, and it left {age:.2f} s ago"
+                saw = f"{prefix}a sun of {age_ms} ms, and it left {age:.2f} s ago"
                 # An answer may have begun before the sun that has only just come.
                 near = age < BEGUN or abs(age_ms / 1000.0 - age) <= AGE_NEAR
                 self._calmly(near, name, saw)
@@ -206,8 +206,8 @@ class AnswerObserver:
         check(bool(flags & _MOVING) or not turns, "it does not move, and its motors turn")
         # A motion that has just begun makes its first step in a moment. Between two answers that
         # are far apart one may have ended, and another begun.
-        gone, board.told_at = now - board.told_at > RESTS, now
-        before = inf if gone else board.moves_since
+        lapsed, board.told_at = now - board.told_at > RESTS, now
+        before = inf if lapsed else board.moves_since
         board.moves_since = min(before, now) if flags & _MOVING else inf
         rests = now - max(account.stepped_at, account.changed_at, board.moves_since)
         saw = f"it moves, and its motors have rested for {rests:.1f} s"
@@ -226,8 +226,8 @@ class AnswerObserver:
         complete = state != states.UNCONFIGURED
         check(bool(flags & _CONFIGURED) == complete, "whether it is configured")
         check(not flags & _READY or account.by_way, "ready, and it has not come to standby")
-        lit = state in (states.TRACKING, states.SEARCHING)
-        check(bool(flags & _READY) or not lit, "not ready")
+        up = state in (states.TRACKING, states.SEARCHING)
+        check(bool(flags & _READY) or not up, "not ready")
         stows = account.place() == account.stow()
         known = not flags & _UNKNOWN
         check(not flags & _AT_STOW or not known or stows, f"at stow, and at {account.place()}")
@@ -248,7 +248,7 @@ class AnswerObserver:
         place = account.place()
         saw = f"STEPS says {counts}, and it is at {place}"
         self._check(counts == place, now, account.name, saw)
-        inside = all(low <= each <= high for each, (low, high) in zip(goals, RANGES, strict=True))
+        inside = all(low <= goal <= high for goal, (low, high) in zip(goals, RANGES, strict=True))
         self._check(inside, now, account.name, f"STEPS says goals {goals} beyond its range")
         held = account.state in (states.STOWED, states.LOCKED, states.FAULT) and goals != place
         # A boot ends the motion; what has the same goals afterwards is another one.
@@ -263,28 +263,32 @@ class AnswerObserver:
 
     def status(self, message: ClusterStatus, names: Sequence[str], now: float) -> None:
         """Judge a status of the cluster as it reaches the plant."""
-        by_name = {each.account.name: each for each in self._boards.values()}
+        by_name = {known.account.name: known for known in self._boards.values()}
         for name, row in zip(names, message.nodes(), strict=True):
             board = by_name.get(name)
             if board is None:
                 continue
-            told = tuple(int(row[each]) for each in _STEPS)
+            reported = tuple(int(row[column]) for column in _STEPS)
             if int(row["steps_ms"]) == NEVER:
-                self._check(not any(told), now, name, f"steps {told} that were never asked for")
+                self._check(
+                    not any(reported), now, name, f"steps {reported} that were never asked for"
+                )
                 continue
             at = now - int(row["steps_ms"]) / 1000.0
             near = [v for t, v in board.steps if at - UNDER_WAY <= t <= at + 0.2]
-            saw = f"steps {told} are reported, of {now - at:.2f} s ago, and it did not answer so"
-            self._check(told in near, now, name, saw)
+            saw = (
+                f"steps {reported} are reported, of {now - at:.2f} s ago, and it did not answer so"
+            )
+            self._check(reported in near, now, name, saw)
             asked, answered = int(row["asked"]), int(row["answered"])
             self._check(answered <= asked, now, name, f"{answered} answers to {asked} questions")
         self._numbers(message)
 
     def _numbers(self, message: ClusterStatus) -> None:
         """Judge the numbers of a cluster near which nothing has failed."""
-        left = message.lease_left
-        saw = f"{left:.2f} s are left of the plant's lease"
-        self._calmly(LEASE_LEAST <= left <= LEASE_MOST, self._cluster, saw)
+        remaining = message.lease_left
+        saw = f"{remaining:.2f} s are left of the plant's lease"
+        self._calmly(LEASE_LEAST <= remaining <= LEASE_MOST, self._cluster, saw)
         off = message.utc_s - self.utc()
         self._calmly(-LATE <= off <= EARLY, self._cluster, f"its time is {off:+.2f} s off")
         cycle = message.cycle_s

@@ -85,9 +85,10 @@ class _Mirror:
         Whether its last motion led to step counts, not to its standby point; whether it has come to
         its standby point by the way from stow since it last had power or was at stow.
     astray_since, lit_since, inside_since
-        Since when its beam is beside its place, on the receiver unsent, inside a volume, s.
+        Since when its beam is beside its place, on the receiver without an order, or inside a
+        volume, s.
     due_at
-        When the drives can have brought its astray beam to its place, s.
+        When the drives can have brought its stray beam to its place, s.
     named_at
         When an alarm last named it, s.
     ordered_at, off_at, resumed_at
@@ -95,7 +96,7 @@ class _Mirror:
         last sent it there, s.
     lost_at
         When it last left TRACKING or SEARCHING without an order, s.
-    given, given_at
+    assigned, assigned_at
         Whether a person has given it to automatic control, and since when, s.
     up, changed_at, reports, seen_up
         Whether it is up, since when, s, and how often that was reported; whether automatic control
@@ -124,8 +125,8 @@ class _Mirror:
     off_at: float = float("-inf")
     resumed_at: float = float("-inf")
     lost_at: float = float("-inf")
-    given: bool = False
-    given_at: float = float("-inf")
+    assigned: bool = False
+    assigned_at: float = float("-inf")
     up: bool = False
     changed_at: float = float("-inf")
     reports: int = 0
@@ -140,7 +141,7 @@ class _Mirror:
         return self.board.outfit.name
 
     @property
-    def left(self) -> bool:
+    def elsewhere_idle(self) -> bool:
         """Whether it is IDLE and holds still, wherever that is."""
         return self.state == states.IDLE and (self.elsewhere or not self.approached)
 
@@ -155,11 +156,11 @@ def slew(board: Board, sun: FloatArray, point: Point) -> float:
     mechanism, (rate, acceleration, _) = board.outfit.mechanism, LIMITS
     low, high = np.transpose(RANGES)
     drives = mechanism.drives.replace(min_count=low, max_count=high)
-    here = np.array([axis.turned for axis in board.axes], dtype=np.float64)
-    found = track(mechanism, sun, point, drives=drives, current=here)
-    if found.chosen(found.status) != TrackingStatus.OK:
+    counts = np.array([axis.turned for axis in board.axes], dtype=np.float64)
+    solution = track(mechanism, sun, point, drives=drives, current=counts)
+    if solution.chosen(solution.status) != TrackingStatus.OK:
         return 0.0
-    return float(np.abs(found.best_counts - here).max()) / rate + rate / acceleration
+    return float(np.abs(solution.best_counts - counts).max()) / rate + rate / acceleration
 
 
 def _since(holds: bool, before: float | None, now: float) -> float | None:
@@ -196,7 +197,7 @@ class BeamObserver:
         Number of emergency orders of which every heliostat was said to be done.
     contradicted
         Whether a witness contradicts the time that plant and clusters share: then no mirror may
-        join the receiver, and where beams rest is nobody's to know. Set by the owner.
+        join the receiver, and the places of idle beams are unknown. Set by the owner.
     """
 
     def __init__(
@@ -220,7 +221,7 @@ class BeamObserver:
         for mirror in self._mirrors.values():
             mirror.standbys.append(("", STANDBY))
         self._alarms: dict[tuple[str, str], tuple[float, bool]] = {}
-        self._left: deque[tuple[float, str]] = deque(maxlen=64)
+        self._departures: deque[tuple[float, str]] = deque(maxlen=64)
         self._lost_at = self._lost_known_at = self._released_at = float("-inf")
         self._proved: dict[tuple[str, str], float] = {}
         self._stalled, self._exchanged = set[str](), set[str]()
@@ -270,18 +271,18 @@ class BeamObserver:
     def taken(self, heliostats: Iterable[str]) -> None:
         """Note that a person commands mirrors: automatic control may not have them any more."""
         for name in heliostats:
-            self._mirrors[name].given = False
+            self._mirrors[name].assigned = False
 
     def given(self, heliostats: Iterable[str], now: float) -> None:
         """Note that a person has given mirrors to automatic control; it lost none before."""
         for name in heliostats:
             mirror = self._mirrors[name]
-            if not mirror.given:
-                mirror.given, mirror.given_at = True, now
+            if not mirror.assigned:
+                mirror.assigned, mirror.assigned_at = True, now
 
     def released(self, now: float) -> None:
         """Note that a person lets automatic control go on after a loss."""
-        self._left.clear()
+        self._departures.clear()
         self._released_at = now
         for mirror in self._mirrors.values():
             mirror.resumed_at = now
@@ -307,11 +308,13 @@ class BeamObserver:
         """Note that automatic control knows by now that a mirror is up, or is not."""
         lost, mirror.seen_up = mirror.seen_up and not mirror.up, mirror.up
         at = mirror.changed_at
-        lost = lost and mirror.given and at >= max(mirror.given_at, self._released_at)
+        lost = lost and mirror.assigned and at >= max(mirror.assigned_at, self._released_at)
         if self._most is None or not lost:
             return
-        self._left.append((at, mirror.name))
-        together = [each for each in self._left if abs(each[0] - at) <= LOST_TOGETHER]
+        self._departures.append((at, mirror.name))
+        together = [
+            departure for departure in self._departures if abs(departure[0] - at) <= LOST_TOGETHER
+        ]
         if len({name for _, name in together}) > self._most:
             self._lost_at, self._lost_known_at = max(together)[0], now
             self.losses += 1
@@ -336,7 +339,7 @@ class BeamObserver:
         self._stalled.add(heliostat)
 
     def exchanged(self, heliostat: str) -> None:
-        """Note that another mirror's board is at a mirror: its beam is where nobody can know."""
+        """Note that another mirror's board is at a mirror: the place of its beam is unknown."""
         self._exchanged.add(heliostat)
 
     def ended(self) -> None:
@@ -350,9 +353,9 @@ class BeamObserver:
                 mirror.astray_since = None
         self._alarms.clear()
         self._proved.clear()
-        self._left.clear()
+        self._departures.clear()
         for mirror in self._mirrors.values():
-            mirror.given = mirror.seen_up = False
+            mirror.assigned = mirror.seen_up = False
             mirror.reports = 0
 
     # -- judgement ---------------------------------------------------------------------------
@@ -401,9 +404,9 @@ class BeamObserver:
     def _stays_off(self, mirror: _Mirror, now: float) -> None:
         """Check that neither a wrong sun nor another mirror's parameters bring a beam up."""
         node, own = mirror.node, mirror.board.outfit.items["armature"]
-        strange = node is not None and node.journal.items.get("armature") != own
+        foreign = node is not None and node.journal.items.get("armature") != own
         by = "a sun that is contradicted" if self.contradicted else "another mirror's parameters"
-        good = mirror.state not in _ON or not (strange or self.contradicted)
+        good = mirror.state not in _ON or not (foreign or self.contradicted)
         self._check(12, good, now, mirror.name, f"{states.STATES[mirror.state]}, by {by}")
 
     def _enters(self, mirror: _Mirror, state: int, now: float) -> None:
@@ -427,7 +430,7 @@ class BeamObserver:
         elif before in _ON and state not in _ON and now - mirror.off_at > TOGETHER:
             mirror.lost_at = now
             if self._most is None:
-                self._left.append((now, mirror.name))
+                self._departures.append((now, mirror.name))
 
     def _returns(self, mirror: _Mirror, now: float) -> None:
         """Check that a mirror returns to the receiver by a person's will, if one is needed."""
@@ -454,7 +457,7 @@ class BeamObserver:
         asked for, as long as it stands. Other alarms about standby have a better remedy.
         """
         sent = _LIT.get(mirror.state)
-        if sent is None or (mirror.left and not mirror.uncalled):
+        if sent is None or (mirror.elsewhere_idle and not mirror.uncalled):
             mirror.astray_since = None
             return
         points = [] if mirror.uncalled else [point for _, point in getattr(mirror, sent)]
@@ -466,10 +469,10 @@ class BeamObserver:
         miss = min(
             (mirror.board.miss(sun, (p[0], p[1], p[2])) for p in points), default=float("inf")
         )
-        astray = mirror.uncalled or (miss > slack and now >= mirror.settled_at)
-        if astray and mirror.astray_since is None:
+        stray = mirror.uncalled or (miss > slack and now >= mirror.settled_at)
+        if stray and mirror.astray_since is None:
             mirror.due_at = now + max((slew(mirror.board, sun, p) for p in points), default=0.0)
-        mirror.astray_since = _since(astray, mirror.astray_since, now)
+        mirror.astray_since = _since(stray, mirror.astray_since, now)
         state, since = states.STATES[mirror.state], mirror.astray_since
         since = None if since is None else max(since, mirror.due_at)
         passed = 0.0 if since is None else now - since
@@ -495,8 +498,8 @@ class BeamObserver:
     def _dark(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
         """Check that a beam that nobody sent to the receiver, or into a volume, leaves."""
         board, sent = mirror.board, mirror.state in _ON
-        lit = not sent and board.miss(sun, RECEIVER) <= OFF
-        mirror.lit_since = _since(lit, mirror.lit_since, now)
+        shines = not sent and board.miss(sun, RECEIVER) <= OFF
+        mirror.lit_since = _since(shines, mirror.lit_since, now)
         inside = any(board.miss(sun, middle) <= radius for middle, radius in self._keep_outs)
         mirror.inside_since = _since(inside, mirror.inside_since, now)
         state = states.STATES[mirror.state]
@@ -510,10 +513,10 @@ class BeamObserver:
 
     def _loss(self, on: int, now: float) -> None:
         """Note a loss that took every mirror off the receiver, two at least."""
-        while self._left and now - self._left[0][0] > TOGETHER:
-            self._left.popleft()
-        if on == 0 and len({name for _, name in self._left}) >= 2:
-            self._left.clear()
+        while self._departures and now - self._departures[0][0] > TOGETHER:
+            self._departures.popleft()
+        if on == 0 and len({name for _, name in self._departures}) >= 2:
+            self._departures.clear()
             self._lost_at = now
             self.losses += 1
 
@@ -556,8 +559,8 @@ class BeamObserver:
             self.proofs, self._complete_order = self.proofs + 1, order.ticket.identity
         done = {name for name in self._mirrors if name not in self._stalled and order.is_done(name)}
         for mirror in self._mirrors.values():
-            lit = holds and mirror.state >= 0 and mirror.board.miss(sun, RECEIVER) <= OFF
-            mirror.shines_since = _since(lit, mirror.shines_since, now)
+            shining = holds and mirror.state >= 0 and mirror.board.miss(sun, RECEIVER) <= OFF
+            mirror.shines_since = _since(shining, mirror.shines_since, now)
             passed = 0.0 if mirror.shines_since is None else now - mirror.shines_since
             shines = f"and its beam has been on the receiver for {passed:.1f} s"
             if complete:

@@ -51,19 +51,19 @@ class DayObserver:
         self.checks: Counter[int] = Counter()
         self._low = sin(lowest)
         self._start, self._boards = start, {board.outfit.name: board for board in boards}
-        self._given: dict[str, float] = {}
+        self._assigned: dict[str, float] = {}
         self._calm: dict[str, float] = {}
         self._low_at, self._acted_at = inf, -inf
 
     def given(self, heliostats: Iterable[str], now: float) -> None:
         """Note that a person has given heliostats to automatic control."""
         for name in heliostats:
-            self._given.setdefault(name, now)
+            self._assigned.setdefault(name, now)
 
     def taken(self, heliostats: Iterable[str]) -> None:
         """Note that a person has moved heliostats: whose they are then is not judged."""
         for name in heliostats:
-            self._given.pop(name, None)
+            self._assigned.pop(name, None)
 
     def on_duty(self, now: float) -> None:
         """Note that a person has the command authority, or asks for it."""
@@ -88,9 +88,9 @@ class DayObserver:
         self._low_at = min(self._low_at, now) if sun[2] < self._low else inf
         # A new program knows nothing of what it was given, and in an emergency all is given up.
         if plant is None or plant.sentinel.order is not None:
-            self._given.clear()
+            self._assigned.clear()
         self._calm = {name: self._calm.get(name, now) for name in quiet}
-        for name, given_at in self._given.items():
+        for name, given_at in self._assigned.items():
             since = max(self._low_at, given_at, self._acted_at, self._calm.get(name, inf))
             if now - since > AWAY_WITHIN:
                 state = self._boards[name].state

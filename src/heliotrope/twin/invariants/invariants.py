@@ -29,7 +29,8 @@ number    check
           (`world.tour`) it is done in time.
 12        A beam in a state that lights anything is where it was sent; otherwise an alarm names
           it within 10 s and it is off within 30 s.
-13        In no state does a beam stay on the receiver unsent, or in a keep-out volume, for 30 s.
+13        In no state does a beam that was not ordered there stay on the receiver, or any beam
+          in a keep-out volume, for 30 s.
 14        After a loss of more mirrors than automatic control may raise again, or of all, only a
           person brings one back.
 15        A mirror proven to be done is off the receiver, or at stow.
@@ -105,7 +106,7 @@ L1, L2, L3, L4 = 18, 19, 20, 21
 
 
 def named(number: int) -> str:
-    """Return what people call an invariant: 1 to 17, L1 to L4."""
+    """Return the short name of an invariant: 1 to 17, L1 to L4."""
     return str(number) if number < L1 else f"L{number - L1 + 1}"
 
 
@@ -282,7 +283,7 @@ class Observer:
     def doubt(self, board: Board) -> None:
         """Note that another board is at a mirror, or that a drive has stalled.
 
-        What it stores is not what was stored before, and where its beam is nobody can know.
+        It stores other values than before, and the place of its beam is unknown.
         """
         self._by_address[board.outfit.address].unsure = True
 
@@ -333,7 +334,9 @@ class Observer:
         elif sent.who == messages.ANYONE:
             # Who is to stow need not defocus first.
             over = ("DEFOCUS", "STOW") if sent.name == "STOW" else (sent.name,)
-            self._emergencies = [each for each in self._emergencies if each[0] not in over]
+            self._emergencies = [
+                emergency for emergency in self._emergencies if emergency[0] not in over
+            ]
 
     def _authorised(self, sent: Sent, now: float) -> None:
         """Check a command on the bus: ordered with authority, in time, and reported."""
@@ -350,8 +353,8 @@ class Observer:
         latest = max((order.until for order in allowed), default=0.0)
         late = f"{where} {now - latest:.2f} s after its order has expired"
         self.check(5, bool(fresh), now, "cluster", late)
-        wrong = self.runs.obeyed((order.identity for order in fresh), now)
-        self.check(4, not wrong, now, "cluster", f"{where}: {wrong}")
+        error = self.runs.obeyed((order.identity for order in fresh), now)
+        self.check(4, not error, now, "cluster", f"{where}: {error}")
         if fresh:
             self._unreported.append((now, where, addresses, fresh))
 
@@ -378,7 +381,7 @@ class Observer:
         account.good = account.board.node.reader.good
 
     def _expects_quiet(self, account: HeliostatAccount, sent: Sent | None, how: str) -> int:
-        """Return the invariant by which a frame must change nothing, 0 if it may act."""
+        """Return the invariant that forbids a frame any change, 0 if it may act."""
         if how == "damaged":
             return 6
         if how == "forged":
@@ -398,8 +401,8 @@ class Observer:
 
     def _fingerprint(self, account: HeliostatAccount, how: str) -> dict[str, object]:
         sent = account.in_hand
-        told = sent is not None and sent.who == messages.CLUSTER
-        return fingerprint(account.board, gate=how in ("damaged", "twice"), clock=not told)
+        by_cluster = sent is not None and sent.who == messages.CLUSTER
+        return fingerprint(account.board, gate=how in ("damaged", "twice"), clock=not by_cluster)
 
     def answered(self, data: bytes, how: str, now: float) -> None:
         """Note an answer that the master has received."""
@@ -409,7 +412,7 @@ class Observer:
             account = self._by_address.get(frame.sender)
             values = frame.values() if frame.name == "STATUS" else None
             if account is not None and values is not None:
-                account.told.append((now, values))
+                account.statuses.append((now, values))
 
     # -- the boards (Witness) --------------------------------------------------------------
 
@@ -519,8 +522,8 @@ class Observer:
         state, name = states.STATES[board.state], account.name
         self.check(7, board.state in AFTER_BOOT, now, name, f"{state} after a boot")
         held = dict(node.journal.items)
-        wrong = "" if account.unsure else account.mixture(held)
-        self.check(7, not wrong, now, name, f"after a boot its journal holds {wrong}")
+        mixture = "" if account.unsure else account.mixture(held)
+        self.check(7, not mixture, now, name, f"after a boot its journal holds {mixture}")
         doubt = node.journal.doubt
         slip = max(abs(s) for s in board.slip)
         saw = (
@@ -548,9 +551,9 @@ class Observer:
         self.check(8, not saw, now, name, saw)
         saw = account.ramp(axis, direction * count, now)
         self.check(8, not saw, now, name, saw)
-        wrong = account.order(axis)
-        if wrong is not None:
-            self.check(10, not wrong, now, name, wrong)
+        error = account.order(axis)
+        if error is not None:
+            self.check(10, not error, now, name, error)
 
     # -- the plant -------------------------------------------------------------------------
 
@@ -632,7 +635,7 @@ class Observer:
                 continue
             age = int(row["heard_ms"]) / 1000.0
             claimed = now - age
-            last = account.told[-1][0] if account.told else float("-inf")
+            last = account.statuses[-1][0] if account.statuses else float("-inf")
             # The age counts from when it was written: it waits for a connection until the next
             # status is made, and may then be in transit for its lifetime.
             slack = 2.0 * STATUS_LIFE + AGE_ROUNDING
@@ -641,7 +644,7 @@ class Observer:
             rounding = AGE_ROUNDING + CLOCKS_APART * age
             of_then = [
                 values
-                for at, values in account.told
+                for at, values in account.statuses
                 if claimed - slack - rounding <= at <= claimed + rounding
             ]
             state = states.STATES[int(row["state"])]
@@ -666,15 +669,15 @@ class Observer:
                 self._due(account, sun, now, leased)
 
     def _reported(self, now: float) -> None:
-        """Check that the plant was told of every command on the bus, if line and cluster worked."""
+        """Check that all commands on the bus were reported, if line and cluster worked."""
         while self._unreported and now - self._unreported[0][0] > ORDER_WITHIN:
             at, where, addresses, orders = self._unreported.popleft()
             if min(order.at for order in orders) <= self.disturbed_at:
                 continue
             names = {self._by_address[address].written for address in addresses} - {""}
-            told = any(names <= set(order.accepted) for order in orders)
+            reported = any(names <= set(order.accepted) for order in orders)
             saw = f"{where} went out {now - at:.1f} s ago and was never reported as accepted"
-            self.check(11, told, now, "cluster", saw)
+            self.check(11, reported, now, "cluster", saw)
 
     def _counted(self, account: HeliostatAccount, now: float) -> None:
         """Check that counted steps are those that were handed to the timers."""
@@ -740,7 +743,7 @@ _TOLD = ("state", "flags", "fault", "armature_crc", "boots")
 
 
 def _row_of(values: "tuple[Any, ...]") -> tuple[int, ...]:
-    """Return what a row must report of the values of a STATUS; see `_TOLD`."""
+    """Return the columns of a row after a STATUS; see `_TOLD`."""
     state, flags, fault, *_, armature_crc, boots = values
     return state, flags, fault, armature_crc, boots
 

@@ -14,7 +14,7 @@ _WHO = (
 
 
 def who_of(number: int) -> int:
-    """Return who may send a message: a constant of `lcu.messages`."""
+    """Return the kind of sender of a message: a constant of `lcu.messages`."""
     for first, last, who in _WHO:
         if first <= number <= last:
             return who
@@ -107,11 +107,11 @@ class FrameLedger:
 
     def note(self, data: bytes, now: float) -> Sent | None:
         """Keep a frame; return None if the bytes hold none."""
-        found = self._frames.get(data)
-        if found is not None:
-            if found.who == messages.ANYONE:
-                self.safe[found.to] = now
-            return found
+        known = self._frames.get(data)
+        if known is not None:
+            if known.who == messages.ANYONE:
+                self.safe[known.to] = now
+            return known
         frames = wire.Reader().feed(data)
         if not frames:
             return None
@@ -170,9 +170,9 @@ class OrderLedger:
 
     def covering(self, name: str, addresses: Iterable[int], now: float) -> list[PlantCommand]:
         """Return the orders of a name for all these addresses that were given before now."""
-        wanted = frozenset(addresses)
+        required = frozenset(addresses)
         return [
             order
             for order in self.by_identity.values()
-            if order.name == name and wanted <= order.addresses and order.at <= now
+            if order.name == name and required <= order.addresses and order.at <= now
         ]

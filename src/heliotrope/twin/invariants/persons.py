@@ -1,11 +1,11 @@
 """The observer of persons: what a person has ordered or locked stands until it is ended (17).
 
-It keeps a ledger of its own, from the calls of persons and not from the plant: who has ordered an
-emergency, by which act, and who has withdrawn it; who has locked a heliostat, and has returned the
-lock. While an order stands, the plant shows it under its owner's name, an emergency of at least
-that act holds, and no mirror is up once it has had the time to turn away. A heliostat that a person
-has locked stands still at stow until the last lock on it is returned, whatever is ordered, and
-nothing is written to it.
+It keeps a ledger of its own, from the calls of persons and not from the plant: the emergencies that
+each person ordered, with their acts, and withdrew; the heliostats that each person locked, and the
+locks returned. While an order stands, the plant shows it under its owner's name, an emergency of at
+least that act holds, and no mirror is up once it has had the time to turn away. A heliostat that a
+person has locked stands still at stow until the last lock on it is returned, whatever is ordered,
+and nothing is written to it.
 
 A board that starts anew is left out until it stands still again: what it does at a start no lock
 can prevent, which is why a person at a mirror uses its switch.
@@ -37,7 +37,7 @@ _UP = (states.APPROACHING, states.TRACKING, states.SEARCHING)
 
 @dataclass
 class _Lock:
-    """The locks on a heliostat: owners, since when; and where it stands by which program."""
+    """The locks on a heliostat: owners, since when; its place, and the program that counts it."""
 
     owners: dict[str, float] = field(default_factory=dict)
     node: Node | None = None
@@ -139,7 +139,7 @@ class PersonsObserver:
     # -- the plant's store ---------------------------------------------------------------------
 
     def words(self) -> Words:
-        """Return what stands now: a backup of the plant's store that is made now has it."""
+        """Return the orders and locks in force, as a backup of the plant's store holds them now."""
         return Words(dict(self.orders), self.locks)
 
     def restored(self, words: Words, now: float) -> None:
@@ -191,10 +191,10 @@ class PersonsObserver:
 
     def _shown(self, plant: PlantController, now: float) -> None:
         """Check that the plant has the locks of each person, and no others."""
-        here = {(lock.name, lock.who) for lock in plant.lockouts}
-        wanted = {(name, owner) for name, lock in self._locks.items() for owner in lock.owners}
-        for name, owner in sorted(wanted ^ here):
-            what = "is not there" if (name, owner) in wanted else "is there, and was returned"
+        present = {(lock.name, lock.who) for lock in plant.lockouts}
+        required = {(name, owner) for name, lock in self._locks.items() for owner in lock.owners}
+        for name, owner in sorted(required ^ present):
+            what = "is not there" if (name, owner) in required else "is there, and was returned"
             self._check(False, now, name, f"the lock of {owner} {what}")
         self._check(True, now, "plant", "")
 
@@ -202,7 +202,7 @@ class PersonsObserver:
         """Check that no mirror is up while somebody's order stands."""
         if not self.orders:
             return
-        owner, (act, at) = min(self.orders.items(), key=lambda each: each[1][1])
+        owner, (act, at) = min(self.orders.items(), key=lambda order: order[1][1])
         for name, board in self._boards.items():
             saw = f"{states.STATES[board.state]} {now - at:.1f} s after {owner} ordered {act.name}"
             self._check(now - at <= DOWN_WITHIN or board.state not in _UP, now, name, saw)
@@ -212,15 +212,15 @@ class PersonsObserver:
         board = self._boards[name]
         if board.node is None:
             return
-        one, two = (axis.turned for axis in board.axes)
+        azimuth, elevation = (axis.turned for axis in board.axes)
         rests = all(axis.idle for axis in board.axes)
         if board.node is not lock.node or lock.place is None:
             lock.node, lock.place = board.node, None
             since = min(lock.owners.values())
             if rests and board.state == states.STOWED and now - since > UNDER_WAY:
-                lock.place = one, two
+                lock.place = azimuth, elevation
             return
-        moved = max(abs(one - lock.place[0]), abs(two - lock.place[1]))
+        moved = max(abs(azimuth - lock.place[0]), abs(elevation - lock.place[1]))
         saw = f"{states.STATES[board.state]}, {moved} steps from where it stood when it was locked "
         saw += f"by {', '.join(lock.owners)}"
         self._check(moved <= STANDS, now, name, saw)

@@ -100,7 +100,7 @@ class PlantObserver:
         self.old: dict[int, float] = {}
         self._start, self._disk, self._settings = start, disk, settings
         self._clusters, self._automatic = clusters, automatic
-        self._accounts = {a.name: a for each in clusters for a in each.accounts}
+        self._accounts = {a.name: a for cluster in clusters for a in cluster.accounts}
         self._holder: tuple[Person, int, float] | None = None
         self._granted_at = self._visited_at = float("-inf")
         self._from_nobody = False  # nobody had the authority when the holder took it
@@ -108,7 +108,7 @@ class PlantObserver:
         self._perhaps = float("-inf")
         self._accepted: Counter[tuple[str, str]] = Counter()
         self._recorded: Counter[tuple[str, str]] = Counter()
-        self._looked = 0  # records already counted
+        self._counted_records = 0  # records already counted
         self._obeyed: dict[str, float] = {}
         self._taken: dict[str, float] = {}  # what the holder has commanded, and since when
         self._aimed: dict[str, float] = {}
@@ -162,8 +162,8 @@ class PlantObserver:
 
     def _void(self, token: int, now: float) -> None:
         self.old[token] = now
-        for each in self._clusters:
-            each.orders.void(token, now + VOID_WITHIN)
+        for cluster in self._clusters:
+            cluster.orders.void(token, now + VOID_WITHIN)
 
     def granted(self, person: Person, token: int, now: float, *, seized: bool) -> None:
         """Judge a grant of the authority."""
@@ -206,7 +206,7 @@ class PlantObserver:
         return self._holder is not None and self._holder[0] == AUTOMATIC
 
     def _leased(self, token: int, now: float) -> None:
-        """Follow the authority of automatic control, which no person tells of.
+        """Follow the authority of automatic control, which no person reports.
 
         It may only have what nobody holds. Leases of one moment to several clusters may be from
         before a grant and after it, and arrive here in any order.
@@ -233,7 +233,7 @@ class PlantObserver:
         return self._by_itself()
 
     def holder(self, now: float) -> str | None:
-        """Return the person who has had the authority for a moment; None: it is not sure.
+        """Return the person with the authority for some moments; None: it is not sure.
 
         Automatic control gives it back without a word.
         """
@@ -455,7 +455,7 @@ class PlantObserver:
     def _count(self, now: float) -> None:
         """Check that each record belongs to one command, and that no command has two."""
         records = self._disk.records
-        for record in islice(records.values(), self._looked, None):
+        for record in islice(records.values(), self._counted_records, None):
             if record.who.endswith(_UNTOLD):
                 continue  # it tells nobody; `posted` wants a record of all that it sends
             if record.who in _OWN:
@@ -464,11 +464,11 @@ class PlantObserver:
                 continue
             key = (record.who, record.what)
             self._recorded[key] += 1
-        for key in self._recorded if self._looked < len(records) else ():
+        for key in self._recorded if self._counted_records < len(records) else ():
             count, most = self._recorded[key], self._accepted[key]
             saw = f"{count} records of {key[1]} by {key[0]}, who ordered it {most} times"
             self.check(11, count <= most, now, saw)
-        self._looked = len(records)
+        self._counted_records = len(records)
 
     def _complete(self, now: float) -> None:
         """Check that late records have been written by now."""
@@ -522,9 +522,9 @@ class PlantObserver:
             age = now - heard[-1][0] if heard else float("inf")
             saw = f"{name} is shown as live, last heard {age:.2f} s ago, limit {limit:.2f} s"
             self.check(11, age <= limit, now, saw)
-            told = {states.STATES[state] for at, state in heard if now - at <= limit}
-            saw = f"{name} is shown as {shown.state}; it reported {', '.join(sorted(told))}"
-            self.check(11, shown.state in told, now, saw)
+            reported = {states.STATES[state] for at, state in heard if now - at <= limit}
+            saw = f"{name} is shown as {shown.state}; it reported {', '.join(sorted(reported))}"
+            self.check(11, shown.state in reported, now, saw)
 
     def _proofs(self, plant: PlantController, now: float) -> None:
         """Check that everything a proof calls done was done."""

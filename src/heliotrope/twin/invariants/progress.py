@@ -1,6 +1,6 @@
 """The observer of progress: automatic control raises the field and calibrates it, in time.
 
-It knows from the persons what they have given to automatic control, and who has the command
+The persons report to it what they have given to automatic control, and the holder of the command
 authority. In a quiet stretch (`quiet`) a heliostat that was given must leave stow, and be measured
 when a target is free; a visit must end, and leave no beam on its target; no part of the work may
 fail; measurements come while some are not calibrated (16). One that stays at stow because volumes
@@ -72,8 +72,8 @@ class ProgressObserver:
     lowest
         Elevation of the sun below which the field belongs at stow, rad.
     dark
-        Heliostats whose beams nobody can see, or know: the plant file is wrong about them, so that
-        they go beside the receiver and the targets, or the mirror is covered.
+        Heliostats whose beams no camera sees: the plant file is wrong about them, so that they
+        go beside the receiver and the targets, or the mirror is covered.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class ProgressObserver:
         self._start, self._targets = start, {target.name: target for target in targets}
         self._boards = {board.outfit.name: board for board in boards}
         self._together, self._across = together, across
-        self._given: set[str] = set()
+        self._assigned: set[str] = set()
         self._out: dict[str, float] = {}
         self._since: dict[tuple[str, ...], float] = {}
         self._lowest, self._dark = lowest, frozenset(dark)
@@ -115,11 +115,11 @@ class ProgressObserver:
 
     def given(self, heliostats: Sequence[str]) -> None:
         """Note that a person has given heliostats to automatic control."""
-        self._given.update(heliostats)
+        self._assigned.update(heliostats)
 
     def taken(self, heliostats: Sequence[str]) -> None:
         """Note that a person has moved heliostats, and may do so until they are given again."""
-        self._given.difference_update(heliostats)
+        self._assigned.difference_update(heliostats)
 
     def commanded(self, what: str, heliostats: Sequence[str]) -> None:
         """Note a command of a person that the plant has accepted: a lock has its owner."""
@@ -146,7 +146,7 @@ class ProgressObserver:
         """Note that the plant's program has ended."""
         self._ended, self._calibrates = True, True
         self._since.clear()
-        self._given.clear()
+        self._assigned.clear()
         self._begun.clear()
 
     def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
@@ -191,13 +191,13 @@ class ProgressObserver:
         failures = [row.text for row in rows if row.condition == FAILED]
         self._check(not failures, now, "automatic control", failures[0] if failures else "")
         if operations.plant.sentinel.order is not None:
-            self._given.clear()
+            self._assigned.clear()
         running = operations.automatic.view().running
         visited = {name for run in running for name in run.heliostats}
         self._visits(running, now)
         lost = any(row.condition == NOBODY and row.active for row in rows)
         well = not (operations.plant.sentinel.on or operations.automatic.waits or lost)
-        self._go_on(operations, self._given & quiet if well else set(), now)
+        self._go_on(operations, self._assigned & quiet if well else set(), now)
         self._step_finely(running, quiet, sun, now)
         stowed = {n for n, board in self._boards.items() if board.state == states.STOWED}
         blocked = {row.subject for row in rows if row.condition == BLOCKED and row.active}
@@ -205,7 +205,7 @@ class ProgressObserver:
         may = governs and not operations.automatic.waits and self._high(sun)
         may &= not operations.plant.sentinel.on
         self._owned(visited, quiet, now)
-        working = [name for name in self._given & quiet if may and name not in self._out]
+        working = [name for name in self._assigned & quiet if may and name not in self._out]
         for name, board in self._boards.items():
             mine = name in working and name not in visited
             self._within(
@@ -216,11 +216,12 @@ class ProgressObserver:
                 name,
                 "it has stood at stow",
             )
-            there = name in self._dark or board.miss(sun, RECEIVER) <= OFF
-            tracks = board.state == states.TRACKING and there
+            on_receiver = name in self._dark or board.miss(sun, RECEIVER) <= OFF
+            tracks = board.state == states.TRACKING and on_receiver
             saw = "automatic control has it, and it has not tracked the receiver"
-            left = name in self._locked and board.state == states.LOCKED
-            away = mine and not tracks and not left  # a person's lock is the person's to give back
+            locked = name in self._locked and board.state == states.LOCKED
+            # A person's lock is the person's to give back.
+            away = mine and not tracks and not locked
             self._within(("tracks", name), away, now, TRACKS_WITHIN, name, saw, L3)
             for target in self._targets.values():
                 lights = mine and board.state == states.TRACKING and self._on(board, target, sun)
@@ -297,12 +298,12 @@ class ProgressObserver:
             target = self._targets.get(run.target)
             if target is None or PHOTOGRAPH not in run.stage:
                 continue
-            for name in self._given & quiet & set(run.heliostats):
+            for name in self._assigned & quiet & set(run.heliostats):
                 board = self._boards[name]
-                lit = board.state == states.TRACKING and self._on(board, target, sun)
+                photographed = board.state == states.TRACKING and self._on(board, target, sun)
                 rough = board.node is not None and board.node.controller.motion.rough > 0
                 saw = f"it is photographed on {run.target}, and steps roughly"
-                self._check(not (lit and rough), now, name, saw)
+                self._check(not (photographed and rough), now, name, saw)
 
     def _measures(
         self, operations: Operations, working: Sequence[str], *, may: bool, now: float
@@ -310,12 +311,12 @@ class ProgressObserver:
         """Check that measurements come while some mirrors have not been visited yet."""
         beliefs = operations.plant.beliefs
         results = operations.automatic.view().results
-        done = {each.heliostat for each in results} | self._dark
-        left = [name for name in working if name not in done and beliefs.record(name) is None]
-        last = max((each.at for each in results if each.new), default=0.0)
+        done = {result.heliostat for result in results} | self._dark
+        remaining = [name for name in working if name not in done and beliefs.record(name) is None]
+        last = max((result.at for result in results if result.new), default=0.0)
         fresh, self._measured = last > self._measured, max(last, self._measured)
-        holds = may and bool(left) and self._calibrates and not fresh
-        saw = f"{len(left)} heliostats are not calibrated, and no visit has measured any"
+        holds = may and bool(remaining) and self._calibrates and not fresh
+        saw = f"{len(remaining)} heliostats are not calibrated, and no visit has measured any"
         self._within(("measured",), holds, now, MEASURED_WITHIN, "automatic control", saw)
 
     def _within(
@@ -338,7 +339,7 @@ class ProgressObserver:
 
     def _on(self, board: Board, target: Target, sun: FloatArray) -> bool:
         """Whether a beam is within a target, by the steps that were made."""
-        x, y, z = (float(each) for each in target.center)
+        x, y, z = (float(coordinate) for coordinate in target.center)
         return board.miss(sun, (x, y, z), believed=True) < 0.5 * min(target.width, target.height)
 
     def _visits(self, running: Sequence[Running], now: float) -> None:
@@ -355,6 +356,6 @@ class ProgressObserver:
             saw = f"its visit to {run.target} has been under way"
             self._within(key, True, now, VISIT_WITHIN, run.heliostat, saw)
             for name in run.heliostats:
-                gone = self._out.get(name, inf)
-                saw = f"it was taken out of service {now - gone:.1f} s ago, and a visit begins"
-                self._check(not (fresh and now - gone > 1.0), now, name, saw)
+                out_at = self._out.get(name, inf)
+                saw = f"it was taken out of service {now - out_at:.1f} s ago, and a visit begins"
+                self._check(not (fresh and now - out_at > 1.0), now, name, saw)

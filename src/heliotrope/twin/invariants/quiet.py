@@ -224,14 +224,14 @@ class QuietObserver:
             self._expect(mirror, may, _Order(message.identity, message.name, now, ends, within))
 
     def _commands(self, message: Command, now: float) -> bool:
-        """Whether the clusters must have the authority by which a command is given."""
+        """Whether the clusters must have the authority of a command."""
         return message.token == self._token != 0 and now - self._token_at > GRANTED
 
     def ordered_off(self, name: str, heliostats: Iterable[str], now: float) -> None:
         """Note DEFOCUS or STOW from the plant."""
         begins, ends, within = SAFE_ORDERS[name]
-        for each in heliostats:
-            mirror = self._mirrors[each]
+        for heliostat in heliostats:
+            mirror = self._mirrors[heliostat]
             before = mirror.order
             if name == "DEFOCUS" and before is not None and before.name == "STOW":
                 continue  # a stow is not undone by a defocus
@@ -326,7 +326,7 @@ class QuietObserver:
         for mirror in self._mirrors.values():
             before = mirror.state
             self._notes(mirror, now)
-            named = (self._named_at.get(each, -inf) for each in (mirror.name, mirror.cluster))
+            named = (self._named_at.get(subject, -inf) for subject in (mirror.name, mirror.cluster))
             calm = now - max(rest[mirror.name], mirror.booted_at, *named) > SETTLED
             if plant is None or mirror.cluster not in carried or mirror.state < 0 or not calm:
                 mirror.order = mirror.off_since = None
@@ -372,7 +372,7 @@ class QuietObserver:
         age = now - account.sun_at
         saw = f"the last sun has reached it {age:.1f} s ago, limit {SUN_EVERY:g} s"
         self._check(age <= SUN_EVERY, now, mirror, saw)
-        age = now - (account.told[-1][0] if account.told else -inf)
+        age = now - (account.statuses[-1][0] if account.statuses else -inf)
         saw = f"its cluster has last heard its state {age:.1f} s ago, limit {STATUS_EVERY:g} s"
         self._check(age <= STATUS_EVERY, now, mirror, saw)
 

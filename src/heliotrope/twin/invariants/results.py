@@ -1,11 +1,10 @@
 """The observer of results: what visits bring, beside the photographs that were taken.
 
-It is told of each photograph when the camera takes it, and reads the step counts of the true mirror
-then. A sighting that the plant keeps must have the time, the point and the step counts of a
-photograph, and the true sun. A result must count the sightings that it brought, and its errors must
-be those of the two calibrations, before and after. The store and the logbook must have it, and a
-new program must know what the one before it knew (16). Visits that bring nothing do not go on
-without end (L2).
+The camera reports each photograph to it, and it reads the step counts of the true mirror then. A
+sighting that the plant keeps must have the time, the point and the step counts of a photograph, and
+the true sun. A result must count the sightings that it brought, and its errors must be those of the
+two calibrations, before and after. The store and the logbook must have it, and a new program must
+know what the one before it knew (16). Visits that bring nothing do not go on without end (L2).
 """
 
 from collections import Counter
@@ -73,7 +72,7 @@ class _Account:
     kept: int = 0
     last: int = 0  # sightings at its last result
     version: int = 0
-    told: int = 0  # version at its last result
+    result_version: int = 0  # version at its last result
     before: Mechanism | None = None
     vain: int = 0  # visits in a row that brought nothing
     searched: int = 0  # visits in a row in which no beam was found by a search
@@ -126,7 +125,7 @@ class ResultObserver:
         self._barren: list[CalibrationEntry] = []  # results in a row
         self._results: set[tuple[str, float]] = set()
         self._program: Operations | None = None
-        self._looked = start
+        self._checked_at = start
 
     def _check(self, good: bool, now: float, subject: str, saw: str, number: int = 16) -> None:
         self.checks[number] += 1
@@ -156,38 +155,40 @@ class ResultObserver:
         begins = operations is not self._program
         self._program = operations
         for name in self._boards:
-            self._learnt(operations, name, now, begins=begins)
+            self._sightings(operations, name, now, begins=begins)
         results = operations.automatic.view().results
-        new = [each for each in results if (each.heliostat, each.at) not in self._results]
+        new = [result for result in results if (result.heliostat, result.at) not in self._results]
         for entry in reversed(new):
             self._results.add((entry.heliostat, entry.at))
             # One from just before the program stood still is seen once it goes on.
-            old = max(self._looked, self._start) - (entry.at - self._zero)
-            saw = f"a result that was not there {now - self._looked:.1f} s ago is {old:.1f} s older"
+            old = max(self._checked_at, self._start) - (entry.at - self._zero)
+            passed = now - self._checked_at
+            saw = f"a result that was not there {passed:.1f} s ago is {old:.1f} s older"
             self._check(old <= SHOWN_WITHIN, now, entry.heliostat, saw)
             self._concluded(operations, entry, now)
-        self._looked = now
+        self._checked_at = now
 
     # -- sightings ---------------------------------------------------------------------------
 
-    def _learnt(self, operations: Operations, name: str, now: float, *, begins: bool) -> None:
+    def _sightings(self, operations: Operations, name: str, now: float, *, begins: bool) -> None:
         account, beliefs = self._accounts[name], operations.plant.beliefs
-        record, seen = beliefs.record(name), beliefs.seen(name)
-        count, version = 0 if seen is None else len(seen), 0 if record is None else record.version
+        record, stored = beliefs.record(name), beliefs.seen(name)
+        count = 0 if stored is None else len(stored)
+        version = 0 if record is None else record.version
         if account.typed and version != account.version and record is not None and not count:
             account.typed, account.kept = False, 0
             account.version, account.before = version, beliefs.present(name)
-            account.last, account.told = 0, version
+            account.last, account.result_version = 0, version
         if begins:
             # Sightings come back with the calibration that they led to.
             saw = f"a new program knows calibration {version}, that before it {account.version}"
             self._check(version >= account.version, now, name, saw)
             saw = f"a new program knows {count} sightings, that before it {account.kept}"
             self._check(count >= account.kept or version == 0, now, name, saw)
-            account.last, account.told, account.searched = count, version, 0
-        elif count > account.kept and seen is not None:
-            new = seen.sightings.take(np.arange(account.kept, count))
-            self._photographs(name, new, seen.targets[account.kept :], now)
+            account.last, account.result_version, account.searched = count, version, 0
+        elif count > account.kept and stored is not None:
+            new = stored.sightings.take(np.arange(account.kept, count))
+            self._photographs(name, new, stored.targets[account.kept :], now)
         saw = f"the plant knows {count} sightings, and knew {account.kept}"
         self._check(begins or count >= account.kept, now, name, saw)
         if account.before is None or begins:
@@ -202,7 +203,7 @@ class ResultObserver:
             away = float(np.linalg.norm(new.source[k] - self._sun(at)))
             saw = f"a sighting has a sun {1e3 * away:.2f} mrad from the true one"
             self._check(away <= SUN_WITHIN, now, name, saw)
-            own = [each for each in account.pictures if abs(each.at - at) < SAME]
+            own = [shot for shot in account.pictures if abs(shot.at - at) < SAME]
             if not own:
                 continue  # of a stack, which `VisitObserver` judges
             picture = own[0]
@@ -220,12 +221,12 @@ class ResultObserver:
     def _concluded(self, operations: Operations, entry: CalibrationEntry, now: float) -> None:
         name, account = entry.heliostat, self._accounts[entry.heliostat]
         plant, at = operations.plant, entry.at - self._zero
-        record, seen = plant.beliefs.record(name), plant.beliefs.seen(name)
+        record, stored = plant.beliefs.record(name), plant.beliefs.seen(name)
         self._check(at <= now + SAME, now, name, f"a result is dated {at - now:.1f} s ahead")
         brought = account.kept - account.last
-        new, version = account.version != account.told, account.version
+        new, version = account.version != account.result_version, account.version
         before = account.before
-        account.last, account.told, account.before = (
+        account.last, account.result_version, account.before = (
             account.kept,
             version,
             plant.beliefs.present(name),
@@ -257,49 +258,51 @@ class ResultObserver:
         self._check(entry.good == new, now, name, saw)
         saw = f"a result names calibration {entry.version}; {version} is believed"
         self._check(entry.version == (version if new else 0), now, name, saw)
-        if seen is None or before is None or brought == 0:
+        if stored is None or before is None or brought == 0:
             return
-        here = seen.sightings.take(np.arange(len(seen) - brought, len(seen)))
-        self._error(entry.measured, "its photographs missed", before, here, now, name)
-        self._error(entry.before, "they missed before", before, seen.sightings, now, name)
+        latest = stored.sightings.take(np.arange(len(stored) - brought, len(stored)))
+        self._error(entry.measured, "its photographs missed", before, latest, now, name)
+        self._error(entry.before, "they missed before", before, stored.sightings, now, name)
         if new and record is not None:
             after = record.mechanism(plant.beliefs.nominal(name))
-            self._error(entry.after, "they miss now", after, seen.sightings, now, name)
+            self._error(entry.after, "they miss now", after, stored.sightings, now, name)
 
     def _error(
-        self, said: float, what: str, by: Mechanism, seen: Sightings, now: float, name: str
+        self, said: float, what: str, by: Mechanism, sightings: Sightings, now: float, name: str
     ) -> None:
         """Check an error of a result; one photograph may have come after it, to verify it."""
         if not isfinite(said):
             return
-        errors = _misses(by, seen)
+        errors = _misses(by, sightings)
         own = [_rms(errors), _rms(errors[:-1])] if len(errors) > 1 else [_rms(errors)]
-        near = min(abs(said - each) for each in own)
-        told = " or ".join(f"{1e3 * each:.2f}" for each in own)
-        saw = f"a result says {what} by {1e3 * said:.2f} mrad; by the observer it is {told} mrad"
+        near = min(abs(said - rms) for rms in own)
+        words = " or ".join(f"{1e3 * rms:.2f}" for rms in own)
+        saw = f"a result says {what} by {1e3 * said:.2f} mrad; by the observer it is {words} mrad"
         self._check(near <= ERROR_WITHIN + SHARE * max(own), now, name, saw)
 
     def _noted(self, operations: Operations, entry: CalibrationEntry, now: float) -> None:
         """Check that logbook and store have a result."""
         name, start = entry.heliostat, f"at {entry.target}: {entry.text}"
         events = operations.logbook.events(200)
-        there = any(
-            each.kind == "calibration"
-            and ((each.who, each.text) == (name, start) or _of_all(each, entry))
-            for each in events
-            if abs(each.at - entry.at) < SHOWN_WITHIN
+        logged = any(
+            record.kind == "calibration"
+            and ((record.who, record.text) == (name, start) or _of_all(record, entry))
+            for record in events
+            if abs(record.at - entry.at) < SHOWN_WITHIN
         )
-        self._check(there, now, name, "a result is not in the logbook")
+        self._check(logged, now, name, "a result is not in the logbook")
         # Visits to two targets may be refused at once.
         kept = [
-            each
-            for each in self._records.visits(5, name)
-            if abs(each.finished - entry.at) < SAME and each.begun <= each.finished
-            if each.target == entry.target
+            record
+            for record in self._records.visits(5, name)
+            if abs(record.finished - entry.at) < SAME and record.begun <= record.finished
+            if record.target == entry.target
         ]
         self._check(bool(kept), now, name, "a result is not in the store")
-        wanted = entry.outcome, entry.new, entry.version
-        same = any((each.outcome, each.sightings, each.version) == wanted for each in kept)
+        expected = entry.outcome, entry.new, entry.version
+        same = any(
+            (record.outcome, record.sightings, record.version) == expected for record in kept
+        )
         self._check(same, now, name, f"the store has a result as {kept[0]}")
         kept_sightings = self._records.sightings((name,))
         count = len(kept_sightings)
@@ -323,13 +326,13 @@ def _of_all(event: EventRow, entry: CalibrationEntry) -> bool:
     return event.who == entry.target and event.text.endswith(f" proven together; {entry.text}")
 
 
-def _misses(by: Mechanism, seen: Sightings) -> FloatArray:
+def _misses(by: Mechanism, sightings: Sightings) -> FloatArray:
     """Return by how much a mechanism misses sightings, rad, (M,)."""
-    pose = by.pose(seen.counts)
-    way = seen.destination - pose.vertex
-    way /= np.linalg.norm(way, axis=-1, keepdims=True)
-    rays = reflect(seen.source, pose.normal)
-    return np.asarray(np.linalg.norm(np.cross(rays, way), axis=-1))
+    pose = by.pose(sightings.counts)
+    direction = sightings.destination - pose.vertex
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    rays = reflect(sightings.source, pose.normal)
+    return np.asarray(np.linalg.norm(np.cross(rays, direction), axis=-1))
 
 
 def _rms(values: FloatArray) -> float:

@@ -30,7 +30,7 @@ class RunAccount:
         self._obeyed = ""
 
     def obeyed(self, orders: Iterable[str], now: float) -> str:
-        """Note a frame that carries out one of some orders; return what is wrong, "" if nothing.
+        """Note a frame that carries out one of some orders; return the error, or "".
 
         Parameters
         ----------
@@ -40,11 +40,11 @@ class RunAccount:
             s.
         """
         runs = {identity.rpartition("-")[0] for identity in orders}
-        left = self._over.get(self._obeyed, now) - now
-        if self._obeyed and self._obeyed not in runs and left > SLACK:
+        remaining = self._over.get(self._obeyed, now) - now
+        if self._obeyed and self._obeyed not in runs and remaining > SLACK:
             return (
                 f"run {min(runs)} is obeyed while run {self._obeyed}, which was obeyed, has the "
-                f"lease for {left:.2f} s more"
+                f"lease for {remaining:.2f} s more"
             )
         if len(runs) == 1:
             (self._obeyed,) = runs

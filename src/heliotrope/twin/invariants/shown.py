@@ -65,11 +65,11 @@ class ShownObserver:
     targets
         Calibration targets.
     plant
-        Observer of the plant, which knows what boards have reported, and who has the authority.
+        Observer of the plant, which has the reports of boards, and the holder of the authority.
     persons
-        Names of the persons whose acts it is told of.
+        Names of the persons whose acts are reported to it.
     dark
-        Heliostats of which the plant file is wrong: where their beams are, nobody can know.
+        Heliostats about which the plant file is wrong: the places of their beams are unknown.
 
     Attributes
     ----------
@@ -101,11 +101,11 @@ class ShownObserver:
         self._out: set[str] = set()
         self._changed: dict[str, float] = {}
         self._acts: list[tuple[float, str, str, Operations | None]] = []
-        self._told: set[tuple[float, str, str]] = set()
+        self._judged: set[tuple[float, str, str]] = set()
         self._places: dict[str, tuple[str, float]] = {}
         self._program: Operations | None = None
         self._waited = True
-        self._begun = self._looked = -inf
+        self._begun = self._judged_at = -inf
         self._frame = 0
         self._turn = 0
 
@@ -145,14 +145,14 @@ class ShownObserver:
             return
         if operations is not self._program:
             self._program, self._frame, self._waited = operations, 0, True
-            self._told.clear()
+            self._judged.clear()
             self._acts = [act for act in self._acts if act[3] is operations]
         if self._waited:
             self._begun, self._waited = now, False
         self._events(operations, now)
-        if now - self._looked < EVERY:
+        if now - self._judged_at < EVERY:
             return
-        self._looked = now
+        self._judged_at = now
         frame = operations.viewer.frame()
         self._rows(operations, frame, quiet, sun, now)
         self._head(operations, now)
@@ -166,9 +166,9 @@ class ShownObserver:
         """Check that each act of a person is an event, once, and nothing else is."""
         for row in operations.logbook.events(100):
             key = (row.at, row.who, row.text)
-            if row.who not in self._persons or key in self._told:
+            if row.who not in self._persons or key in self._judged:
                 continue
-            self._told.add(key)
+            self._judged.add(key)
             own = [act for act in self._acts if act[1] == row.who and act[2] in row.text]
             saw = f"an event of {row.who}, who did nothing like it: {row.text}"
             self._check(bool(own), now, "logbook", saw)
@@ -203,19 +203,19 @@ class ShownObserver:
                 calm = name in quiet and now - self._begun > OLD
                 self._check(not calm, now, name, saw)
                 continue
-            told = self._plant.reports(name, made - age - TRANSIT - FRAME)
+            reported = self._plant.reports(name, made - age - TRANSIT - FRAME)
             saw = f"it is shown as {states.STATES[state]}; it has not reported that"
-            self._check(state in told, now, name, saw)
+            self._check(state in reported, now, name, saw)
             if name in quiet:  # on a bad bus answers are lost, one after the other
                 self._counted(name, frame.counts[row], made - age, now)
             place = operations.viewer.aim_names[int(frame.on[row])]
             self._placed(name, place, sun, now, calm=name in quiet)
-        self._learnt(operations, frame, quiet, sun, now)
+        self._calibrations(operations, frame, quiet, sun, now)
 
     def _counted(self, name: str, counts: FloatArray, at: float, now: float) -> None:
         """Check that shown step counts are those of the last seconds."""
         low, high = self._span(name, at)
-        shown = ", ".join(str(int(each)) for each in counts)
+        shown = ", ".join(str(int(count)) for count in counts)
         saw = f"its counts are shown as {shown}; they were {low} to {high}"
         self._check(bool(((counts >= low) & (counts <= high)).all()), now, name, saw)
 
@@ -247,7 +247,7 @@ class ShownObserver:
         self._check(works == (place != NOWHERE), now, name, saw)
         known = place in self._middles and name not in self._dark
         if state == states.TRACKING and known and self._came(name, now):
-            x, y, z = (float(each) for each in self._middles[place])
+            x, y, z = (float(coordinate) for coordinate in self._middles[place])
             miss = self._boards[name].miss(sun, (x, y, z), believed=True)
             saw += f", {miss:.1f} m from its middle"
             self._check(miss <= NEAR, now, name, saw)
@@ -261,7 +261,7 @@ class ShownObserver:
         turned = float(np.ptp(np.stack(some), axis=0).max())
         return turned <= FOLLOWS or now - self._states[name][1] >= LONGEST
 
-    def _learnt(
+    def _calibrations(
         self,
         operations: Operations,
         frame: FieldFrame,
@@ -323,8 +323,10 @@ class ShownObserver:
         off = float(np.linalg.norm(view.position - np.asarray(where).reshape(-1)[:3]))
         self._check(off < 1.0, now, name, f"it is shown {off:.1f} m from where it is")
         if view.live:
-            told = {states.STATES[each] for each in self._plant.reports(name, now - view.age - 3.3)}
-            self._check(view.state in told, now, name, f"it is shown as {view.state} in detail")
+            reported = {
+                states.STATES[state] for state in self._plant.reports(name, now - view.age - 3.3)
+            }
+            self._check(view.state in reported, now, name, f"it is shown as {view.state} in detail")
             for drive, axis in zip(view.drives, (0, 1), strict=True):
                 if name in quiet:
                     self._drive(name, drive.count, axis, now - view.age, now)
@@ -346,7 +348,7 @@ class ShownObserver:
         self._check(bool(low[axis] <= count <= high[axis]), now, name, saw)
 
 
-def _expected(operations: Operations, name: str, here: FloatArray, sun: FloatArray) -> float:
+def _expected(operations: Operations, name: str, present: FloatArray, sun: FloatArray) -> float:
     """Return the expected error of a mirror's normal at the receiver, rad, by its covariance.
 
     Of the two poses, it is the one nearer to the present counts (2,).
@@ -356,10 +358,10 @@ def _expected(operations: Operations, name: str, here: FloatArray, sun: FloatArr
     assert record is not None
     nominal = beliefs.nominal(name)[0]
     aim = operations.plant.default_aims((name,))[name]
-    counts = track(record.mechanism(nominal), sun, np.asarray(aim), current=here).best_counts
+    counts = track(record.mechanism(nominal), sun, np.asarray(aim), current=present).best_counts
     if not np.isfinite(counts).all():
         return inf
     # Only what leads away from the aim counts; a mirror may stand along its beam without error.
-    way = np.asarray(aim) - record.mechanism(nominal).pose(counts).vertex
-    slope = slope_of(record, nominal, counts, sun, np.asarray(aim)) @ across(way).T
+    direction = np.asarray(aim) - record.mechanism(nominal).pose(counts).vertex
+    slope = slope_of(record, nominal, counts, sun, np.asarray(aim)) @ across(direction).T
     return 0.5 * float(np.sqrt(np.trace(slope.T @ record.covariance @ slope)))

@@ -86,7 +86,7 @@ class TicketObserver:
                 why = ticket.refusals.get(name, "")
                 saw = f"{ticket.name} of {name} is {what}, and the reason is {why!r}"
                 self._check(not failed or len(why) >= _REASON, now, saw)
-        self._open = [(at, each) for at, each in self._open if not each.finished]
+        self._open = [(at, unfinished) for at, unfinished in self._open if not unfinished.finished]
 
     def _true(self, at: float, ticket: Ticket, now: float) -> None:
         """Check that a mirror for which a ticket is done has been where its command leads."""
@@ -96,10 +96,10 @@ class TicketObserver:
         for name in ticket.heliostats:
             if ticket.stage(name) is Stage.DONE and name not in ticket.refusals:
                 account = self._accounts[name]
-                there = account.was_in(asked, at - _REPORTED)
-                there = there or (ticket.name == "STOW" and account.stands_at_stow())
+                reached = account.was_in(asked, at - _REPORTED)
+                reached = reached or (ticket.name == "STOW" and account.stands_at_stow())
                 saw = f"{ticket.name} of {name} is done; it is {states.STATES[account.state]}"
-                self._check(there, now, saw, L2)
+                self._check(reached, now, saw, L2)
 
     def _check(self, good: bool, now: float, saw: str, number: int = 16) -> None:
         self.checks[number] += 1

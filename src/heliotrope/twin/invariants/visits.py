@@ -1,8 +1,8 @@
 """The observer of visits: what photographs have taught the plant, beside the true mirrors.
 
-It judges two things that the plant keeps: a calibration, by which the mirror's true beam must go
-where it is aimed, and miss it by no more than the calibration's own covariance says (12), and a
-sighting, which must show the mirror's own beam (16).
+It judges two things that the plant keeps: a calibration, which must bring the mirror's true beam to
+its aim within the calibration's own covariance (12), and a sighting, which must show the mirror's
+own beam (16).
 """
 
 from collections import Counter
@@ -99,13 +99,13 @@ class VisitObserver:
             if record is not None and (name, record.version, record.at) not in self._judged:
                 self._judged.add((name, record.version, record.at))
                 self._believed(board, record, plant.beliefs.nominal(name)[0], sun, now)
-            seen = plant.beliefs.seen(name)
+            kept = plant.beliefs.seen(name)
             known = self._kept.get(name, 0)
-            if seen is None or len(seen.sightings) < known:
+            if kept is None or len(kept.sightings) < known:
                 self._kept[name] = known = 0  # a person's parameters stand on none
-            if seen is not None and len(seen.sightings) > known:
-                self._kept[name] = len(seen.sightings)
-                new = seen.sightings.take(np.arange(known, len(seen.sightings)))
+            if kept is not None and len(kept.sightings) > known:
+                self._kept[name] = len(kept.sightings)
+                new = kept.sightings.take(np.arange(known, len(kept.sightings)))
                 self._dated(name, new, now)
                 if self._followed and name not in self._slipped:
                     self._own(board, new, now)
@@ -126,11 +126,11 @@ class VisitObserver:
             return
         truth, slip = board.outfit.mechanism, np.asarray(board.slip, dtype=np.float64)
         believed, name = record.mechanism(nominal), board.outfit.name
-        here = [axis.turned for axis in board.axes] - slip
+        present = [axis.turned for axis in board.axes] - slip
         for point in (RECEIVER, *(target.center for target in self._targets)):
             aim = np.asarray(point, dtype=np.float64)
-            found = track(believed, sun, aim, current=here)
-            counts = found.best_counts
+            solution = track(believed, sun, aim, current=present)
+            counts = solution.best_counts
             if not np.isfinite(counts).all():
                 continue
             pose = truth.pose(counts + slip)
@@ -158,16 +158,16 @@ class VisitObserver:
         """Check that sightings show the beam of the mirror itself."""
         pose = board.outfit.mechanism.pose(sightings.counts + np.asarray(board.slip))
         rays = reflect(sightings.source, pose.normal)
-        for vertex, ray, seen in zip(pose.vertex, rays, sightings.destination, strict=True):
-            miss = _passes(vertex, ray, seen)
+        for vertex, ray, point in zip(pose.vertex, rays, sightings.destination, strict=True):
+            miss = _passes(vertex, ray, point)
             saw = f"a sighting that the plant keeps is {miss:.1f} m from its true beam"
             self._check(16, miss <= FOREIGN, now, board.outfit.name, saw)
 
 
-def across(way: FloatArray) -> FloatArray:
+def across(direction: FloatArray) -> FloatArray:
     """Return unit vectors to the right of and above a direction (3,), (2, 3)."""
-    right = np.cross(way, (0.0, 0.0, 1.0))
-    above = np.cross(right, way)
+    right = np.cross(direction, (0.0, 0.0, 1.0))
+    above = np.cross(right, direction)
     return np.stack([right / np.linalg.norm(right), above / np.linalg.norm(above)])
 
 
@@ -182,22 +182,21 @@ def slope_of(
 
     As an angle at the mirror: the beam turns, and a mirror that stands elsewhere moves it too.
     """
-    found = []
-    way = aim - record.mechanism(nominal).pose(counts).vertex
+    slopes = []
+    offset = aim - record.mechanism(nominal).pose(counts).vertex
     for name, value, sigma in zip(record.names, record.values, record.sigma, strict=True):
         step = max(1e-3 * float(sigma), 1e-9)
-        one, two = (
-            nominal.with_parameters({**record.parameters, name: float(value) + way * step})
-            for way in (-1.0, 1.0)
+        before, after = (
+            nominal.with_parameters({**record.parameters, name: float(value) + change}).pose(counts)
+            for change in (-step, step)
         )
-        before, after = one.pose(counts), two.pose(counts)
         turned = reflect(sun, after.normal) - reflect(sun, before.normal)
-        moved = (after.vertex - before.vertex) / np.linalg.norm(way)
-        found.append((turned + moved) / (2.0 * step))
-    return np.array(found)
+        moved = (after.vertex - before.vertex) / np.linalg.norm(offset)
+        slopes.append((turned + moved) / (2.0 * step))
+    return np.array(slopes)
 
 
 def _passes(vertex: FloatArray, ray: FloatArray, point: FloatArray) -> float:
     """Return the distance at which a ray (3,) passes a point (3,), m."""
-    way = point - vertex
-    return float(np.linalg.norm(way - ray * (way @ ray)))
+    offset = point - vertex
+    return float(np.linalg.norm(offset - ray * (offset @ ray)))

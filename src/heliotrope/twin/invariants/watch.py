@@ -27,7 +27,7 @@ class Watch:
     def checks(self) -> Counter[int]:
         """Number of checks of each invariant, of all of them."""
         some = (self.visits, self.day, self.results, self.progress, self.shown)
-        return sum((each.checks for each in some), Counter())
+        return sum((observer.checks for observer in some), Counter())
 
     # -- reports of persons -------------------------------------------------------------------
 

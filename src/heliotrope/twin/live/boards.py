@@ -106,7 +106,7 @@ class BoardField:
     def errors(self, sun: FloatArray, aims: FloatArray) -> FloatArray:
         """Return the error of each normal at its aim (N, 3), rad, (N,); NaN if not tracking."""
         normal, vertex = self.stand()
-        wanted = bisector(sun, normalize(aims - vertex))
-        off = np.arcsin(np.clip(np.linalg.norm(np.cross(normal, wanted), axis=-1), 0.0, 1.0))
+        required = bisector(sun, normalize(aims - vertex))
+        off = np.arcsin(np.clip(np.linalg.norm(np.cross(normal, required), axis=-1), 0.0, 1.0))
         tracks = np.array([board.state == states.TRACKING for board in self.boards])
         return np.where(tracks & (off < _ON_ITS_WAY), off, np.nan)

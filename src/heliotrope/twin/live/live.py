@@ -278,13 +278,13 @@ class World:
     def _mirrors(self) -> list[TrueMirror]:
         """Return the mirrors whose light may be on a target."""
         light, stand = self.sun(), self.field.stand()
-        found: dict[str, TrueMirror] = {}
+        mirrors: dict[str, TrueMirror] = {}
         for target in (*self.design.targets, *self._faces):
             for mirror in mirrors_near(
                 target, light, stand, self.names, self._sizes, beside=self._beside
             ):
-                found[mirror.heliostat] = mirror
-        return list(found.values())
+                mirrors[mirror.heliostat] = mirror
+        return list(mirrors.values())
 
     @property
     def _faces(self) -> tuple[Target, ...]:

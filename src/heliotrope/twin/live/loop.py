@@ -31,18 +31,18 @@ class _Pace(selectors.DefaultSelector):
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         if timeout is None:
-            found = super().select(None)
+            events = super().select(None)
             self.now = max(self.now, self._target())
-            return found
+            return events
         due = self.now + max(timeout, 0.0)
         wait = max(0.0, due - self._target()) / self.speed if timeout > 0.0 else 0.0
-        found = super().select(wait)
+        events = super().select(wait)
         most = due if timeout > 0.0 else self.now + _BUSY
         target = self._target()
         if target - most > LATE:
             self.lag += target - most - LATE
         self.now = max(self.now, min(target, most))
-        return list(found)
+        return list(events)
 
 
 class PacedLoop(asyncio.SelectorEventLoop):
@@ -86,5 +86,5 @@ class PacedLoop(asyncio.SelectorEventLoop):
 
     @property
     def lag(self) -> float:
-        """Loop time by which the loop is behind its speed, s."""
+        """Delay of the loop behind its speed, s of loop time."""
         return self._pace.lag

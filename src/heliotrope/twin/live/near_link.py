@@ -39,8 +39,8 @@ class NearLink:
     def connected(self) -> bool:
         """Whether both ends are present."""
         other = self.other
-        here = not self.closed and other is not None and not other.closed
-        now = here and self.plugged and other is not None and other.plugged
+        present = not self.closed and other is not None and not other.closed
+        now = present and self.plugged and other is not None and other.plugged
         if now and not self._was:
             self.statistics.opened += 1
         self._was = now

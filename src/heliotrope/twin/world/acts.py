@@ -1,6 +1,6 @@
 """What persons do at a plant with automatic control, each act by the calls that a page makes.
 
-The observers are told of each act that the plant accepts. Who acts, and when, is another matter:
+Each act that the plant accepts is reported to the observers. Who acts, and when, is another matter:
 see `shift` and `crew`.
 """
 
@@ -78,7 +78,7 @@ class Acts:
         self._persons = operator.persons
         self.chance = random.Random(f"shift {seed}")
         self._others = random.Random(f"locks {seed}")
-        self._left: set[str] = set()  # what a person keeps from automatic control
+        self._withheld: set[str] = set()  # what a person keeps from automatic control
         self._locked: dict[str, str] = {}  # who has locked each heliostat
         operator.commands = False
 
@@ -109,15 +109,15 @@ class Acts:
             self._beams.released(self.now())
             operations.resume(ENGINEER)
             self.acted("resumed")
-        names = tuple(name for name in self.names if name not in self._left)
+        names = tuple(name for name in self.names if name not in self._withheld)
         for name, owners in self._persons.locks.items():
-            if name not in self._left:
+            if name not in self._withheld:
                 self._returns(operations, name, owners)
         operations.give_back(ENGINEER, names)
         self.acted(f"{len(names)} heliostats given")
         self._beams.given(names, self.now())
         self._watch.given(names, self.now())
-        self._left.clear()
+        self._withheld.clear()
 
     def _returns(self, operations: Operations, name: str, owners: Sequence[str]) -> None:
         """Return one of the locks on a heliostat: its owner does, or an engineer by name."""
@@ -150,13 +150,13 @@ class Acts:
         Parameters
         ----------
         operations, person
-            The plant, and who takes it.
+            The plant, and the person.
         most
             Longest time on duty, s.
         commands
             Called each second with a chance of a fifth.
         reason
-            Why it is seized from the person who has it; "": it is taken.
+            Why it is seized from its holder; "": it is taken.
         leaves
             Whether the person goes without giving it back, so that it runs out.
         """
@@ -297,7 +297,7 @@ class Acts:
         self._observer.obeyed(VIEWER.name, what, self.now(), ticket.identity)
         if self._operator.tickets is not None:
             self._operator.tickets.accepted(ticket, self.now())
-        self._left.add(name)
+        self._withheld.add(name)
 
     async def holds(self, operations: Operations, person: Person = ENGINEER) -> None:
         """Take a mirror out of service, perhaps one that others have locked: it goes to stow."""
@@ -311,7 +311,7 @@ class Acts:
         self._persons.locked(person.name, (name,), self.now())
         self._watch.held((name,), self.now(), out=True)
         self._observer.obeyed(person.name, "STOW", self.now())
-        self._left.add(name)
+        self._withheld.add(name)
 
     def emergency(self, operations: Operations, person: Person, act: Act) -> None:
         """Raise an emergency: automatic control gives up all that it has."""

@@ -1,11 +1,10 @@
-"""The persons of a working day: two operators, a script, and whoever looks after the field.
+"""The persons of a working day: two operators, a script, and an attendant of the field.
 
 They do what people do, and do it at instants that matter: when a visit is on its way, between its
 photographs, while a mirror is locked for its parameters, while the beams are taken apart. Two of
-them may act at once. Whoever looks after the field withdraws emergencies, presses Resume, and gives
-the field back to automatic control, some time later. On one day in two everybody goes to lunch for
-good, and automatic control has the rest of the day. A run may plan what they do instead
-(`CrewAct`).
+them may act at once. The attendant withdraws emergencies, presses Resume, and gives the field back
+to automatic control, some time later. On one day in two everybody goes to lunch for good, and
+automatic control has the rest of the day. A run may plan what they do instead (`CrewAct`).
 """
 
 import asyncio
@@ -86,7 +85,7 @@ class Crew:
     rough
         Whether the engineer lets all heliostats step roughly in the morning.
     planned
-        Their acts, one after another; None: all is drawn. The field is looked after in any case.
+        Their acts, one after another; None: all is drawn. The field has its attendant in any case.
     """
 
     def __init__(
@@ -154,27 +153,27 @@ class Crew:
 
     async def _follows(self, planned: Sequence[CrewAct]) -> None:
         """Act as planned, each time as soon as the moment comes."""
-        for each in planned:
-            await self._moment(each.moment, inf)
-            await asyncio.sleep(each.after)
+        for act in planned:
+            await self._moment(act.moment, inf)
+            await asyncio.sleep(act.after)
             while (operations := self._acts.present()) is None:
                 await asyncio.sleep(_LOOK)
             with contextlib.suppress(RefusedError):
-                await self._does(each.what, operations, each.person)
+                await self._does(act.what, operations, act.person)
 
-    async def _moment(self, wanted: str, patience: float = _PATIENCE) -> None:
+    async def _moment(self, moment: str, patience: float = _PATIENCE) -> None:
         """Wait until a visit is at a stage, for a time at most, s."""
         until = self._acts.now() + patience
-        while self._acts.now() < until and wanted not in self._moments():
+        while self._acts.now() < until and moment not in self._moments():
             await asyncio.sleep(_LOOK)
 
     def _moments(self) -> set[str]:
         operations = self._acts.present()
         running = () if operations is None else operations.automatic.view().running
-        found = {word for word in MOMENTS for run in running if word in run.stage}
+        moments = {word for word in MOMENTS for run in running if word in run.stage}
         if any(board.state == states.LOCKED for board in self._boards):
-            found.add(LOCKED)
-        return found | {ANY_TIME}
+            moments.add(LOCKED)
+        return moments | {ANY_TIME}
 
     async def _does(self, what: str, operations: Operations, person: Person) -> None:
         acts, chance = self._acts, self._chance
@@ -187,8 +186,8 @@ class Crew:
             act = chance.choice([Act.DEFOCUS, Act.DEFOCUS, Act.STOW])
             acts.emergency(operations, chance.choice([VIEWER, person]), act)
         elif what in ("calibrate", "together", "receiver"):
-            lit = what == "receiver"
-            acts.calibrate(operations, person, together=what == "together", receiver=lit)
+            on_receiver = what == "receiver"
+            acts.calibrate(operations, person, together=what == "together", receiver=on_receiver)
         elif what == "switch":
             acts.switches(operations, person, on=False)
             await asyncio.sleep(chance.uniform(5.0, _CARE))

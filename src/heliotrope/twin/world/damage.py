@@ -97,7 +97,7 @@ class Damage:
     def __init__(self, world: SimulatedPlant, faults: Sequence[Fault]) -> None:
         self._of = world
         self._begin = world.begin
-        self._left = deque(sorted(faults, key=lambda fault: fault.at))
+        self._pending = deque(sorted(faults, key=lambda fault: fault.at))
         self._active: list[tuple[float, Fault]] = []
         self._off: dict[int, float] = {}  # boards without power, and when it returns
         self._own: dict[int, NorFlash] = {}  # flash of the boards that were exchanged
@@ -142,8 +142,8 @@ class Damage:
     def look(self, now: float, group: asyncio.TaskGroup) -> None:
         """Begin and end the faults that are due."""
         changed = False
-        while self._left and self._begin + self._left[0].at <= now:
-            fault = self._left.popleft()
+        while self._pending and self._begin + self._pending[0].at <= now:
+            fault = self._pending.popleft()
             self._of.faults[fault.kind] += 1
             self._begins(fault, now)
             changed = True
@@ -157,8 +157,8 @@ class Damage:
             self._apply(group, now)
         self._supply(now)
         times = [until for until, _ in self._active] + list(self._off.values())
-        if self._left:
-            times.append(self._begin + self._left[0].at)
+        if self._pending:
+            times.append(self._begin + self._pending[0].at)
         self.next = min(times, default=math.inf)
 
     def _begins(self, fault: Fault, now: float) -> None:
@@ -209,7 +209,7 @@ class Damage:
         board, pod = of.boards[target], of.pod_of(fault)
         if target in self._own:
             return
-        others = [each.outfit for each in of.boards if each is not board]
+        others = [candidate.outfit for candidate in of.boards if candidate is not board]
         if fault.size < 0.5 or not others:  # of another field, which this plant does not know
             others = outfits(1, seed=int(1e6 * fault.size))
         other = others[int(1e3 * fault.size) % len(others)]
@@ -259,7 +259,7 @@ class Damage:
         of.hang_plant(now, silent=silent, frozen=frozen)
 
     def _file(self, fault: Fault | None, pod: Pod) -> dict[str, str]:
-        """Return what is wrong in the file of a cluster; see `Pod`."""
+        """Return the errors in the file of a cluster; see `Pod`."""
         if fault is None:
             return {}
         name = self._of.boards[fault.target].outfit.name

@@ -44,7 +44,7 @@ def design_of(
         Whether several heliostats are measured at once, on targets and on the receiver.
     """
     home = {name: cluster for cluster, names in homes.items() for name in names}
-    names = tuple(each.name for each in fits)
+    names = tuple(fit.name for fit in fits)
     size = np.full(len(fits), MIRROR)
     group = Heliostats(
         names,
@@ -52,7 +52,7 @@ def design_of(
         size,
         size,
         cluster=tuple(home[name] for name in names),
-        machines=tuple(each.machine for each in fits),
+        machines=tuple(fit.machine for fit in fits),
     )
     receiver = Receiver(
         "receiver", "planar", np.array(RECEIVER), np.array([0.0, 1.0, 0.0]), 6.0, 6.0
@@ -74,8 +74,8 @@ def design_of(
 
 
 def wanted_of(fits: Sequence[Outfit]) -> Wanted:
-    """Return what the boards of heliostats should store."""
-    wanted = Wanted()
+    """Return the items that the boards of heliostats should store."""
+    required = Wanted()
     for fit in fits:
-        wanted.set(fit.name, items_of(fit.mechanism, fit.machine))
-    return Wanted(wanted.items)
+        required.set(fit.name, items_of(fit.mechanism, fit.machine))
+    return Wanted(required.items)

@@ -157,14 +157,14 @@ def drawn(
     if not pause > 0.0:
         raise InputError(f"a pause of {pause} s between faults; it must be above 0")
     chance = random.Random(f"faults {seed}")
-    here = {} if not OWN_FAULTS.isdisjoint(worlds) else dict(KINDS)
+    possible = {} if not OWN_FAULTS.isdisjoint(worlds) else dict(KINDS)
     for world in worlds:
-        here |= KINDS_OF_WORLDS.get(world, {})
-    kinds = list(only) or list(here)
-    weighed = weights_of(worlds, seed, {kind: here.get(kind, known[kind])[0] for kind in kinds})
+        possible |= KINDS_OF_WORLDS.get(world, {})
+    kinds = list(only) or list(possible)
+    weighed = weights_of(worlds, seed, {kind: possible.get(kind, known[kind])[0] for kind in kinds})
     weights = [weighed[kind] for kind in kinds]
     pause = pause_of(worlds, seed, pause)
-    found: list[Fault] = []
+    faults: list[Fault] = []
     at = chance.expovariate(1.0 / pause)
     while at < seconds:
         kind = chance.choices(kinds, weights)[0]
@@ -172,9 +172,9 @@ def drawn(
         lasts = longest * chance.random() ** 3
         if longest > 20.0 and chance.random() < 0.03:
             lasts = _LONG
-        found.append(Fault(kind, at, lasts, chance.randrange(heliostats), chance.random()))
+        faults.append(Fault(kind, at, lasts, chance.randrange(heliostats), chance.random()))
         at += chance.expovariate(1.0 / pause)
-    return found
+    return faults
 
 
 def tick_jump(size: float) -> int:
@@ -210,21 +210,21 @@ def shrunk(
     most
         Maximum number of runs.
     """
-    left, parts, spent = list(faults), 2, 0
-    if spent < most and left and fails([]):
+    remaining, parts, spent = list(faults), 2, 0
+    if spent < most and remaining and fails([]):
         return []
-    while len(left) >= 2 and spent < most:
-        size = -(-len(left) // parts)
-        for start in range(0, len(left), size):
-            rest = left[:start] + left[start + size :]
+    while len(remaining) >= 2 and spent < most:
+        size = -(-len(remaining) // parts)
+        for start in range(0, len(remaining), size):
+            rest = remaining[:start] + remaining[start + size :]
             spent += 1
             if rest and fails(rest):
-                left, parts = rest, max(2, parts - 1)
+                remaining, parts = rest, max(2, parts - 1)
                 break
             if spent >= most:
                 break
         else:
             if size == 1:
                 break
-            parts = min(len(left), 2 * parts)
-    return left
+            parts = min(len(remaining), 2 * parts)
+    return remaining

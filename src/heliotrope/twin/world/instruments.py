@@ -67,7 +67,7 @@ class Instruments:
         return mean if name == "wind_mean" else max(1.2 * mean, gust)
 
     def _shown(self, name: str) -> float | None:
-        """Return what a sensor gives, None for nothing."""
+        """Return the reading of a sensor, None for no reading."""
         lie, true = self.lies[name], self._true(name)
         if lie == "sensor_silent":
             return None

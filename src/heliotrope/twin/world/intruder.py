@@ -51,7 +51,7 @@ class Intruder:
         self._addresses = addresses
 
     def recorded(self, size: float) -> bytes:
-        """Return an earlier frame chosen by ``size`` (0 to 1), b"" if there is none.
+        """Return an earlier frame chosen by ``size`` (0 to 1), or b"".
 
         Every second choice is one of the last commands, which may not have expired yet.
         """

@@ -136,13 +136,13 @@ class Maintenance:
         asks = service is not None and any(lock.who == OWNER for lock in service.out)
         if service is None or not asks or self._chance.random() < _LATER:
             return
-        there = {(lock.name, lock.who) for lock in service.out if lock.who != OWNER}
-        here = {(name, owner) for name, some in self._persons.locks.items() for owner in some}
-        if missing := sorted(here - there):
+        stored = {(lock.name, lock.who) for lock in service.out if lock.who != OWNER}
+        held = {(name, owner) for name, some in self._persons.locks.items() for owner in some}
+        if missing := sorted(held - stored):
             name, owner = missing[0]
             self._puts(service, ENGINEER if owner == ENGINEER.name else OPERATOR, name)
             return
-        for name, owner in sorted(there - here):
+        for name, owner in sorted(stored - held):
             self._gives_back(service, Kind.HELIOSTAT, name, owner)
         self._gives_back(service, Kind.TOWER, TOWER, OWNER)
         self._persons.confirmed()
@@ -159,7 +159,7 @@ class Maintenance:
             self._operator.push(plant, name, {"stow": packed("stow", stow)})
         else:
             counts = plant.field.counts(np.array([plant.field.place(name)]))[0] + steps
-            self._operator.zero(plant, name, [int(each) for each in counts])
+            self._operator.zero(plant, name, [int(count) for count in counts])
         self._written = name
 
     def _takes_off(self, plant: PlantController) -> None:

@@ -99,7 +99,7 @@ class Operator:
     away
         Whether nobody is on duty.
     waits
-        Whether the plant's program is frozen, so that nobody can do anything.
+        Whether the plant's program is frozen, so that it answers no command.
     commands
         Whether they hold the authority; else it is left to automatic control.
     counts
@@ -233,9 +233,9 @@ class Operator:
                     self._emergency,
                     self._one_safe,
                     self._lock,
-                    self._wrong,
+                    self._unauthorised,
                     self._change,
-                    self._astray,
+                    self._into_keep_out,
                 ],
                 self._habits.weights,
             )[0]
@@ -294,7 +294,7 @@ class Operator:
             self.tickets.accepted(ticket, now)
         return ticket
 
-    def _astray(self, plant: PlantController) -> None:
+    def _into_keep_out(self, plant: PlantController) -> None:
         """Ask for a motion that leads a beam through the keep-out volume; it must be refused."""
         name, mine = self._chance.choice(self._names), self._tokens.get(self._duty.name, 0)
         point = self._points((name,), self._keep_out, 0.5)
@@ -357,7 +357,7 @@ class Operator:
     def _lock(self, plant: PlantController) -> None:
         self.give(plant, "LOCK", (self._chance.choice(self._names),))
 
-    def _wrong(self, plant: PlantController) -> None:
+    def _unauthorised(self, plant: PlantController) -> None:
         """Command without authority: with an old token, with another person's, or as a viewer."""
         what = self._chance.choice(["TRACK", "APPROACH", "AIM", "REFOCUS", "STANDBY"])
         name = self._chance.choice(self._names)
@@ -421,9 +421,9 @@ class Operator:
             stow = packed("stow", (MACHINE.stow[0] + low, MACHINE.stow[1] + high))
             self.push(plant, name, chance.choice([{"stow": stow}, narrow_limits()]))
         elif what in ("another", "much"):
-            wrong = {k: v + chance.choice([-1.0, 1.0]) * 0.02 for k, v in fit.causes.items()}
+            causes = {k: v + chance.choice([-1.0, 1.0]) * 0.02 for k, v in fit.causes.items()}
             other = self._fits[chance.choice([n for n in self._names if n != name] or [name])]
-            source = other.mechanism if what == "another" else fit.with_causes(wrong)
+            source = other.mechanism if what == "another" else fit.with_causes(causes)
             if other is not fit or what == "much":
                 self.push(plant, name, {"armature": items_of(source)["armature"]})
         else:
@@ -441,7 +441,7 @@ class Operator:
         who = self._chance.choice([VIEWER, self._duty])
         self.raises(plant, who, act)
         if self._others.random() < _SECOND:  # another person has a reason of their own
-            others = [each for each in (OPERATOR, ENGINEER, VIEWER) if each is not who]
+            others = [person for person in (OPERATOR, ENGINEER, VIEWER) if person is not who]
             act = self._others.choice([Act.DEFOCUS, Act.STOW])
             self.raises(plant, self._others.choice(others), act)
 
@@ -496,7 +496,7 @@ class Operator:
     def _acknowledge(self, plant: PlantController) -> set[str]:
         """Acknowledge every latched condition; return those for which the plant takes it.
 
-        The engineer stands in for the supervisor.
+        The engineer acts for the supervisor.
         """
         taken: set[str] = set()
         waiting: dict[tuple[str, str], bool] = {}

@@ -42,7 +42,7 @@ class _Lie:
     place: FloatArray
     speed: FloatArray
     since: float
-    left: int
+    remaining: int
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class _Spoilt:
     place: FloatArray
     sun: float
     lamp: float
-    left: int
+    remaining: int
 
 
 class LyingCamera:
@@ -97,15 +97,17 @@ class LyingCamera:
         self._stacked: list[float] = []
         self.lies = dict.fromkeys((*LIES, *SPOILS), 0)
         self.taken: list[float] = []
-        self.told: Callable[[str, str, FloatArray, float], None] | None = None
+        self.on_photograph: Callable[[str, str, FloatArray, float], None] | None = None
 
     def away(self, at: float) -> float:
         """Return how far a time is from that of the nearest photograph, s of the monotonic clock.
 
         A sighting of a stack has the time of its middle, which may be between two photographs.
         """
-        near = min((abs(at - each) for each in self.taken), default=math.inf)
-        between = any(one <= at <= two <= one + _GAP for one, two in pairwise(self._stacked))
+        near = min((abs(at - taken) for taken in self.taken), default=math.inf)
+        between = any(
+            before <= at <= after <= before + _GAP for before, after in pairwise(self._stacked)
+        )
         return 0.0 if between else near
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
@@ -121,8 +123,8 @@ class LyingCamera:
             spoilt = self._spoiling()
         if spoilt is None:
             return true
-        if spoilt.left > 1:
-            self._spoilt[target.name] = replace(spoilt, left=spoilt.left - 1)
+        if spoilt.remaining > 1:
+            self._spoilt[target.name] = replace(spoilt, remaining=spoilt.remaining - 1)
         else:
             self._spoilt.pop(target.name, None)
         self.lies[spoilt.kind] += 1
@@ -145,10 +147,10 @@ class LyingCamera:
         return work()
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return what a photograph shows: the heliostat's beam, or something else."""
+        """Return the light on a photograph: the heliostat's beam, or another one."""
         shot = await self._photographed(target, heliostat)
-        if self.told is not None:
-            self.told(heliostat, target.name, shot.point, shot.at)
+        if self.on_photograph is not None:
+            self.on_photograph(heliostat, target.name, shot.point, shot.at)
         return shot
 
     async def _photographed(self, target: Target, heliostat: str) -> Shot:
@@ -160,9 +162,9 @@ class LyingCamera:
         before, self._last[target.name] = self._last.get(target.name), true
         if lie is None:
             return true
-        left = replace(lie, left=lie.left - 1)
-        if left.left > 0:
-            self._lie[target.name] = left
+        rest = replace(lie, remaining=lie.remaining - 1)
+        if rest.remaining > 0:
+            self._lie[target.name] = rest
         else:
             self._lie.pop(target.name, None)
         shown = self._shown(target, true, before, lie)
@@ -171,7 +173,7 @@ class LyingCamera:
 
     def _wavered(self, target: Target, shot: Shot, heliostat: str) -> Shot:
         """Return a photograph of the beam turned by the wind."""
-        mirrors = {each.heliostat: each for each in self._sight.mirrors()}
+        mirrors = {mirror.heliostat: mirror for mirror in self._sight.mirrors()}
         if (mirror := mirrors.get(heliostat)) is None:  # it is covered
             return shot
         slant = float(np.linalg.norm(target.center - mirror.vertex))

@@ -78,7 +78,7 @@ class Pod:
     clock, time
         The cluster's own; ``time`` is None where it uses its system clock.
     addresses
-        Address by which the cluster reaches each heliostat: exchanged, if errors say so.
+        Address of each heliostat for the cluster: exchanged, if errors say so.
     tap, ear
         The plant's end of the line and its listener; None while no plant runs.
     plant
@@ -92,8 +92,8 @@ class Pod:
     freezes
         Whether its program can be frozen.
     file
-        What is wrong in the cluster's file: the name that a heliostat has in it, "" if it is
-        missing there.
+        Errors in the cluster's file: the name that a heliostat has in it, or "" for a missing
+        one.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class Pod:
         cluster = Cluster(config, self.bus, heard, self.clock, keeper, self._kept)
         context = context_of(self.name) if self.freezes else None
         self._running = [
-            group.create_task(each, context=context) for each in (link.run(), cluster.run())
+            group.create_task(part, context=context) for part in (link.run(), cluster.run())
         ]
 
     def crash(self) -> None:
@@ -203,8 +203,8 @@ class Pod:
             self._whole_since = now
             self.observer.disturbed(now)
         if self.lines is not None:
-            there = tap is not None and link is not None
-            self.lines.look(now, clear=there and not hindered, connected=whole)
+            both = tap is not None and link is not None
+            self.lines.look(now, clear=both and not hindered, connected=whole)
 
     @property
     def checks(self) -> Counter[int]:
@@ -240,8 +240,10 @@ class Pod:
                 self.plant.heard(name, int(values[0]), now)
             if name is not None and frame.name == "STEPS":
                 board = next(board for board in self.boards if board.outfit.name == name)
-                one, two = (a.emitted - s for a, s in zip(board.axes, board.slip, strict=True))
-                self.plant.counted(name, (one, two), now)
+                azimuth, elevation = (
+                    a.emitted - s for a, s in zip(board.axes, board.slip, strict=True)
+                )
+                self.plant.counted(name, (azimuth, elevation), now)
 
 
 class _ClusterEar:
@@ -331,10 +333,10 @@ class PlantEar:
                 self._quiet.leased(message.token, now)
         elif isinstance(message, Emergency):
             whom = message.heliostats or tuple(self._addresses)
-            there = tuple(name for name in whom if name not in self._pod.file)
+            addressed = tuple(name for name in whom if name not in self._pod.file)
             carried = self._pod.carried(now)
-            if there:
-                observer.emergency(message.name, now, carried=carried, heliostats=there)
+            if addressed:
+                observer.emergency(message.name, now, carried=carried, heliostats=addressed)
             self._beams.ordered_off(whom, now)
             if self._quiet is not None:
                 self._quiet.ordered_off(message.name, whom, now)
@@ -344,8 +346,8 @@ class PlantEar:
             observer.ordered(self.order(message, now, known=self._plant.known(message.token)))
             self._writes(message, now)
             if isinstance(message, Parameters) and (stow := message.items().get("stow")):
-                one, two = struct.unpack(CODES_OF["stow"], stow)
-                observer.given_stow(message.heliostat, (one, two))
+                azimuth, elevation = struct.unpack(CODES_OF["stow"], stow)
+                observer.given_stow(message.heliostat, (azimuth, elevation))
             if isinstance(message, Command):
                 whom = message.heliostats or tuple(self._addresses)
                 self._beams.sent(message, whom, now)
@@ -369,7 +371,7 @@ class PlantEar:
         else:
             name, whom = "PARAMETERS", (message.heliostat,)
         until = self._plant.until(message.token, now + message.lifetime + UNDER_WAY)
-        addresses = frozenset(self._addresses[each] for each in whom)
+        addresses = frozenset(self._addresses[heliostat] for heliostat in whom)
         return PlantCommand(message.identity, name, addresses, now, until, known, message.token)
 
     def received(self, data: bytes, now: float) -> None:

@@ -111,17 +111,17 @@ def scene_of(worlds: Sequence[str], seed: int, seconds: float, heliostats: int) 
 
 def _clear_at_stow(places: Sequence[tuple[float, float]], suns: FloatArray, ball: Ball) -> bool:
     """Whether no beam at stow comes near a ball; ``suns`` are (S, 3)."""
-    (middle, radius), (vertex, way) = ball, stow_beams(places, suns)
-    along = ((np.array(middle) - vertex) * way).sum(axis=-1, keepdims=True)
-    miss = np.linalg.norm(np.array(middle) - vertex - np.maximum(along, 0.0) * way, axis=-1)
+    (middle, radius), (vertex, direction) = ball, stow_beams(places, suns)
+    along = ((np.array(middle) - vertex) * direction).sum(axis=-1, keepdims=True)
+    miss = np.linalg.norm(np.array(middle) - vertex - np.maximum(along, 0.0) * direction, axis=-1)
     return bool((miss > radius + _ROOM).all())
 
 
 def _beside(place: tuple[float, float]) -> float:
     """Return how far a beam from a place through the standby point passes the receiver, m."""
-    way = np.subtract(STANDBY, (*place, 2.0))
+    direction = np.subtract(STANDBY, (*place, 2.0))
     goal = np.subtract(RECEIVER, (*place, 2.0))
-    return float(np.linalg.norm(goal - way * (goal @ way) / (way @ way)))
+    return float(np.linalg.norm(goal - direction * (goal @ direction) / (direction @ direction)))
 
 
 def _when(chance: random.Random, seconds: float) -> tuple[Site, datetime]:
@@ -149,12 +149,12 @@ def _limit(chance: random.Random, seconds: float) -> tuple[Site, datetime]:
         up = np.arcsin(vector(times, site)[:, 2])
         evening = chance.random() < 0.5
         before = up[:-1] > _STOWS if evening else up[:-1] < _STOWS
-        found = np.flatnonzero(before & ((up[1:] < _STOWS) if evening else (up[1:] > _STOWS)))
-        if not len(found):
+        crossings = np.flatnonzero(before & ((up[1:] < _STOWS) if evening else (up[1:] > _STOWS)))
+        if not len(crossings):
             continue
         share = chance.uniform(*_BEFORE)
         lead = share * min(seconds, _SOON / _BEFORE[0]) if evening else chance.uniform(5.0, _OFTEN)
-        k = found[0]
+        k = crossings[0]
         first = float(times[k] + _OFTEN * (_STOWS - up[k]) / (up[k + 1] - up[k])) - lead
         suns = vector(first + np.linspace(0.0, seconds, 2 + int(seconds / _OFTEN)), site)
         height = np.arcsin(suns[:, 2])

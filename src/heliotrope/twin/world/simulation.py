@@ -88,10 +88,10 @@ from heliotrope.twin.world.worlds import (
     common_error,
     covered_by,
     drawn,
+    joint_visits,
     knows_boards,
     measured,
     motors_of,
-    parties,
     stored_by,
     surveyed,
     works,
@@ -183,7 +183,7 @@ class RunPlan:
     @property
     def size(self) -> int:
         """Number of heliostats: enough for a joint visit, where there are joint visits."""
-        return max(self.heliostats, PARTY) if parties(self.worlds) else self.heliostats
+        return max(self.heliostats, PARTY) if joint_visits(self.worlds) else self.heliostats
 
     @property
     def clusters(self) -> int:
@@ -220,7 +220,7 @@ class RunResult:
     violation
         The first broken invariant, or None.
     problem
-        An exception of the code under test, "" if there was none.
+        An exception of the code under test; empty without one.
     checks
         Number of checks of each invariant.
     faults
@@ -260,7 +260,7 @@ class RunResult:
 
     @property
     def text(self) -> str:
-        """What went wrong in one line, "" if nothing did."""
+        """The failure in one line; empty for a good run."""
         if self.violation is not None:
             return str(self.violation)
         return self.problem
@@ -304,17 +304,17 @@ class Simulation:
         fits = motors_of(outfits(plan.size, plan.seed, scene.places), plan.worlds, plan.seed)
         known = surveyed(fits, plan.worlds, plan.seed)
         self._coarse = fits[0].machine is COARSE
-        self._astray = {a.name for a, b in zip(fits, known, strict=True) if a is not b}
+        self._unsurveyed = {a.name for a, b in zip(fits, known, strict=True) if a is not b}
         stored = [
-            replace(fit, items=one.items)
-            for fit, one in zip(fits, stored_by(known, plan.worlds, plan.seed), strict=True)
+            replace(fit, items=stored_fit.items)
+            for fit, stored_fit in zip(fits, stored_by(known, plan.worlds, plan.seed), strict=True)
         ]
-        self.boards = [self._board(each) for each in stored]
+        self.boards = [self._board(outfit) for outfit in stored]
         self.pods = self._new_pods()
         self._observe(scene)
         self._measured = measured(plan.worlds)
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
-        together = parties(plan.worlds)
+        together = joint_visits(plan.worlds)
         self._design, self._homes = design_of(known, homes, scene, together=together), homes
         # The boards' wanted items and assigned points survive the plant's program.
         self._fits = known
@@ -327,7 +327,7 @@ class Simulation:
         if REPAIRS in plan.worlds:
             self._store = PlantStore(self._clock, self.persons, self._exits)
             self._assigned, self._emergency = self._store.points, self._store.keeper
-        self._assigned.keep({"STANDBY": {each.name: STANDBY for each in fits}})
+        self._assigned.keep({"STANDBY": {outfit.name: STANDBY for outfit in fits}})
         self.disk = RecordsDisk()
         self._employ(fits, scene)
         self.plant: PlantController | None = None
@@ -340,11 +340,13 @@ class Simulation:
         self.persons = PersonsObserver(self.begin, self.boards, alone=alone)
         boards = {pod.name: pod.boards for pod in self.pods}
         most = LOSSES if works(plan.worlds) else None
-        self.beams = BeamObserver(self.begin, boards, self.sun, scene.keep_outs, most, self._astray)
+        self.beams = BeamObserver(
+            self.begin, boards, self.sun, scene.keep_outs, most, self._unsurveyed
+        )
         self.beams.contradicted = COMMON in plan.worlds
         self.readings = SensorObserver(self.begin, boards)
         self.alarms = AlarmObserver(self.begin, boards, plan.worlds)
-        accounts = {each.name: each for pod in self.pods for each in pod.observer.accounts}
+        accounts = {account.name: account for pod in self.pods for account in pod.observer.accounts}
         self.tickets = TicketObserver(self.begin, accounts)
         self.quiet = self._quiet_observer()
         for pod in self.pods:
@@ -413,10 +415,10 @@ class Simulation:
 
         def mirrors() -> Sequence[TrueMirror]:
             """Return the mirrors that throw light."""
-            return [each for each in all_mirrors() if each.heliostat not in self._covered]
+            return [mirror for mirror in all_mirrors() if mirror.heliostat not in self._covered]
 
         sight = FieldSnapshot(clock, mirrors, lambda: self.sun(clock.monotonic()))
-        lights, together = "lights" in plan.worlds, parties(plan.worlds)
+        lights, together = "lights" in plan.worlds, joint_visits(plan.worlds)
         kind = DAY_WORK if DAYS in plan.worlds else LIT_WORK if lights else USUAL_WORK
         machine, lowest = self._fits[0].machine, self._scene.lowest
         kind = replace(kind, together=together, lowest=lowest, machine=machine)
@@ -431,17 +433,17 @@ class Simulation:
 
     def _new_watch(self, work: Work, *, together: bool) -> Watch:
         begin, boards, targets = self.begin, self.boards, self._scene.targets
-        dark = self._astray | self._covered
+        dark = self._unsurveyed | self._covered
         zero = self._clock.utc().timestamp() - self._clock.monotonic()
         results = ResultObserver(
             begin, boards, work.records, self.sun, zero, dark, together=together
         )
-        work.camera.told = results.photographed
+        work.camera.on_photograph = results.photographed
         persons = [person.name for person in CREW]
         lowest = self._scene.lowest
         return Watch(
             VisitObserver(
-                begin, boards, targets, work.away, followed=work.centred, dark=self._astray
+                begin, boards, targets, work.away, followed=work.centred, dark=self._unsurveyed
             ),
             DayObserver(begin, boards, lowest),
             results,
@@ -455,7 +457,7 @@ class Simulation:
                 dark=dark,
             ),
             ShownObserver(
-                begin, boards, self._homes, targets, self.observer, persons, self._astray
+                begin, boards, self._homes, targets, self.observer, persons, self._unsurveyed
             ),
         )
 
@@ -488,11 +490,11 @@ class Simulation:
         return np.asarray(mixed / np.linalg.norm(mixed))
 
     def _sun_at(self, place: int) -> FloatArray:
-        found = self._suns.get(place)
-        if found is None:
-            found = vector(self._scene.start.timestamp() + _SUN_EVERY * place, self._scene.site)
-            self._suns[place] = found
-        return found
+        sun = self._suns.get(place)
+        if sun is None:
+            sun = vector(self._scene.start.timestamp() + _SUN_EVERY * place, self._scene.site)
+            self._suns[place] = sun
+        return sun
 
     def _flux(self) -> float:
         """Return the share of the beams on the receiver."""
@@ -507,10 +509,10 @@ class Simulation:
     @property
     def checks(self) -> Counter[int]:
         """Number of checks of each invariant by the observers of work, alarms and tickets."""
-        found = self.alarms.checks + self.tickets.checks + self.persons.checks
+        counts = self.alarms.checks + self.tickets.checks + self.persons.checks
         if self._work is not None:
-            found += self._work.watch.checks
-        return found if self.quiet is None else found + self.quiet.checks
+            counts += self._work.watch.checks
+        return counts if self.quiet is None else counts + self.quiet.checks
 
     # -- the plant -------------------------------------------------------------------------
 
@@ -557,7 +559,7 @@ class Simulation:
             parts.append(self._sees(plant))
         if self._work is not None:
             parts.append(self._work.control.begins(plant).run())
-        self._program = [group.create_task(each, context=context) for each in parts]
+        self._program = [group.create_task(part, context=context) for part in parts]
 
     def _settings(self) -> PlantSettings:
         """Return the settings of the plant."""
@@ -589,9 +591,9 @@ class Simulation:
         steps = np.array([2000, -2000]) if fault.size < 0.5 else np.array([-1500, 1000])
         stow = np.array(MACHINE.stow) + steps
         if fault.size > _ON_RECEIVER:
-            here = np.array(MACHINE.stow, dtype=np.float64)
+            counts = np.array(MACHINE.stow, dtype=np.float64)
             sun = self.sun(self._clock.monotonic())
-            best = track(fit.mechanism, sun, np.array(RECEIVER), current=here).best_counts
+            best = track(fit.mechanism, sun, np.array(RECEIVER), current=counts).best_counts
             stow = np.rint(best).astype(int)
         self._stows = {fit.name: packed("stow", (int(stow[0]), int(stow[1])))}
 
@@ -709,7 +711,7 @@ class Simulation:
                 tasks += [self._second.operator.keep(), self._second.work()]
             if self._measured:
                 tasks.append(self.instruments.run())
-            others = [group.create_task(each) for each in tasks]
+            others = [group.create_task(work) for work in tasks]
             try:
                 await self._turn(damage, group)
             finally:
@@ -821,7 +823,7 @@ def run(plan: RunPlan) -> RunResult:
 
 
 def _lost(about: dict[str, Any], outcome: RunResult) -> None:
-    """Note an exception that nobody has awaited: one of a task or of a callback."""
+    """Note an exception of a task or of a callback that was not awaited."""
     error = about.get("exception")
     if isinstance(error, Exception) and not outcome.problem:
         outcome.problem = f"{about['message']}: {type(error).__name__}: {error}"
@@ -829,12 +831,12 @@ def _lost(about: dict[str, Any], outcome: RunResult) -> None:
 
 def _blame(error: BaseException, outcome: RunResult) -> None:
     """Find what broke first among all that a task group raises."""
-    found = list(_leaves(error))
-    for each in found:
-        if isinstance(each, InvariantError):
-            outcome.violation = each.violation
+    errors = list(_leaves(error))
+    for leaf in errors:
+        if isinstance(leaf, InvariantError):
+            outcome.violation = leaf.violation
             return
-    first = found[0]
+    first = errors[0]
     place = traceback.extract_tb(first.__traceback__)[-1]
     where = f"{Path(place.filename).name}, line {place.lineno}"
     outcome.problem = f"{type(first).__name__} at {where}: {first}"
@@ -842,8 +844,8 @@ def _blame(error: BaseException, outcome: RunResult) -> None:
 
 def _leaves(error: BaseException) -> Iterator[BaseException]:
     if isinstance(error, BaseExceptionGroup):
-        for each in error.exceptions:
-            yield from _leaves(each)
+        for part in error.exceptions:
+            yield from _leaves(part)
     else:
         yield error
 

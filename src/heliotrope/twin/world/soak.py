@@ -62,7 +62,7 @@ def summary(outcome: RunResult) -> dict[str, Any]:
     }
 
 
-def _one(plan: RunPlan) -> dict[str, Any]:
+def _run_plan(plan: RunPlan) -> dict[str, Any]:
     return summary(run(plan))
 
 
@@ -101,25 +101,25 @@ def run_many(
     """
     if processes < 1:
         raise InputError(f"soak with {processes} processes; give 1 or more")
-    found = SoakResult()
+    result = SoakResult()
     known = {}
     if progress is not None and progress.exists():
         known = _read(progress)
     todo = []
     for plan in plans:
         if plan.seed in known:
-            found.add(known[plan.seed])
+            result.add(known[plan.seed])
         else:
             todo.append(plan)
     clock = clock or SystemClock()
     end = clock.monotonic() + budget
     for line in _results(todo, processes, lambda: clock.monotonic() < end):
-        found.add(line)
+        result.add(line)
         if progress is not None:
             with progress.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")
-        tell(found)
-    return found
+        tell(result)
+    return result
 
 
 def _results(
@@ -129,33 +129,33 @@ def _results(
         for plan in plans:
             if not goes_on():
                 return
-            yield _one(plan)
+            yield _run_plan(plan)
         return
-    left = iter(plans)
+    queue = iter(plans)
     with pool(processes) as workers:
         running: set[Future[dict[str, Any]]] = set()
         while True:
             if goes_on():
                 running |= {
-                    workers.submit(_one, plan)
-                    for plan in islice(left, 2 * processes - len(running))
+                    workers.submit(_run_plan, plan)
+                    for plan in islice(queue, 2 * processes - len(running))
                 }
             if not running:
                 return
             done, running = wait(running, return_when=FIRST_COMPLETED)
-            for each in done:
-                yield each.result()
+            for future in done:
+                yield future.result()
 
 
 def _read(path: Path) -> dict[int, dict[str, Any]]:
-    found = {}
+    lines = {}
     for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
         try:
             line = json.loads(text)
-            found[int(line["seed"])] = line
+            lines[int(line["seed"])] = line
             SoakResult().add(line)
         except (ValueError, KeyError, TypeError, AttributeError):
             raise FormatError(
                 path, "not a run of a soak; name another file, or remove this one", f"line {number}"
             ) from None
-    return found
+    return lines

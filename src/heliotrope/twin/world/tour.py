@@ -2,7 +2,7 @@
 
 An observer of faults finds nothing in a field that does nothing. Here each command must be carried
 out: it is accepted, ends as done in time, the board is in the state that it asks for, and the plant
-shows it; no alarm is raised. A state is a name, so the true mirror is looked at too: its beam is on
+shows it; no alarm is raised. A state is a name, so the true mirror is checked too: its beam is on
 the point that the engineer gave (12), and its motors have turned as the command says. At the end
 the whole field is defocused by an emergency, which is proven, and comes back.
 """
@@ -143,7 +143,7 @@ class Tour:
         board, jog = self._boards[name], [0, 0]
         jog[self._chance.randrange(2)] = self._chance.choice([-JOGGED, JOGGED])
         before = _turned(board)
-        ticket = self._given(what, name, jog)
+        ticket = self._ordered(what, name, jog)
         self._check(ticket is not None, f"{what} {name} was refused: {self._operator.refusal}")
         assert ticket is not None
         async with asyncio.TaskGroup() as group:
@@ -157,7 +157,7 @@ class Tour:
             await self._searched(name)
         await asyncio.sleep(REST)
         self._shown(what, name, state)
-        self._lit(what, name)
+        self._beam(what, name)
         moved = _turned(board) - before
         if what == "JOG":
             good = float(np.abs(moved - jog).max()) <= DRIFT
@@ -168,7 +168,7 @@ class Tour:
         elif what == "LOCK":
             await self._stands(name)
 
-    def _given(self, what: str, name: str, jog: Sequence[int]) -> Ticket | None:
+    def _ordered(self, what: str, name: str, jog: Sequence[int]) -> Ticket | None:
         """Give a command; None if it is refused."""
         if what in ("DEFOCUS", "STOW"):
             return self._operator.safe(self._plant, what, name)
@@ -206,7 +206,7 @@ class Tour:
         row = self._plant.field.of(name, self._clock.monotonic())
         self._check(row.state == state, f"{what} {name}: {state}, and the plant shows {row.state}")
 
-    def _lit(self, what: str, name: str) -> None:
+    def _beam(self, what: str, name: str) -> None:
         """Check where the true beam is, or that the true mirror is at stow."""
         board, points = self._boards[name], self._operator.points
         if board.state == states.STOWED:

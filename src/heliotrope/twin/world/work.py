@@ -96,7 +96,7 @@ class _Rounds:
         able = [name for name, free in zip(self._names, ready, strict=True) if free]
         if not able:
             return None
-        name = min(able, key=lambda each: self._last[each])
+        name = min(able, key=lambda candidate: self._last[candidate])
         self._count += 1
         self._last[name] = self._count
         return Planned(name, target, self._clock.utc().timestamp(), 0.0, "in turn")
@@ -169,7 +169,7 @@ class Work:
         return self.camera.away(at - zero)
 
     def opens(self, on_alarm: Callable[[Alarm], None]) -> Logbook:
-        """Return the logbook of a new program, which tells of all alarms that begin or end."""
+        """Return the logbook of a new program, which reports all alarms that begin or end."""
         self.logbook = Logbook(self._clock, self.records)
         self.logbook.forward = on_alarm
         return self.logbook

@@ -90,10 +90,10 @@ def mixed(seed: int) -> tuple[str, ...]:
             return (alone,)
     chance = random.Random(f"worlds {seed}")
     share = chance.choice([0.0, 0.2, 0.5, 0.8])
-    found = [name for name in MIX if chance.random() < share]
-    found += [name for name in RARE if random.Random(f"{name} {seed}").random() < RARE_SHARE]
+    worlds = [name for name in MIX if chance.random() < share]
+    worlds += [name for name in RARE if random.Random(f"{name} {seed}").random() < RARE_SHARE]
     # Automatic control of a second plant is not judged.
-    return tuple(name for name in found if name != "twice" or not works(found))
+    return tuple(name for name in worlds if name != "twice" or not works(worlds))
 
 
 #: Weights of the actions of persons while much is repaired: emergencies are frequent; and of those
@@ -153,8 +153,8 @@ def weights_of(worlds: Sequence[str], seed: int, weights: Mapping[str, float]) -
     if "swarm" not in worlds:
         return dict(weights)
     chance = random.Random(f"weights {seed}")
-    found = {k: w * chance.choice([0.0, 0.0, 0.3, 1.0, 3.0]) for k, w in weights.items()}
-    return found if any(found.values()) else dict(weights)
+    scaled = {k: w * chance.choice([0.0, 0.0, 0.3, 1.0, 3.0]) for k, w in weights.items()}
+    return scaled if any(scaled.values()) else dict(weights)
 
 
 def pause_of(worlds: Sequence[str], seed: int, pause: float) -> float:
@@ -173,7 +173,7 @@ def works(worlds: Sequence[str]) -> bool:
     return not set(worlds).isdisjoint(WORKING)
 
 
-def parties(worlds: Sequence[str]) -> bool:
+def joint_visits(worlds: Sequence[str]) -> bool:
     """Whether several heliostats are measured at once in a run."""
     return not set(worlds).isdisjoint(PARTIES)
 
@@ -237,14 +237,14 @@ def surveyed(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[O
     chance = random.Random(f"survey {seed}")
     if DAYS not in worlds or chance.random() >= _UNSURVEYED:
         return list(fits)
-    found = list(fits)
+    believed = list(fits)
     for i in chance.sample(range(len(fits)), 3):
         fit, size = fits[i], chance.choice([-1.0, 1.0]) * chance.uniform(*_BESIDE)
         causes = {**fit.causes, "canting": fit.causes["canting"] + size}
         mechanism = fit.with_causes(causes)
         items = {**fit.items, **items_of(mechanism, fit.machine)}
-        found[i] = replace(fit, causes=causes, mechanism=mechanism, items=items)
-    return found
+        believed[i] = replace(fit, causes=causes, mechanism=mechanism, items=items)
+    return believed
 
 
 def covered_by(names: Sequence[str], worlds: Sequence[str], seed: int) -> frozenset[str]:
@@ -326,25 +326,25 @@ class PodErrors:
         chance = self._chance("clock")
         if chance is None:
             return start
-        wrong = chance.choice([-1, 1]) * chance.choice([60.0, 300.0, 600.0, 3600.0])
-        return start + timedelta(seconds=wrong)
+        error = chance.choice([-1, 1]) * chance.choice([60.0, 300.0, 600.0, 3600.0])
+        return start + timedelta(seconds=error)
 
     def site(self, site: Site) -> Site:
         """Return the site that the cluster is configured with."""
         chance = self._chance("site")
         if chance is None:
             return site
-        wrong = chance.choice([-1, 1]) * chance.uniform(0.5, 2.5)
+        error = chance.choice([-1, 1]) * chance.uniform(0.5, 2.5)
         if chance.random() < 0.5:
-            return replace(site, longitude_deg=site.longitude_deg + wrong)
-        return replace(site, latitude_deg=site.latitude_deg + wrong)
+            return replace(site, longitude_deg=site.longitude_deg + error)
+        return replace(site, latitude_deg=site.latitude_deg + error)
 
     def addresses(self, addresses: list[int]) -> list[int]:
         """Return the addresses that the cluster is configured with."""
         chance = self._chance("addresses")
         if chance is None or len(addresses) < 2:
             return addresses
-        one, two = chance.sample(range(len(addresses)), 2)
-        found = list(addresses)
-        found[one], found[two] = addresses[two], addresses[one]
-        return found
+        first, second = chance.sample(range(len(addresses)), 2)
+        exchanged = list(addresses)
+        exchanged[first], exchanged[second] = addresses[second], addresses[first]
+        return exchanged

@@ -96,7 +96,7 @@ parameter_sighting = Table(
     Column("version", Integer, primary_key=True, autoincrement=False),
     Column("place", Integer, primary_key=True, autoincrement=False),
     Column("sighting", Number, ForeignKey(sighting.c.number), nullable=False),
-    *(_real(f"{when}_{way}") for when in ("before", "after") for way in ("right", "above")),
+    *(_real(f"{when}_{side}") for when in ("before", "after") for side in ("right", "above")),
     ForeignKeyConstraint(
         ["heliostat", "version"], [parameter_version.c.heliostat, parameter_version.c.version]
     ),

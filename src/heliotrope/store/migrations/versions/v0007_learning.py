@@ -1,4 +1,4 @@
-"""What was learnt of each group of mirrors."""
+"""The learned hyperparameters of each group of mirrors."""
 
 from alembic import op
 from sqlalchemy import Column, Double, Integer, Text
