@@ -128,9 +128,12 @@ def test_a_cluster_that_may_not_move_keeps_no_other_at_stow(tmp_path: Path) -> N
     play(tmp_path, scene)
 
 
+@pytest.mark.parametrize("asked", [1, 1000])
 def test_what_an_emergency_left_unproven_is_raised_at_once_when_it_is_proven(
-    tmp_path: Path,
+    asked: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("heliotrope.plant.operations.raising.ASKED", asked)
+
     async def scene(bench: Bench) -> None:
         plant, cluster = bench.plant, bench.cluster_of(NAME)
         log = Logbook(bench.clock)
@@ -158,6 +161,7 @@ def test_what_an_emergency_left_unproven_is_raised_at_once_when_it_is_proven(
         assert waits.keys() == {NAME}, waits
         assert waits[NAME].startswith("unproven_after_emergency P1A: ")
         # It keeps no other waiting, and it is no matter of its path.
+        assert asked > 1 or await step() == []
         assert await step() == [("P1B",)]
         assert await step() == []
         assert raising.why_not(NAME) == ""

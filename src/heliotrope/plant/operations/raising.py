@@ -34,6 +34,8 @@ RAISING = RetryLaw(
     memory=1800.0,
     alarm=alarms.RAISING_GIVEN_UP,
 )
+#: Heliostats that are asked in one step whether they may be given a command.
+ASKED = 1000
 #: The next command of a heliostat on its way to the receiver, by its state.
 _NEXT = {states.STOWED: "APPROACH", states.DEFOCUSED: "IDLE", states.IDLE: "TRACK"}
 
@@ -88,6 +90,8 @@ class Raising:
         self._busy_until = np.full(count, -math.inf)
         self._told_in = np.full(count, -1, dtype=np.int16)
         self._halted_at = np.full(count, math.inf)
+        #: The row to ask first for each command.
+        self._next: dict[str, int] = {}
         #: Why beams have no free path, by heliostat.
         self._blocked: dict[str, str] = {}
         self.attempts = Attempts(RAISING, log.take_alarm)
@@ -167,9 +171,14 @@ class Raising:
         return self._plant.blocked(command, names, aims)
 
     def _first(self, command: str, rows: Rows) -> Rows:
-        """Return the first rows (K,) of heliostats that may be given a command."""
-        blocked = self._stopped(command, rows)
-        free = [row for row in rows if self._names[row] not in blocked]
+        """Return the first rows (K,) of heliostats that may be given a command.
+
+        At most `ASKED` are asked; if all of them are blocked, the next step asks those after them.
+        """
+        asked = np.roll(rows, -int(np.searchsorted(rows, self._next.get(command, 0))))[:ASKED]
+        blocked = self._stopped(command, asked)
+        free = [row for row in asked if self._names[row] not in blocked]
+        self._next[command] = int(asked[-1]) + 1 if len(asked) and not free else 0
         return np.array(free[: self._most], dtype=np.intp)
 
     def give_up(self) -> None:
