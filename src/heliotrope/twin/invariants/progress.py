@@ -220,8 +220,7 @@ class ProgressObserver:
             tracks = board.state == states.TRACKING and on_receiver
             saw = "automatic control has it, and it has not tracked the receiver"
             locked = name in self._locked and board.state == states.LOCKED
-            # A person's lock is the person's to give back.
-            away = mine and not tracks and not locked
+            away = mine and not tracks and not locked  # the person gives the lock back
             self._within(("tracks", name), away, now, TRACKS_WITHIN, name, saw, L3)
             for target in self._targets.values():
                 lights = mine and board.state == states.TRACKING and self._on(board, target, sun)
