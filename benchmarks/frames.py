@@ -34,7 +34,7 @@ def frames(rng: np.random.Generator, packets: bool) -> list[bytes]:
             for body in (rng.bytes(PACKET_SIZE - 1) for _ in range(400))
         ]
     made = []
-    for number, name, who, codes, _ in messages.MESSAGES * 8:
+    for number, name, who, codes, *_ in messages.MESSAGES * 8:
         size = sum(_size(code) for code in wire._single(messages.codes_of(number)))
         payload = rng.bytes(size + (int(rng.integers(160)) if codes.endswith("s") else 0))
         mac = rng.bytes(wire.MAC_SIZE) if who == messages.KEY else b""

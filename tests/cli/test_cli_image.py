@@ -369,7 +369,12 @@ def test_crops_need_their_target(folder: Path, call: Any) -> None:
 @pytest.mark.parametrize("record", ["log", "json"])
 def test_two_targets_for_one_photograph_are_refused(record: str, folder: Path, call: Any) -> None:
     plant = read_plant(folder / "plant.toml")
-    other = replace(TARGET, name="other", corners=TARGET.corners + [0.0, 0.0, 30.0])
+    other = replace(
+        TARGET,
+        name="other",
+        corners=TARGET.corners + [0.0, 0.0, 30.0],
+        center=TARGET.center + [0.0, 0.0, 30.0],
+    )
     write_plant(replace(plant, targets=(TARGET, other)), folder / "plant.toml")
     photograph = folder / "photographs" / "7-raw.png"
     (folder / "photographs" / "p0.png").rename(photograph)

@@ -95,8 +95,9 @@ def track(
     from heliotrope.geometry import normalize
     from heliotrope.mechanism import track_path, tracking
 
-    # With a given sun the place on Earth does not matter.
-    plant = _opened(field, site or ("0,0,0" if sun is not None else ""), calibration)
+    # With a given sun the place on Earth does not matter, even to a format that has none.
+    anywhere = sun is not None and field.suffix.lower() in (".csv", ".txt", ".tsv", ".xml")
+    plant = _opened(field, site or ("0,0,0" if anywhere else ""), calibration)
     mechanism = plant[heliostat].calibrated
     _check(every, law, local, trace, target)
     goal = np.array(

@@ -88,8 +88,9 @@ def _read(
         return _of_solarpilot(place, _needed(place, site), templates)
     from heliotrope.field.formats import plant_file
 
+    plant = plant_file.read_plant(place)
     _refuse_unused(place, site=site, centroids=centroids, templates=templates)
-    return plant_file.read_plant(place)
+    return plant
 
 
 def _of_heliok(place: Path, site: Site | None) -> Plant:
