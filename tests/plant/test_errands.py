@@ -115,7 +115,7 @@ def test_a_lock_on_a_target_parks_what_gets_its_aim_back_on_the_way_to_stow() ->
         token = shown.take_authority(ENGINEER).token
         shown.aim_at(ENGINEER, token, (first, second), "left")
         await asyncio.sleep(6.0)
-        shown.keep_authority(ENGINEER, token)
+        shown.plant.authority.keep(ENGINEER, token)
         ticket = shown.hold(OPERATOR, (), "paint target", targets=("left",))
         assert ticket.heliostats == (first, second)
         await asyncio.sleep(3.0)

@@ -293,7 +293,7 @@ def test_a_refusal_names_the_orders_that_stand_and_then_what_is_left_to_do(
         plant.withdraw_emergency(otto)
         one = "Olga: a person at the receiver"
         assert refused() == text.format(one)
-        assert dict(plant.emergency_causes) == {"Olga": "a person at the receiver"}
+        assert dict(plant.sentinel.causes()) == {"Olga": "a person at the receiver"}
         # So it is when the table has made it a STOW.
         for _ in range(8):
             plant.authority.keep(OPERATOR, token)
@@ -314,7 +314,7 @@ def test_a_refusal_names_the_orders_that_stand_and_then_what_is_left_to_do(
         plant.acknowledge(OPERATOR, "operator_emergency")
         await bench.wait(1.0)
         assert not plant.sentinel.on
-        assert plant.emergency_causes == {}
+        assert plant.sentinel.causes() == {}
         with pytest.raises(RefusedError, match="Olga stands; no emergency holds"):
             plant.withdraw_emergency(OPERATOR)
 
