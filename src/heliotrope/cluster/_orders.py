@@ -27,6 +27,11 @@ from heliotrope.lcu import messages, names, states, wire
 from heliotrope.lcu.journal import CODES_OF, ITEMS, SIZE_OF, TARGETS
 from heliotrope.links.messages import Command, Parameters, ProtocolError, Stage
 
+#: Commands by what they do to an order that stands.
+_RELATIVE = messages.having("relative")
+_REPEATED = messages.having("again")
+_STORED = messages.having("stored")
+
 #: The same frame is sent this often before other jobs get their turn.
 TRIES = 3
 #: Temporary refusals: the node has not heard the time, session or authority yet.
@@ -272,7 +277,7 @@ class Orders:
             return self._fail(job, job.last or "not acknowledged before it expired")
         if not job.told_sent:
             job.told_sent = True
-            if job.step.name in messages.RELATIVE:
+            if job.step.name in _RELATIVE:
                 await self._note_origin(job)
             elif self._goals.waits(job.node):
                 # A goal reached since the last poll would be given up.
@@ -309,7 +314,7 @@ class Orders:
             head, key = (*head, edition), node.member.key
         if step.name == "SET_ADDRESS":
             return await self._give_address(job, head, key)
-        slow = bool(key) or step.name in messages.STORED
+        slow = bool(key) or step.name in _STORED
         answer = await self._exchange.ask(
             node,
             step.name,
@@ -323,7 +328,7 @@ class Orders:
         if answer is not None:
             return self._judge(job, answer.values[2], lost=job.unanswered or answer.attempt > 0)
         job.unanswered = True
-        if step.name in messages.RELATIVE:
+        if step.name in _RELATIVE:
             return self._fail(job, f"no answer to {step.name}; it may have been taken")
         return self._again(job, f"no answer to {step.name} before it expired")
 
@@ -395,7 +400,7 @@ class Orders:
             self._epoch.taken(job.node.index)
             return self._advance(job)
         text = f"{name}: {self._why(job.node, result)}"
-        if lost and result == messages.DUPLICATE and name in messages.AGAIN:
+        if lost and result == messages.DUPLICATE and name in _REPEATED:
             job.unanswered = True
             return self._again(job, text)
         if lost and result in _MAYBE and name in GOALS:

@@ -178,12 +178,7 @@ POINTS = having("point")
 SETTINGS = having("setting")
 HARMLESS = having("harmless")
 STOPS = having("stops")
-RELATIVE = having("relative")
-AGAIN = having("again")
-STORED = having("stored")
 BY_OPERATORS = having("operator")
-TAKES_FROM_AUTOMATIC = having("manual")
-GIVES_TO_AUTOMATIC = having("automatic")
 
 NUMBER_OF = {row[1]: row[0] for row in MESSAGES}
 ROW_OF = {row[0]: row for row in MESSAGES}

@@ -55,6 +55,10 @@ from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import Act
 from heliotrope.store.records import Kind, Records
 
+#: Commands that take heliostats from automatic control, and that give them to it.
+_TAKES_FROM_AUTOMATIC = messages.having("manual")
+_GIVES_TO_AUTOMATIC = messages.having("automatic")
+
 #: Time between predictions of the flux, s.
 _FLUX_EVERY = 5.0
 #: Time between looks after the security events, s.
@@ -643,9 +647,9 @@ class Operations:
     # -- notes -----------------------------------------------------------------------------
 
     def _meant(self, name: str, heliostats: Sequence[str]) -> None:
-        if name in messages.TAKES_FROM_AUTOMATIC:
+        if name in _TAKES_FROM_AUTOMATIC:
             self.automatic.want(heliostats, wanted=False)
-        elif name in messages.GIVES_TO_AUTOMATIC:
+        elif name in _GIVES_TO_AUTOMATIC:
             self.automatic.want(heliostats, wanted=True, by_person=True)
 
     def _told(self, person: Person, ticket: Ticket) -> None:
