@@ -23,6 +23,7 @@ from heliotrope.lcu import messages, names, states
 from heliotrope.plant import refusals
 from heliotrope.plant.links_file import TABLES, read_links
 from heliotrope.safety import CONDITIONS, AlarmKind, Watcher, alarms
+from support.absence import absent
 
 ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"
@@ -235,11 +236,7 @@ def test_commands_of_the_pages_exist(call: str) -> None:
 def test_systemd_takes_the_units(tmp_path: Path) -> None:
     tool = shutil.which("systemd-analyze")
     if tool is None:
-        if os.environ.get("CI"):
-            pytest.fail(
-                "systemd-analyze is not installed, and CI tests everything: package systemd"
-            )
-        pytest.skip("no systemd-analyze here: the units are not verified")
+        absent("no systemd-analyze here: the units are not verified")
     program = tmp_path / "heliotrope"
     program.write_text("#!/bin/sh\n")
     program.chmod(0o755)
@@ -260,9 +257,7 @@ def test_systemd_takes_the_units(tmp_path: Path) -> None:
 def test_systemd_finds_the_units_little_exposed(name: str) -> None:
     tool = shutil.which("systemd-analyze")
     if tool is None:
-        if os.environ.get("CI"):
-            pytest.fail("systemd-analyze is not installed, and CI tests everything")
-        pytest.skip("no systemd-analyze here: the units are not judged")
+        absent("no systemd-analyze here: the units are not judged")
     given = [tool, "security", "--offline=true", "--threshold=30", str(DEPLOY / name)]
     done = subprocess.run(given, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout

@@ -11,7 +11,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from lcu.test_micropython import absent
+from support.absence import absent
 
 RELEASE, VERSION = "trixie", "1.25.0"
 #: Each package's file in the archive and its SHA-256, of 2026-11-24. They are taken where the lists

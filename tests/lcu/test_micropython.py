@@ -15,7 +15,7 @@ import sys
 import tempfile
 import zlib
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import pytest
 
@@ -23,6 +23,7 @@ from heliotrope.lcu import journal, messages, ticks, wire
 from heliotrope.lcu.sender import Sender
 from lcu.nor import Nor
 from lcu.test_wire import KEY, example, frame_of, sha256, traffic
+from support.absence import absent
 
 HERE = Path(__file__).parent
 CORE = HERE.parents[1] / "src" / "heliotrope" / "lcu"
@@ -31,13 +32,6 @@ COMPARED = ("__init__", "journal", "messages", "ticks", "wire")
 PACKAGE = "@micropython/micropython-webassembly-pyscript"
 OLDEST, NEWEST = "1.25.0", "1.27.0"
 NOW = 1_480_000_000
-
-
-def absent(reason: str) -> NoReturn:
-    """Skip where a developer lacks something, fail where nothing may be lacking."""
-    if os.environ.get("CI"):
-        pytest.fail(reason)
-    pytest.skip(reason)
 
 
 def installed(version: str) -> tuple[str, Path]:
