@@ -2,6 +2,7 @@
 
 import asyncio
 import dataclasses
+import math
 from datetime import UTC, datetime
 
 import pytest
@@ -186,6 +187,19 @@ def test_a_jump_before_the_first_second_is_seen_though_the_keeper_hides_it() -> 
     keeper.jump(-3600.0)
     watch.second(keeper.time(), 0.0, 100.7)
     assert watch.verdict.dark
+
+
+def test_a_jump_behind_a_short_loss_of_time_is_seen() -> None:
+    """Simulated run 30064: the time was only compared with that of the second before."""
+    clock = VirtualClock(lambda: 100.0, datetime(2026, 6, 21, 12, tzinfo=UTC))
+    keeper = SimulatedTime(clock)
+    keeper.detects = False
+    good = keeper.time()
+    watch = Watch("C", 0.0, Reports(), 100.0, good, {})
+    lost = dataclasses.replace(good, quality="none", error=math.inf)
+    assert not any("clock_jump" in act for act in watch.second(lost, 0.0, 100.7).acts)
+    keeper.jump(-3600.0)
+    assert any("clock_jump" in act for act in watch.second(keeper.time(), 0.0, 101.7).acts)
 
 
 def test_a_cluster_goes_by_the_limits_of_the_site() -> None:

@@ -201,9 +201,11 @@ class Watch:
         return self.verdict
 
     def _step(self, time: Time, now: float) -> float:
-        """Return the step of the time against the monotonic clock, s."""
+        """Return the step of the time against the monotonic clock, s.
+
+        The last time that had a source counts, however long it has had none since.
+        """
         if time.quality == "none":
-            self._offset = None
             return 0.0
         before, self._offset = self._offset, time.gps_s - now
         step = 0.0 if before is None else abs(self._offset - before)
