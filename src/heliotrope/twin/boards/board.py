@@ -9,7 +9,7 @@ import contextlib
 import math
 import random
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -142,10 +142,7 @@ class Board:
         # Where the journal's counts differ from those of the motors, the board slips.
         journal = Journal(self.flash)
         journal.load()
-        self.slip = [
-            axis.turned - count
-            for axis, count in zip(self.axes, (journal.primary, journal.secondary), strict=True)
-        ]
+        self._counts_from((journal.primary, journal.secondary))
         self._last_pass = -math.inf
         try:
             self.node = Node(
@@ -168,8 +165,13 @@ class Board:
     def zeroed(self) -> None:
         """Note that its step counts were declared: how far the motors are from them."""
         if self.node is not None:
-            counted = [self.node.controller.motion.place(axis) for axis in (0, 1)]
-            self.slip = [axis.turned - n for axis, n in zip(self.axes, counted, strict=True)]
+            self._counts_from([self.node.controller.motion.place(axis) for axis in (0, 1)])
+
+    def _counts_from(self, counts: Sequence[int]) -> None:
+        """Count steps anew from where the motors are: what was missed before is in the slip."""
+        self.slip = [axis.turned - count for axis, count in zip(self.axes, counts, strict=True)]
+        for axis in self.axes:
+            axis.emitted = axis.turned
 
     def power_off(self, now: float, *, warned: bool = False) -> None:
         """Cut the supply; ``warned``: the brown-out detector notices in time."""
