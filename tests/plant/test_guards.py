@@ -30,6 +30,7 @@ def plant(**parts: Any) -> Guards:
         "orders": SimpleNamespace(to_stow=lambda name: False),
         "sentinel": alarms({}),
         "rivals": SimpleNamespace(refusal=lambda clusters: ""),
+        "witnesses": SimpleNamespace(contradiction=""),
         "identities": SimpleNamespace(blocked=lambda name: None),
         "sync": SimpleNamespace(differing=lambda name: None),
         "doubts": SimpleNamespace(reasons=lambda names, points: [None] * len(names)),
@@ -57,6 +58,12 @@ def alarms(barred: dict[str, dict[str, str]], cluster: str = "", night: str = ""
 def stopped(plant: Guards, *kinds: Any) -> set[str]:
     """The commands that guards stop for heliostat A."""
     return {name for name in COMMANDS if plant.reasons(Asked(name, ("A",)), *kinds)}
+
+
+def test_nothing_leaves_stow_by_a_sun_that_a_witness_contradicts() -> None:
+    contradicted = plant(witnesses=SimpleNamespace(contradiction="x"))
+    assert stopped(contradicted, NOT_NOW) == {"APPROACH"}
+    assert not stopped(contradicted, BEAM_REFUSED, OUT_OF_SERVICE)
 
 
 def test_nothing_stops_a_plant_in_order() -> None:

@@ -194,10 +194,13 @@ def test_a_plant_sends_beams_to_targets_only_until_a_witness_agrees(tmp_path: Pa
             ticket = plant.command(OPERATOR, token, "TRACK", ("P5A", "P5B"))
             assert ticket.blocked.keys() == {"P5B"}
             assert "no independent witness confirms the sun" in ticket.blocked["P5B"]
+            assert not plant.held(("P5A",))
             plant.witnesses.take(SENSOR, sun(600.0), 0.0)
+            assert "a clock that is" in plant.held(("P5A",))["P5A"], "nothing leaves stow by it"
             with pytest.raises(RefusedError, match=r"TRACK P5B.*a clock that is 6\d\d s slow"):
                 plant.command(OPERATOR, token, "TRACK", ("P5B",))
             plant.witnesses.take(SENSOR, sun(0.0), 0.0)
+            assert not plant.held(("P5A",))
             assert await plant.command(OPERATOR, token, "TRACK", ("P5B",)).end(5.0)
 
     run_virtual(main)

@@ -305,6 +305,7 @@ class PlantController:
             self._orders,
             self.sentinel,
             self._rivals,
+            self.witnesses,
             self._identities,
             self._sync,
             self.doubts,

@@ -27,6 +27,7 @@ from heliotrope.plant.parameters import ParameterSync
 from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE, Refusal, RefusedError
 from heliotrope.plant.rivals import Rivals
 from heliotrope.plant.stowing import WAITS
+from heliotrope.plant.witnesses import Witnesses
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ class Guards:
     orders: PlantOrders
     sentinel: Sentinel
     rivals: Rivals
+    witnesses: Witnesses
     identities: Identities
     sync: ParameterSync
     doubts: Doubts
@@ -243,6 +245,10 @@ GUARDS: tuple[Guard, ...] = (
         NOT_NOW,
         messages.JOINING | messages.TO_STANDBY,
         _cluster(lambda plant, _: plant.sentinel.night),
+    ),
+    # The path from stow is free for the sun that is computed; another may lead it through volumes.
+    Guard(
+        NOT_NOW, frozenset({"APPROACH"}), _cluster(lambda plant, _: plant.witnesses.contradiction)
     ),
     Guard(
         NOT_NOW,

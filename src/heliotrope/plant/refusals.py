@@ -280,10 +280,11 @@ SEEN_ASTRAY = Refusal(
 )
 UNWITNESSED = Refusal(
     "sun not witnessed",
-    "A heliostat is sent to the receiver, and an independent witness contradicts the sun of plant "
-    "and clusters, or none of those required has agreed today.",
+    "A heliostat is sent to the receiver, or up from stow, and an independent witness contradicts "
+    "the sun of plant and clusters; or to the receiver, and none of those required has agreed "
+    "today.",
     "no independent witness confirms the sun of this plant: {problem}",
-    "Follow the alarm `sun_contradicted` or `unwitnessed`. Targets and standby stay open.",
+    "Follow the alarm `sun_contradicted` or `unwitnessed`. What is up may go to targets.",
 )
 PARAMETERS_NOT_HERE = Refusal(
     "parameters not here",

@@ -4,7 +4,7 @@ Where plant and clusters share a wrong time or site, all of their suns agree, an
 follows them in good order, beside its aim. So before the first heliostat of a day joins a
 receiver, a witness must have seen the sun where the plant computes it: a satellite receiver (its
 time and its place), a sun sensor, or photographs of beams on targets. Beams may go to targets
-meanwhile.
+meanwhile. While one contradicts, nothing leaves stow: the path is free for the computed sun.
 """
 
 import asyncio
@@ -158,6 +158,11 @@ class Witnesses:
     def _day(self, utc: float) -> int:
         """Return the number of the day at the site, from midnight to midnight of mean time."""
         return math.floor(utc / 86_400.0 + self._site.longitude_deg / 360.0)
+
+    @property
+    def contradiction(self) -> str:
+        """Why no heliostat may leave stow, "" if heliostats may: a witness contradicts the sun."""
+        return self.refusal if self._contradicting else ""
 
     @property
     def refusal(self) -> str:

@@ -184,7 +184,7 @@ SUN_CONTRADICTED = AlarmKind(
     "An independent witness sees the sun elsewhere than the plant computes it: the time or site "
     "that plant and clusters share is wrong.",
     "{problem}, at {at} UTC by the plant's clock",
-    "No heliostat joins a receiver; those that track go on, beside their aims.",
+    "No heliostat leaves stow or joins a receiver; those that track go on, beside their aims.",
     "Defocus the field. Compare the plant's clock with another one, and its site with a map; then "
     "correct them.",
     over="{subject} sees the sun where the plant computes it",

@@ -6,6 +6,7 @@ so a wrong clock, site, armature or address, and false step counts, show as a be
 It checks invariants 12 to 15.
 """
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
@@ -406,7 +407,10 @@ class BeamObserver:
         node, own = mirror.node, mirror.board.outfit.items["armature"]
         foreign = node is not None and node.journal.items.get("armature") != own
         by = "a sun that is contradicted" if self.contradicted else "another mirror's parameters"
-        good = mirror.state not in _ON or not (foreign or self.contradicted)
+        # On its way to a target it may show where the sun stands.
+        points = [point for _, point in mirror.aims] or [RECEIVER]
+        joins = self.contradicted and any(math.dist(point, RECEIVER) <= OFF for point in points)
+        good = mirror.state not in _ON or not (foreign or joins)
         self._check(12, good, now, mirror.name, f"{states.STATES[mirror.state]}, by {by}")
 
     def _enters(self, mirror: _Mirror, state: int, now: float) -> None:
