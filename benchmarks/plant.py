@@ -35,16 +35,16 @@ from heliotrope.links.messages import (
     decode,
     encode,
 )
-from heliotrope.plant.agreement import Agreement
-from heliotrope.plant.aims import BeamCheck
-from heliotrope.plant.assigned import Points
-from heliotrope.plant.audit import JsonLines
-from heliotrope.plant.beam_watch import BeamWatch
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.doubts import Doubts
-from heliotrope.plant.field_state import FieldState
-from heliotrope.plant.identity import Identities
-from heliotrope.plant.unsent import UnsentBeams
+from heliotrope.plant.field.agreement import Agreement
+from heliotrope.plant.field.aims import BeamCheck
+from heliotrope.plant.field.assigned import Points
+from heliotrope.plant.field.doubtful_positions import DoubtfulPositions
+from heliotrope.plant.field.identity import Identities
+from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.motion.beam_watch import BeamWatch
+from heliotrope.plant.motion.stray_beams import StrayBeams
+from heliotrope.plant.orders.audit import JsonLines
 from heliotrope.sun import Site, vector
 
 MEMBERS = 32
@@ -71,7 +71,7 @@ CHECKS: tuple[tuple[type[Any], str], ...] = (
     (BeamWatch, "readings"),
     (Identities, "look"),
     (Identities, "off"),
-    (Doubts, "look"),
+    (DoubtfulPositions, "look"),
 )
 
 
@@ -295,7 +295,7 @@ def _at_rest(count: int) -> float:
         field.rows[end] = field.rows[f"{end}_goal"] = place
     light = vector(_MORNING, design.site)
     points = Points(field.names, None)
-    beams = UnsentBeams(check, field, points, lambda _: light, check.machines)
+    beams = StrayBeams(check, field, points, lambda _: light, check.machines)
     beams.look(0.1)  # the first compiles
     spent = []
     for _ in range(9):

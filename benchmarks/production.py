@@ -30,8 +30,8 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.coded_layout import moments_on
 from heliotrope.plant.visits.neighbours import Unhidden

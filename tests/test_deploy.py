@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from heliotrope.errors import FormatError
 from heliotrope.lcu import messages, names, states
 from heliotrope.plant import refusals
-from heliotrope.plant.links_file import TABLES, read_links
+from heliotrope.plant.io.links_file import TABLES, read_links
 from heliotrope.safety import CONDITIONS, AlarmKind, Watcher, alarms
 from support.absence import absent
 

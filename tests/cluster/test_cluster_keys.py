@@ -15,7 +15,7 @@ from heliotrope.links.connection import CarriedLink
 from heliotrope.links.keys import Keys
 from heliotrope.links.link import running
 from heliotrope.links.messages import ClusterStatus
-from heliotrope.plant.links_file import read_links
+from heliotrope.plant.io.links_file import read_links
 from heliotrope.safety import Alarm
 from support.cluster_process import KEY, Line, Plant, ended, start, until, written
 from support.clusters import Board

@@ -31,11 +31,11 @@ from heliotrope.links.link import running
 from heliotrope.links.messages import Stage
 from heliotrope.links.tcp import TcpServer
 from heliotrope.mechanism.board_items import Wanted
-from heliotrope.plant.audit import JsonLines
-from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.orders.audit import JsonLines
+from heliotrope.plant.orders.authority import RefusedError
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.visits import CalibrationCycle, CycleSettings, Shot
 from heliotrope.sun import Site
 from heliotrope.twin.boards import outfit

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 import httpx
 import pytest
 
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.interface.admission import Admission, BusyError
 from heliotrope.plant.interface.calls import CALLS
+from heliotrope.plant.orders.authority import Person, Role
 from support.live_console import LiveConsole
 
 Ask = Callable[..., httpx.Response]

@@ -23,7 +23,7 @@ from heliotrope.console.people import FIRST, first_start
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import InputError
 from heliotrope.field.volumes import outline
-from heliotrope.plant import audit
+from heliotrope.plant.orders import audit
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import StoreError
 from support.live_console import GATE, PASSWORD, LiveConsole, serving

@@ -259,7 +259,7 @@ def test_an_order_is_as_long_as_the_field_needs(
 def test_every_route_has_a_limit() -> None:
     """Lists of heliostats and points are accepted for a whole field, forms are small."""
     from heliotrope.console.app import ROUTERS
-    from heliotrope.plant.authority import Role
+    from heliotrope.plant.orders.authority import Role
 
     known = routes.Routes(ROUTERS, ["/login"], {})
     for method, path, role, largest in (

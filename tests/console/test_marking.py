@@ -22,9 +22,9 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.targets.teaching import known_points, with_camera
 from heliotrope.links.clock import VirtualClock
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking
+from heliotrope.plant.orders.authority import Person, Role
 from support.live_console import ROLES, LiveConsole
 from support.pages import NEEDS_BROWSER, entering, orders_counted, said
 

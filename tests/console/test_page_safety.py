@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from heliotrope.plant.drive_checks import PHOTOGRAPH
+from heliotrope.plant.field.drive_checks import PHOTOGRAPH
 from support.live_console import LiveConsole
 from support.pages import NEEDS_BROWSER, menu, orders_counted, said, until
 

@@ -15,9 +15,9 @@ from heliotrope.field.layouts import lay_out
 from heliotrope.field.stellenbosch import prototype
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism import track
-from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.zero import lock_position, zero
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Event
 from heliotrope.twin.field import Field, FieldBus

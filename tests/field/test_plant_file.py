@@ -25,7 +25,7 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.mechanism.tracking import track
-from heliotrope.plant.aims import BeamCheck
+from heliotrope.plant.field.aims import BeamCheck
 from heliotrope.sun import Site
 from support.data import juelich
 from support.machines import every_kind, imperfect

@@ -19,7 +19,7 @@ from heliotrope.links.link import LinkSettings, SendOutcome, running
 from heliotrope.links.mqtt import Broker, _MqttCarrier, mqtt_link
 from heliotrope.links.papers import Papers
 from heliotrope.links.tcp import TcpServer, tcp_link
-from heliotrope.plant.links_file import read_links
+from heliotrope.plant.io.links_file import read_links
 from support.broker import Mosquitto, mosquitto_for
 
 OLD, NEW = b"o" * 32, b"n" * 32

@@ -12,7 +12,7 @@ from heliotrope.errors import FormatError
 from heliotrope.links.clock import SystemClock, VirtualClock
 from heliotrope.links.papers import Papers, end_of
 from heliotrope.links.tls import RenewedTls, client_tls, server_tls
-from heliotrope.plant.links_file import read_links
+from heliotrope.plant.io.links_file import read_links
 from heliotrope.safety import Alarm
 from support.papers import certificate
 

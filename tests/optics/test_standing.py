@@ -16,8 +16,8 @@ from heliotrope.optics.standing import (
     standing_beams,
     suns_of_the_year,
 )
-from heliotrope.plant.aims import BeamCheck, default_aims
-from heliotrope.plant.leaving import defocused_field
+from heliotrope.plant.field.aims import BeamCheck, default_aims
+from heliotrope.plant.motion.defocusing import defocused_field
 from heliotrope.sun import Site, fast_vector
 
 LATITUDE = np.radians(-28.5)

@@ -15,7 +15,7 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.mechanism.tracking import track
-from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.safety import Act
 from heliotrope.sun import fast_vector
 from support.plant_bench import OPERATOR, Bench, running

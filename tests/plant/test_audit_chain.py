@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from heliotrope.errors import FormatError
-from heliotrope.plant.audit import AuditError, JsonLines, Record, read, verify
+from heliotrope.plant.orders.audit import AuditError, JsonLines, Record, read, verify
 
 AT = datetime(2026, 6, 21, 10, tzinfo=UTC)
 

@@ -16,8 +16,8 @@ from heliotrope.field.plant import Plant
 from heliotrope.geometry import MRAD, FloatArray, as_float, direction
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.tracking import track
-from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.field.beliefs import Beliefs
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.twin.boards.outfit import outfits
 from heliotrope.twin.invariants.visits import across, slope_of

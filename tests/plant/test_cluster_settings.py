@@ -9,7 +9,7 @@ import pytest
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.common_settings import CommonSettings, settings_checksum
 from heliotrope.links.messages import ClusterStatus, Emergency
-from heliotrope.plant.cluster_settings import PATIENCE, ClusterSettings
+from heliotrope.plant.field.cluster_settings import PATIENCE, ClusterSettings
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Alarm, Severity, alarms
 from support.plant_bench import Bench, running

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.visits import JointCycle, ReceiverCycle, coded_cycle
 from heliotrope.plant.visits.coded_cycle import Light
 from heliotrope.plant.visits.target_light import Exposed, TargetLight

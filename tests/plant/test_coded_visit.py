@@ -14,9 +14,9 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism.drives import SLOTS
 from heliotrope.plant import refusals
-from heliotrope.plant.aims import BeamCheck
-from heliotrope.plant.authority import Mandate, Person, Role
-from heliotrope.plant.beam_watch import BeamError
+from heliotrope.plant.field.aims import BeamCheck
+from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.orders.authority import Mandate, Person, Role
 from heliotrope.plant.visits.coded_layout import SentBeam, beams_of, coded
 from heliotrope.plant.visits.coded_visit import CodedVisit
 from heliotrope.plant.visits.joint_layout import _places, _too_bright

@@ -15,11 +15,11 @@ from heliotrope.field.plant import Plant
 from heliotrope.lcu import diagnosis, names, states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Command, Emergency
-from heliotrope.plant.authority import RefusedError
-from heliotrope.plant.drive_checks import PHOTOGRAPH, TILT_SENSOR
+from heliotrope.plant.field.drive_checks import PHOTOGRAPH, TILT_SENSOR
 from heliotrope.plant.operations import Logbook, Operations
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.movement_checks import CHECKING, MOST
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Act, Alarm, alarms
 from heliotrope.twin.boards.board import Board

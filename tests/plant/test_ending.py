@@ -9,8 +9,8 @@ import pytest
 from heliotrope.cli.run._shared import Lines, stow
 from heliotrope.field.layouts import malan_plant
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.authority import Person, Role
 from support.live import LiveOptions, LivePlant
 
 PERSON = Person("engineer", Role.ENGINEER)

@@ -8,10 +8,10 @@ import pytest
 
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Stage
-from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.errands import Errands, Step
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
+from heliotrope.plant.orders.tickets import Ticket
 from support.live import LivePlant, live
 
 ENGINEER, OPERATOR = Person("Egon", Role.ENGINEER), Person("Olga", Role.OPERATOR)

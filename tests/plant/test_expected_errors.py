@@ -13,9 +13,9 @@ from heliotrope.calibration.uncertainty import expected_error, precision
 from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import bisector, direction
-from heliotrope.plant.aims import BeamCheck
-from heliotrope.plant.beliefs import Beliefs
-from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.field.aims import BeamCheck
+from heliotrope.plant.field.beliefs import Beliefs
+from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.visits import coded_layout, joint_layout
 from heliotrope.plant.visits import expected_errors as module
 from heliotrope.plant.visits.coded_layout import beams_of, moments_on

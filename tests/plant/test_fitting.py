@@ -20,7 +20,7 @@ from heliotrope.mechanism import parameters
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
 from heliotrope.optics.beam import CHI_SQUARE_90
-from heliotrope.plant.beliefs import Beliefs
+from heliotrope.plant.field.beliefs import Beliefs
 from heliotrope.plant.visits.fitting import Believed, JudgedFit, fit_heliostat, surprise_of
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.plant.visits.swings import swung

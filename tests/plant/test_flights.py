@@ -314,17 +314,17 @@ def test_a_large_change_waits_for_a_photograph_off_the_receiver(play: Play) -> N
         assert (view.in_use, view.at_stow, view.at_target) == (0, 0, len(NAMES))
         assert {name: beliefs.record(name) for name in KNOWN} == records
         # A flight sees these beside their beams' places; the others were never on the receiver.
-        reasons = site.plant.doubts.reasons(NAMES, np.repeat(receiver, len(NAMES), axis=0))
+        reasons = site.plant.doubtful.reasons(NAMES, np.repeat(receiver, len(NAMES), axis=0))
         astray = refusals.SEEN_ASTRAY.text
         assert reasons == [astray if name in KNOWN else None for name in NAMES]
         target = DESIGN.targets[0].center[None]
-        assert site.plant.doubts.reasons(KNOWN[:1], target) == [None]
+        assert site.plant.doubtful.reasons(KNOWN[:1], target) == [None]
         # A visit that has fitted the flight's rows with its photographs ends it.
         record = records[KNOWN[0]]
         assert record is not None
         beliefs.take(replace(record, version=2))
         site.intake.look()
-        assert site.plant.doubts.reasons(KNOWN[:1], receiver) == [None]
+        assert site.plant.doubtful.reasons(KNOWN[:1], receiver) == [None]
         assert site.intake.views()[0].in_use == 1
 
     play(scene)

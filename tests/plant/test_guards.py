@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from heliotrope.lcu import messages, states
-from heliotrope.plant.beam_watch import BeamError
-from heliotrope.plant.guards import Asked, Guards
+from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.orders.guards import Asked, Guards
 from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE, RefusedError
 
 NAMES = ("A", "B", "C")
@@ -29,11 +29,11 @@ def plant(**parts: Any) -> Guards:
         "authority": SimpleNamespace(visited=dict),
         "orders": SimpleNamespace(to_stow=lambda name: False),
         "sentinel": alarms({}),
-        "rivals": SimpleNamespace(refusal=lambda clusters: ""),
+        "second_plant": SimpleNamespace(refusal=lambda clusters: ""),
         "witnesses": SimpleNamespace(contradiction=""),
         "identities": SimpleNamespace(blocked=lambda name: None),
         "sync": SimpleNamespace(differing=lambda name: None),
-        "doubts": SimpleNamespace(reasons=lambda names, points: [None] * len(names)),
+        "doubtful": SimpleNamespace(reasons=lambda names, points: [None] * len(names)),
         "lockouts": SimpleNamespace(blocked=lambda names, points: {}),
         "given": SimpleNamespace(untaken=lambda *_: None, unknown=lambda *_: None),
         "aims": np.zeros((3, 3)),
@@ -82,7 +82,7 @@ def test_nothing_stops_a_plant_in_order() -> None:
             messages.TO_STANDBY,
         ),
         (
-            {"doubts": SimpleNamespace(reasons=lambda names, points: ["x"] * len(names))},
+            {"doubtful": SimpleNamespace(reasons=lambda names, points: ["x"] * len(names))},
             messages.JOINING | {"AIM"},
         ),
         ({"sentinel": alarms({"any": {"A": "x"}})}, messages.JOINING),
@@ -124,7 +124,7 @@ def test_a_board_of_another_takes_only_what_makes_it_safe() -> None:
 def test_lock_is_accepted_while_an_alarm_holds_and_not_beside_a_second_plant() -> None:
     assert "LOCK" not in stopped(plant(sentinel=alarms({}, "north")), NOT_NOW)
     assert "GOTO" in stopped(plant(sentinel=alarms({}, "north")), NOT_NOW)
-    second = plant(rivals=SimpleNamespace(refusal=lambda clusters: "a second plant"))
+    second = plant(second_plant=SimpleNamespace(refusal=lambda clusters: "a second plant"))
     assert "LOCK" in stopped(second, NOT_NOW)
 
 
@@ -197,7 +197,7 @@ def test_beams_in_doubt_are_judged_by_where_a_command_sends_them() -> None:
         asked_of.append(points.tolist())
         return [None] * len(names)
 
-    doubts = plant(doubts=SimpleNamespace(reasons=reasons), aims=np.eye(3))
-    doubts.reasons(Asked("TRACK", ("B",)), BEAM_REFUSED)
-    doubts.reasons(Asked("AIM", ("B",), np.full((1, 3), 5.0)), BEAM_REFUSED)
+    doubtful = plant(doubtful=SimpleNamespace(reasons=reasons), aims=np.eye(3))
+    doubtful.reasons(Asked("TRACK", ("B",)), BEAM_REFUSED)
+    doubtful.reasons(Asked("AIM", ("B",), np.full((1, 3), 5.0)), BEAM_REFUSED)
     assert asked_of == [[[0.0, 1.0, 0.0]], [[5.0, 5.0, 5.0]]]

@@ -11,12 +11,12 @@ from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Command, Emergency
-from heliotrope.plant.assigned import HELD, AssignedFile, Points
-from heliotrope.plant.audit import read
-from heliotrope.plant.authority import Person, Role
-from heliotrope.plant.locks import CERTAIN
+from heliotrope.plant.field.assigned import HELD, AssignedFile, Points
+from heliotrope.plant.field.locks import CERTAIN
 from heliotrope.plant.operations import Logbook, Operations
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.audit import read
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.store.records import Kind, Lockout
 from support.plant_bench import OPERATOR, Bench, running
 

@@ -12,7 +12,7 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Command, Emergency, Parameters
 from heliotrope.mechanism.board_items import Wanted, items_of
-from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.safety import alarms
 from support.plant_bench import ENGINEER, OPERATOR, Bench, ScriptedCluster, running
 

@@ -25,7 +25,6 @@ from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.field.example import example_plant
 from heliotrope.lcu import states
 from heliotrope.local import EMERGENCY, ORDINARY, CallError, LocalConnection, ask_once
-from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.interface import CALLS, frame_of, frame_parts, kind_of, plain, remade
 from heliotrope.plant.interface.calls import Call, Later, asked
 from heliotrope.plant.interface.console_process import CONSOLE, ConsoleProcess, Patience
@@ -34,6 +33,7 @@ from heliotrope.plant.interface.orders import AimOrder, EmergencyCall
 from heliotrope.plant.interface.service import PlantInterface, _Turns
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.views import CameraView
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.safety import Alarm
 from heliotrope.twin.field.field_bus import FieldBus
 from support.live_console import ROLES, LiveConsole

@@ -26,11 +26,11 @@ from heliotrope.imaging.coded import Verdict
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts
-from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.operations.calibrating import Calibrating, TrueErrors
 from heliotrope.plant.operations.coded_visits import JointVisits
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import PictureRow, Planned
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.schedule.scheduler import VISITS
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits import CycleResult, JointCycle

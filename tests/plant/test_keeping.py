@@ -8,7 +8,7 @@ import pytest
 
 from heliotrope.calibration.sightings import sightings
 from heliotrope.field.layouts import malan_plant
-from heliotrope.plant.beliefs import Beliefs
+from heliotrope.plant.field.beliefs import Beliefs
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import StoreError

@@ -22,13 +22,13 @@ from heliotrope.field.example import example_plant
 from heliotrope.field.layouts import malan_plant
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism import parameters
-from heliotrope.plant.audit import JsonLines
-from heliotrope.plant.authority import RefusedError
-from heliotrope.plant.learner import LearnerProcess
+from heliotrope.plant.field.learner import LearnerProcess
 from heliotrope.plant.operations.automatic import AUTOMATIC, AutomaticSettings
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.learning import EVERY, Learning
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.orders.audit import JsonLines
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.schedule.scheduler import Scheduler
 from heliotrope.plant.schedule.settings import Settings
 from heliotrope.plant.visits.fitting import Believed, fit_heliostat
@@ -310,7 +310,7 @@ def test_a_process_is_ended_with_the_plant_and_after_too_long(
         begun.append(really(["sleep", "600"], stdin=subprocess.PIPE, stdout=subprocess.PIPE))
         return begun[-1]
 
-    monkeypatch.setattr("heliotrope.plant.learner.subprocess.Popen", start)
+    monkeypatch.setattr("heliotrope.plant.field.learner.subprocess.Popen", start)
 
     async def cancelled() -> None:
         task = asyncio.create_task(LearnerProcess().learn(whole()))
@@ -333,6 +333,6 @@ def test_a_process_that_fails_is_named_in_one_line(monkeypatch: pytest.MonkeyPat
     with pytest.raises(InputError, match=r"^UnpicklingError: ") as error:
         asyncio.run(LearnerProcess().learn(whole()))
     assert "\n" not in str(error.value)
-    monkeypatch.setattr("heliotrope.plant.learner._MODULE", "heliotrope.no_such_module")
+    monkeypatch.setattr("heliotrope.plant.field.learner._MODULE", "heliotrope.no_such_module")
     with pytest.raises(InputError, match="its process ended with code 1"):
         asyncio.run(LearnerProcess().learn(whole()))

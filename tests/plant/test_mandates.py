@@ -13,9 +13,9 @@ import pytest
 
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.lcu import states
-from heliotrope.plant.authority import Person, RefusedError, Role
-from heliotrope.plant.beam_watch import BeamError
+from heliotrope.plant.motion.beam_watch import BeamError
 from heliotrope.plant.operations.automatic import AUTOMATIC
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.visits import CycleResult, CycleSettings
 from support.joint_scene import Scene, joint
 from support.visit_scene import ENGINEER, left_to_work

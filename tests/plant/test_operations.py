@@ -24,11 +24,11 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import SendOutcome, Statistics
 from heliotrope.links.messages import Ask, ClusterStatus, Lease, encode
 from heliotrope.optics import FluxView, air_loss, intercept_rectangle, predict_flux
-from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.photographs import Shot, seen, spiral
 from heliotrope.plant.visits.settings import Centring

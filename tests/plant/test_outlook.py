@@ -18,8 +18,8 @@ from heliotrope.field.coded_visits import ReceiverSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import MRAD
-from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.field.beliefs import Beliefs
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.foresight import Foresight
 from heliotrope.plant.operations.keeping import Keeping

@@ -17,9 +17,9 @@ from heliotrope.links.messages import Ask, Parameters
 from heliotrope.mechanism.board_items import Wanted, items_of, packed, tables_with
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import track
-from heliotrope.plant.audit import read
-from heliotrope.plant.authority import RefusedError
-from heliotrope.plant.beam_watch import BeamError
+from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.orders.audit import read
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.store.records import Kind, Lockout
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 

@@ -14,9 +14,9 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.layouts import lay_out
 from heliotrope.files.disk import DiskBusyError
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.pictures import KeptCamera, Pictures, PictureSettings
 from heliotrope.plant.operations.views import CalibrationEntry, CameraView, PictureRow
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.visits.photographs import Shot
 from support.live import LiveOptions, LivePlant
 

@@ -31,10 +31,10 @@ from heliotrope.links.messages import (
 from heliotrope.mechanism.board_items import Wanted, items_of
 from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.mechanism.tracking import track
-from heliotrope.plant.audit import AuditError, read
-from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.field.cluster_alarms import ClusterAlarms
+from heliotrope.plant.orders.audit import AuditError, read
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.plant.told_alarms import ToldAlarms
 from heliotrope.safety import Alarm, Severity, alarms
 from support.plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
 
@@ -535,7 +535,7 @@ def test_nothing_that_a_cluster_says_ends_the_plant(tmp_path: Path) -> None:
 
 
 def test_an_alarm_of_a_cluster_ends_with_its_list_though_its_end_was_lost() -> None:
-    told = ToldAlarms()
+    told = ClusterAlarms()
     bus = Alarm("bus_failed", "", Severity.ALARM, "text")
     node = Alarm("node_fault", "P1A", Severity.ALARM, "text")
     event = alarms.PLANT_UNINTELLIGIBLE.raised(problem="a test")

@@ -11,8 +11,8 @@ from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Progress, Stage
-from heliotrope.plant.aims import BeamCheck
-from heliotrope.plant.assigned import (
+from heliotrope.plant.field.aims import BeamCheck
+from heliotrope.plant.field.assigned import (
     AssignedError,
     AssignedFile,
     Points,
@@ -20,9 +20,9 @@ from heliotrope.plant.assigned import (
     points_of,
     rest_on,
 )
-from heliotrope.plant.audit import read
-from heliotrope.plant.authority import Person, RefusedError, Role
-from heliotrope.plant.kept_audit import KeptPoints
+from heliotrope.plant.orders.audit import read
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
+from heliotrope.plant.orders.kept_audit import KeptPoints
 from heliotrope.plant.refusals import COUNTS_DOUBTFUL
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.store.backup import backup, restore
@@ -608,9 +608,9 @@ def test_doubt_that_arises_before_the_turn_is_judged_by_the_new_aim(
             ticket = plant.aim(OPERATOR, token, {name: after})
             await bench.wait(1.3)  # its record is written, and its turn has come
             cluster.rows["flags"][cluster.names.index(name)] |= meanings.COUNTS_DOUBTFUL
-            plant.doubts.standing[plant.field.place(name)] = True
+            plant.doubtful.standing[plant.field.place(name)] = True
             await ticket.end(8.0)
-            assert plant.doubts.standing[plant.field.place(name)]
+            assert plant.doubtful.standing[plant.field.place(name)]
             assert ticket.good == to_target, ticket.text
             last = after if to_target else before
             assert plant.aims[plant.field.place(name)] == pytest.approx(last)
@@ -638,7 +638,9 @@ def test_an_aim_whose_path_is_blocked_while_it_is_stored_is_not_assigned(
             disk.delay = 0.9
             ticket = plant.aim(OPERATOR, token, {name: plant.design.targets[0].center})
             await bench.wait(1.3)
-            monkeypatch.setattr(plant.doubts, "reasons", lambda names, _: ["in doubt"] * len(names))
+            monkeypatch.setattr(
+                plant.doubtful, "reasons", lambda names, _: ["in doubt"] * len(names)
+            )
             assert not await ticket.end(5.0)
             assert ticket.refusals[name] == "in doubt"
             assert plant.aims[plant.field.place(name)].tolist() == list(AIM)

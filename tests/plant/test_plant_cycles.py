@@ -33,8 +33,8 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Parameters
 from heliotrope.mechanism.board_items import items_of, packed
 from heliotrope.mechanism.tracking import track
-from heliotrope.plant.authority import RefusedError
-from heliotrope.plant.flights import TakenFlight
+from heliotrope.plant.field.flights import TakenFlight
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.visits.calibration_cycle import (
     CalibrationCycle,
     CycleResult,
@@ -525,7 +525,7 @@ def test_a_photograph_confirms_step_counts_in_doubt(tmp_path: Path, seen: str) -
         plant, row = bench.plant, bench.plant.field.place(NAME)
         doubtful(bench, 4)
         await bench.wait(2.0)
-        assert plant.doubts.standing[row]
+        assert plant.doubtful.standing[row]
         if seen == "nothing":
             eye.reasons = ("cloud",)
         elif seen == "a power cut":
@@ -533,11 +533,11 @@ def test_a_photograph_confirms_step_counts_in_doubt(tmp_path: Path, seen: str) -
             eye.during = lambda: doubtful(bench, 5)
         await whole.run(ENGINEER, token, NAME, "target")
         await bench.wait(2.0)
-        assert plant.doubts.standing[row] == (seen != "the beam")
+        assert plant.doubtful.standing[row] == (seen != "the beam")
         if seen == "the beam":
             doubtful(bench, 5)
             await bench.wait(2.0)
-            assert plant.doubts.standing[row], "the next cut ends the confirmation"
+            assert plant.doubtful.standing[row], "the next cut ends the confirmation"
 
     cycle(tmp_path, scene)
 
@@ -550,7 +550,7 @@ def test_a_beam_that_is_beside_its_place_confirms_nothing(tmp_path: Path) -> Non
         doubtful(bench, 4)
         await whole.run(ENGINEER, token, NAME, "target")
         await bench.wait(2.0)
-        assert bench.plant.doubts.standing[bench.plant.field.place(NAME)]
+        assert bench.plant.doubtful.standing[bench.plant.field.place(NAME)]
 
     given = CycleSettings(shots=1, interval=5.0, least=5)
     cycle(tmp_path, scene, given, azimuth_bias=3e-3)

@@ -15,13 +15,13 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import NODE, Acknowledge, Emergency
 from heliotrope.mechanism.drives import Drive, rotary
-from heliotrope.plant.audit import read
-from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.emergency import UNPROVEN, EmergencyOrder, carried_out
 from heliotrope.plant.operations.given_readings import GivenReadings
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.orders.audit import read
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import FLUX_READING, Act, FluxProof, conditions, limited
 from heliotrope.twin.wind import Wind
 from support.plant_bench import ENGINEER, LEADS, OPERATOR, VIEWER, Bench, running

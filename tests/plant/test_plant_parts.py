@@ -32,10 +32,16 @@ from heliotrope.mechanism.board_items import (
     packed,
 )
 from heliotrope.mechanism.machine import AxisLimits, Machine
-from heliotrope.plant.aims import BeamCheck, spread
 from heliotrope.plant.attempts import Attempts
-from heliotrope.plant.audit import STOPPED, AuditError, JsonLines, Record, read
-from heliotrope.plant.authority import (
+from heliotrope.plant.field.aims import BeamCheck, spread
+from heliotrope.plant.field.ordered import Ordered
+from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.io.links_file import PlantLinks
+from heliotrope.plant.operations.keeping import Keeping
+from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.operations.views import CalibrationEntry
+from heliotrope.plant.orders.audit import STOPPED, AuditError, JsonLines, Record, read
+from heliotrope.plant.orders.authority import (
     Authority,
     Mandate,
     Person,
@@ -43,19 +49,13 @@ from heliotrope.plant.authority import (
     Role,
     TakenOutError,
 )
-from heliotrope.plant.field_state import FieldState
-from heliotrope.plant.joining import JoiningJob, JoinQueue
-from heliotrope.plant.links_file import PlantLinks
-from heliotrope.plant.movements import Movements
-from heliotrope.plant.operations.keeping import Keeping
-from heliotrope.plant.operations.operations import Operations
-from heliotrope.plant.operations.views import CalibrationEntry
-from heliotrope.plant.ordered import Ordered
+from heliotrope.plant.orders.joining import JoiningJob, JoinQueue
+from heliotrope.plant.orders.movements import Movements
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.schedule.choice import Assignment
 from heliotrope.plant.schedule.plant_schedule import STEPS, PlantSchedule
 from heliotrope.plant.schedule.scheduler import VISITS
 from heliotrope.plant.settings import clusters_of
-from heliotrope.plant.tickets import Ticket
 from support.lcu_machines import STANDBY, STOW, heliostat, items_of_heliostat
 from support.machines import every_kind, imperfect, jacks
 
@@ -153,7 +153,7 @@ def test_a_disk_that_fails_is_an_error_and_the_line_is_not_glued_to_the_next(
 
 
 def test_a_full_disk_is_no_confirmation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("heliotrope.plant.audit.LEAST_FREE", 1 << 62)
+    monkeypatch.setattr("heliotrope.plant.orders.audit.LEAST_FREE", 1 << 62)
     audit = JsonLines(tmp_path / "a.jsonl", AT)
     with pytest.raises(AuditError, match="bytes are left on its disk"):
         audit.confirm()

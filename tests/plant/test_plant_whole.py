@@ -7,8 +7,8 @@ import pytest
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Stage
 from heliotrope.mechanism.board_items import checksums, items_of
-from heliotrope.plant.audit import read
-from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.orders.audit import read
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.visits import CalibrationCycle, CycleSettings
 from heliotrope.safety import Act
 from support.whole_plant import ENGINEER, MACHINE, WholePlant

@@ -9,7 +9,7 @@ from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.field.target import Target
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism.board_items import checksums
-from heliotrope.plant.beam_watch import BeamWatch
+from heliotrope.plant.motion.beam_watch import BeamWatch
 from heliotrope.plant.visits import CalibrationCycle, CycleResult, CycleSettings
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.settings import Centring

@@ -14,12 +14,12 @@ from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Stage
-from heliotrope.plant.authority import RefusedError
-from heliotrope.plant.beam_watch import BeamError
+from heliotrope.plant.motion.beam_watch import BeamError
 from heliotrope.plant.operations import Logbook
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.raising import Raising
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.refusals import NoFreePath
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Act

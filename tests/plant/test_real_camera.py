@@ -31,7 +31,7 @@ from heliotrope.imaging.sources import (
 from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.imaging.targets.view import posed_view
 from heliotrope.links.clock import SystemClock
-from heliotrope.plant.cameras import RealCameras, source_of
+from heliotrope.plant.io.cameras import RealCameras, source_of
 from heliotrope.plant.visits.target_light import light_on
 from heliotrope.safety import Alarm
 from heliotrope.twin.cameras import FieldSnapshot, RenderedCamera

@@ -23,9 +23,9 @@ from heliotrope.imaging.synthetic.rendering import render
 from heliotrope.imaging.synthetic.scenes import exposed
 from heliotrope.links.clock import SystemClock
 from heliotrope.plant.assembly import AssemblySettings, PlantAssembly
-from heliotrope.plant.audit import JsonLines
-from heliotrope.plant.cameras import RealCameras
+from heliotrope.plant.io.cameras import RealCameras
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.audit import JsonLines
 from heliotrope.twin.drawing import PEAK
 from heliotrope.twin.live import World
 from support.live import in_thread

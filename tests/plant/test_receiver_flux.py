@@ -23,9 +23,9 @@ from heliotrope.imaging.files import write_image
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.receiver_file import write_reference
 from heliotrope.imaging.receiver_light import ReceiverReference
-from heliotrope.plant.links_file import read_links
-from heliotrope.plant.receiver_flux import ReceiverFlux, check_reference
-from heliotrope.plant.sensors import AllSensors, Readings, SensorFiles
+from heliotrope.plant.io.links_file import read_links
+from heliotrope.plant.io.receiver_flux import ReceiverFlux, check_reference
+from heliotrope.plant.io.sensors import AllSensors, Readings, SensorFiles
 from heliotrope.safety import FLUX_READING
 from plant.test_run_real import Process, call, first_password, free_port, private, until
 from support.receiver_scene import CAMERA, RECEIVER, capped, frame, mirrors, reference, true_share
@@ -109,7 +109,7 @@ def test_a_fault_of_the_program_is_told_and_leaves_other_sensors_alone(
     def broken(*_: object) -> None:
         raise RuntimeError("OpenCV(5.0) error")
 
-    monkeypatch.setattr("heliotrope.plant.receiver_flux.receiver_light", broken)
+    monkeypatch.setattr("heliotrope.plant.io.receiver_flux.receiver_light", broken)
     assert problem(desk.news(frame(0))) == "camera eye: RuntimeError: OpenCV(5.0) error"
     monkeypatch.undo()
     assert desk.news(frame(0)).values

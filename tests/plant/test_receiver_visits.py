@@ -27,12 +27,12 @@ from heliotrope.geometry import bisector, reflect
 from heliotrope.imaging.coded import SeparatedBeam, Verdict
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.plant.authority import Person, RefusedError, Role
-from heliotrope.plant.beam_watch import BeamError
+from heliotrope.plant.motion.beam_watch import BeamError
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.coded_visits import ReceiverVisits
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import PictureRow
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.visits import CalibrationCycle, Centring, CycleResult, Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.receiver_layout import caught

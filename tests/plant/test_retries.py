@@ -16,13 +16,13 @@ from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.attempts import Attempts
-from heliotrope.plant.authority import RefusedError, TakenOutError
 from heliotrope.plant.emergency.sentinel import _TABLE
 from heliotrope.plant.operations import Logbook
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import FRESH, PLACES, Calibrating
 from heliotrope.plant.operations.raising import RAISING
 from heliotrope.plant.operations.views import CalibrationEntry, Planned
+from heliotrope.plant.orders.authority import RefusedError, TakenOutError
 from heliotrope.plant.schedule.scheduler import VISITS
 from heliotrope.plant.visits import CycleResult
 from heliotrope.safety import Act, Alarm

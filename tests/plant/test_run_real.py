@@ -46,10 +46,10 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
 from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
-from heliotrope.plant.audit import JsonLines
-from heliotrope.plant.links_file import LinksFile, read_links
+from heliotrope.plant.io.links_file import LinksFile, read_links
+from heliotrope.plant.io.sensors import FED, SensorFiles
+from heliotrope.plant.orders.audit import JsonLines
 from heliotrope.plant.ports import Ports
-from heliotrope.plant.sensors import FED, SensorFiles
 from heliotrope.plant.settings import PlantSettings, clusters_of
 from heliotrope.sun import Site
 from heliotrope.twin.live import near_pair

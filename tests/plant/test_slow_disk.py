@@ -16,8 +16,8 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual, sleep_until
 from heliotrope.links.messages import Command, Emergency, Lease, Stage
 from heliotrope.mechanism.board_items import items_of
-from heliotrope.plant.assigned import AssignedFile
-from heliotrope.plant.audit import read
+from heliotrope.plant.field.assigned import AssignedFile
+from heliotrope.plant.orders.audit import read
 from heliotrope.safety import Act
 from heliotrope.store.records import Kind, Lockout
 from support.midsummer import DayClock
@@ -255,7 +255,7 @@ def test_a_slow_or_full_file_holds_up_no_lease_and_no_emergency(
 ) -> None:
     """In real time, with a real file whose syncing takes seconds, or fails."""
     sync = Sync()
-    monkeypatch.setattr("heliotrope.plant.audit.os.fsync", sync)
+    monkeypatch.setattr("heliotrope.plant.orders.audit.os.fsync", sync)
     disk = DiskThread()
     audited: list[Path] = []
 

@@ -10,8 +10,8 @@ import pytest
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency
-from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.emergency import UNPROVEN, Call, Standing, read_standing
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Act
 from heliotrope.store.keeper import Keeper

@@ -16,8 +16,8 @@ from heliotrope.lcu import names as meanings
 from heliotrope.mechanism.drives import SLOTS
 from heliotrope.mechanism.machine import Machine
 from heliotrope.mechanism.machine import Stepping as Stepped
-from heliotrope.plant.field_state import FieldState
-from heliotrope.plant.stepping import Stepping
+from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.orders.stepping import Stepping
 from heliotrope.twin.live.boards import BoardField
 from support.live import LiveOptions, LivePlant, play
 from support.visit_scene import ENGINEER

@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 from heliotrope.cli import app
 from heliotrope.errors import InputError
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.io.syslog import Receiver, Syslog
 from heliotrope.plant.operations import Logbook, SecurityEvent, SecurityNote
-from heliotrope.plant.syslog import Receiver, Syslog
 from heliotrope.safety import alarms
 from heliotrope.store import chain
 from heliotrope.store.records import StoreError

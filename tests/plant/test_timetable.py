@@ -12,7 +12,7 @@ from heliotrope.field.layouts import lay_out
 from heliotrope.field.plant import Plant
 from heliotrope.field.timetable import TimetableEntry
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import TimetableRecord
 from support.live import LiveOptions, LivePlant

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import running
-from heliotrope.plant.audit import JsonLines
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.orders.audit import JsonLines
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.refusals import RefusedError
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import FLUX_READING, alarms

@@ -15,9 +15,9 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Parameters
 from heliotrope.mechanism.board_items import Wanted, items_of
-from heliotrope.plant.audit import read
-from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.operations.typed_parameters import TypedParameters
+from heliotrope.plant.orders.audit import read
+from heliotrope.plant.orders.authority import RefusedError
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 NAME = "P1A"

@@ -12,7 +12,7 @@ from heliotrope.calibration.sightings import Sightings, sightings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import MRAD, FloatArray, reflect
 from heliotrope.mechanism.tracking import track
-from heliotrope.plant.beliefs import Beliefs
+from heliotrope.plant.field.beliefs import Beliefs
 from heliotrope.plant.visits.verification import Prediction
 from heliotrope.sun import vector
 

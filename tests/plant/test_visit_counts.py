@@ -11,8 +11,8 @@ from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import direction
 from heliotrope.lcu.states import DEFOCUSED, TRACKING
 from heliotrope.links.clock import VirtualClock, run_virtual, sleep_until
-from heliotrope.plant.aims import BeamCheck
-from heliotrope.plant.authority import Mandate, Person, RefusedError, Role
+from heliotrope.plant.field.aims import BeamCheck
+from heliotrope.plant.orders.authority import Mandate, Person, RefusedError, Role
 from heliotrope.plant.visits.photographs import Plain, Shot, measured
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.plant.visits.swings import swung

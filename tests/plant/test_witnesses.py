@@ -16,10 +16,10 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.gpsd import Gpsd
 from heliotrope.mechanism.tracking import track
-from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.field.witnesses import PHOTOGRAPHS, SatelliteWitness, SunSensorFile, Witnesses
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.plant.witnesses import PHOTOGRAPHS, SatelliteWitness, SunSensorFile, Witnesses
 from heliotrope.safety import Alarm, Severity
 from heliotrope.store.keeper import Keeper
 from heliotrope.sun import Site, fast_vector

@@ -20,8 +20,8 @@ import plant_load
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.calibration.sightings import sightings
 from heliotrope.links.clock import SystemClock
-from heliotrope.plant.audit import Record
-from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
+from heliotrope.plant.orders.audit import Record
+from heliotrope.plant.orders.kept_audit import KeptAudit, KeptPoints
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Event, StoreError
 from heliotrope.store.telemetry import Look, Telemetry, TelemetrySettings

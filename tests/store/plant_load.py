@@ -11,10 +11,10 @@ from heliotrope.field.layouts import malan_plant
 from heliotrope.files.disk import DiskThread
 from heliotrope.links.clock import SystemClock, VirtualClock
 from heliotrope.links.messages import Stage
-from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
+from heliotrope.plant.orders.kept_audit import KeptAudit, KeptPoints
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Event
 from heliotrope.twin.live.loop import PacedLoop

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from sqlalchemy import select, text
 
-from heliotrope.plant.audit import STOPPED
+from heliotrope.plant.orders.audit import STOPPED
 from heliotrope.store import audit, chain, tables
 from heliotrope.store.database import Database
 from heliotrope.store.keeper import Keeper

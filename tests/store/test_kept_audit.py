@@ -11,10 +11,10 @@ from sqlalchemy import event
 from heliotrope.errors import InputError
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Stage
-from heliotrope.plant.assigned import AssignedError, Points
-from heliotrope.plant.audit import STOPPED, AuditError, Record
-from heliotrope.plant.authority import RefusedError
-from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
+from heliotrope.plant.field.assigned import AssignedError, Points
+from heliotrope.plant.orders.audit import STOPPED, AuditError, Record
+from heliotrope.plant.orders.authority import RefusedError
+from heliotrope.plant.orders.kept_audit import KeptAudit, KeptPoints
 from heliotrope.store import audit as kept
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import AuditEntry, StoreError
@@ -153,7 +153,7 @@ class TestAudit:
         if keeper.database.file is None:
             audit.confirm()  # the server's disk is not ours to look at
             return
-        monkeypatch.setattr("heliotrope.plant.kept_audit.LEAST_FREE", 1 << 62)
+        monkeypatch.setattr("heliotrope.plant.orders.kept_audit.LEAST_FREE", 1 << 62)
         with pytest.raises(AuditError, match=r"bytes are left on its disk.*make room"):
             audit.confirm()
 

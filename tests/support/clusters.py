@@ -32,7 +32,7 @@ from heliotrope.links.messages import (
     decode,
     encode,
 )
-from heliotrope.plant.told_alarms import ToldAlarms
+from heliotrope.plant.field.cluster_alarms import ClusterAlarms
 from heliotrope.safety import Alarm
 from heliotrope.sun import Site
 from heliotrope.twin.boards.bus import TwinBus
@@ -142,7 +142,7 @@ class Plant:
         self.run = "first"
 
     async def listen(self) -> None:
-        told = ToldAlarms()
+        told = ClusterAlarms()
         async for data in received(self.link):
             message = decode(data)
             repeated = isinstance(message, Alarm) and not told.take("C1", message)

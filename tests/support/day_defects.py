@@ -12,15 +12,15 @@ import pytest
 
 from heliotrope.lcu import messages
 from heliotrope.links.messages import Stage
-from heliotrope.plant import guards
 from heliotrope.plant.attempts import Attempts
-from heliotrope.plant.authority import Authority
-from heliotrope.plant.giving_back import GivingBack
-from heliotrope.plant.locks import Locks
+from heliotrope.plant.field.locks import Locks
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.raising import Raising
-from heliotrope.plant.stepping import Stepping
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders import guards
+from heliotrope.plant.orders.authority import Authority
+from heliotrope.plant.orders.giving_back import GivingBack
+from heliotrope.plant.orders.stepping import Stepping
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits import coded_layout
 from heliotrope.plant.visits.visit import Visit
 from heliotrope.twin.invariants.invariants import L1, L2, L3, L4

@@ -23,10 +23,10 @@ from heliotrope.cli import main
 from heliotrope.errors import HeliotropeError
 from heliotrope.links.clock import SystemClock
 from heliotrope.links.tcp import TcpServer
-from heliotrope.plant.authority import Person, Role
-from heliotrope.plant.clusters import ClusterEnd
+from heliotrope.plant.field.clusters import ClusterEnd
 from heliotrope.plant.interface import PlantInterface
 from heliotrope.plant.operations import Operations
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.twin.field.field_bus import FieldBus
 from heliotrope.twin.live.loop import PacedLoop
 

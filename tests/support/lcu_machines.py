@@ -266,13 +266,13 @@ class Bench:
         self.journal.zero = self.declare  # type: ignore[method-assign]
         self.check()
 
-    def declare(self, primary: int, secondary: int, doubts: int = 0) -> None:
+    def declare(self, primary: int, secondary: int, doubtful: int = 0) -> None:
         """ZERO: the motors stand where they stood, under other counts."""
         counts = primary, secondary
         slip = zip(self.slip, self.made, counts, strict=True)
         self.slip = [s + m - c for s, m, c in slip]
         self.made = list(counts)
-        Journal.zero(self.journal, primary, secondary, doubts)
+        Journal.zero(self.journal, primary, secondary, doubtful)
 
     def read_tilt(self) -> tuple[float, float] | None:
         """The accelerometer."""

@@ -15,11 +15,11 @@ from heliotrope.geometry import FloatArray
 from heliotrope.links.clock import Clock, VirtualClock, run_virtual
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
-from heliotrope.plant.assigned import Assigned
-from heliotrope.plant.audit import Audit
+from heliotrope.plant.field.assigned import Assigned
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.learning import Learner
 from heliotrope.plant.operations.pictures import Pictures
+from heliotrope.plant.orders.audit import Audit
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import Records

@@ -27,11 +27,11 @@ from heliotrope.field.volumes import Box
 from heliotrope.links.clock import VirtualClock
 from heliotrope.links.link import running
 from heliotrope.local import EMERGENCY, LocalConnection
-from heliotrope.plant.audit import JsonLines
-from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.interface import PlantInterface
 from heliotrope.plant.interface.console_process import Patience
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.audit import JsonLines
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.store.keeper import Keeper
 from heliotrope.twin.live.loop import PacedLoop

@@ -34,9 +34,9 @@ from heliotrope.links.messages import (
     decode,
     encode,
 )
-from heliotrope.plant.audit import JsonLines
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.orders.audit import JsonLines
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.settings import PlantSettings
 
 OPERATOR = Person("Olga", Role.OPERATOR)

@@ -11,16 +11,17 @@ from heliotrope.calibration.learn.own_model import OwnModel
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.calibration.sightings import join
 from heliotrope.links.messages import Stage
-from heliotrope.plant import authority, field_state
-from heliotrope.plant.audit import AuditError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency.order import EmergencyOrder
-from heliotrope.plant.identity import Identities
+from heliotrope.plant.field import state as field_state
+from heliotrope.plant.field.identity import Identities
 from heliotrope.plant.operations.automatic import AutomaticControl
 from heliotrope.plant.operations.losses import Losses
-from heliotrope.plant.orders import PlantOrders
-from heliotrope.plant.parameters import ParameterSync
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders import authority
+from heliotrope.plant.orders.audit import AuditError
+from heliotrope.plant.orders.parameters import ParameterSync
+from heliotrope.plant.orders.queue import PlantOrders
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.photographs import Centred, seen
 from heliotrope.plant.visits.verification import Verification

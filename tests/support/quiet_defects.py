@@ -15,12 +15,13 @@ from heliotrope.lcu.lease import SunLease
 from heliotrope.lcu.search import Spiral
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.messages import Stage
-from heliotrope.plant import authority, refusals
-from heliotrope.plant.authority import Authority
-from heliotrope.plant.clusters import ClusterEnd
+from heliotrope.plant import refusals
 from heliotrope.plant.emergency.order import EmergencyOrder
-from heliotrope.plant.identity import Identities
-from heliotrope.plant.parameters import ParameterSync
+from heliotrope.plant.field.clusters import ClusterEnd
+from heliotrope.plant.field.identity import Identities
+from heliotrope.plant.orders import authority
+from heliotrope.plant.orders.authority import Authority
+from heliotrope.plant.orders.parameters import ParameterSync
 
 Plant = Callable[[pytest.MonkeyPatch], None]
 

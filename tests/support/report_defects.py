@@ -14,7 +14,7 @@ from heliotrope.cluster._polling import Polling
 from heliotrope.cluster._reports import Reports
 from heliotrope.lcu.controller import Controller
 from heliotrope.lcu.stepper import Axis
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import alarms
 
 Plant = Callable[[pytest.MonkeyPatch], None]

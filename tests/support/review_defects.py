@@ -14,14 +14,14 @@ from heliotrope.cluster._emergencies import Emergencies
 from heliotrope.cluster._work import Work
 from heliotrope.lcu import motion, states
 from heliotrope.links.messages import Stage
-from heliotrope.plant import guards
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import Standing, sentinel
-from heliotrope.plant.identity import Identities
-from heliotrope.plant.lockouts import Lockouts
+from heliotrope.plant.field.identity import Identities
+from heliotrope.plant.field.lockouts import Lockouts
+from heliotrope.plant.field.witnesses import Witnesses
+from heliotrope.plant.motion.stray_beams import StrayBeams
+from heliotrope.plant.orders import guards
 from heliotrope.plant.refusals import OUT_OF_SERVICE
-from heliotrope.plant.unsent import UnsentBeams
-from heliotrope.plant.witnesses import Witnesses
 from heliotrope.store import backup
 from heliotrope.twin.invariants.invariants import WORDS
 from heliotrope.twin.world.faults import Fault
@@ -87,14 +87,14 @@ def emergency_forgotten(patch: pytest.MonkeyPatch) -> None:
 
 def any_stow_position(patch: pytest.MonkeyPatch) -> None:
     """Stow positions are written unproven, and the proof believes a mirror that is at stow."""
-    lit = UnsentBeams.lit
+    lit = StrayBeams.lit
 
     def off_stow(self: Any, rows: Any) -> Any:
         found = lit(self, rows)
         return found & ~np.isin(self._field.rows["state"][rows], states.STOWED)
 
     patch.setattr(PlantController, "_resting", lambda self, heliostat, items: "")
-    patch.setattr(UnsentBeams, "lit", off_stow)
+    patch.setattr(StrayBeams, "lit", off_stow)
 
 
 def counts_of_another_mirror(patch: pytest.MonkeyPatch) -> None:

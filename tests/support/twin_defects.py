@@ -22,7 +22,7 @@ from heliotrope.lcu import (
 )
 from heliotrope.links.messages import Stage
 from heliotrope.mechanism.board_items import items_of
-from heliotrope.plant import aims
+from heliotrope.plant.field import aims
 from heliotrope.safety import evaluation
 from heliotrope.twin.boards import outfit
 from heliotrope.twin.world.crew import CrewAct

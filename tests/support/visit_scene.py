@@ -9,7 +9,7 @@ import numpy as np
 
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.lcu import states
-from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.visits import CycleSettings
 from support.live import LivePlant
 

@@ -15,8 +15,8 @@ from heliotrope import warm
 from heliotrope.field.layouts import malan_plant
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.processes import end, pool
 from heliotrope.twin import warm as warm_twin
 from heliotrope.twin.live import World, WorldOptions

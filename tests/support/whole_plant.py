@@ -26,9 +26,9 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.board_items import Wanted, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
-from heliotrope.plant.audit import JsonLines
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.orders.audit import JsonLines
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.safety import FLUX_READING

@@ -13,9 +13,9 @@ import pytest
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.lcu import states
 from heliotrope.links.messages import Command, Stage
-from heliotrope.plant.audit import Record
-from heliotrope.plant.authority import Person
 from heliotrope.plant.operations.automatic import AUTOMATIC
+from heliotrope.plant.orders.audit import Record
+from heliotrope.plant.orders.authority import Person
 from heliotrope.safety import Alarm, Severity
 from heliotrope.sun import vector
 from heliotrope.twin.invariants.alarms import AlarmObserver

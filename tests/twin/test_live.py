@@ -22,9 +22,9 @@ from heliotrope.lcu.sender import Sender
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import LinkClosedError, SendOutcome
 from heliotrope.mechanism.board_items import items_of
-from heliotrope.plant.authority import Person, Role
-from heliotrope.plant.kept_audit import KeptAudit
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.authority import Person, Role
+from heliotrope.plant.orders.kept_audit import KeptAudit
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.safety import FluxProof

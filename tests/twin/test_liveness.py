@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from heliotrope.plant import refusals
-from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.refusals import Refusal
 from heliotrope.twin.invariants import plant_observer as told
 from heliotrope.twin.invariants import quiet as silent

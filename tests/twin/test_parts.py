@@ -19,8 +19,8 @@ from heliotrope.lcu import ticks, wire
 from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of, run_virtual
 from heliotrope.links.link import LinkClosedError, SendOutcome
 from heliotrope.links.messages import Emergency, Lease, encode
-from heliotrope.plant.audit import AuditError, Record
-from heliotrope.plant.authority import Person
+from heliotrope.plant.orders.audit import AuditError, Record
+from heliotrope.plant.orders.authority import Person
 from heliotrope.safety import Alarm, Severity
 from heliotrope.sun import vector
 from heliotrope.twin import invariants

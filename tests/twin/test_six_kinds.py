@@ -10,8 +10,8 @@ import pytest
 
 from heliotrope.field.formats.plant_file import read_plant, write_plant
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.authority import Person, Role
 from support.live import LiveOptions, LivePlant
 from support.six_kinds import BUILDERS, mixed
 

@@ -149,7 +149,7 @@ def migrate(place: Place) -> None:
 def head(place: Place) -> None:
     """Print the heads of the chains of events and audit: note them on another machine."""
     if place.endswith(_LINES):
-        from heliotrope.plant import audit
+        from heliotrope.plant.orders import audit
 
         print(audit.verify(place))
         return
@@ -183,7 +183,7 @@ def verify(
     known = [Head.read(word) for text in typed for word in text.split()]
     exported = [entry for file in files for entry in chain.read_heads(file)]
     if place.endswith(_LINES):
-        from heliotrope.plant import audit
+        from heliotrope.plant.orders import audit
 
         last = audit.verify(place, [*known, *exported])
         print(f"{place}: every record fits; {last}")

@@ -27,7 +27,7 @@ def check(
 ) -> None:
     """Print everything that is wrong or strange in a plant file; exit code 2 if it cannot run."""
     from heliotrope.field.formats import plant_file
-    from heliotrope.plant.aims import BeamCheck
+    from heliotrope.plant.field.aims import BeamCheck
 
     findings = plant_file.check_plant(file)
     invalid = any(finding.severity == "error" for finding in findings)
@@ -111,8 +111,8 @@ def defocus(
     from heliotrope.field.formats import plant_file
     from heliotrope.geometry import direction
     from heliotrope.optics.standing import hottest
-    from heliotrope.plant.aims import BeamCheck, default_aims
-    from heliotrope.plant.leaving import defocused_field
+    from heliotrope.plant.field.aims import BeamCheck, default_aims
+    from heliotrope.plant.motion.defocusing import defocused_field
 
     design = plant_file.read_plant(file)
     if not design.receivers or not len(design):

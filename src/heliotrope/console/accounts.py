@@ -20,8 +20,8 @@ from heliotrope.console.auth import (
 from heliotrope.console.headers import COOKIE
 from heliotrope.console.people import ROLES
 from heliotrope.console.sign_in import confirm, log_in, set_cookie
-from heliotrope.plant.authority import Role
 from heliotrope.plant.operations.security import SecurityEvent
+from heliotrope.plant.orders.authority import Role
 from heliotrope.store.people import Account
 
 router = APIRouter(prefix="/api/v1", responses=REFUSALS)

@@ -35,9 +35,9 @@ from heliotrope.console.auth import (
 )
 from heliotrope.console.models import json_type
 from heliotrope.local.frames import REQUEST_BLOB
-from heliotrope.plant.authority import OPERATOR_COMMANDS, Role
 from heliotrope.plant.interface import CALLS, Call, WithBlob, orders
 from heliotrope.plant.operations.security import SecurityEvent
+from heliotrope.plant.orders.authority import OPERATOR_COMMANDS, Role
 
 #: Answers that any route behind the sign-in may give.
 REFUSALS: dict[int | str, dict[str, Any]] = {

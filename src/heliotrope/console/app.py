@@ -30,9 +30,9 @@ from heliotrope.console.settings import ConsoleSettings
 from heliotrope.console.sign_in import enter, set_cookie
 from heliotrope.errors import HeliotropeError, UnknownNameError
 from heliotrope.local import AwayError
-from heliotrope.plant.audit import AuditError
-from heliotrope.plant.authority import RefusedError, Role
 from heliotrope.plant.interface import BusyError
+from heliotrope.plant.orders.audit import AuditError
+from heliotrope.plant.orders.authority import RefusedError, Role
 from heliotrope.store.records import StoreError
 
 ABOUT = (

@@ -27,8 +27,8 @@ from heliotrope.console.people import ROLES, person_of
 from heliotrope.console.remote import RemotePeople, RemotePlant
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.security import SPAN, SecurityEvent, plain
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.store.people import Account, ApiToken, Session
 
 T = TypeVar("T")

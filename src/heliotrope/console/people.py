@@ -1,7 +1,7 @@
 """The people of the console: the store's accounts, and the first of them."""
 
 from heliotrope.console import _secrets
-from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.store.people import People
 
 ROLES = {"viewer": Role.VIEWER, "operator": Role.OPERATOR, "engineer": Role.ENGINEER}

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from heliotrope.local import EMERGENCY, INTERNAL, ORDINARY, CallError, LocalConnection
-from heliotrope.plant.authority import Person
 from heliotrope.plant.interface import CALLS, remade
 from heliotrope.plant.operations.security import SecurityEvent
+from heliotrope.plant.orders.authority import Person
 from heliotrope.store.factors import Used
 from heliotrope.store.people import Account, ApiToken, Expired, Session
 

@@ -15,7 +15,7 @@ from starlette.types import Scope
 
 from heliotrope.calibration.flights import FlightDocument
 from heliotrope.console.auth import AtLeast, caller
-from heliotrope.plant.authority import Role
+from heliotrope.plant.orders.authority import Role
 
 #: Largest body, bytes: of a stranger or where none is expected; of a form; of points or names for
 #: every heliostat of the largest field.

@@ -4,9 +4,9 @@ The form is that of Ho, Ghanbari and Diver, "Methodology to assess potential gli
 from concentrating solar power plants", J. Sol. Energy Eng. 133 (2011) 031021. Their text has not
 been read: formulae and constants come from later descriptions and carry no equation numbers; the
 tests hold one anchor, a look at the bare sun. No decision of the plant rests on this module: where
-people may look into beams it asks for less than one sun (`heliotrope.plant.aims.MOST_SUNS`). Do
-not approve a place for people by these figures. Inside, irradiances are in W/m² (the paper: W/cm²,
-1 W/cm² = 10⁴ W/m²).
+people may look into beams it asks for less than one sun (`heliotrope.plant.field.aims.MOST_SUNS`).
+Do not approve a place for people by these figures. Inside, irradiances are in W/m² (the paper:
+W/cm², 1 W/cm² = 10⁴ W/m²).
 
 Limits. The thresholds are for a short look (0.15 s, the blink) through the naked eye in
 daylight: not for binoculars, telescopes or cameras, and not for a forced stare. The sun is a

@@ -10,17 +10,17 @@ chooses which heliostat is measured next. `kept_audit` needs the store's librari
 from its module.
 """
 
-from heliotrope.plant.aims import BeamCheck, default_aims, spread
-from heliotrope.plant.assigned import Assigned, AssignedError, AssignedFile, rest_on
-from heliotrope.plant.audit import Audit, AuditError, JsonLines, Record
-from heliotrope.plant.authority import OPERATOR_COMMANDS, Authority, Grant, Person, Role
-from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
-from heliotrope.plant.field_state import FieldState, HeliostatState
+from heliotrope.plant.field.aims import BeamCheck, default_aims, spread
+from heliotrope.plant.field.assigned import Assigned, AssignedError, AssignedFile, rest_on
+from heliotrope.plant.field.state import FieldState, HeliostatState
+from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.orders.audit import Audit, AuditError, JsonLines, Record
+from heliotrope.plant.orders.authority import OPERATOR_COMMANDS, Authority, Grant, Person, Role
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.refusals import Refusal, RefusedError
 from heliotrope.plant.settings import PlantSettings, clusters_of
-from heliotrope.plant.tickets import Ticket
 
 __all__ = [
     "OPERATOR_COMMANDS",

@@ -22,10 +22,10 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
 from heliotrope.links.link import running
 from heliotrope.mechanism.board_items import items_of
-from heliotrope.plant.assigned import rest_on
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import at_stow
+from heliotrope.plant.field.assigned import rest_on
+from heliotrope.plant.io.sensors import Sensors
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.foresight import Prospect
@@ -34,10 +34,10 @@ from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.pictures import KeptCamera
 from heliotrope.plant.operations.views import CalibrationEntry, Planned
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.ports import Cameras, Ports
 from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
 from heliotrope.plant.schedule.scheduler import Scheduler
-from heliotrope.plant.sensors import Sensors
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.joint_cycle import JointCycle

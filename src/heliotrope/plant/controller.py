@@ -45,18 +45,6 @@ from heliotrope.links.messages import (
 from heliotrope.mechanism.board_items import POSE_ITEMS, Wanted, items_of, tables_with
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant import refusals
-from heliotrope.plant.agreement import Agreement
-from heliotrope.plant.aims import BeamCheck, default_aims
-from heliotrope.plant.assigned import KINDS, Assigned, Points
-from heliotrope.plant.audit import Audit
-from heliotrope.plant.authority import Authority, Grant, Person, Role
-from heliotrope.plant.beam_watch import BeamError, BeamWatch
-from heliotrope.plant.beliefs import Beliefs
-from heliotrope.plant.cluster_settings import ClusterSettings
-from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
-from heliotrope.plant.commands import Commands
-from heliotrope.plant.doubts import Doubts
-from heliotrope.plant.drive_checks import DriveChecks
 from heliotrope.plant.emergency import (
     EmergencyOrder,
     EmergencyRecord,
@@ -64,25 +52,37 @@ from heliotrope.plant.emergency import (
     Sentinel,
     TableWatch,
 )
-from heliotrope.plant.field_state import FieldState
-from heliotrope.plant.firmware import Firmware
-from heliotrope.plant.given import Given
-from heliotrope.plant.giving_back import GivingBack
-from heliotrope.plant.guards import Asked, Guards
-from heliotrope.plant.identity import Identities
-from heliotrope.plant.joining import JoinDispatcher, JoinQueue
-from heliotrope.plant.lockouts import Lockouts
-from heliotrope.plant.locks import Locks
-from heliotrope.plant.movements import Movements
-from heliotrope.plant.orders import PlantOrders
-from heliotrope.plant.parameters import ParameterSync, Tables, change_of_beam
+from heliotrope.plant.field.agreement import Agreement
+from heliotrope.plant.field.aims import BeamCheck, default_aims
+from heliotrope.plant.field.assigned import KINDS, Assigned, Points
+from heliotrope.plant.field.beliefs import Beliefs
+from heliotrope.plant.field.cluster_alarms import ClusterAlarms
+from heliotrope.plant.field.cluster_settings import ClusterSettings
+from heliotrope.plant.field.clusters import QUESTION_LIFE, ClusterEnd, Clusters
+from heliotrope.plant.field.doubtful_positions import DoubtfulPositions
+from heliotrope.plant.field.drive_checks import DriveChecks
+from heliotrope.plant.field.firmware import Firmware
+from heliotrope.plant.field.identity import Identities
+from heliotrope.plant.field.lockouts import Lockouts
+from heliotrope.plant.field.locks import Locks
+from heliotrope.plant.field.second_plant import SecondPlant
+from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.field.witnesses import Witnesses
+from heliotrope.plant.motion.beam_watch import BeamError, BeamWatch
+from heliotrope.plant.orders.audit import Audit
+from heliotrope.plant.orders.authority import Authority, Grant, Person, Role
+from heliotrope.plant.orders.commands import Commands
+from heliotrope.plant.orders.giving_back import GivingBack
+from heliotrope.plant.orders.guards import Asked, Guards
+from heliotrope.plant.orders.joining import JoinDispatcher, JoinQueue
+from heliotrope.plant.orders.movements import Movements
+from heliotrope.plant.orders.parameters import ParameterSync, Tables, change_of_beam
+from heliotrope.plant.orders.queue import PlantOrders
+from heliotrope.plant.orders.stepping import Stepping
+from heliotrope.plant.orders.tickets import Ticket
+from heliotrope.plant.orders.unacknowledged import Unacknowledged
 from heliotrope.plant.refusals import BEAM_REFUSED, OUT_OF_SERVICE
-from heliotrope.plant.rivals import Rivals
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
-from heliotrope.plant.stepping import Stepping
-from heliotrope.plant.tickets import Ticket
-from heliotrope.plant.told_alarms import ToldAlarms
-from heliotrope.plant.witnesses import Witnesses
 from heliotrope.safety import Act, Alarm, Condition, alarms, conditions, limited
 from heliotrope.sun import fast_vector
 
@@ -130,7 +130,7 @@ class PlantController:
 
     Attributes
     ----------
-    design, settings, field, authority, wanted, counters, beliefs, doubts, witnesses, drive_checks
+    design, settings, field, authority, wanted, counters, beliefs, doubtful, witnesses, drive_checks
         See their classes.
     beams
         Mirrors and keep-out volumes; see `BeamCheck`.
@@ -207,9 +207,9 @@ class PlantController:
         self.witnesses = Witnesses(
             self.settings.witnesses, design.site, lambda: clock.utc().timestamp(), self._tell
         )
-        self.drive_checks, self.doubts = self._doubting()
+        self.drive_checks, self.doubtful = self._doubting()
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
-        self._rivals, self._told_alarms = Rivals(self.name, self._tell), ToldAlarms()
+        self._second_plant, self._told_alarms = SecondPlant(self.name, self._tell), ClusterAlarms()
         self._cluster_settings = ClusterSettings(self._tell, _expected(self.settings))
         self._firmware = Firmware(self.settings.firmware, self._clusters, self._tell)
         self._orders = self._ordering(clock, audit, disk or AtOnce())
@@ -225,7 +225,7 @@ class PlantController:
             self._unwritable,
         )
         self.sentinel = self._guarded(table, record)
-        self._given = Given(self.field, points)
+        self._given = Unacknowledged(self.field, points)
         self._guards = self._guarding()
         self.commands = self._directed()
         self._joiner = self._dispatching()
@@ -234,13 +234,13 @@ class PlantController:
         self._closing = asyncio.Event()
         self._last_safe: tuple[tuple[str, Act, tuple[str, ...]], Ticket] | None = None
 
-    def _doubting(self) -> tuple[DriveChecks, Doubts]:
+    def _doubting(self) -> tuple[DriveChecks, DoubtfulPositions]:
         """Return what is known of drives, and what keeps heliostats in doubt off the receiver."""
         sensed = (name for name, each in self.beams.machines.items() if each.tilt_sensor)
         checks = DriveChecks(
             self.field, self._clusters, sensed, self.design.site, self.clock, self._tell
         )
-        return checks, Doubts(
+        return checks, DoubtfulPositions(
             self.field,
             self.design,
             self._tell,
@@ -304,11 +304,11 @@ class PlantController:
             self.authority,
             self._orders,
             self.sentinel,
-            self._rivals,
+            self._second_plant,
             self.witnesses,
             self._identities,
             self._sync,
-            self.doubts,
+            self.doubtful,
             self.lockouts,
             self._given,
             self.aims,
@@ -451,11 +451,11 @@ class PlantController:
         self._sync.greet(self.field.restarted)
         self._agreement.take(end.name, status)
         self._cluster_settings.take(end.name, status, now)
-        self._rivals.take(end.name, status)
+        self._second_plant.take(end.name, status)
         for alarm in self._told_alarms.compare(end.name, status):
             self._tell(alarm)
         self._give_up(self._identities.look(end.name))
-        self.doubts.look(end.name)
+        self.doubtful.look(end.name)
         self.drive_checks.look(end.name)
         if not self.field.knows_order(end.name) and now - self._named_at[end.name] >= _ASK_NAMES:
             # The message that names the rows was lost; the statistics come in the same order.
@@ -688,7 +688,7 @@ class PlantController:
         person.must_be(Role.OPERATOR, condition)
         role = person.role.acknowledges_as
         if condition == alarms.COUNTS_DOUBTFUL.name:
-            self.doubts.confirm(subject)
+            self.doubtful.confirm(subject)
         elif condition == alarms.DRIVE_STALLED.name:
             self.drive_checks.confirm(subject)
         elif condition in self.sentinel.table.rows or subject not in self._clusters.ends:
@@ -852,7 +852,7 @@ class PlantController:
 
         It may not join the receiver, and its ways are proven with both.
         """
-        with self.doubts.unverified(heliostat), self._ways.unverified(heliostat):
+        with self.doubtful.unverified(heliostat), self._ways.unverified(heliostat):
             yield
 
     def misled(self, heliostat: str, point: FloatArray) -> str:

@@ -19,15 +19,15 @@ from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Link
-from heliotrope.plant.assigned import Assigned
-from heliotrope.plant.audit import Audit
+from heliotrope.plant.field.assigned import Assigned
+from heliotrope.plant.field.witnesses import Witness
+from heliotrope.plant.io.sensors import Sensors
 from heliotrope.plant.operations.learning import Learner
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import CameraView
-from heliotrope.plant.sensors import Sensors
+from heliotrope.plant.orders.audit import Audit
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.target_light import Exposed
-from heliotrope.plant.witnesses import Witness
 from heliotrope.plant.workers import Worker, at_once
 from heliotrope.safety import Alarm
 from heliotrope.store.records import Records

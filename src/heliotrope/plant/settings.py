@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.links.common_settings import CommonSettings
-from heliotrope.plant.field_state import STALE
+from heliotrope.plant.field.state import STALE
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ def points(connection: Connection) -> dict[str, dict[str, tuple[float, ...]]]:
 def doubt_points(connection: Connection) -> None:
     """Let no assigned point count as taken by its local controller.
 
-    A point before that is like the assigned one says so; see `plant.assigned`.
+    A point before that is like the assigned one says so; see `plant.field.assigned`.
     """
     known = points(connection)
     doubted = {

@@ -36,7 +36,7 @@ from heliotrope.store.signing import PublicKey, SigningKey
 
 MANIFEST, SIGNATURE = "manifest.json", "manifest.sig"
 TELEMETRY = "telemetry"
-#: Owner of the lock on the tower that a backup holds; see `plant.lockouts`.
+#: Owner of the lock on the tower that a backup holds; see `plant.field.lockouts`.
 OWNER = "restored backup"
 _ROWS = 5000
 

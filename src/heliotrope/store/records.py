@@ -351,7 +351,7 @@ class OutlookEntry:
 
 @dataclass(frozen=True)
 class AuditEntry:
-    """One accepted command, as `plant.audit.Record`; times are ISO 8601."""
+    """One accepted command, as `plant.orders.audit.Record`; times are ISO 8601."""
 
     identity: str
     who: str

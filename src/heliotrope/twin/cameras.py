@@ -22,7 +22,7 @@ from heliotrope.imaging.photograph import Photograph, PhotographSettings
 from heliotrope.imaging.synthetic.scenes import Scene, Thrown
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.links.clock import Clock, sleep_until
-from heliotrope.plant.camera_views import SEVERAL, Views, beam_of, light_of, picture_of, shot_of
+from heliotrope.plant.io.camera_views import SEVERAL, Views, beam_of, light_of, picture_of, shot_of
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.coded_layout import moments_on
 from heliotrope.plant.visits.photographs import Shot

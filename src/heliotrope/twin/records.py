@@ -9,8 +9,8 @@ from dataclasses import replace
 from heliotrope.errors import InputError
 from heliotrope.files.disk import Then, Work
 from heliotrope.links.clock import Clock
-from heliotrope.plant.assigned import Places
-from heliotrope.plant.audit import STOPPED, AuditError, Record
+from heliotrope.plant.field.assigned import Places
+from heliotrope.plant.orders.audit import STOPPED, AuditError, Record
 
 
 class RecordsDisk:
@@ -128,7 +128,7 @@ class DiskQueue:
 
 
 class SimulatedAudit:
-    """A `plant.audit.Audit` of one run of the plant.
+    """A `plant.orders.audit.Audit` of one run of the plant.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray
 from heliotrope.links.clock import Clock
-from heliotrope.plant.sensors import Readings
+from heliotrope.plant.io.sensors import Readings
 from heliotrope.safety import FLUX_READING
 
 #: Time between two readings, s.

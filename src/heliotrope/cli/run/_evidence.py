@@ -8,8 +8,8 @@ from pathlib import Path
 
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.plant.assembly import PlantAssembly
+from heliotrope.plant.io.syslog import Receiver, Syslog
 from heliotrope.plant.operations.security import SecurityEvent
-from heliotrope.plant.syslog import Receiver, Syslog
 from heliotrope.safety import alarms
 from heliotrope.store import chain
 from heliotrope.store.digests import Head

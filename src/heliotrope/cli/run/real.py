@@ -23,14 +23,14 @@ from heliotrope.files.disk import DiskThread
 from heliotrope.links.clock import SystemClock
 from heliotrope.links.link import running
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
-from heliotrope.plant.audit import Forgetful
-from heliotrope.plant.cameras import RealCameras
-from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
-from heliotrope.plant.learner import LearnerProcess
+from heliotrope.plant.field.learner import LearnerProcess
+from heliotrope.plant.io.cameras import RealCameras
+from heliotrope.plant.io.receiver_flux import check_reference, flux_by
+from heliotrope.plant.io.sensors import AllSensors, Sensors
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.audit import Forgetful
+from heliotrope.plant.orders.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.ports import Ports
-from heliotrope.plant.receiver_flux import check_reference, flux_by
-from heliotrope.plant.sensors import AllSensors, Sensors
 from heliotrope.plant.settings import clusters_of
 from heliotrope.plant.workers import Worker, at_once
 from heliotrope.store.keeper import Keeper
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from heliotrope.imaging.receiver_light import ReceiverReference
     from heliotrope.links.link import Link
     from heliotrope.links.papers import Papers
-    from heliotrope.plant.links_file import PlantLinks
+    from heliotrope.plant.io.links_file import PlantLinks
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ class _Outside:
 def _outside(design: Plant, choice: RealChoice, clock: SystemClock) -> _Outside:
     try:
         from heliotrope.cluster.program import LocalCluster
-        from heliotrope.plant.links_file import read_links
+        from heliotrope.plant.io.links_file import read_links
     except ImportError as error:
         raise InputError(
             f"run: {error.name} is not installed; say pip install 'heliotrope[control]'"

@@ -18,9 +18,9 @@ from heliotrope.field.plant import Plant
 from heliotrope.files.disk import DiskThread
 from heliotrope.links.clock import SystemClock, VirtualClock
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
-from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
-from heliotrope.plant.learner import LearnerProcess
+from heliotrope.plant.field.learner import LearnerProcess
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.kept_audit import KeptAudit, KeptPoints
 from heliotrope.twin import warm
 from heliotrope.twin.live import CYCLE, PacedLoop, World, WorldOptions
 

@@ -20,7 +20,7 @@ from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.messages import Stage
 from heliotrope.mechanism.drives import Drive
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import Act, Proof, ProofReport
 
 #: An axis this close to the goal of its defocus (rad) has taken the beam off the receiver.

@@ -17,19 +17,19 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
 from heliotrope.links.messages import Progress, Stage
 from heliotrope.mechanism.drives import Drive
-from heliotrope.plant.beam_watch import BeamWatch
-from heliotrope.plant.drive_checks import DriveChecks
 from heliotrope.plant.emergency.order import (
     EmergencyOrder,
     switched_off,
 )
 from heliotrope.plant.emergency.standing import Call, EmergencyRecord, Standing, read_standing
 from heliotrope.plant.emergency.table import ORDERED, TableWatch
-from heliotrope.plant.field_state import FieldState
-from heliotrope.plant.identity import Identities
-from heliotrope.plant.joining import JoinQueue
-from heliotrope.plant.orders import PlantOrders
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.field.drive_checks import DriveChecks
+from heliotrope.plant.field.identity import Identities
+from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.motion.beam_watch import BeamWatch
+from heliotrope.plant.orders.joining import JoinQueue
+from heliotrope.plant.orders.queue import PlantOrders
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import FLUX_READING, AcknowledgeRole, Act, Alarm
 from heliotrope.store.records import StoreError
 
@@ -379,7 +379,7 @@ class Sentinel:
             heliostats = tuple(
                 n for n in heliostats if good[self._field.index[n]] and not self._doubted(n)
             )
-            if self._ways.unsent.watches:
+            if self._ways.stray.watches:
                 stage = Stage.ACKNOWLEDGED
         order.take_stage(heliostats, stage, self._clock.monotonic())
 
@@ -395,7 +395,7 @@ class Sentinel:
         rows = [self._field.index[n] for n in names if not order.is_done(n)]
         if rows:
             index = np.array(rows, dtype=np.intp)
-            lit = self._ways.unsent.lit(index)
+            lit = self._ways.stray.lit(index)
             order.take_rows(
                 tuple(self._field.names[r] for r in rows),
                 self._field.rows[index],

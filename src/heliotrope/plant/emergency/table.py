@@ -9,11 +9,11 @@ import numpy as np
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray
-from heliotrope.plant.agreement import Agreement
-from heliotrope.plant.authority import Authority
-from heliotrope.plant.beam_watch import BeamWatch
-from heliotrope.plant.field_state import FieldState
-from heliotrope.plant.orders import PlantOrders
+from heliotrope.plant.field.agreement import Agreement
+from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.motion.beam_watch import BeamWatch
+from heliotrope.plant.orders.authority import Authority
+from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.safety import (
     FLUX_READING,
     AcknowledgeRole,

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from heliotrope.errors import HeliotropeError
 from heliotrope.local import Buckets
-from heliotrope.plant.authority import Person
+from heliotrope.plant.orders.authority import Person
 
 #: Orders of one person, and of all: 1/s, and at once.
 OWN, ALL = (10.0, 100.0), (30.0, 200.0)

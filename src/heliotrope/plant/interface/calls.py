@@ -22,7 +22,6 @@ from heliotrope.errors import InputError
 from heliotrope.field.timetable import TimetableEntry
 from heliotrope.optics import FluxView
 from heliotrope.plant.attempts import Retry
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.interface import orders
 from heliotrope.plant.interface.desk import AuthorityState, CameraReading, Desk, FieldDesign
 from heliotrope.plant.interface.encoding import frame_parts
@@ -34,7 +33,8 @@ from heliotrope.plant.operations.marking import MarksView, PictureToMark
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.operations.typed_parameters import ParametersView
 from heliotrope.plant.operations.zero import lock_position, zero
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.authority import Person, Role
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.store.records import Lockout
 
 T = TypeVar("T")

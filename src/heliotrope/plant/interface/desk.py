@@ -20,15 +20,15 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.plant import refusals
-from heliotrope.plant.authority import Person
 from heliotrope.plant.interface import orders
 from heliotrope.plant.interface.tickets import Tickets, TicketState
 from heliotrope.plant.operations.given_readings import GivenReadings
 from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.views import CameraView, EmergencyView, PictureRow
-from heliotrope.plant.orders import RECORDING
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.authority import Person
+from heliotrope.plant.orders.queue import RECORDING
+from heliotrope.plant.orders.tickets import Ticket
 
 #: An emergency order with the word of an earlier one is that one for this long, s.
 SAME, _MOST_CALLED = 30.0, 100

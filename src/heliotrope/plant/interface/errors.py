@@ -2,8 +2,8 @@
 
 from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.local import CallError
-from heliotrope.plant.audit import AuditError
 from heliotrope.plant.interface.admission import BusyError
+from heliotrope.plant.orders.audit import AuditError
 from heliotrope.plant.refusals import RefusedError
 from heliotrope.store.records import StoreError
 

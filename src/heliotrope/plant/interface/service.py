@@ -28,7 +28,6 @@ from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.local import EMERGENCY, ORDINARY, Frame, LocalLimits, LocalServer, socket_folder
 from heliotrope.local.sockets import make_folder
 from heliotrope.plant import refusals
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.interface.admission import Admission
 from heliotrope.plant.interface.calls import CALLS, Call, Later, WithBlob, asked
 from heliotrope.plant.interface.desk import Desk
@@ -37,6 +36,7 @@ from heliotrope.plant.interface.errors import kind_of
 from heliotrope.plant.interface.orders import Beat
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.security import SecurityEvent
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.store.factors import KEY_FILE, Factors
 from heliotrope.store.people import People
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from heliotrope.errors import UnknownNameError
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.tickets import Ticket
 
 #: Number of tickets kept; those of whole fields are large.
 KEPT = 200

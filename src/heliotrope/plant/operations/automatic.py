@@ -23,7 +23,6 @@ from heliotrope.links.clock import sleep_until
 from heliotrope.links.messages import Stage
 from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
-from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, TrueErrors
 from heliotrope.plant.operations.calibration_book import CalibrationBook
@@ -41,6 +40,7 @@ from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.operations.service import Service
 from heliotrope.plant.operations.timetable import Timetable
 from heliotrope.plant.operations.views import CalibrationView, Planned
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle

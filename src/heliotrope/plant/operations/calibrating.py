@@ -13,7 +13,6 @@ from heliotrope.errors import HeliotropeError
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
-from heliotrope.plant.authority import Person, RefusedError, TakenOutError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.coded_visits import JointVisits, ReceiverVisits, Requests
@@ -22,6 +21,7 @@ from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import CalibrationEntry, Planned, Running
+from heliotrope.plant.orders.authority import Person, RefusedError, TakenOutError
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
 from heliotrope.plant.visits.coded_cycle import CodedCycle
 from heliotrope.safety import alarms
@@ -419,7 +419,7 @@ class Calibrating:
         self._scheduler.attempts.renew(first - self._flown)
         self._flown = first
         changed = np.isin(self._plant.field.names, list(first))
-        return np.asarray(self._plant.doubts.standing | changed)
+        return np.asarray(self._plant.doubtful.standing | changed)
 
     def _chosen(self, target: str, ready: npt.NDArray[np.bool_]) -> tuple[str, bool]:
         """Return the heliostat, and whether its beam is only searched for."""
@@ -430,7 +430,7 @@ class Calibrating:
         changed = np.isin(self._plant.field.names, list(self._first()))
         fresh = ready & self._fresh()
         alone = fresh if self._joint is None else self._joint.alone(fresh)
-        doubted = fresh & self._plant.doubts.standing
+        doubted = fresh & self._plant.doubtful.standing
         for rows in (doubted, fresh & changed, alone, fresh, ready):
             chosen = self._scheduler.next(target, rows) if rows.any() else None
             if chosen is not None:

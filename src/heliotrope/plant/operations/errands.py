@@ -12,7 +12,7 @@ from itertools import count
 
 from heliotrope.links.clock import Clock
 from heliotrope.links.messages import Stage
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.tickets import Ticket
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,13 @@ from heliotrope.calibration.flights import Flight, FlightDocument
 from heliotrope.calibration.record import Provenance
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.plant import refusals
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.flights import Flights, TakenFlight
+from heliotrope.plant.field.flights import Flights, TakenFlight
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.views import FlightView
-from heliotrope.plant.parameters import TAKES_POSE
+from heliotrope.plant.orders.authority import Person, Role
+from heliotrope.plant.orders.parameters import TAKES_POSE
 from heliotrope.plant.visits.fitting import (
     WRONG,
     JudgedFit,
@@ -254,7 +254,7 @@ class FlightIntake:
                     )
                 )
 
-        self._plant.doubts.astray(
+        self._plant.doubtful.astray(
             name
             for name, waiting in self._waiting.items()
             if waiting.way is _Way.AT_TARGET and waiting.astray

@@ -8,9 +8,9 @@ replace a sensor that the plant reads.
 import math
 
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.plant.authority import Person
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.orders.authority import Person
 
 #: Age from which a reading is refused: by then it is stale in most rows of the safety table, s.
 OLDEST = 5.0

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from heliotrope.calibration.flights import Flight, parse_flight
 from heliotrope.calibration.record import HeliostatCalibration, Identities
 from heliotrope.calibration.sightings import Sightings
-from heliotrope.plant.beliefs import Beliefs
-from heliotrope.plant.flights import TakenFlight
+from heliotrope.plant.field.beliefs import Beliefs
+from heliotrope.plant.field.flights import TakenFlight
 from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.store.records import (
     FlightEntry,

@@ -22,11 +22,11 @@ from heliotrope.calibration.learn.group import (
 )
 from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.mechanism import parameters as parameter_table
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.views import LearningView
+from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.store.records import LearningEntry
 
 #: Least time between two nightly attempts, s: one a night.

@@ -35,9 +35,9 @@ from heliotrope.imaging.targets.teaching import (
     write_taught,
 )
 from heliotrope.imaging.targets.view import faces, fit_view
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.orders.authority import Person, Role
 
 #: Pictures that are held for persons who mark them.
 _HELD = 4

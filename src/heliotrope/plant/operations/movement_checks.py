@@ -2,7 +2,7 @@
 
 A heliostat with a tilt sensor is released at stow (IDLE, where it holds), moves each axis a little
 and back (DIAGNOSE), and is stowed again: a drive that ice holds is found before its step counts
-leave stow. `plant.drive_checks` takes the results.
+leave stow. `plant.field.drive_checks` takes the results.
 """
 
 from collections.abc import Callable
@@ -13,9 +13,9 @@ import numpy.typing as npt
 from heliotrope.lcu import states
 from heliotrope.links.messages import Stage
 from heliotrope.plant.attempts import Attempts, RetryLaw
-from heliotrope.plant.authority import Person
-from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.orders.authority import Person
 from heliotrope.safety import Alarm, alarms
 
 #: Heliostats that are diagnosed at once: they take the supply of drives, and no light.

@@ -28,10 +28,9 @@ from heliotrope.lcu import messages
 from heliotrope.links.clock import sleep_until
 from heliotrope.optics import FluxView, predict_flux
 from heliotrope.plant import refusals
-from heliotrope.plant.authority import Grant, Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
-from heliotrope.plant.lockouts import TOWER
+from heliotrope.plant.field.lockouts import TOWER
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.errands import Errands
@@ -47,7 +46,8 @@ from heliotrope.plant.operations.views import (
     Summary,
     SunView,
 )
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.authority import Grant, Person, Role
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.photographs import Shot

@@ -12,11 +12,11 @@ from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, RetryLaw
-from heliotrope.plant.authority import Person
-from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.motion.beam_watch import BeamError
 from heliotrope.plant.operations.logbook import Logbook
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.authority import Person
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import alarms
 
 #: Time before a heliostat is tried again whose beam has no free path, and one that was refused

@@ -11,11 +11,11 @@ from heliotrope.lcu import states
 from heliotrope.links.messages import Stage
 from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, RetryLaw
-from heliotrope.plant.authority import Person
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.lockouts import TOWER, Lockouts
+from heliotrope.plant.field.lockouts import TOWER, Lockouts
 from heliotrope.plant.operations.errands import Step
 from heliotrope.plant.operations.keeping import Keeping
+from heliotrope.plant.orders.authority import Person
 from heliotrope.safety import Alarm, alarms
 from heliotrope.store.records import Kind, Lockout
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 from heliotrope.errors import HeliotropeError
 from heliotrope.field.timetable import TimetableEntry, check_timetable
-from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.views import TimetableRow
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.refusals import by_reason
 from heliotrope.store.records import TimetableRecord
 

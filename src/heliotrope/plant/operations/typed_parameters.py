@@ -15,10 +15,10 @@ from heliotrope.calibration.record import HeliostatCalibration, Provenance
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
-from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.logbook import Logbook
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.authority import Person, RefusedError
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import Records
 

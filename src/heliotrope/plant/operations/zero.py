@@ -14,9 +14,9 @@ from heliotrope.lcu import states
 from heliotrope.mechanism import track
 from heliotrope.mechanism.tracking import TrackingStatus
 from heliotrope.plant import refusals
-from heliotrope.plant.authority import Person
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.authority import Person
+from heliotrope.plant.orders.tickets import Ticket
 
 #: Largest turn of the mirror's normal that LOCK POSITION may declare, rad: a beam that is off by
 #: more than twice as much is another heliostat's, or the aim is another.

@@ -31,9 +31,9 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
-from heliotrope.plant.authority import Mandate, Person, RefusedError
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.drive_checks import PHOTOGRAPH
+from heliotrope.plant.field.drive_checks import PHOTOGRAPH
+from heliotrope.plant.orders.authority import Mandate, Person, RefusedError
 from heliotrope.plant.visits.coded_visit import Returned
 from heliotrope.plant.visits.fitting import (
     Believed,
@@ -331,7 +331,7 @@ class CalibrationCycle:
             say("learning from the verification")
             result = result.then(await self._again(visit, proof, say, fewest))
         if taken.used and self._missed(visit.heliostat, taken) <= PLACED:
-            self._plant.doubts.confirm(visit.heliostat, visit.boots)
+            self._plant.doubtful.confirm(visit.heliostat, visit.boots)
             self._plant.drive_checks.seen(visit.heliostat, PHOTOGRAPH)
         return result
 

@@ -27,8 +27,8 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded import Verdict
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.lcu import states
-from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.orders.authority import Person, RefusedError
 from heliotrope.plant.visits.calibration_cycle import (
     CalibrationCycle,
     CycleResult,

@@ -17,9 +17,9 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
-from heliotrope.plant.authority import Mandate, Person, RefusedError
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.authority import Mandate, Person, RefusedError
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.visit import BroughtHome, Order, Visit, carried_out
 
 #: Gives heliostats points, by name, for a person with a token.

@@ -27,8 +27,8 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray, angle_between
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
-from heliotrope.plant.beliefs import Beliefs
-from heliotrope.plant.flights import Flights
+from heliotrope.plant.field.beliefs import Beliefs
+from heliotrope.plant.field.flights import Flights
 from heliotrope.plant.visits.settings import CycleSettings
 
 #: Largest error of the last day's photographs that a fit that follows the drift may leave, in sigma

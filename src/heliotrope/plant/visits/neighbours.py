@@ -17,7 +17,7 @@ from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
 from heliotrope.optics import Neighbours, nearest
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.visits.photographs import Shot, TargetCamera
 from heliotrope.plant.workers import Worker
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
-from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.plant.visits.swings import spread_at
 from heliotrope.plant.visits.visit import Visit

@@ -21,8 +21,8 @@ from heliotrope.field.coded_visits import ReceiverSettings
 from heliotrope.field.target import Target
 from heliotrope.imaging.targets.view import posed_view
 from heliotrope.lcu import states
-from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult, Leaving
 from heliotrope.plant.visits.coded_cycle import CodedCycle, Light, Move, of_each
 from heliotrope.plant.visits.coded_layout import Layout

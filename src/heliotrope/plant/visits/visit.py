@@ -2,7 +2,7 @@
 
 Whatever a visit takes it gives back on every way out: the place on the target (`BroughtHome`), the
 lock for writing parameters (`Visit.locked`), the aim and the receiver (`joint_visit.Returned`).
-Where it cannot, the plant does so later: see `plant.giving_back`.
+Where it cannot, the plant does so later: see `plant.orders.giving_back`.
 """
 
 import asyncio
@@ -21,10 +21,10 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant import refusals
-from heliotrope.plant.authority import Mandate, RefusedError
-from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.orders.authority import Mandate, RefusedError
+from heliotrope.plant.orders.tickets import Ticket
 
 #: Gives an order to some heliostats.
 Order = Callable[[tuple[str, ...]], Ticket]

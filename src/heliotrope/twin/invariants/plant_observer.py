@@ -13,11 +13,11 @@ from itertools import islice
 
 from heliotrope.lcu import states
 from heliotrope.links.messages import Command, Emergency, Lease, Message, Parameters
-from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.automatic import AUTOMATIC
+from heliotrope.plant.orders.authority import Person, Role
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.plant.tickets import Ticket
 from heliotrope.twin.invariants.invariants import InvariantError, Observer, Violation
 from heliotrope.twin.records import RecordsDisk
 

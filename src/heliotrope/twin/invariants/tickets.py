@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 from heliotrope.lcu import states
 from heliotrope.links.messages import Stage
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.twin.invariants._account import HeliostatAccount
 from heliotrope.twin.invariants.invariants import ASKED, L2, InvariantError, Violation
 

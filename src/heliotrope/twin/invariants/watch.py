@@ -4,8 +4,8 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from heliotrope.plant.authority import Person
 from heliotrope.plant.operations import Operations
+from heliotrope.plant.orders.authority import Person
 from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.progress import ProgressObserver
 from heliotrope.twin.invariants.results import ResultObserver

@@ -36,9 +36,9 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.optics import nearest
-from heliotrope.plant.aims import default_aims
-from heliotrope.plant.assigned import Assigned
-from heliotrope.plant.audit import Audit, Forgetful
+from heliotrope.plant.field.aims import default_aims
+from heliotrope.plant.field.assigned import Assigned
+from heliotrope.plant.orders.audit import Audit, Forgetful
 from heliotrope.plant.ports import Ports
 from heliotrope.plant.settings import clusters_of
 from heliotrope.plant.visits.settings import CycleSettings

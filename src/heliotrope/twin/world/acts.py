@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
-from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations import Operations
 from heliotrope.plant.operations.automatic import AUTOMATIC
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import Act
 from heliotrope.twin.boards.outfit import RECEIVER, STANDBY
 from heliotrope.twin.invariants.alarms import CALLED

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from math import inf
 
 from heliotrope.lcu import states
-from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations import Operations
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.safety import Act
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.world.acts import Acts

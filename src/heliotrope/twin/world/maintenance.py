@@ -13,10 +13,10 @@ import numpy as np
 
 from heliotrope.links.clock import Clock
 from heliotrope.mechanism.board_items import packed
-from heliotrope.plant.authority import Person
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.lockouts import TOWER
+from heliotrope.plant.field.lockouts import TOWER
 from heliotrope.plant.operations.service import Service
+from heliotrope.plant.orders.authority import Person
 from heliotrope.store.backup import OWNER
 from heliotrope.store.records import Kind
 from heliotrope.twin.boards.board import Board

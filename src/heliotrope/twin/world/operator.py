@@ -21,11 +21,11 @@ from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.link import LinkClosedError
 from heliotrope.links.messages import Command, encode
 from heliotrope.mechanism.board_items import items_of, packed
-from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency.order import EmergencyOrder
-from heliotrope.plant.parameters import TAKES_POSE
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
+from heliotrope.plant.orders.parameters import TAKES_POSE
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import FLUX_READING, Act, alarms
 from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STANDBY, Outfit
 from heliotrope.twin.invariants.alarms import AlarmObserver

@@ -10,9 +10,9 @@ import contextlib
 from dataclasses import dataclass
 
 from heliotrope.geometry import FloatArray
-from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations import Operations
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.safety import Act
 from heliotrope.twin.invariants.watch import Watch
 from heliotrope.twin.world.acts import Acts

@@ -26,12 +26,12 @@ from heliotrope.links.common_settings import CommonSettings
 from heliotrope.links.tapped import TappedLink
 from heliotrope.mechanism.board_items import Wanted, packed
 from heliotrope.mechanism.tracking import track
-from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyRecord
+from heliotrope.plant.field.assigned import Assigned
+from heliotrope.plant.field.witnesses import SENSOR_ERROR
 from heliotrope.plant.operations.service import Service
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.plant.witnesses import SENSOR_ERROR
 from heliotrope.safety import FLUX_READING, Alarm, conditions
 from heliotrope.sun import vector
 from heliotrope.twin.boards.board import Board

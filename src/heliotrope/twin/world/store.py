@@ -7,9 +7,9 @@ from pathlib import Path
 
 from heliotrope.links.clock import Clock
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.kept_audit import KeptPoints
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.service import Service
+from heliotrope.plant.orders.kept_audit import KeptPoints
 from heliotrope.safety import Alarm
 from heliotrope.store import backup
 from heliotrope.store.keeper import Keeper

@@ -18,7 +18,7 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
 from heliotrope.mechanism.board_items import packed
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import Act
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, RECEIVER, STANDBY

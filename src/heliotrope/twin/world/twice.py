@@ -12,8 +12,8 @@ from heliotrope.field.plant import Plant
 from heliotrope.links.clock import VirtualClock
 from heliotrope.links.tapped import TappedLink
 from heliotrope.mechanism.board_items import Wanted
-from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.field.assigned import Assigned
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Alarm, Condition
 from heliotrope.twin.boards.outfit import Ball, Outfit

@@ -1,0 +1,292 @@
+"""The plant's own view of time, site and pointing, compared with what is reported.
+
+A cluster with a wrong clock or site sends its local controllers a wrong sun, and each of them then
+follows it, in good order, beside its aim or its standby point. So the plant compares the time and
+the site in each status with its own; and from the step counts of each heliostat, the sun and the
+parameters that it knows, it computes where the beam goes, and compares that with the point where
+the beam was sent.
+
+A beam is sent to a point in three states: TRACKING, SEARCHING (within the radius that the plant
+ordered), and IDLE, unless the heliostat holds still there: it does so after UNLOCK and CLEAR_FAULT,
+where a person moved it, and until it has come to standby by the way from stow. In every other state
+it is turned away, on its way, locked, or at stow by the counts that it stores itself, and no point
+is to be compared.
+"""
+
+from collections.abc import Callable, Collection, Sequence
+from zlib import crc32
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, normalize
+from heliotrope.lcu import messages, states
+from heliotrope.lcu import names as meanings
+from heliotrope.links.messages import ClusterStatus
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.board_items import packed
+from heliotrope.mechanism.drives import Drive
+from heliotrope.plant.field.aims import BeamCheck
+from heliotrope.plant.field.assigned import Points, differ, put_before
+from heliotrope.plant.field.state import FieldState, Mask
+from heliotrope.safety import Reading
+from heliotrope.sun import Site, fast_vector
+
+#: Pause between two looks at the pointing, s.
+LOOK_PERIOD = 2.0
+#: Errors from here on (rad) are handed to the safety table.
+NOTED = 1e-3
+#: Most heliostats that are named; with more, the field is the subject.
+MOST_NAMED = 150
+#: Step counts count from this time after a beam was first seen to be sent to its point, s.
+_SETTLE = 1.0
+#: An axis that comes nearer to its goal by this between two looks is on its way, rad.
+_CLOSING = 1e-4
+#: The motion of the sun is taken over this time, s.
+_SPAN = 10.0
+#: Longest time that a command of `messages.STANDS` is under way to its heliostat, s.
+_UNDER_WAY = 15.0
+#: States from which a heliostat that is ready comes to IDLE by following its standby point.
+_COMES = (states.APPROACHING, states.TRACKING, states.SEARCHING, states.DEFOCUSED)
+
+Rows = npt.NDArray[np.intp]
+
+
+class _Points:
+    """Assigned points of one kind, and where the beams were found.
+
+    Parameters
+    ----------
+    points
+        ENU, m, (N, 3); NaN where there is none; assigned by others.
+    before
+        The points before that were not replaced for certain when the plant's program began.
+
+    Attributes
+    ----------
+    before
+        The points before the assigned ones, the latest first, (`assigned.BEFORE`, N, 3); NaN from
+        where the beam was found: an assigned point may be refused by the local controller, and
+        then the beam goes on to one before.
+    changed_at
+        When each point was seen to change, monotonic s, (N,).
+    """
+
+    def __init__(self, points: FloatArray, before: FloatArray) -> None:
+        self.points, self._last = points, points.copy()
+        self.before = before.copy()
+        self.changed_at = np.full(len(points), -np.inf)
+
+    def look(self, now: float) -> Mask:
+        """Return which points have changed since the last look, (N,)."""
+        new, last = self.points, self._last
+        changed = differ(new, last)
+        put_before(self.before, np.flatnonzero(changed), last[changed])
+        self.changed_at[changed], last[changed] = now, new[changed]
+        return changed
+
+    def beside(self, rows: Rows, beam: FloatArray, vertex: FloatArray) -> FloatArray:
+        """Return the angle between beams (K, 3) and the nearest of their points, rad, (K,)."""
+        error = _angle(beam, self.points[rows] - vertex)
+        self.before[:, rows[error < NOTED]] = np.nan
+        for points in self.before[:, rows]:
+            some = np.isfinite(points).all(axis=-1)
+            error[some] = np.minimum(error[some], _angle(beam[some], (points - vertex)[some]))
+        return error
+
+
+class Agreement:
+    """Comparison of what clusters and heliostats report with what the plant knows itself.
+
+    Parameters
+    ----------
+    field, points
+        State of the field; assigned aims.
+    check
+        Mirrors as the plant knows them at its start.
+    site
+        Site of the plant.
+    utc
+        Returns the plant's time, POSIX s.
+    differing
+        Returns why a heliostat does not store the wanted parameters, None if it does.
+    """
+
+    def __init__(
+        self,
+        field: FieldState,
+        points: Points,
+        check: BeamCheck,
+        site: Site,
+        utc: Callable[[], float],
+        differing: Callable[[str], str | None],
+    ) -> None:
+        self._field, self._site, self._utc, self._differing = field, site, utc, differing
+        self._aims = _Points(points.aims, points.earlier["AIM"])
+        self._standbys = _Points(points.standbys, points.earlier["STANDBY"])
+        self._armature, self._drives = check.armature.table.copy(), check.drives.table.copy()
+        #: New parameters that the local controllers do not store yet: checksum, armature, drives.
+        self._pending: dict[int, tuple[int, FloatArray, FloatArray]] = {}
+        self._time_off = dict.fromkeys(field.clusters, 0.0)
+        self._sun_off = dict.fromkeys(field.clusters, 0.0)
+        count = len(field)
+        #: States at the last look; those whose beams are sent to aims and to standby points.
+        self._states = np.full(count, -1, dtype=np.int64)
+        self._on_aim, self._at_rest = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+        #: Since when they are; when a command that leaves them still was last sent, monotonic s.
+        self._since, self._stilled_at = np.full(count, np.inf), np.full(count, -np.inf)
+        #: Radius of the last search, rad.
+        self._radius = np.full(count, np.nan)
+        self._lag = np.full(count, np.inf)
+        #: Whether the axes stand beside their goals, by counts that came at a time, monotonic s.
+        self._stands, self._counted = np.zeros(count, dtype=bool), np.full(count, -np.inf)
+        self._wrong: dict[str, float] = {}
+        self._at = -np.inf
+
+    def believe(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
+        """Take new parameters, which hold once the local controller reports their checksum."""
+        self._pending[row] = crc32(packed("armature", tuple(armature))), armature, drives
+
+    def sent(
+        self, name: str, values: Sequence[float], heliostats: Collection[str], now: float
+    ) -> None:
+        """Note a command that has been sent."""
+        if name != "SEARCH" and name not in messages.STANDS:
+            return
+        rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
+        if name == "SEARCH":
+            # One that searches already goes on with its spiral if it refuses the new one.
+            searches = self._field.rows["state"][rows] == states.SEARCHING
+            self._radius[rows] = np.fmax(values[1], np.where(searches, self._radius[rows], np.nan))
+            return
+        self._stilled_at[rows], self._at_rest[rows] = now, False
+
+    def obeyed(self, name: str, accepted_at: float, heliostats: Sequence[str], now: float) -> None:
+        """Note a command, accepted at a monotonic time, that has been acknowledged.
+
+        IDLE brings back to its standby point one that is IDLE already and stands elsewhere.
+        """
+        if name == "IDLE":
+            rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
+            rows = rows[(self._stilled_at[rows] < accepted_at) & ~self._at_rest[rows]]
+            rows = rows[self._field.rows["state"][rows] == states.IDLE]
+            self._at_rest[rows], self._since[rows] = True, now
+
+    def take(self, cluster: str, status: ClusterStatus) -> None:
+        """Take a cluster's status that has just arrived."""
+        utc_s = self._utc()
+        if status.time_quality != "none":
+            self._time_off[cluster] = abs(status.utc_s - utc_s)
+        if status.site:
+            self._sun_off[cluster] = _sun_off(status.site, self._site, utc_s)
+
+    def readings(self, now: float) -> dict[tuple[str, str], Reading]:
+        """Return the differences of clusters and of heliostats; what is not named agrees.
+
+        A cluster that has fallen silent keeps its last difference: its silence has its own row.
+        """
+        if now - self._at >= LOOK_PERIOD:
+            self._at = now
+            self._look(now)
+        found = {("pointing_error", name): Reading(x, now) for name, x in self._wrong.items()}
+        found["pointing_error", ""] = Reading(0.0, now)
+        found["pointing_errors", ""] = Reading(float(len(self._wrong)), now)
+        for name in self._field.clusters:
+            found["cluster_time_off", name] = Reading(self._time_off[name], now)
+            found["cluster_sun_off", name] = Reading(self._sun_off[name], now)
+        return found
+
+    def _look(self, now: float) -> None:
+        field = self._field
+        for row, (crc, armature, drives) in list(self._pending.items()):
+            stored = int(field.rows["armature_crc"][row]) == crc
+            if stored and not self._differing(field.names[row]):
+                self._armature[row], self._drives[row] = armature, drives
+                del self._pending[row]
+        begins = self._sort(now)
+        self._aims.before[:, field.live(now) & ~self._on_aim] = np.nan
+        aims, standbys = self._aims.look(now), self._standbys.look(now)
+        begins |= np.where(self._on_aim, aims, standbys)
+        self._lag[begins], self._stands[begins] = np.inf, False
+        kinds = ((self._on_aim, self._aims), (self._at_rest, self._standbys))
+        error = np.zeros(len(field))
+        for mine, sent in kinds:
+            # Counts from before a new point say nothing about it.
+            begun = np.maximum(self._since, sent.changed_at) + _SETTLE
+            known = np.isfinite(sent.points).all(axis=-1) & (field.counted_at >= begun)
+            rows = np.flatnonzero(mine & known & field.sure(now))
+            error[rows] = self._errors(rows, sent, now)
+        searches = self._on_aim & (self._states == states.SEARCHING)
+        error[searches] -= self._radius[searches]
+        bad = np.flatnonzero(error >= NOTED)
+        worst = bad[np.argsort(-error[bad], kind="stable")][:MOST_NAMED]
+        self._wrong = {field.names[row]: float(error[row]) for row in worst}
+
+    def _sort(self, now: float) -> Mask:
+        """Find which beams are sent to which points; return those for which that has changed."""
+        field = self._field
+        live, state = field.live(now), field.rows["state"].astype(np.int64)
+        ready = live & (state == states.IDLE) & (field.rows["flags"] & meanings.READY != 0)
+        came = ready & np.isin(self._states, _COMES) & (self._stilled_at < now - _UNDER_WAY)
+        at_rest = np.where(live, ready & (self._at_rest | came), self._at_rest)
+        on_aim = live & np.isin(state, states.ON_AIM)
+        on_aim &= (state == states.TRACKING) | np.isfinite(self._radius)
+        begins = (on_aim & ~self._on_aim) | (at_rest & ~self._at_rest)
+        self._since[begins] = now
+        self._on_aim, self._at_rest = on_aim, at_rest
+        self._states[live] = state[live]
+        return np.asarray(begins | ~(on_aim | at_rest))
+
+    def _errors(self, rows: Rows, sent: _Points, now: float) -> FloatArray:
+        """Return the angle between each beam (K,) and its point, rad, by goals and counts."""
+        field = self._field
+        sun = self._sun_at(now - field.counted_at[rows])
+        drives = Drive(self._drives[rows])
+        ends = np.asarray(drives.angles(field.goals(rows)))
+        here = np.asarray(drives.angles(field.counts(rows)))
+        error = self._beside(rows, sent, ends, sun)
+        lag = np.abs(ends - here).max(axis=-1)
+        # Axes that come no nearer to their goals stand where they are.
+        # In large fields counts are older than a look: the same counts say nothing new.
+        newer = field.counted_at[rows] > self._counted[rows]
+        still = (lag > NOTED) & (lag > self._lag[rows] - _CLOSING)
+        stands = np.where(newer, still, self._stands[rows])
+        self._lag[rows], self._stands[rows] = lag, stands
+        self._counted[rows] = field.counted_at[rows]
+        if stands.any():
+            beside = self._beside(rows[stands], sent, here[stands], sun[stands])
+            error[stands] = np.maximum(error[stands], beside)
+        return error
+
+    def _sun_at(self, ages: FloatArray) -> FloatArray:
+        """Return the vectors to the sun some time ago, (K, 3); ages (K,) in s."""
+        utc_s = self._utc()
+        sun = fast_vector(utc_s, self._site)
+        rate = (sun - fast_vector(utc_s - _SPAN, self._site)) / _SPAN
+        return normalize(sun - rate * ages[:, None], "sun")
+
+    def _beside(self, rows: Rows, sent: _Points, angles: FloatArray, sun: FloatArray) -> FloatArray:
+        """Return the angle between beams (K,), the axes at angles (K, 2), and their points, rad."""
+        normal, vertex = Armature(self._armature[rows]).pose(angles)
+        beam = 2.0 * np.sum(sun * normal, axis=-1, keepdims=True) * normal - sun
+        return sent.beside(rows, beam, vertex)
+
+
+def _angle(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the angles between vectors (K, 3), rad."""
+    cross = np.linalg.norm(np.cross(a, b), axis=-1)
+    return np.asarray(np.arctan2(cross, np.sum(a * b, axis=-1)))
+
+
+def _sun_off(values: Sequence[float], site: Site, utc_s: float) -> float:
+    """Return the angle between the suns of a reported site and of the plant's, rad."""
+    if tuple(values) == site.numbers:
+        return 0.0
+    try:
+        latitude, longitude, height, pressure, temperature = values
+        other = Site(latitude, longitude, height, None if pressure < 0.0 else pressure, temperature)
+        suns = np.stack([fast_vector(utc_s, each) for each in (other, site)])
+    except (InputError, ValueError):
+        return np.pi
+    return float(_angle(suns[:1], suns[1:])[0])

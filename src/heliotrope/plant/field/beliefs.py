@@ -1,0 +1,215 @@
+"""The plant's beliefs about its mirrors: the one owner of calibrations and their sightings.
+
+A new `HeliostatCalibration` is taken here once and passed to all subscribers: the controller (beam
+checks and wanted parameters), automatic control, the schedule, the store and the pages. A
+calibration recalled from the store comes the same way.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.growth import Growth, default_growth
+from heliotrope.calibration.learn.drift import Hyperparameters
+from heliotrope.calibration.record import HeliostatCalibration, Identities
+from heliotrope.calibration.sightings import Sightings, join
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.plant.field.flights import Flights
+
+#: Stores sightings of a heliostat on a target; returns their numbers, (M,), 0 where it failed.
+Numbering = Callable[[str, str, Sightings], Identities]
+Subscriber = Callable[[HeliostatCalibration], None]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The M known sightings of one heliostat, in order of time.
+
+    Attributes
+    ----------
+    sightings
+        With heliostat row 0.
+    identities
+        Numbers given by the store; 0 for a sighting that is not stored, (M,).
+    targets
+        Name of the target of each, M.
+    missed
+        Beam error under the mechanism believed when it was taken, rad, (M,); NaN if recalled.
+    """
+
+    sightings: Sightings
+    identities: Identities
+    targets: tuple[str, ...]
+    missed: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.sightings)
+
+
+class Beliefs:
+    """Nominal mechanism, sightings and current calibration of each heliostat.
+
+    Parameters
+    ----------
+    design
+        The plant.
+
+    Attributes
+    ----------
+    design
+        The plant.
+    flights
+        Flights of a drone; a new one replaces the object.
+    """
+
+    def __init__(self, design: Plant) -> None:
+        self.design, self.flights = design, Flights()
+        self._records: dict[str, HeliostatCalibration] = {}
+        self._seen: dict[str, Seen] = {}
+        self._subscribers: list[Subscriber] = []
+        self._number: Numbering = _unkept
+        self._drifting: list[Subscriber] = []
+        self._hyper: dict[str, Hyperparameters] = {}
+        self._growth: dict[str, Growth] = {}
+        for group in design.groups.values():
+            self._growth |= dict.fromkeys(group.names, default_growth(group.mechanism))
+
+    def subscribe(self, subscriber: Subscriber, *, held: bool = True) -> None:
+        """Call a function with each new calibration and, if ``held``, now with the current ones."""
+        self._subscribers.append(subscriber)
+        for record in self._records.values() if held else ():
+            subscriber(record)
+
+    def subscribe_drift(self, subscriber: Subscriber) -> None:
+        """Call a function with each calibration whose covariance grows otherwise from now on."""
+        self._drifting.append(subscriber)
+
+    def number_with(self, numbering: Numbering) -> None:
+        """Let a store keep and number new sightings."""
+        self._number = numbering
+
+    # -- looking -------------------------------------------------------------------------------
+
+    def nominal(self, heliostat: str) -> Mechanism:
+        """Return the mechanism of the design, batch shape (1,)."""
+        group, row = self.design.find(heliostat)
+        return group.mechanism[np.array([row])]
+
+    def present(self, heliostat: str) -> Mechanism:
+        """Return the mechanism that is believed now, batch shape (1,).
+
+        Before the first calibration it is the mechanism of the plant file, with its parameters.
+        """
+        record = self._records.get(heliostat)
+        if record is not None:
+            return record.mechanism(self.nominal(heliostat))
+        group, row = self.design.find(heliostat)
+        values = {name: float(v[row]) for name, v in group.parameters.items()}
+        return self.nominal(heliostat).with_parameters(values)
+
+    def record(self, heliostat: str) -> HeliostatCalibration | None:
+        """Return the current calibration; None before the first."""
+        return self._records.get(heliostat)
+
+    def growth(self, heliostat: str) -> Growth:
+        """Return how the covariance of a heliostat's calibration grows with time."""
+        return self._growth[heliostat]
+
+    def hyper(self, heliostat: str) -> Hyperparameters | None:
+        """Return what was learnt of the heliostat's group; None while the defaults are in force."""
+        return self._hyper.get(heliostat)
+
+    def seen(self, heliostat: str) -> Seen | None:
+        """Return the known sightings; None if there are none."""
+        return self._seen.get(heliostat)
+
+    def count(self, heliostat: str) -> int:
+        """Return the number of known sightings of a heliostat, by photograph and from the air."""
+        seen = self._seen.get(heliostat)
+        return (0 if seen is None else len(seen)) + self.flights.count(heliostat)
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def __iter__(self) -> Iterator[HeliostatCalibration]:
+        """Iterate over the current calibrations."""
+        return iter(self._records.values())
+
+    # -- taking --------------------------------------------------------------------------------
+
+    def note(self, heliostat: str, target: str, new: Sightings) -> Seen:
+        """Add sightings of a heliostat (row 0) on a target; return all that are known now.
+
+        Sightings that the store could not keep before are offered to it again.
+        """
+        missed = beam_errors(self.present(heliostat), new).beam
+        added = Seen(new, np.zeros(len(new), np.int64), (target,) * len(new), missed)
+        known = _joined(self._seen.get(heliostat), added)
+        identities = known.identities.copy()
+        for name in dict.fromkeys(known.targets):
+            there = np.array([each == name for each in known.targets], dtype=np.bool_)
+            rows = np.flatnonzero((identities == 0) & there)
+            if len(rows):
+                identities[rows] = self._number(heliostat, name, known.sightings.take(rows))
+        self._seen[heliostat] = Seen(known.sightings, identities, known.targets, known.missed)
+        return self._seen[heliostat]
+
+    def take(self, record: HeliostatCalibration) -> HeliostatCalibration:
+        """Make a calibration the current one, pass it to all subscribers, and return it.
+
+        Its covariance grows from now on as its group drifts.
+        """
+        record = record.growing(self.growth(record.heliostat))
+        self._records[record.heliostat] = record
+        for subscriber in self._subscribers:
+            subscriber(record)
+        return record
+
+    def adopt(self, group: str, hyper: Hyperparameters, source: str) -> None:
+        """Put the hyperparameters of a group of the design in force.
+
+        Later fits follow the drift by them, and the covariances of the present calibrations grow as
+        they say; the values of these stay as they are until the next visit.
+        """
+        growth, names = Growth.of(hyper, source), self.design.groups[group].names
+        self._hyper |= dict.fromkeys(names, hyper)
+        self._growth |= dict.fromkeys(names, growth)
+        for name in names:
+            record = self._records.get(name)
+            if record is not None:
+                self._records[name] = record = record.growing(growth)
+                for subscriber in self._drifting:
+                    subscriber(record)
+
+    def recall(
+        self,
+        record: HeliostatCalibration,
+        sightings: Sightings,
+        identities: Identities,
+        targets: Sequence[str],
+    ) -> None:
+        """Restore a calibration and its sightings from before a restart."""
+        if len(sightings):
+            unknown = np.full(len(sightings), np.nan)
+            self._seen[record.heliostat] = Seen(sightings, identities, tuple(targets), unknown)
+        self.take(record)
+
+
+def _joined(known: Seen | None, added: Seen) -> Seen:
+    if known is None:
+        return added
+    return Seen(
+        join([known.sightings, added.sightings]),
+        np.concatenate([known.identities, added.identities]),
+        (*known.targets, *added.targets),
+        np.concatenate([known.missed, added.missed]),
+    )
+
+
+def _unkept(heliostat: str, target: str, sightings: Sightings) -> Identities:
+    del heliostat, target
+    return np.zeros(len(sightings), np.int64)

@@ -1,0 +1,44 @@
+"""The alarms that clusters have told of, compared with those that they list in their statuses."""
+
+from dataclasses import replace
+
+from heliotrope.links.messages import ClusterStatus
+from heliotrope.safety import Alarm, alarms
+
+_Key = tuple[str, str]
+
+
+class ClusterAlarms:
+    """Alarms of clusters, each told once though it is repeated, and ended though its end was lost.
+
+    A message may be lost with its connection, or come when the plant's program stands still. So a
+    cluster repeats its alarms, and lists them; see `ClusterStatus`.
+    """
+
+    def __init__(self) -> None:
+        self._active: dict[str, dict[_Key, Alarm]] = {}
+
+    def take(self, cluster: str, alarm: Alarm) -> list[Alarm]:
+        """Take an alarm of a cluster; return it if it is news."""
+        alarm = replace(alarm, subject=alarm.subject or cluster)
+        kind = alarms.KINDS.get(alarm.condition)
+        if kind is not None and not kind.over:
+            return [alarm]  # an event: it neither lasts nor ends
+        active, key = self._active.setdefault(cluster, {}), (alarm.condition, alarm.subject)
+        if not alarm.active:
+            active.pop(key, None)
+        elif active.get(key) == alarm:
+            return []
+        else:
+            active[key] = alarm
+        return [alarm]
+
+    def compare(self, cluster: str, status: ClusterStatus) -> list[Alarm]:
+        """Return the ends of those alarms that a cluster no longer lists."""
+        if not status.alarms_listed:
+            return []
+        pairs = (line.partition(" ") for line in status.alarms)
+        listed = {(condition, subject or cluster) for condition, _, subject in pairs}
+        active = self._active.get(cluster, {})
+        ended = [active.pop(key) for key in tuple(active) if key not in listed]
+        return [replace(each, text=f"{each.condition}: over", active=False) for each in ended]

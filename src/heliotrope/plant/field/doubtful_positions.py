@@ -1,0 +1,145 @@
+"""Heliostats whose step counts or parameters are in doubt, and what confirms that they are right.
+
+A power cut in motion may leave the step counts of a local controller wrong by up to 1,000 steps,
+which it reports as COUNTS_DOUBTFUL until ZERO. Its beam may then stand beside its place without
+any other sign. Such a heliostat is named, and kept off the receiver until a photograph on a target
+or a person has confirmed its place. A confirmation holds for one boot: it says nothing of the next
+cut. One that stores new parameters which a calibration has yet to verify stays off in the same way,
+one whose parameters a flight of a drone contradicts, one whose drives stall, and all while no
+witness confirms the sun.
+"""
+
+import contextlib
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+
+import numpy as np
+
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import names as meanings
+from heliotrope.plant import refusals
+from heliotrope.plant.field.state import FieldState, Mask
+from heliotrope.safety import Alarm, alarms
+
+
+class DoubtfulPositions:
+    """Doubts of local controllers about their step counts.
+
+    Parameters
+    ----------
+    field
+        State of the field.
+    design
+        Its targets may be aimed at in doubt: a photograph there ends it.
+    tell
+        Called with each alarm.
+    unwitnessed
+        Returns why no heliostat may join a receiver, "" if heliostats may; see `witnesses`.
+    stalled
+        Heliostats whose drives stall; see `drive_checks`.
+
+    Attributes
+    ----------
+    standing
+        Heliostats whose counts are in doubt, (N,).
+    """
+
+    def __init__(
+        self,
+        field: FieldState,
+        design: Plant,
+        tell: Callable[[Alarm], None],
+        unwitnessed: Callable[[], str],
+        stalled: Collection[str],
+    ) -> None:
+        self._unwitnessed, self._stalled = unwitnessed, stalled
+        self._field, self._tell = field, tell
+        self._receivers = np.array([each.center for each in design.receivers]).reshape(-1, 3)
+        self._targets = np.array([each.center for each in design.targets]).reshape(-1, 3)
+        self._reach = np.array([np.hypot(each.width, each.height) for each in design.targets])
+        #: Rows whose new parameters are being verified.
+        self._unverified: set[int] = set()
+        #: Rows that a flight sees far from where their parameters say.
+        self._astray: frozenset[int] = frozenset()
+        #: Boots of each local controller when its place was confirmed, -1 before.
+        self._confirmed = np.full(len(field), -1, dtype=np.int64)
+        self.standing: Mask = np.zeros(len(field), dtype=np.bool_)
+
+    def look(self, cluster: str) -> None:
+        """Judge the heliostats of a cluster by its status."""
+        self._judge([self._field.index[name] for name in self._field.members[cluster]])
+
+    def confirm(self, heliostat: str, boots: int | None = None) -> None:
+        """Take the step counts of a heliostat as right until it boots again.
+
+        Parameters
+        ----------
+        heliostat
+            Name.
+        boots
+            Its number of boots when its place was seen; None: as last heard.
+        """
+        row = self._field.place(heliostat)
+        self._confirmed[row] = int(self._field.rows["boots"][row]) if boots is None else boots
+        self._judge([row])
+
+    @contextlib.contextmanager
+    def unverified(self, heliostat: str) -> Iterator[None]:
+        """Keep a heliostat off the receiver while its new parameters are being verified."""
+        row = self._field.place(heliostat)
+        self._unverified.add(row)
+        try:
+            yield
+        finally:
+            self._unverified.discard(row)
+
+    def verifying(self, heliostats: Iterable[str]) -> dict[str, str]:
+        """Return the heliostats whose new parameters are being verified, and the reasons."""
+        place, text = self._field.place, refusals.NOT_VERIFIED.text
+        return {name: text for name in heliostats if place(name) in self._unverified}
+
+    def astray(self, heliostats: Iterable[str]) -> None:
+        """Keep heliostats off the receiver that a flight sees far from where they should be.
+
+        The others that were named before may join it again.
+        """
+        self._astray = frozenset(self._field.place(name) for name in heliostats)
+
+    def _judge(self, rows: list[int]) -> None:
+        found = self._field.rows[rows]
+        # Counts that are not known at all are a fault of their own, which only ZERO ends.
+        doubtful = found["flags"] & meanings.COUNTS_DOUBTFUL != 0
+        doubtful &= found["flags"] & meanings.COUNTS_UNKNOWN == 0
+        doubtful &= found["boots"] != self._confirmed[rows]
+        changed = np.flatnonzero(doubtful != self.standing[rows])
+        self.standing[rows] = doubtful
+        for i in changed:
+            name, kind = self._field.names[rows[i]], alarms.COUNTS_DOUBTFUL
+            self._tell(kind.raised(name) if doubtful[i] else kind.ended(name))
+
+    def reasons(self, names: Sequence[str], points: FloatArray) -> list[str | None]:
+        """Return why each of some heliostats (K) may not join its point (K, 3), None if it may."""
+        rows = [self._field.place(name) for name in names]
+        unverified, astray = (np.isin(rows, list(s)) for s in (self._unverified, self._astray))
+        blocked = self._unwitnessed()
+        stalled = np.array([name in self._stalled for name in names], dtype=np.bool_)
+        doubted = self.standing[rows] | unverified | astray | stalled | bool(blocked)
+        if not doubted.any():
+            return [None] * len(names)
+        found = np.full(len(names), blocked or None, dtype=np.object_)
+        found[self.standing[rows]] = refusals.COUNTS_DOUBTFUL.text
+        found[astray] = refusals.SEEN_ASTRAY.text
+        found[stalled] = refusals.DRIVE_STALLED.text
+        found[unverified] = refusals.NOT_VERIFIED.text
+        found[self._on_target(points)] = None
+        reasons: list[str | None] = found.tolist()
+        return reasons
+
+    def _on_target(self, points: FloatArray) -> Mask:
+        """Return which points (K, 3) are at a target, and nearer to it than to a receiver."""
+        apart, away = (
+            np.linalg.norm(points[:, None] - centers, axis=-1)
+            for centers in (self._targets, self._receivers)
+        )
+        near = apart.min(axis=1, initial=np.inf) < away.min(axis=1, initial=np.inf)
+        return np.asarray(near & (apart <= self._reach).any(axis=1))

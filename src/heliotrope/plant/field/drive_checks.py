@@ -1,0 +1,155 @@
+"""Whether drives turn their mirrors: what a measurement has shown today, and which drives stall.
+
+Step counts are the steps that a board has sent to its motors. Ice, a loose coupling or a driver
+without current leave the mirror where it is, and the counts go on. A diagnosis of movement with a
+tilt sensor on the mirror shows it, and so does a photograph of the beam on a target. A heliostat
+whose drives stall is named, joins no receiver, and nothing that it reports proves an emergency.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from datetime import date
+
+from heliotrope.lcu import diagnosis
+from heliotrope.lcu.names import FAULTS
+from heliotrope.links.clock import Clock, sleep_until
+from heliotrope.links.messages import Answer
+from heliotrope.plant.field.clusters import Clusters
+from heliotrope.plant.field.state import FieldState
+from heliotrope.safety import Alarm, alarms
+from heliotrope.sun import Site, solar_day
+
+#: What shows that a mirror follows its drives.
+TILT_SENSOR, PHOTOGRAPH = "tilt sensor", "photograph"
+_MOVED = diagnosis.MOVED_PRIMARY | diagnosis.MOVED_SECONDARY
+#: Bit of a diagnosis, and number of the fault that a board latches, for each drive that stalls.
+_STALLS = (
+    (diagnosis.STUCK_PRIMARY, FAULTS.index("primary drive stuck"), "primary"),
+    (diagnosis.STUCK_SECONDARY, FAULTS.index("secondary drive stuck"), "secondary"),
+)
+#: Time between two checks of whether results have come, s.
+_POLL = 0.5
+
+
+class DriveChecks:
+    """What is known of the drives beside their step counts.
+
+    Parameters
+    ----------
+    field, clusters
+        State of the field, and the clusters, which are asked for results of diagnoses.
+    sensed
+        Heliostats with a sensor of the mirror's tilt.
+    site, clock
+        The plant's, whose day counts.
+    tell
+        Called with each alarm.
+
+    Attributes
+    ----------
+    stalled
+        Heliostats whose drives stall, and how that was seen.
+    """
+
+    def __init__(
+        self,
+        field: FieldState,
+        clusters: Clusters,
+        sensed: Iterable[str],
+        site: Site,
+        clock: Clock,
+        tell: Callable[[Alarm], None],
+    ) -> None:
+        self._field, self._clusters, self._sensed = field, clusters, frozenset(sensed)
+        self._site, self._clock, self._tell = site, clock, tell
+        self.stalled: dict[str, str] = {}
+        #: Day on which mirrors were last seen to follow their drives, and by what.
+        self._shown: dict[str, tuple[date, str]] = {}
+        #: Day of the last diagnosis that came to its end, whatever its result.
+        self._diagnosed: dict[str, date] = {}
+        #: Heliostats whose boards report a drive that stalls, and whose sensors do not answer.
+        self._faulty: set[str] = set()
+        self._silent: set[str] = set()
+
+    async def told(self, heliostats: Iterable[str], timeout: float) -> None:
+        """Wait until heliostats are no longer due, ``timeout`` s at most."""
+        until = self._clock.monotonic() + timeout
+        while self.due.intersection(heliostats) and self._clock.monotonic() < until:
+            await sleep_until(self._clock, self._clock.monotonic() + _POLL)
+
+    def look(self, cluster: str) -> None:
+        """Take the faults that the boards of a cluster report."""
+        faults = self._field.rows["fault"]
+        for name in self._field.members[cluster]:
+            fault = int(faults[self._field.index[name]])
+            drives = [drive for _, number, drive in _STALLS if number == fault]
+            if not drives:
+                self._faulty.discard(name)
+            elif name not in self._faulty:
+                self._faulty.add(name)
+                self._stalls(name, drives)
+
+    def ask(self, heliostats: Iterable[str]) -> None:
+        """Ask for the results of diagnoses that have come to their end."""
+        for name in heliostats:
+            take = self._taker(name)
+            self._clusters.ask(self._clusters.home(name), "diagnosis", take, name)
+
+    def _taker(self, name: str) -> Callable[[Answer], None]:
+        def take(answer: Answer) -> None:
+            result = answer.data.get("result")
+            self._diagnosed[name] = self._today()
+            if not isinstance(result, int) or result & diagnosis.NO_SENSOR:
+                self._without_sensor(name)
+                return
+            if name in self._silent:
+                self._silent.remove(name)
+                self._tell(alarms.TILT_SENSOR_SILENT.ended(name))
+            stalls = [drive for bit, _, drive in _STALLS if result & bit]
+            if stalls:
+                self._stalls(name, stalls)
+            elif result & _MOVED:
+                self.seen(name, TILT_SENSOR)
+
+        return take
+
+    def _without_sensor(self, name: str) -> None:
+        if name in self._sensed and name not in self._silent:
+            self._silent.add(name)
+            self._tell(alarms.TILT_SENSOR_SILENT.raised(name))
+
+    def _stalls(self, name: str, drives: Iterable[str]) -> None:
+        text = " and ".join(f"its {drive} drive" for drive in drives)
+        self._diagnosed[name] = self._today()
+        self._shown.pop(name, None)
+        if name not in self.stalled:
+            self.stalled[name] = f"{text} made steps, and its mirror did not follow"
+            self._tell(alarms.DRIVE_STALLED.raised(name, drives=text))
+
+    def seen(self, heliostat: str, by: str) -> None:
+        """Note that the mirror was seen to follow its drives, by a sensor."""
+        self._shown[heliostat] = self._today(), by
+        self._follows(heliostat)
+
+    def confirm(self, heliostat: str) -> None:
+        """Take a person's word that the mirror follows its drives; it is due to be diagnosed."""
+        self._diagnosed.pop(heliostat, None)
+        self._follows(heliostat)
+
+    def _follows(self, heliostat: str) -> None:
+        if self.stalled.pop(heliostat, None) is not None:
+            self._tell(alarms.DRIVE_STALLED.ended(heliostat))
+
+    @property
+    def shown(self) -> Mapping[str, str]:
+        """What has shown today that mirrors follow their drives, by heliostat."""
+        today = self._today()
+        return {name: by for name, (day, by) in self._shown.items() if day == today}
+
+    @property
+    def due(self) -> frozenset[str]:
+        """Heliostats with a tilt sensor whose movement has not been diagnosed today."""
+        today = self._today()
+        return self._sensed.difference(n for n, day in self._diagnosed.items() if day == today)
+
+    def _today(self) -> date:
+        return solar_day(self._clock.utc(), self._site)

@@ -1,0 +1,76 @@
+"""Firmware versions of the local controllers, compared with the one that the plant expects.
+
+No status carries them: each cluster is asked to search its bus when it has connected.
+"""
+
+from collections.abc import Callable
+
+from heliotrope.links.messages import Answer
+from heliotrope.plant.field.clusters import Clusters
+from heliotrope.safety import Alarm, alarms
+
+#: Longest search of a bus, s; after it a cluster that has not answered is asked again.
+SEARCH = 600.0
+#: Most boards that one alarm names.
+_NAMED = 5
+
+
+class Firmware:
+    """The comparison of firmware versions.
+
+    Parameters
+    ----------
+    expected
+        Version that every board should have; None: nothing is compared, and no bus is searched.
+    clusters
+        The clusters, which are asked.
+    tell
+        Called with each alarm.
+    """
+
+    def __init__(
+        self, expected: int | None, clusters: Clusters, tell: Callable[[Alarm], None]
+    ) -> None:
+        self._expected, self._clusters, self._tell = expected, clusters, tell
+        #: When clusters that have not answered are asked next, monotonic s.
+        self._due: dict[str, float] = {}
+        self._told: set[str] = set()
+
+    def greet(self, cluster: str, now: float) -> None:
+        """Compare the boards of a cluster that has connected."""
+        if self._expected is not None:
+            self._due[cluster] = now
+
+    def beat(self, now: float) -> None:
+        """Ask the clusters that are due."""
+        for cluster, due in self._due.items():
+            if now >= due:
+                self._due[cluster] = now + SEARCH
+                end, take = self._clusters.ends[cluster], self._taker(cluster)
+                self._clusters.ask(end, "discover", take, patience=SEARCH)
+
+    def _taker(self, cluster: str) -> Callable[[Answer], None]:
+        def take(answer: Answer) -> None:
+            found = answer.data.get("found")
+            if not isinstance(found, list):
+                return  # it is asked again
+            self._due.pop(cluster, None)
+            others = {
+                str(one.get("name") or f"serial number {one.get('serial')}"): one.get("firmware")
+                for one in found
+                if isinstance(one, dict) and one.get("firmware") != self._expected
+            }
+            if others:
+                listed = [f"{name} ({version})" for name, version in others.items()][:_NAMED]
+                more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+                self._told.add(cluster)
+                self._tell(
+                    alarms.FIRMWARE_DIFFERS.raised(
+                        cluster, boards=", ".join(listed) + more, expected=self._expected
+                    )
+                )
+            elif cluster in self._told:
+                self._told.remove(cluster)
+                self._tell(alarms.FIRMWARE_DIFFERS.ended(cluster))
+
+        return take

@@ -1,0 +1,172 @@
+"""Which board answers at an address: two exchanged addresses, or a board moved to another mirror.
+
+Every local controller reports the checksum of the armature that it stores. The armature holds the
+place of the mirror, so no two are equal, and the checksum of another heliostat's armature shows
+that other heliostat's board: a command to H1 would move H2. A checksum that the plant has never
+known says nothing about whose board it is.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from zlib import crc32
+
+import numpy as np
+
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import names as meanings
+from heliotrope.lcu import states
+from heliotrope.plant import refusals
+from heliotrope.plant.field.state import FieldState
+from heliotrope.safety import Act, Alarm, alarms
+
+#: Why a board proves nothing that stores an armature which the plant has never known.
+_UNKNOWN = "its local controller stores parameters that this plant does not know"
+
+
+class Identities:
+    """Comparison of the armatures that local controllers report with those of the whole field.
+
+    Parameters
+    ----------
+    field
+        State of the field.
+    armatures
+        Armatures of the plant's beliefs at its start, (N, 18).
+    wanted
+        Items that heliostats should store, by name and item.
+    connections
+        Returns how often the link to a cluster has been opened.
+    tell
+        Called with each alarm.
+
+    Attributes
+    ----------
+    strange
+        Why a heliostat is not what its address says, by name.
+    """
+
+    def __init__(
+        self,
+        field: FieldState,
+        armatures: FloatArray,
+        wanted: Mapping[str, Mapping[str, bytes]],
+        connections: Callable[[str], int],
+        tell: Callable[[Alarm], None],
+    ) -> None:
+        self._field, self._connections, self._tell = field, connections, tell
+        self._wanted = wanted
+        self.strange: dict[str, str] = {}
+        #: Rows of the heliostats that have ever had an armature, by its checksum.
+        self._owners: defaultdict[int, set[int]] = defaultdict(set)
+        #: Checksums last reported, 0 before; whether they are the heliostat's own.
+        self._stored = np.zeros(len(field), dtype=np.uint32)
+        self._own = np.zeros(len(field), dtype=np.bool_)
+        #: Heliostats whose alarm says that they have no row.
+        self._unlisted: set[str] = set()
+        #: Rows whose checksum is another's.
+        self._foreign: set[int] = set()
+        self._rows = {
+            name: np.array([field.index[n] for n in held], dtype=np.intp)
+            for name, held in field.members.items()
+        }
+        #: Connection in which each cluster last sent a status.
+        self._judged: dict[str, int] = {}
+        for row, armature in enumerate(armatures):
+            self._owners[crc32(armature.tobytes())].add(row)
+        for name, items in wanted.items():
+            if "armature" in items:
+                self._owners[crc32(items["armature"])].add(field.index[name])
+
+    def learn(self, row: int, armature: FloatArray) -> dict[str, str]:
+        """Add an armature (18,) that a heliostat may store; return as `look`."""
+        crc = crc32(np.ascontiguousarray(armature).tobytes())
+        if row in self._owners[crc]:
+            return {}
+        self._owners[crc].add(row)
+        return self._judge(np.flatnonzero(self._stored == crc).tolist())
+
+    def look(self, cluster: str) -> dict[str, str]:
+        """Judge the heliostats of a cluster by its status; return those newly found strange."""
+        self._judged[cluster] = self._connections(cluster)
+        self._compare_rows(cluster)
+        rows = self._rows[cluster]
+        stored = self._field.rows["armature_crc"][rows]
+        changed = stored != self._stored[rows]
+        self._stored[rows] = stored
+        return self._judge(rows[changed].tolist())
+
+    def _compare_rows(self, cluster: str) -> None:
+        """Raise the alarm about heliostats for which their cluster reports no row, and end it."""
+        unlisted = self._field.unlisted.intersection(self._field.members[cluster])
+        known = self._unlisted.intersection(self._field.members[cluster])
+        for name in sorted(unlisted - known):
+            self._tell(alarms.UNLISTED.raised(name, cluster=cluster))
+        for name in sorted(known - unlisted):
+            self._tell(alarms.UNLISTED.ended(name, cluster=cluster))
+        self._unlisted = (self._unlisted - known) | unlisted
+
+    def _judge(self, changed: list[int]) -> dict[str, str]:
+        """Judge rows whose checksum, or its owners, have changed, and with them their pairs."""
+        for row in changed:
+            self._own[row] = row in self._of(row)
+            alien = not self._own[row] and bool(self._of(row))
+            (self._foreign.add if alien else self._foreign.discard)(row)
+        if not changed or not (self._foreign or self.strange):
+            return {}
+        names, found = self._field.names, dict[str, str]()
+        pairs = [(row, other) for row in sorted(self._foreign) for other in sorted(self._of(row))]
+        for row, other in pairs:
+            text = refusals.OTHER_PARAMETERS.text.format(other=names[other])
+            found.setdefault(names[row], text)
+        for row, other in pairs:
+            if not self._own[other]:
+                text = f"its parameters answer at the address of {names[row]}"
+                found.setdefault(names[other], text)
+        new = {name: text for name, text in found.items() if self.strange.get(name) != text}
+        for name, text in new.items():
+            self._tell(alarms.IDENTITY.raised(name, problem=text))
+        for name in self.strange.keys() - found.keys():
+            self._tell(alarms.IDENTITY.ended(name))
+        self.strange = found
+        return new
+
+    def _of(self, row: int) -> set[int]:
+        """Return the rows of the heliostats that have ever had the armature of a row."""
+        return self._owners.get(int(self._stored[row]), set())
+
+    def untrusted(self, heliostat: str) -> str:
+        """Return why nothing that a heliostat reports proves where its beam is, "" if it may.
+
+        It is strange, or its board stores an armature that the plant has never known: its step
+        counts are those of the mirror that it was at before.
+        """
+        row = self._field.index[heliostat]
+        unknown = self._stored[row] != 0 and not self._own[row] and heliostat in self._wanted
+        return self.strange.get(heliostat) or (_UNKNOWN if unknown else "")
+
+    def blocked(self, heliostat: str) -> str | None:
+        """Return why a heliostat may be neither moved nor written, None if it may."""
+        field, row = self._field, self._field.place(heliostat)
+        cluster = field.clusters[field.cluster[row]]
+        if heliostat in self.strange:
+            return self.strange[heliostat]
+        if heliostat in field.unlisted:
+            return refusals.UNLISTED.text.format(cluster=cluster)
+        judged = self._judged.get(cluster, -1) == self._connections(cluster)
+        return None if judged and math.isfinite(field.heard[row]) else refusals.NOT_HEARD.text
+
+    def off(self, now: float) -> dict[str, tuple[Act, str]]:
+        """Return the strange heliostats that must leave, by name: by which act, and why."""
+        if not self.strange:
+            return {}
+        field = self._field
+        # DEFOCUSED is not among them: a defocus is relative to goals, which may belong to the
+        # other mirror.
+        going = field.among(states.TO_STOW, now) | (field.rows["flags"] & meanings.AT_STOW != 0)
+        needed = field.live(now) & ~going
+        return {
+            name: (Act.STOW, f"{name}: {text}")
+            for name, text in self.strange.items()
+            if needed[field.index[name]]
+        }

@@ -1,0 +1,175 @@
+"""Locks of visits: heliostats that a visit has locked to write their parameters.
+
+A visit unlocks them itself. Where it cannot, because an emergency holds, a person's order has taken
+the heliostat out of the visit or the visit was cancelled, the plant unlocks them as soon as it may
+(`giving_back`). A local controller stays LOCKED through DEFOCUS and STOW, and UNLOCK stops it; so
+one that was ordered off is unlocked at stow.
+
+A lock is on the disk before it is taken (`assigned.HELD`). A program that finds one there does not
+know what was ordered since the last program ended, so it sends the heliostat to stow and unlocks it
+there. After a longer time a person may have locked it, by a program whose store was lost: then only
+a person unlocks it.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from heliotrope.lcu import messages, states
+from heliotrope.lcu import names as meanings
+from heliotrope.plant.field.assigned import Held, Places
+from heliotrope.plant.field.ordered import STOWING, Ordered
+from heliotrope.plant.field.state import FieldState
+
+#: A report from this long after a lock was sent shows it, s.
+_SHOWN = 1.0
+#: Pause before an order is given again, s: it doubles from one to the next, up to the longest.
+_AGAIN, _LONGEST = 3.0, 300.0
+#: A lock that is older when a program starts is left to a person, s.
+CERTAIN = 3600.0
+#: Instead of an order: a person must give it.
+_WAIT = "wait"
+
+
+@dataclass
+class _Lock:
+    """A lock: under which mandate, since when, the next attempt, and whether it was released.
+
+    ``at`` is when it was taken, POSIX s; an earlier program took it if it is ``recalled``.
+    """
+
+    token: int
+    since: float
+    due: float
+    at: float
+    pause: float = _AGAIN
+    released: bool = False
+    recalled: bool = False
+    uncertain: bool = False
+
+
+class Locks:
+    """The heliostats that visits have locked, by name.
+
+    Parameters
+    ----------
+    field, ordered
+        State of the field, and what was ordered.
+    utc
+        Returns the time, POSIX s.
+    """
+
+    def __init__(self, field: FieldState, ordered: Ordered, utc: Callable[[], float]) -> None:
+        self._field, self._ordered, self._utc = field, ordered, utc
+        self._locked: dict[str, _Lock] = {}
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The heliostats that a visit has locked, or that wait to be unlocked."""
+        return frozenset(self._locked)
+
+    def take(self, heliostats: Iterable[str], token: int, now: float) -> None:
+        """Note that heliostats are locked under the mandate of a visit."""
+        at = self._utc()
+        self._locked.update({name: _Lock(token, now, now + _SHOWN, at) for name in heliostats})
+
+    def recall(self, held: Places, now: float) -> None:
+        """Go on with the locks that an earlier program has left; see `record`."""
+        for name, (at, *_) in held.items():
+            sure = 0.0 <= self._utc() - at <= CERTAIN
+            lock = _Lock(0, now, now + _SHOWN, at, recalled=True, uncertain=not sure)
+            self._locked[name] = lock
+
+    def record(self, heliostats: Iterable[str], *, visit: bool) -> Held:
+        """Return what is to be stored before a visit, or a person, locks heliostats."""
+        place = (self._utc(), 0.0, 0.0) if visit else None
+        return {"LOCKED": dict.fromkeys(heliostats, place)}
+
+    def reason(self, heliostat: str, visit: str, held: str = "") -> str:
+        """Return why a heliostat is LOCKED, since when and until when, in words.
+
+        ``visit`` names the visit that it is in; "" if it is in none. ``held`` is why its cluster
+        may begin no motion now; "" if it may.
+        """
+        lock = self._locked.get(heliostat)
+        if lock is None:
+            return "locked by an order; it stays locked until a person gives UNLOCK"
+        since = f"since {datetime.fromtimestamp(lock.at, UTC):%H:%M:%S} UTC"
+        if lock.uncertain:
+            return (
+                f"a visit locked it before the plant's program started ({since}), so long ago that "
+                "a person may have locked it meanwhile; ask, then give UNLOCK"
+            )
+        if visit:
+            return f"{visit} has locked it {since}, until its parameters are written and read back"
+        left = "a visit that the plant's program did not survive" if lock.recalled else "a visit"
+        off = lock.recalled or self._ordered.since(heliostat, messages.SAFE, lock.since)
+        there = "at stow, " if off else ""
+        return (
+            f"{left} has left it locked ({since}); the plant unlocks it {there}as soon as motions "
+            "are accepted and somebody has the command authority"
+            f"{held and f'; now they are not: {held}'}"
+        )
+
+    def forget(self, heliostats: Iterable[str]) -> None:
+        """Forget heliostats that a person locks: the person unlocks them."""
+        for name in heliostats:
+            self._locked.pop(name, None)
+
+    def due(
+        self, now: float, left: Callable[[int, Iterable[str]], frozenset[str]]
+    ) -> dict[str, list[str]]:
+        """Return the heliostats that are to be given an order now, by its name.
+
+        Parameters
+        ----------
+        now
+            Monotonic s.
+        left
+            Returns those that no visit looks after any more: the visit has ended, or a person has
+            ordered something else.
+        """
+        found: dict[str, list[str]] = {}
+        for name, lock in list(self._locked.items()):
+            heard = self._field.heard[self._field.index[name]]
+            fresh = heard >= lock.since + _SHOWN and now - heard <= self._field.limit
+            if not fresh or not left(lock.token, (name,)):
+                continue
+            what = self._next(name, lock)
+            if not what:
+                del self._locked[name]
+            elif now >= lock.due and what != _WAIT:
+                lock.due = now + lock.pause
+                found.setdefault(what, []).append(name)
+        return found
+
+    def _next(self, name: str, lock: _Lock) -> str:
+        """Return the order that brings a heliostat on, "" if none is left to be given.
+
+        It waits for a person if nobody knows whose lock it is.
+        """
+        node = self._field.rows[self._field.index[name]]
+        if node["state"] != states.LOCKED:
+            # It stands where it was unlocked until it is sent to its standby point.
+            return "IDLE" if lock.released and node["state"] == states.IDLE else ""
+        if lock.uncertain:
+            return _WAIT
+        off = lock.recalled or self._ordered.since(name, messages.SAFE, lock.since)
+        return "STOW" if off and not node["flags"] & meanings.AT_STOW else "UNLOCK"
+
+    def sent(self, what: str, heliostats: Iterable[str]) -> None:
+        """Note an order that has been given; one that is not obeyed is given again."""
+        for name in heliostats:
+            lock = self._locked[name]
+            if what == "UNLOCK":
+                lock.released, lock.pause = True, min(2.0 * lock.pause, _LONGEST)
+            if what == "IDLE":
+                del self._locked[name]
+
+    def under_way(self, heliostats: Iterable[str]) -> frozenset[str]:
+        """Return those that were sent to stow since they were locked: nothing more is needed."""
+        return frozenset(
+            name
+            for name in heliostats
+            if self._ordered.since(name, STOWING, self._locked[name].since)
+        )

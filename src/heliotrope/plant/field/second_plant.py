@@ -1,0 +1,49 @@
+"""Another plant with the same keys: clusters tell in each status which run they belong to."""
+
+from collections.abc import Callable, Iterable
+
+from heliotrope.links.messages import ClusterStatus
+from heliotrope.safety import Alarm, alarms
+
+
+class SecondPlant:
+    """Clusters that refuse this plant because they belong to another one.
+
+    Parameters
+    ----------
+    run
+        Name of this run of the plant, as its leases carry it.
+    tell
+        Called with each alarm.
+    """
+
+    def __init__(self, run: str, tell: Callable[[Alarm], None]) -> None:
+        self._run, self._tell = run, tell
+        #: The run that a cluster belongs to, by cluster.
+        self._lost: dict[str, str] = {}
+
+    def take(self, cluster: str, status: ClusterStatus) -> None:
+        """Take a cluster's status."""
+        before = bool(self._lost)
+        if self._run in status.barred:
+            new = self._lost.get(cluster) != status.run
+            self._lost[cluster] = status.run
+        else:
+            new = self._lost.pop(cluster, None) is not None
+        if self._lost and new:
+            clusters, holder = ", ".join(sorted(self._lost)), next(iter(self._lost.values()))
+            self._tell(
+                alarms.SECOND_PLANT.raised(run=self._run, clusters=clusters, holder=holder or "?")
+            )
+        elif before and not self._lost:
+            self._tell(alarms.SECOND_PLANT.ended())
+
+    def refusal(self, clusters: Iterable[str]) -> str:
+        """Return why clusters take no motion from this plant, "" if they do."""
+        lost = sorted(set(clusters) & self._lost.keys())
+        if not lost:
+            return ""
+        return (
+            f"{', '.join(lost)} belong to another plant with the same keys "
+            f"(alarm {alarms.SECOND_PLANT.name}); switch one of the two off"
+        )

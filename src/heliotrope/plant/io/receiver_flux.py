@@ -1,0 +1,174 @@
+"""The flux on the receiver by its camera: the port `plant.ports.Sensors` for `FLUX_READING`.
+
+Once a second the newest frame of the receiver's camera is measured against a reference
+(`imaging.receiver_light`). A reading counts from the earliest moment at which its frame may have
+been exposed. No reading comes of a frame that may hide light, of one that repeats the last one, or
+that is old: the last reading goes stale, and the proof of an emergency counts light.
+"""
+
+import asyncio
+import math
+import re
+from collections.abc import Callable
+from datetime import datetime
+from functools import partial
+
+import numpy as np
+
+from heliotrope.errors import HeliotropeError, InputError
+from heliotrope.field.camera import Camera
+from heliotrope.field.plant import Plant
+from heliotrope.imaging.frame import Frame, Pixels
+from heliotrope.imaging.receiver_light import ReceiverLight, ReceiverReference, receiver_light
+from heliotrope.links.clock import Clock
+from heliotrope.plant.io.cameras import dated
+from heliotrope.plant.io.sensors import Readings
+from heliotrope.plant.ports import Cameras
+from heliotrope.safety import FLUX_READING
+from heliotrope.safety.proof import FLUX_AGE, FLUX_LIMIT
+
+#: Time between two readings, s.
+EVERY = 1.0
+#: A frame may be this far ahead of the plant's clock, s.
+AHEAD = 0.5
+
+
+def check_reference(design: Plant, reference: ReceiverReference) -> None:
+    """Check that a reference fits a plant.
+
+    Raises
+    ------
+    InputError
+        No such receiver, several receivers, no such camera, frames of another size, or receiver
+        visits by another camera.
+    """
+    sight = reference.sight
+    who = f"{FLUX_READING}: a reference of receiver {sight.receiver}, camera {sight.camera}"
+    names = [receiver.name for receiver in design.receivers]
+    if names != [sight.receiver]:
+        have = ", ".join(names) or "none"
+        raise InputError(
+            f"{who}; the plant's receivers: {have}; this reading comes from a camera only where "
+            "the plant has one receiver"
+        )
+    camera = next((each for each in design.cameras if each.name == sight.camera), None)
+    if camera is None:
+        have = ", ".join(each.name for each in design.cameras) or "none"
+        raise InputError(f"{who}; the plant's cameras: {have}; add it to the plant file")
+    if camera.size != sight.size:
+        raise InputError(
+            f"{who} of {sight.size[0]} × {sight.size[1]} px; the plant file says "
+            f"{camera.size[0]} × {camera.size[1]} px; take the reference again"
+        )
+    visits = design.receiver_visits
+    if visits is not None and visits.receiver == sight.receiver and visits.camera != sight.camera:
+        raise InputError(
+            f"{who}; receiver visits see it by camera {visits.camera}; take the reference by that"
+        )
+
+
+def flux_by(cameras: Cameras, clock: Clock, reference: ReceiverReference) -> "ReceiverFlux":
+    """Return the flux of a receiver by the camera that a plant's cameras have for it.
+
+    Raises
+    ------
+    UnknownNameError
+        If no camera looks at it.
+    """
+    receiver = reference.sight.receiver
+    newest = partial(cameras.frame, receiver)
+    return ReceiverFlux(cameras.eye(receiver), newest, clock, reference)
+
+
+class ReceiverFlux:
+    """The flux on the receiver, measured by its camera.
+
+    Parameters
+    ----------
+    eye
+        The camera.
+    newest
+        Returns its newest frame, or raises a `HeliotropeError` if there is none.
+    clock
+        Clock of the plant.
+    reference
+        Of this camera.
+
+    Attributes
+    ----------
+    names
+        The one reading.
+    """
+
+    def __init__(
+        self,
+        eye: Camera,
+        newest: Callable[[], Frame],
+        clock: Clock,
+        reference: ReceiverReference,
+    ) -> None:
+        self.names = frozenset({FLUX_READING})
+        self._eye, self._newest, self._clock = eye, newest, clock
+        self._reference = reference
+        self._read_at = -math.inf
+        self._seen: tuple[datetime, Pixels] | None = None
+        self._kind = ""
+
+    async def news(self) -> Readings:
+        """Return a reading each second, or why there is none."""
+        now = self._clock.monotonic()
+        if now - self._read_at < EVERY:
+            return Readings()
+        self._read_at = now
+        found = Readings()
+        try:
+            problem = await self._read(found)
+        except HeliotropeError as error:
+            problem = str(error)
+        except Exception as error:  # noqa: BLE001 - of OpenCV; other sensors are read beside it
+            problem = f"camera {self._eye.name}: {type(error).__name__}: {error}"
+        if problem is None:
+            return found
+        # Its numbers change each second; the alarm is told once.
+        kind = re.sub(r"[\d.]+", "", problem)
+        if kind != self._kind:
+            found.problems[FLUX_READING] = problem
+            self._kind = kind
+        return found
+
+    async def _read(self, found: Readings) -> str | None:
+        """Take a reading; return why there is none, "" if there is, None if nothing is new."""
+        frame, who = self._newest(), f"camera {self._eye.name}"
+        made = dated(frame, self._eye)
+        age = (self._clock.utc() - made).total_seconds()
+        if age > FLUX_AGE:
+            return f"{who}: its newest frame is {age:.0f} s old, the limit is {FLUX_AGE:g} s"
+        if age < -AHEAD:
+            return (
+                f"{who}: its newest frame is {-age:.1f} s ahead of the plant's clock; set the "
+                "camera's clock"
+            )
+        if self._seen is not None and made == self._seen[0]:
+            return None
+        light = await asyncio.to_thread(self._measure, frame)
+        self._seen = made, frame.pixels
+        if light is None:
+            return f"{who}: its frames repeat themselves to the last pixel; it has frozen"
+        # Light needs no proof that the camera sees all of it.
+        if light.doubt and not light.share >= FLUX_LIMIT:
+            return f"{who}: {light.doubt}"
+        found.values[FLUX_READING] = light.share
+        found.made[FLUX_READING] = self._clock.monotonic() - max(
+            0.0, (self._clock.utc() - made).total_seconds()
+        )
+        return ""
+
+    def _measure(self, frame: Frame) -> ReceiverLight | None:
+        """Return the flux in a frame; None if it repeats the last one."""
+        if self._seen is not None:
+            rows, columns = self._reference.sight.box
+            before, after = self._seen[1][rows, columns], frame.pixels[rows, columns]
+            # A sensor's noise differs from frame to frame.
+            if before.shape == after.shape and np.array_equal(before, after):
+                return None
+        return receiver_light(frame, self._reference)

@@ -1,0 +1,549 @@
+"""Commands of people: permitted, proven, recorded, and sent, at once or when their turn comes."""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from types import MappingProxyType
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import UnknownNameError
+from heliotrope.field.plant import Plant
+from heliotrope.files.disk import Work
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import messages as wire
+from heliotrope.lcu import states
+from heliotrope.mechanism.board_items import Wanted
+from heliotrope.plant import refusals
+from heliotrope.plant.field.assigned import NOTHING, Held, grouped, points_of
+from heliotrope.plant.field.locks import Locks
+from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.motion.beam_watch import BeamError, BeamWatch
+from heliotrope.plant.orders.audit import AuditError
+from heliotrope.plant.orders.authority import Authority, Person
+from heliotrope.plant.orders.guards import TO_AIMS, Asked, Guards
+from heliotrope.plant.orders.joining import Assign, Clear, JoiningJob, JoinQueue, in_slices
+from heliotrope.plant.orders.movements import Movements
+from heliotrope.plant.orders.queue import PlantOrders, whole
+from heliotrope.plant.orders.stepping import Stepping
+from heliotrope.plant.orders.tickets import Ticket
+from heliotrope.plant.orders.unacknowledged import Unacknowledged
+from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE
+
+#: Work of the disk, and its reverse.
+Storing = tuple[Work, Callable[..., object]]
+#: A new point so near the last one, and both so far off all receivers, bring no light there, m.
+_BESIDE = 3.0
+
+
+@dataclass(frozen=True)
+class NewPoints:
+    """Points that are given to heliostats; each is assigned when it is sent.
+
+    Attributes
+    ----------
+    name
+        AIM or STANDBY.
+    names, wanted
+        Heliostats (K,), and their points, ENU, m, (K, 3).
+    token
+        The holder's, or a mandate's.
+    store
+        Called with some heliostats and their points: returns work of the disk that must be done
+        before they are sent, and its reverse.
+    note
+        Called with those that are being assigned, and their points.
+    check
+        Called with the heliostats whose turn it is; raises `RefusedError` if their points may no
+        longer be assigned.
+    free
+        Returns the heliostats that need no turn; None: those that bring no light to a receiver.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    wanted: FloatArray
+    token: int
+    store: Callable[[tuple[str, ...], FloatArray], Storing]
+    note: Callable[[tuple[str, ...], FloatArray], None] = lambda *_: None
+    check: Callable[[tuple[str, ...]], None] = lambda _: None
+    free: Callable[[], frozenset[str]] | None = None
+
+    def of(self, names: Sequence[str]) -> FloatArray:
+        """Return the points of some heliostats, (M, 3)."""
+        row = {name: i for i, name in enumerate(self.names)}
+        return self.wanted[np.array([row[name] for name in names], dtype=np.intp)]
+
+    def grouped(self, names: Iterable[str]) -> dict[tuple[float, ...], list[str]]:
+        """Return the heliostats of each point, which share one command."""
+        some = tuple(names)
+        return grouped(some, self.of(some))
+
+
+class Commands:
+    """Gives the commands of the wire that need the command authority.
+
+    Parameters
+    ----------
+    now
+        Returns the monotonic time, s.
+    field, orders, joining
+        The plant's.
+    guards
+        What stops heliostats; see `GUARDS`.
+    given
+        Points that were given, and whether they were taken.
+    ways
+        Where beams may go.
+    design
+        Knows the targets and receivers.
+    wanted
+        Parameters that local controllers should store, their standby points among them.
+    patience
+        Time that a heliostat waits for its turn to join, s.
+    movements, locks, stepping
+        What visits have taken: aims, heliostats that are locked, and fine steps.
+    authority
+        The plant's.
+    """
+
+    def __init__(
+        self,
+        now: Callable[[], float],
+        field: FieldState,
+        orders: PlantOrders,
+        joining: JoinQueue,
+        guards: Guards,
+        given: Unacknowledged,
+        ways: BeamWatch,
+        design: Plant,
+        wanted: Wanted,
+        patience: float,
+        movements: Movements,
+        locks: Locks,
+        stepping: Stepping,
+        authority: Authority,
+    ) -> None:
+        self._now, self._field, self._orders, self._joining = now, field, orders, joining
+        self._guards, self._given, self._ways = guards, given, ways
+        self._design, self._wanted, self._patience = design, wanted, patience
+        self._movements, self._locks = movements, locks
+        self._stepping, self._authority = stepping, authority
+
+    def give(
+        self,
+        person: Person,
+        token: int,
+        name: str,
+        heliostats: Sequence[str],
+        values: Sequence[float],
+    ) -> Ticket:
+        """Give a command without points; see `PlantController.command`."""
+        row = wire.ROW_OF.get(wire.NUMBER_OF.get(name, -1))
+        if row is None or row[2] != wire.AUTHORITY or name in wire.POINTS:
+            known = [r[1] for r in wire.MESSAGES if r[2] == wire.AUTHORITY]
+            known = [each for each in known if each not in wire.POINTS]
+            raise UnknownNameError("command (points are given by aim and standby)", name, known)
+        numbers = whole(values, row[3], name)
+        self._authority.check(person, token, name)
+        names = tuple(dict.fromkeys(heliostats)) or self._field.names
+        others, out = self._guards.passed(Asked(name, names, token=token), OUT_OF_SERVICE)
+        clear, wrong = self.examine(name, numbers, others, token)
+        blocked = {**wrong, **out}
+        store = self._lock_record(clear, token) if name == "LOCK" else None
+        ticket = self.accept(person, token, name, numbers, names, store=store, blocked=blocked)
+        if name not in wire.SETTINGS:
+            # A heliostat that still waits to join must not undo a later command.
+            self._joining.drop(f"superseded by {name}", frozenset(names))
+        self._orders.when_recorded(ticket, partial(self._send, ticket, numbers, clear, token))
+        return ticket
+
+    def _send(
+        self,
+        ticket: Ticket,
+        numbers: tuple[float, ...],
+        heliostats: tuple[str, ...],
+        token: int,
+        again: bool,
+    ) -> None:
+        """Send a recorded command; one that waited for its record (``again``) is examined again.
+
+        Raises
+        ------
+        RefusedError
+            If it may no longer be sent.
+        """
+        name, left = ticket.name, ticket.waiting(heliostats)
+        if again and left:
+            out = self._guards.reasons(Asked(name, left), OUT_OF_SERVICE)
+            others = tuple(n for n in left if n not in out)
+            left, wrong = self.examine(name, numbers, others, token)
+            ticket.block({**wrong, **out})
+            if name not in wire.SETTINGS:
+                # One that was given before it may have joined the queue after its acceptance.
+                self._joining.drop(f"superseded by {name}", frozenset(left))
+        if left and name == "LOCK":
+            self._note_lock(left, token)
+        if name == "ROUGH":
+            self._stepping.ordered(left, bool(numbers[0]))
+        if left:
+            waits = name in wire.JOINING or in_slices(name, left)
+            send = self._join if waits else self._orders.command
+            send(ticket, name, numbers, left, token)
+
+    def accept(
+        self,
+        person: Person,
+        token: int,
+        name: str,
+        values: tuple[float, ...],
+        heliostats: Sequence[str],
+        note: str = "",
+        store: tuple[Work, Work] | None = None,
+        blocked: Mapping[str, str] = MappingProxyType({}),
+    ) -> Ticket:
+        """Return the ticket of a command that may be given, with its record on the way.
+
+        It ends at once for those that are ``blocked``. A person's command takes the others out of
+        the visits that they are in. Where a visit verifies new parameters, no person sends the beam
+        to an aim: only the visit sees whether it gets there.
+
+        Raises
+        ------
+        RefusedError
+            If it may not.
+        """
+        for each in heliostats:
+            self._field.place(each)
+        self._authority.check(person, token, name)
+        self._guards.refuse_now(name, [each for each in heliostats if each not in blocked])
+        mandate = self._authority.mandate_of(token)
+        if mandate is not None:
+            wrong = mandate.refused(heliostats)
+        else:
+            wrong = self._guards.doubtful.verifying(heliostats) if name in TO_AIMS else {}
+            if name in wire.JOINING and len(wrong) < len(heliostats):
+                blocked, wrong = {**blocked, **wrong}, {}
+        if wrong:
+            raise BeamError(name, wrong)
+        try:
+            ticket = self._orders.accept(
+                (person.name, person.role.title, name), values, heliostats, note, store=store
+            )
+        except AuditError as error:
+            raise refusals.NOT_RECORDED.error(what=name, problem=error) from None
+        ticket.block(blocked)
+        if mandate is None and name not in wire.SETTINGS:
+            self._authority.prevail(ticket.waiting(heliostats), f"{person.name} ordered {name}")
+        return ticket
+
+    def _lock_record(self, heliostats: tuple[str, ...], token: int) -> tuple[Work, Work]:
+        """Return work that stores whose lock it is, before it is taken; and its reverse."""
+        visit = self._authority.mandate_of(token) is not None
+        return self._ways.points.holding(self._locks.record(heliostats, visit=visit))
+
+    def _note_lock(self, heliostats: tuple[str, ...], token: int) -> None:
+        """Note whose lock it is: a visit's, which the plant opens in the end, or a person's."""
+        if self._authority.mandate_of(token) is None:
+            self._locks.forget(heliostats)
+        else:
+            self._locks.take(heliostats, token, self._now())
+
+    def examine(
+        self, name: str, numbers: tuple[float, ...], names: tuple[str, ...], token: int = 0
+    ) -> tuple[tuple[str, ...], dict[str, str]]:
+        """Return the heliostats that may be sent a command now, and why the others may not.
+
+        Raises
+        ------
+        BeamError
+            If none may.
+        """
+        asked = Asked(name, names, token=token)
+        able, wrong = self._guards.passed(asked, NOT_NOW, BEAM_REFUSED)
+        if in_slices(name, able):
+            return able, wrong  # each slice is examined when its turn comes
+        clear, blocked = self._ways.clear(name, numbers, able, self._now())
+        return clear, wrong | blocked
+
+    def zero(self, person: Person, token: int, heliostat: str, counts: Sequence[float]) -> Ticket:
+        """Declare the step counts of the axes of one heliostat that is locked or has a fault.
+
+        Nothing moves; its local controller stores the counts. It needs an engineer, and the
+        heliostat's key in its cluster.
+
+        Parameters
+        ----------
+        person, token
+            The person commanding, and the token of the command authority.
+        heliostat
+            Name.
+        counts
+            Of the primary and the secondary axis, steps.
+
+        Raises
+        ------
+        RefusedError
+            If it is not accepted; nothing is sent then.
+        InputError
+            Counts that do not fit.
+        UnknownNameError
+            If there is no such heliostat.
+        """
+        numbers = whole(counts, wire.ROW_OF[wire.NUMBER_OF["ZERO"]][3], "ZERO")
+        asked = Asked("ZERO", (heliostat,), token=token)
+        self._guards.passed(asked, BEAM_REFUSED)
+        self._guards.passed(asked, OUT_OF_SERVICE)
+        ticket = self.accept(person, token, "ZERO", numbers, (heliostat,))
+
+        def send(again: bool) -> None:
+            if again:
+                self._guards.passed(asked, OUT_OF_SERVICE)
+            left = ticket.waiting((heliostat,))
+            self._orders.command(ticket, "ZERO", numbers, left, token)
+
+        self._orders.when_recorded(ticket, send)
+        return ticket
+
+    def point(
+        self, person: Person, token: int, name: str, points: Mapping[str, npt.ArrayLike]
+    ) -> Ticket:
+        """Give AIM or STANDBY with a point (3,) for each heliostat; see `PlantController.aim`."""
+        names, _, wanted, out = self._pointed(name, points)
+        self.prove_points(name, names, wanted)
+        visit = self._authority.mandate_of(token) is not None
+
+        def store(some: tuple[str, ...], places: FloatArray) -> Storing:
+            held: Held = NOTHING
+            if name == "AIM":
+                held = self._lent(some, places) if visit else {"LENT": dict.fromkeys(some)}
+            return self.storing(name, some, places, held)
+
+        def note(some: tuple[str, ...], places: FloatArray) -> None:
+            if name == "AIM" and visit:
+                self._movements.lend(some, self._aims(self._places(some)), places, token)
+            elif name == "AIM":
+                self._movements.forget(some)
+            else:
+                for each, place in zip(some, places, strict=True):
+                    self._wanted.rest(each, tuple(place))
+
+        groups = grouped(names, wanted)
+        values = next(iter(groups)) if len(groups) == 1 else ()
+        all_names, text = (*names, *out), f"{len(groups)} points"
+
+        def accept(store: tuple[Work, Work] | None) -> Ticket:
+            each = person, token, name, values, all_names, text, store, out
+            return self.accept(*each)
+
+        return self.give_points(NewPoints(name, names, wanted, token, store, note), accept)
+
+    def move(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
+        """Move beams a little on their receiver, for a measurement; their aims stay assigned.
+
+        The beams go back to their aims by themselves; see `movements`. No turn is needed, since
+        they bring no light to the receiver.
+
+        Parameters
+        ----------
+        person, token
+            The person commanding, and the token of the command authority.
+        points
+            ENU, m, (3,), by name.
+
+        Raises
+        ------
+        RefusedError
+            If it is not accepted, or one of the beams may not go there.
+        """
+        names, rows, wanted, out = self._pointed("AIM", points)
+        tracking, aims = self._field.among((states.TRACKING,), self._now())[rows], self._aims(rows)
+        if wrong := self._movements.refused(names, rows, aims, wanted, tracking):
+            raise BeamError("AIM", wrong)
+        self.prove_points("AIM", names, wanted)
+
+        def store(some: tuple[str, ...], places: FloatArray) -> Storing:
+            return self.holding(self._lent(some, places))
+
+        def check(some: tuple[str, ...]) -> None:
+            rows, on = self._places(some), np.ones(len(some), dtype=np.bool_)
+            if wrong := self._movements.refused(some, rows, self._aims(rows), new.of(some), on):
+                raise BeamError("AIM", wrong)  # aimed elsewhere while the record was written
+
+        def note(some: tuple[str, ...], places: FloatArray) -> None:
+            del places
+            self._movements.take(some, self._aims(self._places(some)), token, self._now())
+
+        def accept(store: tuple[Work, Work] | None) -> Ticket:
+            each = person, token, "AIM", (), (*names, *out), f"{len(names)} coded movements"
+            return self.accept(*each, store, out)
+
+        every = frozenset(names)
+        new = NewPoints("AIM", names, wanted, token, store, note, check, lambda: every)
+        return self.give_points(new, accept)
+
+    @property
+    def aimed(self) -> frozenset[str]:
+        """The heliostats with a new aim that waits for the disk or for its turn."""
+        return self._joining.waiting("AIM") | self._orders.unstored("AIM")
+
+    def holding(self, held: Held) -> tuple[Work, Work]:
+        """Return work that stores what a visit takes, and its reverse; see `Points.holding`."""
+        return self._ways.points.holding(held)
+
+    def _places(self, names: Sequence[str]) -> npt.NDArray[np.intp]:
+        return np.array([self._field.place(name) for name in names], dtype=np.intp)
+
+    def _aims(self, rows: npt.NDArray[np.intp]) -> FloatArray:
+        return np.asarray(self._ways.points.aims[rows])
+
+    def _pointed(
+        self, name: str, points: Mapping[str, npt.ArrayLike]
+    ) -> tuple[tuple[str, ...], npt.NDArray[np.intp], FloatArray, dict[str, str]]:
+        """Return heliostats, rows (K,) and points (K, 3), and which are out of service, and why."""
+        wanted = points_of(name, points) if name == "AIM" else None
+        left, out = self._guards.passed(Asked(name, tuple(points), wanted), OUT_OF_SERVICE)
+        points = {n: points[n] for n in left}
+        rows = self._places(left)
+        return tuple(points), rows, points_of(name, points), out
+
+    def storing(
+        self, name: str, names: tuple[str, ...], places: FloatArray, held: Held = NOTHING
+    ) -> Storing:
+        """Return work that stores points (K, 3) and what visits hold then, and its reverse."""
+        return self._ways.points.storing(name, self._places(names), places, held)
+
+    def _lent(self, names: tuple[str, ...], places: FloatArray) -> Held:
+        """Return what is to be stored before a visit sends beams to points (K, 3)."""
+        return self._movements.record(names, self._aims(self._places(names)), places)
+
+    def give_points(
+        self, new: NewPoints, accept: Callable[[tuple[Work, Work] | None], Ticket]
+    ) -> Ticket:
+        """Give points that are proven; each is stored and assigned when it is sent.
+
+        Parameters
+        ----------
+        new
+            The points.
+        accept
+            Returns their ticket; it is given work that stores those that need no turn, with the
+            record of the ticket.
+        """
+        waiting = self._joins(new)
+        early = tuple(n for n in new.names if n not in waiting)
+        store = new.store(early, new.of(early)) if early else None
+        ticket = accept(store)
+
+        def send(again: bool) -> None:
+            if again:
+                self._guards.refuse_now(new.name, new.names)
+                self.prove_points(new.name, new.names, new.wanted)
+            new.check(new.names)
+            self._joining.drop(f"superseded by another {new.name}", frozenset(new.names), new.name)
+            joins = waiting | self._joins(new)
+            if store is not None and (late := joins - waiting):
+                self._orders.owe(partial(store[1], late))
+            still = tuple(n for n in new.names if n not in joins)
+            self._assign(new, ticket, still)
+            for point, members in new.grouped(still).items():
+                self._orders.command(ticket, new.name, point, members, new.token)
+            for point, members in new.grouped(n for n in new.names if n in joins).items():
+                part = replace(new, names=tuple(members), wanted=new.of(members))
+                assign = partial(self._assign_in_turn, part, ticket)
+                self._join(ticket, new.name, point, members, new.token, assign)
+
+        self._orders.when_recorded(ticket, send)
+        return ticket
+
+    def _assign_in_turn(
+        self,
+        new: NewPoints,
+        ticket: Ticket,
+        names: tuple[str, ...],
+        clear: Clear,
+        send: Callable[[tuple[str, ...]], None],
+    ) -> None:
+        """Store and assign the points of heliostats whose turn has come, then send them."""
+        store = new.store(names, new.of(names))
+
+        def stored(again: bool) -> None:
+            new.check(names)
+            left = names
+            if again:
+                self._guards.refuse_now(new.name, names)
+                left = clear(names)
+            if gone := set(names).difference(left):
+                self._orders.owe(partial(store[1], gone))
+            self._assign(new, ticket, left)
+            send(left)
+
+        self._orders.when_stored(ticket, names, store, stored)
+
+    def _assign(self, new: NewPoints, ticket: Ticket, names: tuple[str, ...]) -> None:
+        """Assign the points of some heliostats, which are sent now."""
+        places = new.of(names)
+        new.note(names, places)
+        self._ways.points.assign(new.name, self._places(names), places)
+        self._given.sent(ticket, names)
+
+    def _joins(self, new: NewPoints) -> frozenset[str]:
+        """Return the heliostats that track, and need a turn to join their new aims.
+
+        Those that bring no light to a receiver need none: see `_stays`.
+        """
+        if new.name != "AIM":
+            return frozenset()
+        rows = self._places(new.names)
+        moves = self._field.among(states.ON_AIM, self._now())[rows]
+        if new.free is not None:
+            return frozenset(new.names[i] for i in np.flatnonzero(moves)) - new.free()
+        return frozenset(
+            new.names[i] for i in np.flatnonzero(moves & ~self._stays(rows, new.wanted))
+        )
+
+    def prove_points(self, name: str, names: tuple[str, ...], wanted: FloatArray) -> None:
+        """Prove that heliostats (K,) may be given points (K, 3) now.
+
+        Raises
+        ------
+        BeamError
+            If one of them may not.
+        """
+        rows = self._places(names)
+        tracking = self._field.among(states.ON_AIM, self._now())[rows]
+        moves = tracking if name == "AIM" else self._field.among((states.IDLE,), self._now())[rows]
+        moved = tuple(names[i] for i in np.flatnonzero(moves))
+        if wrong := self._guards.reasons(Asked(name, moved, wanted[moves]), BEAM_REFUSED):
+            raise BeamError(name, wrong)
+        self._ways.check_points(name, rows, wanted, tracking)
+
+    def _stays(self, rows: npt.NDArray[np.intp], wanted: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return which heliostats bring no light to a receiver by new points (K, 3), (K,).
+
+        Aim and new point lie on the same target, or near each other and off every receiver: so
+        moves a beam that is sent beside a target, because it misses.
+        """
+        aims = self._ways.points.aims[rows]
+        found = np.linalg.norm(wanted - aims, axis=-1) <= _BESIDE
+        for receiver in self._design.receivers:
+            clear = 0.5 * float(np.hypot(receiver.width, receiver.height)) + _BESIDE
+            for points in (aims, wanted):
+                found &= np.linalg.norm(points - receiver.center, axis=-1) > clear
+        for target in self._design.targets:
+            found |= target.holds(aims) & target.holds(wanted)
+        return np.asarray(found)
+
+    def _join(
+        self,
+        ticket: Ticket,
+        name: str,
+        values: tuple[float, ...],
+        heliostats: Sequence[str],
+        token: int,
+        assign: Assign | None = None,
+    ) -> None:
+        until, waiting = self._now() + self._patience, deque(heliostats)
+        self._joining.put(JoiningJob(ticket, name, values, token, waiting, until, assign))

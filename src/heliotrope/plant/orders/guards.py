@@ -1,0 +1,287 @@
+"""Guards: why heliostats may not be given a command, as one table.
+
+A row names the refusal, the commands that it stops, and the check that gives each heliostat's
+reason. The table is evaluated when a command is accepted, when its record is written, and when its
+turn comes; of several reasons, the first row's is given. Where the beams may go is proven after
+that: see `BeamWatch`.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import messages, states
+from heliotrope.plant import refusals
+from heliotrope.plant.emergency import UNPROVEN, Sentinel
+from heliotrope.plant.field.doubtful_positions import DoubtfulPositions
+from heliotrope.plant.field.identity import Identities
+from heliotrope.plant.field.lockouts import Lockouts
+from heliotrope.plant.field.second_plant import SecondPlant
+from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.field.witnesses import Witnesses
+from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.orders.authority import Authority
+from heliotrope.plant.orders.parameters import ParameterSync
+from heliotrope.plant.orders.queue import PlantOrders
+from heliotrope.plant.orders.stowing import WAITS
+from heliotrope.plant.orders.unacknowledged import Unacknowledged
+from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE, Refusal, RefusedError
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A command that is to be given.
+
+    Attributes
+    ----------
+    name, heliostats
+        The command, and K heliostats.
+    points
+        Where it sends their beams, ENU, m, (K, 3); None: to their aims, if to a surface at all.
+    token
+        The holder's or a mandate's; None: the plant's own command.
+    """
+
+    name: str
+    heliostats: tuple[str, ...]
+    points: FloatArray | None = None
+    token: int | None = None
+
+
+@dataclass(frozen=True)
+class Guards:
+    """The parts of the plant whose state stops commands, and the evaluation of the table."""
+
+    field: FieldState
+    authority: Authority
+    orders: PlantOrders
+    sentinel: Sentinel
+    second_plant: SecondPlant
+    witnesses: Witnesses
+    identities: Identities
+    sync: ParameterSync
+    doubtful: DoubtfulPositions
+    lockouts: Lockouts
+    given: Unacknowledged
+    aims: FloatArray
+
+    def reasons(self, asked: Asked, *kinds: Refusal) -> dict[str, str]:
+        """Return the heliostats that guards with some refusals, or any, stop, and the reasons."""
+        found: dict[str, str] = {}
+        for guard in GUARDS:
+            if guard.refusal in (kinds or (guard.refusal,)) and asked.name in guard.commands:
+                reasons = guard.check(self, asked)
+                for name, reason in zip(asked.heliostats, reasons, strict=False):
+                    if reason:
+                        found.setdefault(name, reason)
+        return {name: found[name] for name in asked.heliostats if name in found}
+
+    def passed(self, asked: Asked, *kinds: Refusal) -> tuple[tuple[str, ...], dict[str, str]]:
+        """Return the heliostats that guards let pass, and those that they stop with the reasons.
+
+        Raises
+        ------
+        RefusedError
+            If they stop all; `BeamError` unless the refusal of all is the first of ``kinds``.
+        """
+        wrong = self.reasons(asked, *kinds)
+        if wrong and len(wrong) == len(asked.heliostats):
+            raise self._error(asked, kinds[0], wrong)
+        return tuple(name for name in asked.heliostats if name not in wrong), wrong
+
+    def held(self, name: str, heliostats: Sequence[str]) -> dict[str, str]:
+        """Return the heliostats in whose clusters no new motion may begin now, and the reasons."""
+        return self.reasons(Asked(name, tuple(dict.fromkeys(heliostats))), NOT_NOW)
+
+    def in_turn(
+        self, name: str, values: Sequence[float], heliostats: tuple[str, ...]
+    ) -> dict[str, str]:
+        """Return the heliostats whose turn has come and that may not go, and the reasons.
+
+        AIM brings a new aim, its values; every other command leads to those that they have.
+        """
+        points = np.tile(values, (len(heliostats), 1)) if name == "AIM" else None
+        return self.reasons(Asked(name, heliostats, points), BEAM_REFUSED)
+
+    def refuse_now(self, name: str, heliostats: Sequence[str]) -> None:
+        """Refuse a command where no new motion may begin now.
+
+        Raises
+        ------
+        BeamError
+            If it may begin in some of their clusters.
+        RefusedError
+            If it may begin in none.
+        """
+        if held := self.held(name, heliostats):
+            raise self._error(Asked(name, tuple(dict.fromkeys(heliostats))), NOT_NOW, held)
+
+    def _error(self, asked: Asked, kind: Refusal, wrong: dict[str, str]) -> RefusedError:
+        if kind is BEAM_REFUSED or len(self.reasons(asked, kind)) < len(asked.heliostats):
+            return BeamError(asked.name, wrong)
+        first, reason = next(iter(wrong.items()))
+        more = f" and {len(wrong) - 1} more" if len(wrong) > 1 else ""
+        return kind.error(what=asked.name, heliostat=first, more=more, reason=reason)
+
+    def destined(self, asked: Asked) -> FloatArray | None:
+        """Return the points (K, 3) to which a command sends beams; None: it sends them to none."""
+        if asked.points is not None or asked.name not in TO_AIMS:
+            return asked.points
+        rows = np.array([self.field.place(name) for name in asked.heliostats], dtype=np.intp)
+        return np.asarray(self.aims[rows])
+
+
+#: Gives the reason for each heliostat of a command (K), None where there is none; () for all.
+Check = Callable[[Guards, Asked], Iterable[str | None]]
+
+
+@dataclass(frozen=True)
+class Guard:
+    """A row of the table.
+
+    Attributes
+    ----------
+    refusal
+        Of the whole command, where it stops all heliostats.
+    commands
+        Those that it stops.
+    check
+        The reason for each heliostat.
+    """
+
+    refusal: Refusal
+    commands: frozenset[str]
+    check: Check
+
+
+def _each(reason: Callable[[Guards, str], str | None]) -> Check:
+    return lambda plant, asked: (reason(plant, name) for name in asked.heliostats)
+
+
+def _cluster(reason: Callable[[Guards, str], str]) -> Check:
+    """Ask once for each cluster."""
+
+    def check(plant: Guards, asked: Asked) -> Iterable[str | None]:
+        field = plant.field
+        rows = [field.cluster[field.place(name)] for name in asked.heliostats]
+        reasons = {row: reason(plant, field.clusters[row]) for row in set(rows)}
+        return (reasons[row] for row in rows) if any(reasons.values()) else ()
+
+    return check
+
+
+def _among(reasons: Callable[[Guards, Asked], dict[str, str]]) -> Check:
+    """Look the heliostats up among those that have a reason."""
+
+    def check(plant: Guards, asked: Asked) -> Iterable[str | None]:
+        found = reasons(plant, asked)
+        return map(found.get, asked.heliostats) if found else ()
+
+    return check
+
+
+def _alarm(condition: str = "") -> Check:
+    """Stop heliostats that a row of the safety table, or any, keeps from their aims."""
+    return _among(lambda plant, _: plant.sentinel.table.barred(condition))
+
+
+def _astray(plant: Guards, _: Asked) -> dict[str, str]:
+    """Stop beams that went astray, and are off: they would go astray again."""
+    state, place = plant.field.rows["state"], plant.field.place
+    astray = plant.sentinel.table.barred("pointing_disagrees")
+    return {name: text for name, text in astray.items() if state[place(name)] in states.AWAY}
+
+
+def _unacknowledged(plant: Guards, asked: Asked) -> Iterable[str | None]:
+    """Stop heliostats that have not acknowledged their aims, unless they get new ones before."""
+    return (
+        plant.given.untaken("AIM", name) if asked.points is None else None
+        for name in asked.heliostats
+    )
+
+
+def _doubted(plant: Guards, asked: Asked) -> Iterable[str | None]:
+    """Stop heliostats in doubt on their way to a receiver; a photograph on a target ends it."""
+    points = plant.destined(asked)
+    assert points is not None
+    return plant.doubtful.reasons(asked.heliostats, points)
+
+
+def _visited(plant: Guards, asked: Asked) -> dict[str, str]:
+    """Stop what would disturb a measurement, unless the visit orders it, or the plant."""
+    visited = {} if asked.token is None else plant.authority.visited()
+    return {
+        name: refusals.IN_VISIT.text.format(where=visit.where)
+        for name, visit in visited.items()
+        if visit.token != asked.token
+    }
+
+
+#: Commands that need the command authority; DEFOCUS and STOW do not, and nothing stops them.
+_ORDERS = messages.ORDERS | {"PARAMETERS"}
+#: Commands that send beams to their aims.
+TO_AIMS = messages.JOINING | {"AIM"}
+
+#: All guards; the first that stops a heliostat gives its reason.
+GUARDS: tuple[Guard, ...] = (
+    # ZERO and PARAMETERS are not harmless: the next STOW would go where stow is by then.
+    Guard(
+        OUT_OF_SERVICE,
+        _ORDERS - messages.HARMLESS,
+        _among(
+            lambda plant, asked: plant.lockouts.blocked(asked.heliostats, plant.destined(asked))
+        ),
+    ),
+    # The plant itself gives STOW after a visit, and does not while an emergency holds.
+    Guard(
+        NOT_NOW,
+        (_ORDERS | messages.SAFE) - messages.STOPS,
+        _cluster(lambda plant, name: plant.sentinel.refusal((name,))),
+    ),
+    # The sun is needed to follow it, and to stand at standby; work at the mirrors is not.
+    Guard(
+        NOT_NOW,
+        messages.JOINING | messages.TO_STANDBY,
+        _cluster(lambda plant, _: plant.sentinel.night),
+    ),
+    # The path from stow is free for the sun that is computed; another may lead it through volumes.
+    Guard(
+        NOT_NOW, frozenset({"APPROACH"}), _cluster(lambda plant, _: plant.witnesses.contradiction)
+    ),
+    Guard(
+        NOT_NOW,
+        _ORDERS | messages.SAFE,
+        _cluster(lambda plant, name: plant.second_plant.refusal((name,))),
+    ),
+    Guard(BEAM_REFUSED, messages.JOINING, _unacknowledged),
+    Guard(BEAM_REFUSED, TO_AIMS, _doubted),
+    Guard(BEAM_REFUSED, messages.JOINING, _alarm()),
+    Guard(
+        BEAM_REFUSED,
+        messages.TO_STANDBY,
+        _each(lambda plant, name: plant.given.unknown("STANDBY", name)),
+    ),
+    Guard(BEAM_REFUSED, messages.TO_STANDBY, _alarm(UNPROVEN)),
+    Guard(BEAM_REFUSED, messages.TO_STANDBY, _among(_astray)),
+    # A heliostat that is being sent off is not stopped.
+    Guard(BEAM_REFUSED, messages.RELEASES, _alarm("beam_unsent")),
+    Guard(BEAM_REFUSED, messages.RELEASES, _alarm("keep_out_predicted")),
+    Guard(BEAM_REFUSED, messages.SETTINGS, _among(_visited)),
+    Guard(
+        BEAM_REFUSED,
+        _ORDERS - messages.STOPS,
+        _each(lambda plant, name: plant.identities.blocked(name)),
+    ),
+    Guard(
+        BEAM_REFUSED,
+        messages.MOTIONS,
+        _each(lambda plant, name: WAITS if plant.orders.to_stow(name) else None),
+    ),
+    Guard(
+        BEAM_REFUSED,
+        messages.MOTIONS | messages.POINTS,
+        _each(lambda plant, name: plant.sync.differing(name)),
+    ),
+)

@@ -1,0 +1,188 @@
+"""Aims that visits have moved, and the aims to which the beams go back.
+
+A receiver visit moves beams by a milliradian; a visit to a target gives heliostats an
+aim there. So that they come back whatever becomes of the visit, the plant itself sends each beam
+back to its aim (`giving_back`): when the visit says so, when a small movement was not renewed for a
+while, and when the mandate or the command authority under which it was moved is over. That needs a
+command authority, for clusters obey nobody else.
+"""
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.field.target import Receiver, Target
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism.armature import Armature
+from heliotrope.plant.field.assigned import Held, Places
+from heliotrope.plant.orders.tickets import Ticket
+
+#: Longest distance of a beam from its aim, rad: below that at which `pointing_disagrees` trips.
+MOST = 3e-3
+#: Time without a movement after which a beam goes back, s.
+LIFE = 90.0
+#: Time after which a beam that did not go back is sent back again, s: it doubles from one attempt
+#: to the next, up to the longest.
+_AGAIN, _LONGEST = 3.0, 300.0
+
+#: Returns the heliostats that nobody looks after any more under a token.
+Left = Callable[[int, Iterable[str]], frozenset[str]]
+
+
+@dataclass(frozen=True)
+class _Moved:
+    """A beam beside its aim: the aim, and until when which token keeps it there.
+
+    ``small``: it is on the receiver where its aim is, too; ``pause``: before the next attempt, s.
+    """
+
+    aim: FloatArray
+    token: int
+    until: float
+    small: bool
+    pause: float = _AGAIN
+
+
+class Movements:
+    """The beams that are moved, by heliostat.
+
+    Parameters
+    ----------
+    receivers
+        Of the plant; beams move on planar ones.
+    armature
+        Of all heliostats, as they are believed now.
+    """
+
+    def __init__(self, receivers: Sequence[Receiver], armature: Armature) -> None:
+        self._faces: tuple[Target, ...] = tuple(r.face for r in receivers if r.kind == "planar")
+        self._armature = armature
+        self._moved: dict[str, _Moved] = {}
+        self._sent: list[Ticket] = []
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The heliostats whose beams are moved, or on the way back."""
+        return frozenset(self._moved)
+
+    def aim(self, heliostat: str, present: FloatArray) -> FloatArray:
+        """Return the aim of a heliostat without movement, (3,); ``present`` if it is not moved."""
+        known = self._moved.get(heliostat)
+        return present if known is None else known.aim
+
+    def refused(
+        self,
+        names: Sequence[str],
+        rows: npt.NDArray[np.intp],
+        aims: FloatArray,
+        wanted: FloatArray,
+        tracking: npt.NDArray[np.bool_],
+    ) -> dict[str, str]:
+        """Return which heliostats (K,) may not be moved to points (K, 3), and why."""
+        base = np.stack([self.aim(name, aim) for name, aim in zip(names, aims, strict=True)])
+        on = np.zeros(len(names), dtype=np.bool_)
+        for face in self._faces:
+            on |= face.holds(base) & face.holds(wanted)
+        away = np.linalg.norm(wanted - base, axis=-1)
+        slant = np.linalg.norm(base - self._armature.origin_1[rows], axis=-1)
+        wrong = {}
+        for i, name in enumerate(names):
+            if not tracking[i]:
+                wrong[name] = "it does not track the receiver"
+            elif not on[i]:
+                wrong[name] = "its aim, or the point beside it, is not on a planar receiver"
+            elif not away[i] <= MOST * slant[i]:
+                wrong[name] = (
+                    f"{1e3 * away[i] / slant[i]:.1f} mrad beside its aim; a movement has "
+                    f"{1e3 * MOST:g} mrad at most"
+                )
+        return wrong
+
+    def take(self, names: Sequence[str], aims: FloatArray, token: int, now: float) -> None:
+        """Note that beams are moved; ``aims`` (K, 3) are those of heliostats not moved before."""
+        for name, present in zip(names, aims, strict=True):
+            aim = np.array(self.aim(name, present))
+            self._moved[name] = _Moved(aim, token, now + LIFE, small=True)
+
+    def lend(self, names: Sequence[str], aims: FloatArray, wanted: FloatArray, token: int) -> None:
+        """Note aims that a visit gives (K, 3), and the present ones (K, 3) to which beams go back.
+
+        A heliostat that gets its own aim back, or had none, goes nowhere later.
+        """
+        for name, aim in self.record(names, aims, wanted)["LENT"].items():
+            if aim is not None:
+                self._moved[name] = _Moved(np.array(aim), token, np.inf, small=False)
+            else:
+                self._moved.pop(name, None)
+
+    def recall(self, held: Places) -> None:
+        """Send beams back to the aims from which visits of an earlier program moved them."""
+        for name, aim in held.items():
+            self._moved[name] = _Moved(np.array(aim), 0, -np.inf, small=False)
+
+    def record(self, names: Sequence[str], aims: FloatArray, wanted: FloatArray) -> Held:
+        """Return what is to be stored before a visit gives aims ``wanted``; see `lend`."""
+        found: dict[str, tuple[float, ...] | None] = {}
+        for name, present, point in zip(names, aims, wanted, strict=True):
+            aim = np.array(self.aim(name, present))
+            goes_back = np.isfinite(aim).all() and not np.array_equal(aim, point)
+            found[name] = tuple(aim.tolist()) if goes_back else None
+        return {"LENT": found}
+
+    def small(self, names: Sequence[str]) -> frozenset[str]:
+        """Return the heliostats that were moved a little: on the way back they need no turn."""
+        return frozenset(name for name in names if self._moved[name].small)
+
+    def forget(self, heliostats: Iterable[str]) -> None:
+        """Forget beams that have another aim now."""
+        for name in heliostats:
+            self._moved.pop(name, None)
+
+    @contextmanager
+    def ending(self, heliostats: Collection[str]) -> Iterator[None]:
+        """Let the beams of heliostats go back at the end of a block, however it ends."""
+        try:
+            yield
+        finally:
+            self.end(heliostats)
+
+    def end(self, heliostats: Collection[str]) -> None:
+        """Let beams go back at the next look."""
+        for name in heliostats:
+            if name in self._moved:
+                self._moved[name] = replace(self._moved[name], until=-np.inf)
+
+    def due(self, now: float, token: int, left: Left) -> dict[str, FloatArray]:
+        """Return the aims of beams that are to go back now, by heliostat.
+
+        None are without a command authority (``token`` 0). ``left`` returns those that nobody
+        looks after any more under the token that moved them.
+        """
+        for ticket in [ticket for ticket in self._sent if ticket.finished]:
+            self._sent.remove(ticket)
+            self.forget(name for name in ticket.heliostats if name not in ticket.refusals)
+        if not token:
+            return {}
+        back = {name for ticket in self._sent for name in ticket.waiting(ticket.heliostats)}
+        return {
+            name: moved.aim
+            for name, moved in self._moved.items()
+            if name not in back and (now >= moved.until or left(moved.token, (name,)))
+        }
+
+    def sent(self, ticket: Ticket, now: float) -> None:
+        """Note the order that brings beams back; those that do not obey are sent back again."""
+        self._sent.append(ticket)
+        for name in ticket.heliostats:
+            if (moved := self._moved.get(name)) is not None:
+                pause = min(2.0 * moved.pause, _LONGEST)
+                self._moved[name] = replace(moved, until=now + moved.pause, pause=pause)
+
+    def wait(self, heliostats: Iterable[str], token: int, now: float) -> None:
+        """Let beams that cannot go back now be tried again."""
+        for name in heliostats:
+            if (moved := self._moved.get(name)) is not None:
+                self._moved[name] = replace(moved, token=token, until=now + _AGAIN)

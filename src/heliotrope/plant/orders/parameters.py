@@ -1,0 +1,291 @@
+"""Parameters of local controllers: compared with the wanted ones at connection, then pushed."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.geometry import FloatArray, angle_between, normalize, reflect
+from heliotrope.lcu import states
+from heliotrope.lcu.controller import HARMLESS, MACHINE, POSE
+from heliotrope.links.messages import Answer, ProtocolError
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.board_items import CALIBRATION_ITEMS, POSE_ITEMS, Wanted, checksums
+from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.tracking import track
+from heliotrope.plant import refusals
+from heliotrope.plant.field.clusters import Clusters
+from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.orders.audit import AuditError
+from heliotrope.plant.orders.queue import PlantOrders
+from heliotrope.plant.orders.tickets import Ticket
+from heliotrope.safety import Alarm, alarms
+
+#: States in which a local controller takes items that change the pose: it stands still there.
+TAKES_POSE = POSE
+#: Pause before another attempt, s.
+AGAIN = 30.0
+
+
+#: Suns for which a change of parameters is measured: azimuth and elevation, rad.
+_SUNS = tuple(
+    (math.radians(azimuth), math.radians(elevation))
+    for azimuth in range(0, 360, 60)
+    for elevation in (25, 50)
+)
+#: Armature (18,) and drives (2, 19) of one heliostat.
+Tables = tuple[FloatArray, FloatArray]
+
+
+def change_of_beam(before: Tables, after: Tables, aims: npt.ArrayLike) -> float:
+    """Return the largest angle by which new parameters turn a beam from its aim, rad.
+
+    The mirror is taken to be as the present parameters say, and its local controller to aim by the
+    new ones, for suns all around. Infinite if the new ones reach none of the poses, or an aim that
+    the present ones reach is out of reach.
+
+    Parameters
+    ----------
+    before, after
+        Armature and drives under the present and the new parameters.
+    aims
+        Aim points, ENU, m, (K, 3).
+    """
+    suns = np.array(
+        [(math.sin(a) * math.cos(e), math.cos(a) * math.cos(e), math.sin(e)) for a, e in _SUNS]
+    )
+    points = np.reshape(np.asarray(aims, dtype=np.float64), (-1, 3))
+    light, goals = np.repeat(suns, len(points), axis=0), np.tile(points, (len(suns), 1))
+
+    def many(table: FloatArray) -> FloatArray:
+        return np.repeat(table[None], len(light), axis=0)
+
+    solved = [
+        track(Armature(many(a)), light, goals, drives=Drive(many(d))) for a, d in (before, after)
+    ]
+    reached, again = (found.reachable for found in solved)
+    if not reached.any() or (reached & ~again).any():
+        return math.inf
+    angles = Drive(many(before[1])).angles(solved[1].best_counts)
+    normal, vertex = Armature(many(before[0])).pose(angles)
+    missed = angle_between(reflect(light, normal), normalize(goals - vertex))
+    return float(missed[reached].max())
+
+
+def stored_items(answer: Answer) -> dict[str, bytes]:
+    """Return the items in an answer to ``stored``; none if the cluster could not read them.
+
+    Raises
+    ------
+    ProtocolError
+        Names, sizes and block that do not fit together.
+    """
+    names, sizes = answer.data.get("names"), answer.data.get("sizes")
+    if "error" in answer.data:
+        return {}
+    if not (isinstance(names, list) and isinstance(sizes, list)) or len(names) != len(sizes):
+        raise ProtocolError(f"answer {answer.identity}: it lacks the names and sizes of items")
+    if not all(isinstance(size, int) for size in sizes) or sum(sizes) != len(answer.block):
+        raise ProtocolError(f"answer {answer.identity}: names, sizes and block do not fit together")
+    found, place = {}, 0
+    for name, size in zip(names, sizes, strict=True):
+        found[str(name)] = answer.block[place : place + size]
+        place += size
+    return found
+
+
+class ParameterSync:
+    """Comparison of the stored parameters with the wanted ones, and the push of those that differ.
+
+    Parameters
+    ----------
+    field, wanted, orders, clusters
+        Of the plant.
+    tell
+        Called with each alarm.
+    proof
+        Returns why items may not be written where a heliostat stands, "" if they may.
+    stow_proof
+        Returns why a heliostat may not rest at the stow position in items, "" if it may.
+    blocked
+        Returns why nothing may be written to a heliostat, None if it may.
+    """
+
+    def __init__(
+        self,
+        field: FieldState,
+        wanted: Wanted,
+        orders: PlantOrders,
+        clusters: Clusters,
+        tell: Callable[[Alarm], None],
+        proof: Callable[[str, Mapping[str, bytes]], str],
+        stow_proof: Callable[[str, Mapping[str, bytes]], str],
+        blocked: Callable[[str], str | None],
+    ) -> None:
+        self._field, self._wanted, self._orders = field, wanted, orders
+        self._clusters, self._tell, self._proof = clusters, tell, proof
+        self._stow_proof, self._blocked = stow_proof, blocked
+        #: Heliostats to be compared, each with its time, monotonic s.
+        self._due = dict.fromkeys(wanted.items, -math.inf)
+        #: Those not compared since their cluster connected, or their board started.
+        self._strange = set(self._due)
+        self._tickets: dict[str, Ticket] = {}
+        self._tried: dict[str, float] = {}
+
+    def compare(self, heliostat: str) -> None:
+        """Compare a heliostat as soon as possible."""
+        if heliostat in self._wanted.items:
+            self._due[heliostat] = -math.inf
+
+    def greet(self, heliostats: Sequence[str]) -> None:
+        """Compare heliostats before they may move, since any boards may answer there.
+
+        Their cluster has connected, or their boards have started anew.
+        """
+        for name in heliostats:
+            self.compare(name)
+        self._strange.update(name for name in heliostats if name in self._wanted.items)
+
+    def differing(self, heliostat: str) -> str | None:
+        """Return why the parameters of a heliostat differ or may differ, None if they do not.
+
+        They may while they have not been compared since its cluster connected, or its board
+        started.
+        """
+        ticket = self._tickets.get(heliostat)
+        items = self._wanted.missing.get(heliostat, ())
+        if items or (ticket is not None and not ticket.finished):
+            listed = ", ".join(items) or "being written"
+            return refusals.PARAMETERS_DIFFER.text.format(items=listed)
+        return refusals.NOT_COMPARED.text if heliostat in self._strange else None
+
+    def check(self, heliostat: str, items: Mapping[str, bytes]) -> None:
+        """Check that the beam of a heliostat is safe if items are written now.
+
+        Raises
+        ------
+        RefusedError
+            If they change its pose where it does not stand still, or where its beam is not free; or
+            a stow position from which its beam would light a receiver, a target or a volume.
+        """
+        if reason := self._stow_proof(heliostat, items):
+            raise refusals.STOW_UNPROVEN.error(heliostat=heliostat, reason=reason)
+        state = int(self._field.rows["state"][self._field.place(heliostat)])
+        moving = ", ".join(sorted(POSE_ITEMS.intersection(items)))
+        reason = ""
+        if moving and state not in TAKES_POSE:
+            reason = f"it is {states.STATES[state]}, and {moving} would move its beam"
+        elif moving and state != states.STOWED:
+            reason = self._proof(heliostat, items)
+        if reason:
+            raise refusals.PARAMETERS_NOT_HERE.error(heliostat=heliostat, reason=reason)
+
+    def push(
+        self,
+        ticket: Ticket,
+        heliostat: str,
+        items: Mapping[str, bytes],
+        token: int,
+        before: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Send items of an accepted ticket once it is recorded; call ``before`` just before.
+
+        The heliostat is compared when the ticket has ended.
+        """
+
+        def send(again: bool) -> None:
+            if again:
+                if reason := self._blocked(heliostat):
+                    raise refusals.NOT_NOW.error(what=f"PARAMETERS {heliostat}", reason=reason)
+                self.check(heliostat, items)
+            before()
+            self._orders.parameters(ticket, heliostat, items, token)
+
+        self._tickets[heliostat] = ticket
+        self._orders.when_recorded(ticket, send)
+
+    async def stored(self, heliostat: str, timeout: float) -> dict[str, int]:
+        """Return the checksums of the items that a local controller stores, by item.
+
+        Raises
+        ------
+        RefusedError
+            If no answer comes within ``timeout`` s, or nothing is stored.
+        """
+        home = self._clusters.home(heliostat).name
+        answer = await self._clusters.answer(home, "stored", timeout, heliostat)
+        if answer is None:
+            late = f"nothing within {timeout:g} s; check that it is live"
+            raise refusals.NO_ANSWER.error(heliostat=heliostat, problem=late)
+        items = stored_items(answer)
+        if not items:
+            problem = answer.data.get("error", "nothing is stored")
+            raise refusals.NO_ANSWER.error(heliostat=heliostat, problem=problem)
+        sums = checksums(items)
+        self._strange.discard(heliostat)
+        self._wanted.compare(heliostat, sums)
+        return sums
+
+    def beat(self, now: float, token: int, allowed: bool) -> None:
+        """Ask for and push what is due; nothing is pushed unless ``allowed``."""
+        for name, ticket in list(self._tickets.items()):
+            if ticket.finished:
+                del self._tickets[name]
+                self.compare(name)
+        live = self._field.live(now)
+        for name, due in self._due.items():
+            # One that is being written is compared when its ticket has ended.
+            if now >= due and live[self._field.index[name]] and name not in self._tickets:
+                self._due[name] = now + AGAIN
+                self._ask(name)
+        if token and allowed:
+            for name, missing in list(self._wanted.missing.items()):
+                busy = name in self._tickets or name in self._due
+                if live[self._field.index[name]] and not busy and not self._blocked(name):
+                    self._push(name, missing, token, now)
+
+    def _ask(self, name: str) -> None:
+        def take(answer: Answer) -> None:
+            items = stored_items(answer)
+            if not items:
+                return
+            self._due.pop(name, None)
+            self._strange.discard(name)
+            differing = self._wanted.compare(name, checksums(items))
+            if differing:
+                self._tell(alarms.PARAMETERS_DIFFER.raised(name, items=", ".join(differing)))
+
+        self._clusters.ask(self._clusters.home(name), "stored", take, name)
+
+    def _push(self, name: str, missing: tuple[str, ...], token: int, now: float) -> None:
+        state = int(self._field.rows["state"][self._field.index[name]])
+        able = [item for item in missing if state in _takes(item)]
+        if not able or now - self._tried.get(name, -math.inf) < AGAIN:
+            return
+        self._tried[name] = now
+        items = {item: self._wanted.items[name][item] for item in able}
+        if reason := self._stow_proof(name, items):
+            del items["stow"]
+            listed = f"stow, which is not written: {reason}"
+            self._tell(alarms.PARAMETERS_DIFFER.raised(name, items=listed))
+        if not items:
+            return
+        try:
+            self.check(name, items)
+        except refusals.RefusedError:
+            return  # it is written at stow
+        try:
+            ticket = self._orders.accept(
+                ("plant", "plant", "PARAMETERS"), (), (name,), ", ".join(items)
+            )
+        except AuditError:
+            return  # nothing is sent without its record; the safety table reports the disk
+        self.push(ticket, name, items, token)
+
+
+def _takes(item: str) -> tuple[int, ...]:
+    """Return the states in which an item is written."""
+    if item not in CALIBRATION_ITEMS:
+        return MACHINE
+    return TAKES_POSE if item in POSE_ITEMS else HARMLESS

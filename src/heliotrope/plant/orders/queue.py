@@ -1,0 +1,668 @@
+"""Accepted commands under way: their records, their messages, and their results."""
+
+import struct
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+
+from heliotrope.errors import InputError
+from heliotrope.files.disk import Disk, DiskBusyError, Work
+from heliotrope.lcu import messages
+from heliotrope.links.clock import Clock, sleep_until
+from heliotrope.links.link import SendOutcome
+from heliotrope.links.messages import Command, Emergency, Parameters, Progress, Stage
+from heliotrope.plant.field.assigned import AssignedError
+from heliotrope.plant.field.clusters import ClusterEnd, Clusters
+from heliotrope.plant.orders.audit import Audit, AuditError, Record
+from heliotrope.plant.orders.authority import Authority, RefusedError
+from heliotrope.plant.orders.stowing import StowQueue
+from heliotrope.plant.orders.tickets import Ticket
+from heliotrope.safety import Act
+
+#: Reports on a message are ignored this long after it was sent, once its ticket has ended, s.
+FORGOTTEN = 60.0
+#: Pause between repetitions of DEFOCUS and STOW to heliostats that have not acknowledged, s.
+REPEAT = 1.0
+#: Time that a cluster may need beyond a command's life to report that it failed, s.
+GRACE = 3.0
+#: A command whose record is not on the disk within this time is not sent, s.
+RECORDING = 2.0
+#: Owed records that are written together, and the time after which the rest must wait: commands
+#: that are given meanwhile wait behind them, s.
+_BATCH, _TURN = 256, 0.5
+#: Clusters hear of a new token within this time, s.
+_HEARD = 3.0
+#: Commands that move nothing by themselves: an emergency does not overtake them.
+_STILL = messages.POINTS | {"PARAMETERS"}
+#: Time allowed at the end of the plant for the records that are owed, s.
+_LAST = 10.0
+
+
+@dataclass
+class _Under:
+    """One message under way.
+
+    It was given with the token ``given`` and left with ``token``; ``again`` sends it again.
+    """
+
+    ticket: Ticket
+    cluster: str
+    heliostats: tuple[str, ...]
+    at: float
+    given: int = 0
+    token: int = 0
+    again: Callable[[tuple[str, ...]], None] | None = None
+
+
+@dataclass
+class _Recording:
+    """What must be on the disk before some heliostats of a ticket are sent their command."""
+
+    ticket: Ticket
+    heliostats: tuple[str, ...]
+    #: Writes the record of the ticket; None: it is on the disk already.
+    begin: Work | None
+    #: Stores what the command assigns, after its record, and takes that back.
+    store: tuple[Work, Work] | None
+    until: float
+    send: Callable[[bool], None] | None = None
+    begun: bool = False
+    waited: bool = False
+    error: Exception | None = None
+
+    def write(self) -> None:
+        """Write the record, then store what the command assigns."""
+        if self.begin is not None:
+            self.begin()
+        self.begun = True
+        if self.store is not None:
+            self.store[0]()
+
+
+class PlantOrders:
+    """Accepted commands: their records, their messages and their tickets.
+
+    Nothing here waits for a disk. A command waits in the plant until its record is on the disk
+    (`when_recorded`); DEFOCUS and STOW do not, and overtake the commands that wait.
+
+    Parameters
+    ----------
+    clock
+        Clock of the plant.
+    authority
+        Tokens of the commands; what is accepted from anybody takes heliostats out of visits.
+    audit
+        Store of the records.
+    disk
+        Does the work of the audit.
+    clusters
+        Their links carry the messages.
+    prefix
+        Prefix of identities; no two runs of a plant may have the same one.
+    lifetime, patience
+        Time allowed until a command is acknowledged, and from then until it is done, s.
+    stow_rate
+        Heliostats a second that `stow_in_turn` sends; 0: all at once.
+    sent
+        Called with name, values and heliostats of each command that is sent, DEFOCUS and STOW
+        among them, and the time.
+
+    Attributes
+    ----------
+    confirmed_at
+        Last time that the audit confirmed that it can write, monotonic s.
+    problem
+        Why it cannot write, "" if it can.
+    latest
+        Ticket of the last command; None before the first.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        authority: Authority,
+        audit: Audit,
+        disk: Disk,
+        clusters: Clusters,
+        prefix: str,
+        lifetime: float,
+        patience: float,
+        stow_rate: float,
+        sent: Callable[[str, tuple[float, ...], tuple[str, ...], float], None],
+    ) -> None:
+        self._sent, self._authority = sent, authority
+        self._clock, self._audit, self._disk, self._clusters = clock, audit, disk, clusters
+        self._prefix, self._lifetime, self._patience = prefix, lifetime, patience
+        self._number = self._messages = 0
+        self._open: dict[str, Ticket] = {}
+        self.latest: Ticket | None = None
+        self._under: dict[str, _Under] = {}
+        #: What clusters refused because their token was not the present one.
+        self._again: list[tuple[_Under, tuple[str, ...]]] = []
+        #: Identities of commands that wait for their turn on the line to their cluster.
+        self._unsent: set[str] = set()
+        self._recording: dict[str, _Recording] = {}
+        self._owed: deque[Work] = deque()
+        self._paying = False
+        self._sent_at: dict[str, float] = {}
+        self._stowing = StowQueue(stow_rate)
+        self._purged_at = clock.monotonic()
+        self.confirmed_at = clock.monotonic()
+        self.problem = ""
+
+    @property
+    def open(self) -> tuple[Ticket, ...]:
+        """Tickets that have not ended."""
+        return tuple(self._open.values())
+
+    @property
+    def owing(self) -> bool:
+        """Whether records wait to be written and the audit accepted the last one."""
+        return bool(self._owed) and not self.problem
+
+    def accept(
+        self,
+        record: tuple[str, str, str],
+        values: Sequence[float],
+        heliostats: Sequence[str],
+        note: str = "",
+        *,
+        late: bool = False,
+        fault: bool = False,
+        store: tuple[Work, Work] | None = None,
+    ) -> Ticket:
+        """Accept a command and give its record to the disk; see `when_recorded`.
+
+        Parameters
+        ----------
+        record
+            The giver's name and role, and the command's name.
+        values, heliostats, note
+            For the record and the ticket.
+        late
+            Whether the record may be written later: DEFOCUS and STOW wait for nothing.
+        fault
+            Whether the heliostats have caused the order; see `Mandate.take_out`.
+        store
+            Work of the disk that stores what the command assigns, in one piece with its record, and
+            work that takes it back if the command is not sent in the end.
+
+        Raises
+        ------
+        AuditError
+            If it is already known that the record cannot be written, and it may not be ``late``.
+        """
+        self._number += 1
+        who, role, what = record
+        identity = f"{self._prefix}-{self._number}"
+        named = () if len(heliostats) == len(self._clusters) else tuple(heliostats)
+        entry = Record(identity, who, role, what, self._utc(), tuple(values), named, note)
+        ticket = Ticket(identity, what, heliostats, self._clock, self._patience)
+        if late:
+            self._overtake(frozenset(heliostats), what)
+            why = f"{who} ordered {what}{note and f' ({note})'}"
+            self._authority.prevail(heliostats, why, fault=fault)
+            self._owed.append(lambda: self._audit.begin(entry))
+        else:
+            self._record(ticket, entry, store)
+        self._open[identity] = self.latest = ticket
+        return ticket
+
+    def _record(self, ticket: Ticket, entry: Record, store: tuple[Work, Work] | None) -> None:
+        """Give the record of a ticket to the disk."""
+        begin, until = partial(self._audit.begin, entry), self._clock.monotonic() + RECORDING
+        recording = _Recording(ticket, ticket.heliostats, begin, store, until)
+        try:
+            self._write(ticket.identity, recording)
+        except DiskBusyError as error:
+            raise AuditError(f"audit: {error}") from None
+        if recording.error is not None and not recording.begun:
+            raise recording.error
+
+    def when_stored(
+        self,
+        ticket: Ticket,
+        heliostats: tuple[str, ...],
+        store: tuple[Work, Work],
+        send: Callable[[bool], None],
+    ) -> None:
+        """Call ``send`` once what a recorded command assigns to some heliostats is on the disk.
+
+        See `when_recorded`; ``store`` is as in `accept`.
+        """
+        until, self._messages = self._clock.monotonic() + RECORDING, self._messages + 1
+        recording = _Recording(ticket, heliostats, None, store, until, send)
+        try:
+            self._write(f"{ticket.identity}.{self._messages}", recording)
+        except DiskBusyError as error:
+            ticket.advance(heliostats, Stage.REFUSED, f"not sent: {error}")
+
+    def _write(self, key: str, recording: _Recording) -> None:
+        """Give the disk what must be on it before a command is sent."""
+        self._recording[key] = recording
+        try:
+            self._disk.do(recording.write, partial(self._recorded, key, recording))
+        except DiskBusyError:
+            del self._recording[key]
+            raise
+        recording.waited = True
+
+    def _recorded(self, key: str, recording: _Recording, error: Exception | None) -> None:
+        """Send a command whose record is on the disk, or end it because that failed."""
+        ticket, heliostats = recording.ticket, recording.heliostats
+        self._give_up_late(recording, self._clock.monotonic())
+        del self._recording[key]
+        recording.error = error
+        if recording.begun:
+            self.confirmed_at = self._clock.monotonic()
+        if error is None:
+            if ticket.waiting(heliostats):
+                ticket.record()
+                if recording.send is not None:
+                    self._send_recorded(recording, recording.send)
+            elif recording.store is not None:
+                self._owed.append(recording.store[1])
+        elif recording.begun:
+            text = f"not sent, because it cannot be stored: {error}"
+            ticket.advance(heliostats, Stage.REFUSED, text)
+        elif ticket.identity in self._open and recording.begin is not None:
+            text = f"not sent: its record could not be written: {error}"
+            ticket.advance(heliostats, Stage.REFUSED, text)
+            # It was accepted, so it gets a record as soon as the disk takes one.
+            self._owed.append(recording.begin)
+
+    def _send_recorded(self, recording: _Recording, send: Callable[[bool], None]) -> None:
+        """Send a command that waited for its record, unless it may no longer be sent."""
+        try:
+            send(recording.waited)
+        except Exception as error:
+            stage = Stage.REFUSED if isinstance(error, RefusedError) else Stage.FAILED
+            recording.ticket.advance(recording.heliostats, stage, f"not sent: {error}")
+            if recording.store is not None:
+                self._owed.append(recording.store[1])
+            if not isinstance(error, RefusedError):
+                raise
+
+    @staticmethod
+    def _give_up_late(recording: _Recording, now: float) -> None:
+        if now > recording.until:
+            text = f"not sent: its record was not on the disk within {RECORDING:g} s"
+            recording.ticket.advance(recording.heliostats, Stage.REFUSED, text)
+
+    def when_recorded(self, ticket: Ticket, send: Callable[[bool], None]) -> None:
+        """Call ``send`` once the ticket's record is on the disk; never, if that takes too long.
+
+        ``send`` is called with whether the command had to wait: what was proven at its acceptance
+        must then be proven again, and heliostats that have ended meanwhile (`Ticket.waiting`) are
+        left out. It may raise `RefusedError`, which ends the ticket.
+        """
+        recording = self._recording.get(ticket.identity)
+        if recording is not None:
+            recording.send = send
+        elif ticket.recorded:
+            send(False)
+
+    def unstored(self, name: str) -> frozenset[str]:
+        """Return the heliostats whose command of a name waits for the disk."""
+        waiting = (r for r in self._recording.values() if r.ticket.name == name)
+        return frozenset(each for r in waiting for each in r.heliostats)
+
+    def _overtake(self, heliostats: frozenset[str], what: str) -> None:
+        """Give up commands that wait for their records or for the line to their cluster.
+
+        None may follow DEFOCUS, STOW or LOCK.
+        """
+        for recording in self._recording.values():
+            ticket = recording.ticket
+            if ticket.name not in _STILL:
+                names = [name for name in recording.heliostats if name in heliostats]
+                ticket.advance(names, Stage.REFUSED, f"not sent: overtaken by {what}")
+        for identity in self._unsent:
+            under = self._under.get(identity)
+            if under is not None and under.ticket.name not in _STILL:
+                names = [name for name in under.heliostats if name in heliostats]
+                under.ticket.advance(names, Stage.FAILED, f"not sent: overtaken by {what}")
+
+    def note(self, who: str, role: str, what: str, note: str) -> None:
+        """Record an action that is complete at once, such as a change of the command authority."""
+        ticket = self.accept((who, role, what), (), (), note, late=True)
+        del self._open[ticket.identity]
+        self._owe_result(ticket.identity, "done")
+
+    def owe(self, work: Work) -> None:
+        """Give work to the disk after the records that are owed; it may be done again."""
+        self._owed.append(work)
+
+    def pay(self) -> None:
+        """Give the oldest owed records to the disk, unless earlier ones are on their way."""
+        if self._paying:
+            return
+        batch, done = tuple(islice(self._owed, _BATCH)), [0]
+
+        def write() -> None:
+            until = self._clock.monotonic() + _TURN
+            for each in batch:
+                done[0] += 1
+                try:
+                    each()
+                except (AuditError, AssignedError):
+                    done[0] -= 1  # it is tried again; what is refused for its content is not
+                    raise
+                if self._clock.monotonic() >= until:
+                    break
+            self._audit.confirm()
+
+        self._paying = True
+        try:
+            self._disk.do(write, lambda error: self._paid(done[0], error))
+        except DiskBusyError as error:
+            self._paying, self.problem = False, str(error)
+
+    def _paid(self, count: int, error: Exception | None) -> None:
+        self._paying = False
+        for _ in range(count):
+            self._owed.popleft()
+        if error is None:
+            self.confirmed_at, self.problem = self._clock.monotonic(), ""
+            return
+        self.problem = str(error)
+        if not isinstance(error, AuditError | AssignedError):
+            raise error
+
+    # Sending.
+
+    def command(
+        self,
+        ticket: Ticket,
+        name: str,
+        values: tuple[float, ...],
+        heliostats: Iterable[str],
+        token: int,
+        lifetime: float | None = None,
+        again: Callable[[tuple[str, ...]], None] | None = None,
+    ) -> None:
+        """Send a command to some heliostats of a ticket.
+
+        It is sent again where a cluster refuses it because the command authority has just changed.
+
+        Parameters
+        ----------
+        ticket, name, values, heliostats
+            The ticket, and the command.
+        token
+            The holder's, or a mandate's.
+        lifetime
+            Replaces the usual one, s.
+        again
+            Sends it to some heliostats again; None: as before, at once.
+        """
+        heliostats = tuple(heliostats)
+
+        def repeat(names: tuple[str, ...]) -> None:
+            self.command(ticket, name, values, names, token, lifetime)
+
+        if name == "LOCK":
+            for other, names in self._stowing.take(heliostats).items():
+                other.advance(names, Stage.FAILED, "superseded by LOCK")
+        self._sent(name, values, heliostats, self._clock.monotonic())
+        life = self._lifetime if lifetime is None else lifetime
+        for end, part in self._clusters.parts(heliostats):
+            identity = self._begin(ticket, end, part)
+            self._repeated(identity, token, again or repeat)
+            self._unsent.add(identity)
+
+            def message(
+                identity: str = identity, end: ClusterEnd = end, part: tuple[str, ...] = part
+            ) -> Command | None:
+                self._unsent.discard(identity)
+                left = ticket.waiting(part)  # without those that DEFOCUS or STOW has overtaken
+                named = () if len(left) == len(end.members) else left
+                own = self._own(identity, token) if left else 0
+                return Command(identity, name, values, named, own, life) if own else None
+
+            end.post(message, life, self._told(identity))
+
+    def emergency(
+        self, ticket: Ticket, act: Act, heliostats: Sequence[str], *, again: bool = False
+    ) -> None:
+        """Send DEFOCUS or STOW before everything else that has not been sent.
+
+        A repetition (``again``) gives no more time to acknowledge.
+        """
+        if not again:
+            for other, names in self._stowing.take(heliostats).items():
+                if other is not ticket:
+                    other.advance(names, Stage.FAILED, f"superseded by {ticket.name}")
+            self._supersede(ticket, frozenset(heliostats))
+        # Further portions of a STOW must not put off the repetition of the first.
+        self._sent_at.setdefault(ticket.identity, self._clock.monotonic())
+        self._sent(act.name, (), tuple(heliostats), self._clock.monotonic())
+        for end, part in self._clusters.parts(heliostats):
+            identity = self._begin(ticket, end, part, again=again)
+            named = () if len(part) == len(end.members) else part
+            end.post(Emergency(identity, act.name, named), None, self._told(identity), urgent=True)
+
+    def stow_in_turn(self, ticket: Ticket, heliostats: Sequence[str]) -> tuple[str, ...]:
+        """Send STOW to heliostats in portions; return those that have been sent it.
+
+        Orders that they were given before are repeated until it is their turn. An order by
+        `emergency` meanwhile goes at once and takes the place of this one.
+        """
+        if not self._stowing.staggers(heliostats):
+            self.emergency(ticket, Act.STOW, heliostats)
+            return tuple(heliostats)
+        now = self._clock.monotonic()
+        self._sent_at[ticket.identity] = now
+        for other, names in self._stowing.put(ticket, heliostats).items():
+            other.advance(names, Stage.FAILED, f"superseded by {ticket.name}")
+        self._stow(self._stowing.due(now))
+        return tuple(name for name in heliostats if name not in self._stowing)
+
+    def to_stow(self, heliostat: str) -> bool:
+        """Whether a heliostat waits for its turn to go to stow: no motion is for it."""
+        return heliostat in self._stowing
+
+    def _stow(self, parts: Mapping[Ticket, Sequence[str]]) -> None:
+        for ticket, names in parts.items():
+            self.emergency(ticket, Act.STOW, ticket.waiting(names))
+
+    def repeat(self, ticket: Ticket, act: Act, heliostats: Sequence[str]) -> None:
+        """Send DEFOCUS or STOW again to those heliostats whose clusters are connected."""
+        left = self._clusters.connected(heliostats)
+        if left:
+            self.emergency(ticket, act, left, again=True)
+
+    def _supersede(self, ticket: Ticket, heliostats: frozenset[str]) -> None:
+        """End older repeated orders to the same heliostats, but no STOW by a DEFOCUS."""
+        for identity in self._sent_at:
+            other = self._open.get(identity)
+            if other is not None and other is not ticket and Act[other.name] <= Act[ticket.name]:
+                left = [name for name in other.unacknowledged() if name in heliostats]
+                other.advance(left, Stage.FAILED, f"superseded by {ticket.name}")
+
+    def parameters(
+        self, ticket: Ticket, heliostat: str, items: Mapping[str, bytes], token: int
+    ) -> None:
+        """Send items of one heliostat."""
+
+        def repeat(names: tuple[str, ...]) -> None:
+            if names:
+                self.parameters(ticket, heliostat, items, token)
+
+        for end, part in self._clusters.parts([heliostat]):
+            identity = self._begin(ticket, end, part)
+            self._repeated(identity, token, repeat)
+            life = Parameters.lifetime
+            ticket.expect(part, self._clock.monotonic() + life + GRACE)
+
+            def message(identity: str = identity) -> Parameters | None:
+                own = self._own(identity, token)
+                return Parameters.of(identity, heliostat, items, own) if own else None
+
+            end.post(message, life, self._told(identity))
+
+    def _begin(
+        self, ticket: Ticket, end: ClusterEnd, part: tuple[str, ...], *, again: bool = False
+    ) -> str:
+        now = self._clock.monotonic()
+        self._messages += 1
+        identity = f"{ticket.identity}.{self._messages}"
+        self._under[identity] = _Under(ticket, end.name, part, now)
+        if not again:
+            ticket.expect(part, now + self._lifetime + GRACE)
+        return identity
+
+    def _repeated(
+        self, identity: str, token: int, again: Callable[[tuple[str, ...]], None]
+    ) -> None:
+        """Note how a message is sent again."""
+        self._under[identity].given, self._under[identity].again = token, again
+
+    def _own(self, identity: str, token: int) -> int:
+        """Return the token with which a message leaves now; 0: it may not leave any more."""
+        own = self._authority.present(token)
+        if own and identity in self._under:
+            self._under[identity].token, self._under[identity].ticket.sent = own, True
+        return own
+
+    def _told(self, identity: str) -> Callable[[SendOutcome], None]:
+        def told(outcome: SendOutcome) -> None:
+            under = self._under.get(identity)
+            # DEFOCUS and STOW are repeated until they are acknowledged.
+            if under is None or outcome is SendOutcome.SENT or under.ticket.name in messages.SAFE:
+                return
+            text = f"cluster {under.cluster}: {outcome.value}"
+            under.ticket.advance(under.heliostats, Stage.FAILED, text)
+
+        return told
+
+    # Reports of clusters.
+
+    def take(self, cluster: str, progress: Progress) -> tuple[Ticket, tuple[str, ...]] | None:
+        """Take a cluster's report; return its ticket and heliostats, None if neither is known."""
+        under = self._under.get(progress.identity)
+        if under is None or under.cluster != cluster:
+            return None
+        mine = set(under.heliostats)
+        part = tuple(name for name in progress.heliostats if name in mine)
+        # A report without heliostats is about all of them.
+        part = part if progress.heliostats else under.heliostats
+        if self._crossed(under, progress.stage):
+            waiting = set(under.ticket.unacknowledged())
+            early = tuple(name for name in part if name in waiting)
+            self._again.append((under, early))
+            part = tuple(name for name in part if name not in early)
+        under.ticket.advance(part, progress.stage, progress.text)
+        return under.ticket, part
+
+    def _crossed(self, under: _Under, stage: Stage) -> bool:
+        """Whether a message and a change of the command authority may have crossed each other.
+
+        Its cluster may then have refused its token, and nothing else is wrong with it. What failed
+        may have been done, so a person's command is sent again only where it was refused. One of an
+        earlier holder is never sent again.
+        """
+        mandated = self._authority.mandate_of(under.given) is not None
+        if stage is not Stage.REFUSED and not (mandated and stage is Stage.FAILED):
+            return False
+        own = self._authority.present(under.given)
+        if under.again is None or own == 0 or own != self._authority.token:
+            return False
+        young = self._clock.monotonic() - self._authority.changed_at < _HEARD
+        return young or under.token != own
+
+    def beat(self, now: float) -> None:
+        """End commands that were not answered in time; record the results of ended tickets."""
+        for recording in self._recording.values():
+            self._give_up_late(recording, now)
+        self._stow(self._stowing.due(now))
+        crossed, self._again = self._again, []
+        for under, names in crossed:
+            if under.again is not None and (left := under.ticket.waiting(names)):
+                under.again(left)
+        ended = []
+        for identity, ticket in self._open.items():
+            ticket.expire(now)
+            if ticket.finished and identity not in self._recording:
+                ended.append(identity)
+                unsent = "" if ticket.sent or ticket.name in messages.SAFE else "not sent: "
+                self._owe_result(identity, f"{unsent}{ticket.text}")
+        for identity in ended:
+            del self._open[identity]
+        self._repeat(now)
+        if now - self._purged_at >= FORGOTTEN:
+            self._purged_at = now
+            self._under = {
+                key: u
+                for key, u in self._under.items()
+                if u.ticket.identity in self._open or now - u.at < FORGOTTEN
+            }
+
+    def _repeat(self, now: float) -> None:
+        """Send DEFOCUS and STOW again to heliostats that have not acknowledged them."""
+        for identity, at in list(self._sent_at.items()):
+            ticket = self._open.get(identity)
+            if ticket is None:
+                del self._sent_at[identity]
+            elif now - at >= REPEAT:
+                self._sent_at[identity] = now
+                left = [name for name in ticket.unacknowledged() if name not in self._stowing]
+                self.repeat(ticket, Act[ticket.name], left)
+
+    async def end(self, now: float) -> None:
+        """Record the state of every open ticket, at the end of the plant."""
+        until = now + _LAST
+        for recording in self._recording.values():
+            text = "not sent: the plant was closed"
+            recording.ticket.advance(recording.heliostats, Stage.REFUSED, text)
+        self.beat(now)
+        await self._until(lambda: not self._recording, until)
+        for identity, ticket in self._open.items():
+            if identity not in self._recording:
+                self._owe_result(identity, f"{ticket.text}; then the plant was closed")
+        self._open.clear()
+        self.problem = ""
+        self.pay()
+        await self._until(self._settled, until)
+
+    def _settled(self) -> bool:
+        """Whether the owed records are written or cannot be; the next batch is on its way."""
+        if self.owing:
+            self.pay()
+        return not (self._paying or self.owing)
+
+    async def _until(self, what: Callable[[], bool], until: float) -> None:
+        while not what() and self._clock.monotonic() < until:
+            await sleep_until(self._clock, self._clock.monotonic() + 0.05)
+
+    def _owe_result(self, identity: str, result: str) -> None:
+        at = self._utc()
+        self._owed.append(lambda: self._audit.finish(identity, result, at))
+
+    def _utc(self) -> str:
+        return self._clock.utc().isoformat(timespec="milliseconds")
+
+
+def whole(values: Sequence[float], codes: str, command: str) -> tuple[float, ...]:
+    """Return a command's numbers as the wire carries them.
+
+    Raises
+    ------
+    InputError
+        Too many or too few numbers, or one out of range.
+    """
+    if len(values) != len(codes):
+        raise InputError(f"{command}: {len(values)} numbers given; the wire takes {len(codes)}")
+    checked: list[float] = [
+        int(v) if code not in "fd" and float(v).is_integer() else v
+        for v, code in zip(values, codes, strict=True)
+    ]
+    try:
+        data = struct.pack("<" + codes, *checked)
+    except (struct.error, OverflowError) as error:
+        raise InputError(f"{command}: {tuple(values)} cannot be sent: {error}") from None
+    if not all(abs(v) < float("inf") for v in struct.unpack("<" + codes, data)):
+        raise InputError(f"{command}: {tuple(values)} cannot be sent: give finite numbers")
+    return tuple(float(v) for v in values)

@@ -1,0 +1,69 @@
+"""The queue of an ordinary STOW of many heliostats: they go one after the other, not all at once.
+
+As STOW ALL of Malan's controller (thesis, table D.1, 0xD9), it spares the supply the current of all
+drives that start together. Emergencies, the safety table and lost leases never wait here.
+"""
+
+from collections.abc import Collection, Iterable
+
+from heliotrope.plant.orders.tickets import Ticket
+
+#: Why such a heliostat is not moved meanwhile.
+WAITS = "it waits for its turn to go to stow"
+
+
+class StowQueue:
+    """Heliostats that wait for their STOW, in their order.
+
+    Parameters
+    ----------
+    rate
+        Heliostats a second, and at once after a rest; 0: nobody waits.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self.rate = rate
+        self._waiting: dict[str, Ticket] = {}
+        self._spare, self._at = rate, float("-inf")
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def __contains__(self, heliostat: str) -> bool:
+        return heliostat in self._waiting
+
+    def staggers(self, heliostats: Collection[str]) -> bool:
+        """Return whether an order to some heliostats is one of many."""
+        return 0.0 < self.rate < len(heliostats)
+
+    def put(self, ticket: Ticket, heliostats: Iterable[str]) -> dict[Ticket, list[str]]:
+        """Add heliostats; return those of earlier orders that wait for this one now.
+
+        One that waits already keeps its place: whoever repeats an order delays nobody.
+        """
+        replaced: dict[Ticket, list[str]] = {}
+        for name in heliostats:
+            other = self._waiting.get(name)
+            if other is not None and other is not ticket:
+                replaced.setdefault(other, []).append(name)
+            self._waiting[name] = ticket
+        return replaced
+
+    def due(self, now: float) -> dict[Ticket, list[str]]:
+        """Take out the heliostats whose turn it is at a time, monotonic s."""
+        if not self._waiting:
+            return {}
+        self._spare = min(self.rate, self._spare + self.rate * (now - self._at))
+        self._at = now
+        some = list(self._waiting)[: int(self._spare)]
+        self._spare -= len(some)
+        return self.take(some)
+
+    def take(self, heliostats: Iterable[str]) -> dict[Ticket, list[str]]:
+        """Take out some heliostats, whether or not it is their turn."""
+        found: dict[Ticket, list[str]] = {}
+        for name in heliostats if self._waiting else ():
+            ticket = self._waiting.pop(name, None)
+            if ticket is not None:
+                found.setdefault(ticket, []).append(name)
+        return found
