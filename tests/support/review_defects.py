@@ -14,6 +14,7 @@ from heliotrope.cluster._emergencies import Emergencies
 from heliotrope.cluster._work import Work
 from heliotrope.lcu import motion, states
 from heliotrope.links.messages import Stage
+from heliotrope.mechanism import machine
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import Standing, sentinel
 from heliotrope.plant.field.identity import Identities
@@ -102,6 +103,12 @@ def counts_of_another_mirror(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(motion, "ELSEWHERE", 1e9)
 
 
+def turned_away_together(patch: pytest.MonkeyPatch) -> None:
+    """All mirrors of a group turn away by the same angles."""
+    together = lambda defocus, names, spread: np.tile(defocus, (len(names), 1))  # noqa: E731
+    patch.setattr(machine, "spread_defocus", together)
+
+
 def all_withdrawn(patch: pytest.MonkeyPatch) -> None:
     """One person's withdrawal ends the orders of all."""
     withdraw = sentinel.Sentinel.withdraw
@@ -158,6 +165,8 @@ ROWS: tuple[
      STOW_FILE, ("repairs",), False, 3),
     ((15,), "another mirror's board keeps its counts", counts_of_another_mirror,
      SPARE, ("repairs", "calm"), False, 0),
+    ((13,), "all turn away by the same angles", turned_away_together,
+     ("line_cut",), ("repairs",), False, 5),
     ((WORDS,), "one person withdraws all orders", all_withdrawn,
      CALM, ("repairs",), False, 2),
     ((WORDS,), "a restored store does not know it", backup_unknown,

@@ -5,7 +5,7 @@ import math
 import random
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,7 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
-from heliotrope.mechanism.machine import AxisLimits, Machine, Stepping
+from heliotrope.mechanism.machine import AxisLimits, Machine, spread_machines
 
 #: Steps per turn of a joint: 15.7 µrad a step. At 8000 steps/s a turn takes 50 s.
 STEPS_PER_TURN = 400_000
@@ -29,12 +29,10 @@ RANGES = ((-20_000, 406_000), (-4000, 104_000))
 RECEIVER = (0.0, 0.0, 50.0)
 STANDBY = (12.0, 0.0, 40.0)
 DEFOCUS = (0.1, 0.05)
-#: What the boards of `outfits` store besides their mechanisms.
+#: What the boards of `outfits` store besides their mechanisms, but for the spread of the defocus.
 MACHINE = Machine(
     (AxisLimits(*RANGES[0], *LIMITS), AxisLimits(*RANGES[1], *LIMITS)), STOW, DEFOCUS, STANDBY
 )
-#: The same with motors whose full step is 0.5 mrad of the joint: rough stepping goes by full steps.
-COARSE = replace(MACHINE, stepping=Stepping((32, 32)))
 #: Centre and radius of a sphere that no beam may enter, m; no way leads there unless ordered.
 KEEP_OUT, KEEP_OUT_RADIUS = (-12.0, 0.0, 25.0), 2.0
 #: Centre and radius of a ball, ENU, m.
@@ -105,7 +103,8 @@ def outfits(count: int, seed: int = 0, places: Sequence[tuple[float, float]] = (
         raise InputError(f"{count} heliostats on a bus; give 1 to {MOST}")
     chance = random.Random(seed)
     fits = []
-    for i in range(count):
+    machines = spread_machines(MACHINE, [f"H{i + 1:02d}" for i in range(count)])
+    for i, machine in enumerate(machines):
         bearing = math.radians(-35.0 + 70.0 * (i + chance.uniform(0.2, 0.8)) / count)
         away = chance.uniform(60.0, 130.0)
         drawn = (away * math.sin(bearing), away * math.cos(bearing))
@@ -122,7 +121,8 @@ def outfits(count: int, seed: int = 0, places: Sequence[tuple[float, float]] = (
                 key,
                 mechanism,
                 causes,
-                {**items_of(mechanism, MACHINE), **own_items(address)},
+                {**items_of(mechanism, machine), **own_items(address)},
+                machine,
             )
         )
     return fits

@@ -55,6 +55,8 @@ _SEARCH = 8e-3
 #: Error of the beams of which the plant file is wrong, until they are calibrated, rad: twice that
 #: of their mirrors.
 UNSURVEYED = 45e-3
+#: This many heliostats do not all turn away by the same angles.
+_MANY = 3
 #: States in which a beam is sent to a point.
 _LIT = {states.TRACKING: "aims", states.SEARCHING: "aims", states.IDLE: "standbys"}
 _ON = (states.TRACKING, states.SEARCHING)
@@ -429,12 +431,21 @@ class BeamObserver:
             mirror.uncalled = False
         elif state != states.IDLE or before in _AWAY:
             mirror.uncalled = now - mirror.called_at > TOGETHER
+        if state == states.DEFOCUSED:
+            self._parted(mirror, now)
         if state in _ON and before not in _ON:
             self._returns(mirror, now)
         elif before in _ON and state not in _ON and now - mirror.off_at > TOGETHER:
             mirror.lost_at = now
             if self._most is None:
                 self._departures.append((now, mirror.name))
+
+    def _parted(self, mirror: _Mirror, now: float) -> None:
+        """Check that beams do not turn away together: they would make a hot spot elsewhere."""
+        aside = [m.node for m in self._mirrors.values() if m.board.state == states.DEFOCUSED]
+        turns = {node.journal.items.get("defocus") for node in aside if node is not None}
+        saw = f"{len(aside)} heliostats turned away by the same angles"
+        self._check(13, len(aside) < _MANY or len(turns) > 1, now, mirror.name, saw)
 
     def _returns(self, mirror: _Mirror, now: float) -> None:
         """Check that a mirror returns to the receiver by a person's will, if one is needed."""

@@ -30,7 +30,7 @@ number    check
 12        A beam in a state that lights anything is where it was sent; otherwise an alarm names
           it within 10 s and it is off within 30 s.
 13        In no state does a beam that was not ordered there stay on the receiver, or any beam
-          in a keep-out volume, for 30 s.
+          in a keep-out volume, for 30 s; the beams that turn away part.
 14        After a loss of more mirrors than automatic control may raise again, or of all, only a
           person brings one back.
 15        A mirror proven to be done is off the receiver, or at stow.

@@ -22,7 +22,7 @@ from heliotrope.links.messages import Command, Progress, Stage
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.controller import PlantController
 from heliotrope.safety import Act, Alarm
-from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STANDBY
+from heliotrope.twin.boards.outfit import RECEIVER, STANDBY
 from heliotrope.twin.invariants._account import HeliostatAccount
 from heliotrope.twin.invariants.beams import slew
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
@@ -171,7 +171,8 @@ class QuietObserver:
             for account in observer.accounts
         }
         for mirror in self._mirrors.values():
-            items = items_of(mirror.account.board.outfit.mechanism, MACHINE)
+            outfit = mirror.account.board.outfit
+            items = items_of(outfit.mechanism, outfit.machine)
             mirror.own = {name: items[name] for name in _OWN if name in items}
         self._quiet: frozenset[str] = frozenset()
         self._refusals: list[tuple[_Mirror, bool, str]] = []

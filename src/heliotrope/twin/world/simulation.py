@@ -37,7 +37,6 @@ from heliotrope.sun import vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.clocks import TickCounter
 from heliotrope.twin.boards.outfit import (
-    COARSE,
     MACHINE,
     RECEIVER,
     STANDBY,
@@ -78,6 +77,7 @@ from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
 from heliotrope.twin.world.twice import SecondPlant
 from heliotrope.twin.world.work import DAY_WORK, LIT_WORK, LOSSES, USUAL_WORK, Work
 from heliotrope.twin.world.worlds import (
+    COARSE,
     COMMON,
     DAYS,
     PARTY,
@@ -303,7 +303,7 @@ class Simulation:
         self._suns: dict[int, FloatArray] = {}
         fits = motors_of(outfits(plan.size, plan.seed, scene.places), plan.worlds, plan.seed)
         known = surveyed(fits, plan.worlds, plan.seed)
-        self._coarse = fits[0].machine is COARSE
+        self._coarse = fits[0].machine.stepping == COARSE
         self._unsurveyed = {a.name for a, b in zip(fits, known, strict=True) if a is not b}
         stored = [
             replace(fit, items=stored_fit.items)
@@ -420,8 +420,7 @@ class Simulation:
         sight = FieldSnapshot(clock, mirrors, lambda: self.sun(clock.monotonic()))
         lights, together = "lights" in plan.worlds, joint_visits(plan.worlds)
         kind = DAY_WORK if DAYS in plan.worlds else LIT_WORK if lights else USUAL_WORK
-        machine, lowest = self._fits[0].machine, self._scene.lowest
-        kind = replace(kind, together=together, lowest=lowest, machine=machine)
+        kind = replace(kind, together=together, lowest=self._scene.lowest)
         work = Work(plan.seed, sight, self._exits, kind)
         watch = self._new_watch(work, together=together)
         truth = {name: board.outfit.causes for name, board in boards.items()}

@@ -19,7 +19,6 @@ import numpy.typing as npt
 from heliotrope.calibration.learn.drift import START_NOISE
 from heliotrope.links.clock import Clock
 from heliotrope.mechanism.board_items import items_of
-from heliotrope.mechanism.machine import Machine
 from heliotrope.plant.assembly import CYCLE
 from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.controller import PlantController
@@ -31,7 +30,6 @@ from heliotrope.plant.visits import CalibrationCycle, Centring, CycleSettings, J
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import Alarm
 from heliotrope.store.keeper import Keeper
-from heliotrope.twin.boards.outfit import MACHINE
 from heliotrope.twin.cameras import FieldSnapshot
 from heliotrope.twin.world.photographs import LyingCamera
 
@@ -62,8 +60,6 @@ class WorkKind:
         Whether the plant chooses by its own schedule, and measures several heliostats at once.
     lowest
         Elevation of the sun below which the field is stowed, rad.
-    machine
-        Motors of all heliostats.
     """
 
     lies: float = 0.2
@@ -71,7 +67,6 @@ class WorkKind:
     lights: bool = False
     together: bool = False
     lowest: float = math.radians(8.0)
-    machine: Machine = MACHINE
 
 
 #: Kinds of work: of most worlds, of "lights", and of "days".
@@ -191,7 +186,8 @@ class Work:
             receiver=self._receiver(plant, cycle),
         )
         for name in plant.field.names:
-            plant.wanted.set(name, items_of(plant.beliefs.present(name)[0], self._kind.machine))
+            believed = plant.beliefs.present(name)[0]
+            plant.wanted.set(name, items_of(believed, plant.design.machine(name)))
         return self.operations
 
     def _schedule(self, plant: PlantController) -> PlantSchedule:

@@ -7,8 +7,9 @@ from datetime import datetime, timedelta
 
 from heliotrope.errors import InputError
 from heliotrope.mechanism.board_items import items_of, packed
+from heliotrope.mechanism.machine import Stepping
 from heliotrope.sun import Site
-from heliotrope.twin.boards.outfit import COARSE, MACHINE, Outfit
+from heliotrope.twin.boards.outfit import MACHINE, Outfit
 
 #: Everything that a run may add, and its meaning.
 WORLDS = {
@@ -61,9 +62,11 @@ MIX = (
 #: Worlds that `mixed` adds to this share of runs each, beside those that it draws. A cluster that
 #: is wrong from the start is found within seconds, and then keeps its mirrors from all else.
 RARE, RARE_SHARE = ("lights", "clock", "site", "addresses", COMMON), 0.04
+#: Motors whose full step is 0.5 mrad of the joint: rough stepping goes by full steps.
+COARSE = Stepping((32, 32))
 #: Shares of days with motors that step coarsely, and with heliostats of which the plant file is
 #: wrong; by how much, rad of the mirror.
-_COARSE, _UNSURVEYED, _BESIDE = 1.0 / 3.0, 1.0 / 3.0, (0.018, 0.022)
+_COARSE_DAYS, _UNSURVEYED, _BESIDE = 1.0 / 3.0, 1.0 / 3.0, (0.018, 0.022)
 #: Share of the days on which a mirror is covered: it throws no light.
 _COVERED = 0.25
 #: Share of the runs of `mixed` that are a working day, or repairs, and nothing else.
@@ -222,11 +225,18 @@ def stored_by(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[
 
 def motors_of(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
     """Return heliostats with their motors: on one day in three these step coarsely."""
-    coarse = DAYS in worlds and random.Random(f"motors {seed}").random() < _COARSE
+    coarse = DAYS in worlds and random.Random(f"motors {seed}").random() < _COARSE_DAYS
     if not coarse:
         return list(fits)
-    items = items_of(fits[0].mechanism, COARSE)["stepping"]
-    return [replace(f, machine=COARSE, items={**f.items, "stepping": items}) for f in fits]
+    stepping = items_of(fits[0].mechanism, replace(MACHINE, stepping=COARSE))["stepping"]
+    return [
+        replace(
+            fit,
+            machine=replace(fit.machine, stepping=COARSE),
+            items={**fit.items, "stepping": stepping},
+        )
+        for fit in fits
+    ]
 
 
 def surveyed(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
