@@ -34,7 +34,7 @@ from heliotrope.mechanism.board_items import (
 from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.field.aims import BeamCheck, spread
-from heliotrope.plant.field.ordered import Ordered
+from heliotrope.plant.field.ledger import Ordered
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.io.links_file import PlantLinks
 from heliotrope.plant.operations.keeping import Keeping

@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from heliotrope.lcu import messages, states
 from heliotrope.lcu import names as meanings
 from heliotrope.plant.field.assigned import Held, Places
-from heliotrope.plant.field.ordered import STOWING, Ordered
+from heliotrope.plant.field.ledger import STOWING, Ordered
 from heliotrope.plant.field.state import FieldState
 
 #: A report from this long after a lock was sent shows it, s.

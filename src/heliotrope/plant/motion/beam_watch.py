@@ -17,7 +17,7 @@ from heliotrope.mechanism.machine import Machine
 from heliotrope.mechanism.tracking import TrackingStatus
 from heliotrope.plant.field.aims import BeamCheck
 from heliotrope.plant.field.assigned import BEFORE, KINDS, Points
-from heliotrope.plant.field.ordered import Ordered
+from heliotrope.plant.field.ledger import Ordered
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.motion.defocusing import way_out
 from heliotrope.plant.motion.paths import Paths

@@ -1,7 +1,7 @@
 """Losses: heliostats that left the receiver or its standby point without an order of the plant.
 
 Whether one was ordered off, by a person, a visit, the safety table or automatic control, is asked
-of what the plant has sent (`plant.field.ordered`). A heliostat that lost its cluster, its sun or its
+of what the plant has sent (`plant.field.ledger`). A heliostat that lost its cluster, its sun or its
 supply turns away by itself. Automatic control may raise a few such heliostats again. After a loss
 of many it waits for a person: nobody knows what has happened in the field.
 """
